@@ -84,16 +84,23 @@ class Addition:
         return not self.against
 
     @property
+    def confirmed(self) -> bool:
+        """Whether the final samples show what it is for, or come nearer to the model with it."""
+        return not self.before.at_floor or self.after.value < self.before.value
+
+    @property
     def named(self) -> bool:
         """Whether the verdict names it."""
-        return self.alone and self.fits and not self.described
+        return self.verdict == "named"
 
     @property
     def verdict(self) -> State:
         """The verdict of it alone."""
         if self.described:
             return "described"
-        return "unexplained" if not self.fits else "named" if self.alone else "ambiguous"
+        if not self.fits:
+            return "unexplained"
+        return "named" if self.alone and self.confirmed else "ambiguous"
 
     def step(self, size: Size | None) -> Step:
         """Return it as ``discrepancy.json`` holds it."""
@@ -102,7 +109,8 @@ class Addition:
         return Step(
             effect=self.effect.tag if self.named else None,
             verdict=self.verdict,
-            candidates=self.candidates,
+            # one that is not confirmed is not confused with those that it beats
+            candidates=self.candidates[:1] if self.alone and not self.confirmed else self.candidates,
             parameters=parameters_of(self.effect, self.strength_stderr),
             place=place_words(self.effect),
             gap_before=self.before.value,
@@ -336,14 +344,7 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
     if state == "described":
         return _described(found, titles, sizes)
     if state == "ambiguous":
-        sets = [
-            " or ".join(_title(c.effect) for c in each.candidates)
-            for each in added.additions
-            if not each.named
-        ]
-        also = f"{_and(titles)} is missing, and " if titles else ""
-        lacks = f"{also}{_and(sets)}{_rest(found)}{_left(added)}"
-        return f"The model lacks something that these {data} cannot tell apart: {lacks}."
+        return _ambiguous(found, titles, sizes)
     if found.before.at_floor:
         return f"The model was missing {_and(titles)}, too little for the final {data} alone to show."
     if state == "named_in_part":
@@ -352,6 +353,21 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
     them = "them" if len(titles) > 1 else "it"
     words = f"with {them}, no more of the gap is left than chance makes{_left(added)}{_doubts(added)}"
     return f"The model was missing {_and(titles)}; {words}."
+
+
+def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size | None]) -> str:
+    """Return what the model may lack: effects not told apart, and what the final samples do not confirm."""
+    data, additions = found.samples, found.added.additions
+    unknown = [" or ".join(_title(c.effect) for c in each.candidates) for each in additions if not each.alone]
+    weak = _and([_sized(e.effect, sizes) for e in additions if e.alone and e.fits and not e.confirmed])
+    also = f"{_and(titles)} is missing, and " if titles else ""
+    if not unknown:
+        also = f"The model was missing {_and(titles)}, and it may" if titles else "The model may"
+        left = f"{_rest(found)}{_left(found.added)}"
+        return f"{also} lack {weak}, which the final {data} do not confirm: more samples would tell{left}."
+    weak = f"; it may lack {weak}, which the final {data} do not confirm" if weak else ""
+    lacks = f"{also}{_and(unknown)}{weak}{_rest(found)}{_left(found.added)}"
+    return f"The model lacks something that these {data} cannot tell apart: {lacks}."
 
 
 def _sized(effect: Effect, sizes: Mapping[str, Size | None]) -> str:

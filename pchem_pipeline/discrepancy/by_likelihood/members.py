@@ -119,6 +119,11 @@ class Member:
         return any(isinstance(v, tuple | list) and len(v) > _LONGEST_LIST for _, v in self.effect)
 
     @property
+    def free_satellites(self) -> bool:
+        """Whether each pixel has a weight of its own, so that no number is shared."""
+        return bool(self.effect.sample_law(SampleLaw(), _ONE_PIXEL).free_satellites)
+
+    @property
     def bends_codes(self) -> bool:
         """Whether it moves the edges of codes, which no comb of a pixel's own follows."""
         law = self.effect.sample_law(SampleLaw(), _ONE_PIXEL)
@@ -182,6 +187,11 @@ def law_of(
     return law
 
 
+def leads_in_histograms(effect: type[Effect]) -> bool:
+    """Tell whether the statistic that an effect moves most is one that histograms have."""
+    return not effect.signature or effect.signature[0].partition(".")[0] in _FAMILIES
+
+
 def find_members(
     classes: Mapping[str, type[Effect]], evidence: Evidence, present: Sequence[Effect]
 ) -> tuple[list[Member], dict[str, str], dict[str, str]]:
@@ -202,7 +212,7 @@ def find_members(
     for tag, effect in classes.items():
         if tag in have:
             continue
-        if effect.signature and effect.signature[0].partition(".")[0] not in _FAMILIES:
+        if not leads_in_histograms(effect):
             untestable[tag] = NO_ORDER
             continue
         if effect.rough_law:

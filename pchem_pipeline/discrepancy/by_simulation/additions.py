@@ -189,8 +189,9 @@ class AddedRounds:
             new = one.tags - compared.chosen.tags
             if len(new) == 1 and one.tags == (compared.chosen.tags - {added.tag}) | new:
                 hypothesis = next(h for h in one.hypotheses if h.tag in new)
-                behind = one.score - compared.chosen.score
-                found.setdefault(hypothesis.tag, _Other(hypothesis.effect, behind, one.mean, one.rest, True))
+                behind, error = compared.witnessed.get(one.tags, (one.score - compared.chosen.score, None))
+                other = _Other(hypothesis.effect, behind, one.mean, one.rest, True, error)
+                found.setdefault(hypothesis.tag, other)
         noise = Noise(this.null.covariance / 2.0, self.settings.model_error)
         shift = self.z.both - this.null.mean
         best = fit_set(this.added.hypotheses, shift, noise).log_score(shift, noise)
@@ -221,6 +222,8 @@ class AddedRounds:
             # in the unit in which the statistic is told elsewhere
             left = this.null.shifted(other.mean - this.null.mean).pulls(self.z.both, 2)[worst]
             why = f"leaves {STATISTICS[this.null.names[worst]].sentence} ({left:+.1f} sd)"
+        elif other.error is not None:
+            why = f"fits the histograms of the pixels worse, by {-other.behind:.1f} +- {other.error:.1f} nats"
         else:
             why = f"fits all statistics together worse, by {-other.behind:.1f} nats of likelihood"
         return Rival(effect=other.effect.tag, gap_after=gap.value, behind=other.behind, why=why)
@@ -236,6 +239,7 @@ class _Other:
         mean: statistics of the model with it, shape (m,).
         rest: what is left of the data, in its errors, shape (m,).
         closes: whether a strength above 0 explains anything.
+        error: of ``behind`` where the histograms of the pixels say it, nats; None: all statistics do.
     """
 
     effect: Effect
@@ -243,6 +247,7 @@ class _Other:
     mean: FloatArray
     rest: FloatArray
     closes: bool
+    error: float | None = None
 
 
 def left_of(rounds: Sequence[Round], last: NullModel, z: Measured, allowed: float) -> FloatArray:

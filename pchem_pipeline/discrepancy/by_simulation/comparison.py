@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, stats
 
 from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
@@ -51,6 +51,10 @@ _MOVED = 3.0  # by which that effect must move it
 _UNTOUCHED = 0.5  # of that, the most by which the others may move it
 _NO_WORSE = 10.0  # nats by which fewer replicates may make a set look worse
 _PLACEBO_STEPS = 2  # corrections of its strength
+_NEARLY_AS_GOOD = 40.0  # nats between sets that a second witness is asked about
+
+#: Says how far a set of effects is behind another, nats, and the error of that; None where it cannot.
+Witness = Callable[[Sequence[Effect], Sequence[Effect]], tuple[float, float] | None]
 
 
 @dataclass(frozen=True)
@@ -61,11 +65,14 @@ class Comparison:
         chosen: the best.
         tried: all, the best first.
         failed: effects of which the refit failed, and why.
+        witnessed: by their tags, how far other sets are behind the chosen one by another witness than the
+            statistics, nats, and the error of that.
     """
 
     chosen: Refitted
     tried: tuple[Refitted, ...]
     failed: Mapping[str, str] = field(default_factory=dict)
+    witnessed: Mapping[frozenset[str], tuple[float, float]] = field(default_factory=dict)
 
     def rivals_of(self, tag: str) -> tuple[Contender, ...]:
         """Return what could stand in the place of an effect of the chosen set, itself first."""
@@ -77,10 +84,14 @@ class Comparison:
                 continue
             [name] = new
             hypothesis = next(h for h in one.hypotheses if h.tag == name)
-            behind = _worth(one) - _worth(self.chosen)
-            found[name] = Contender(
-                hypothesis, behind, _apart(one, self.chosen), float(np.exp(min(behind, 0.0)))
-            )
+            if one.tags in self.witnessed:
+                behind, error = self.witnessed[one.tags]
+                # neither need be the very law of the samples
+                probability = float(stats.norm.cdf(behind / max(error, 1e-9)))
+            else:
+                behind, error = _worth(one) - _worth(self.chosen), _apart(one, self.chosen)
+                probability = float(np.exp(min(behind, 0.0)))
+            found[name] = Contender(hypothesis, behind, error, probability)
         total = sum(c.probability for c in found.values())
         shared = [Contender(c.hypothesis, c.score, c.stderr, c.probability / total) for c in found.values()]
         return tuple(sorted(shared, key=lambda c: (-c.probability, -c.score)))
@@ -93,6 +104,7 @@ def compare(
     choice: Choice,
     before: Refitted | None = None,
     beside: Callable[[Refitted], Choice | None] = lambda _: None,
+    witness: Witness = lambda one, other: None,
 ) -> Comparison | None:
     """Refit the sets worth it, and choose the simplest that leaves nothing, else the best; None: none holds.
 
@@ -103,6 +115,7 @@ def compare(
         choice: how their sets compare by fingerprints.
         before: the effects held, at their best fit; None: not known.
         beside: compares new hypotheses by what they do beside a refitted set.
+        witness: asked about sets that the statistics tell badly apart.
 
     Raises:
         EffortSpentError: the work is at its limit.
@@ -153,11 +166,15 @@ def compare(
     chosen = _chosen(to_choose, tried, [] if before is None else [before])
     if chosen is None:
         return None
+    witnessed = _witnessed(chosen, tried, witness)
+    best = max(tried, key=lambda one: witnessed.get(one.tags, (0.0, 0.0))[0])
+    if witnessed.get(best.tags, (0.0, 0.0))[0] > 0.0 and _all_seen(to_choose, best, tried):
+        chosen, witnessed = best, _witnessed(best, tried, witness)
     known = {h.tag for h in held}
     for member in chosen.hypotheses:
         if member.tag not in known:
             tried += _placebo(refitter, hypotheses, chosen, member, tried)
-    return Comparison(chosen, tuple(tried), failed)
+    return Comparison(chosen, tuple(tried), failed, witnessed)
 
 
 def _chosen(refitter: Refitter, tried: list[Refitted], before: Sequence[Refitted]) -> Refitted | None:
@@ -184,6 +201,21 @@ def _chosen(refitter: Refitter, tried: list[Refitted], before: Sequence[Refitted
             return chosen
         for i in short:
             tried[i] = refitter.refined(tried[i].hypotheses, chosen.score)
+
+
+def _witnessed(
+    chosen: Refitted, tried: Sequence[Refitted], witness: Witness
+) -> dict[frozenset[str], tuple[float, float]]:
+    """Ask about the sets nearly as good as the chosen one that have another effect in the place of one."""
+    found: dict[frozenset[str], tuple[float, float]] = {}
+    for one in tried:
+        swapped = len(one.tags - chosen.tags) == len(chosen.tags - one.tags) == 1
+        near = abs(_worth(one) - _worth(chosen)) < _NEARLY_AS_GOOD
+        if swapped and near and one.tags not in found:
+            answer = witness(one.effects, chosen.effects)
+            if answer is not None:
+                found[one.tags] = answer
+    return found
 
 
 def unrelated(one: Effect, other: Effect) -> bool:

@@ -52,6 +52,7 @@ from pchem_pipeline.discrepancy.by_simulation.maps import (
     learn_sensor,
     refit_maps,
 )
+from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import PixelLikelihood, with_details
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.replicate import (
     Replicate,
@@ -289,6 +290,10 @@ class FrameExplainer:
             for guess in simulator.guesses(self.classes, evidence, apart, beside, most)
             if not share_place((*found, guess))
         ]
+        if slopes is None:
+            guesses = with_details(
+                guesses, self._own_samples(model), drawn.fit.maps, self.frames.effects(model), self.effort
+            )
         hypotheses = simulator.fingerprints([*guesses, *placebo_for(guesses, self.classes)])
         if slopes is None:
             hypotheses = simulator.refined(hypotheses, (shifts[0] + shifts[1]) / 2.0, self._noise(null, 2))
@@ -315,6 +320,7 @@ class FrameExplainer:
                 explanation.choice,
                 self.held,
                 lambda best: self._left_by(best, refitter, z),
+                self._behind,
             )
         except EffortSpentError as spent:
             tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
@@ -341,6 +347,14 @@ class FrameExplainer:
         null = NullModel.from_replicates(self.first.names, best.vectors, self.first)
         null = null.shifted(np.expm1(best.change) @ best.slopes)
         return self._asked(model, self.drawn[model], null, z, best.slopes)[1]
+
+    def _behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
+        """Return how far a set is behind another by the likelihood of the pixels; see `PixelLikelihood`."""
+        present = self.frames.effects([e for e in self.model if e in self.given])
+        if not all(effect.everywhere for effect in (*present, *one, *other)):
+            return None
+        frames = self._own_samples((*present, *one))
+        return PixelLikelihood(frames, self.plain.maps, present, self.effort).behind(one, other)
 
     def _widens(self, added: Refitted, null: NullModel, z: Measured) -> bool:
         """Tell whether a set, its strengths as the data ask for, leaves a wider gap than without it."""

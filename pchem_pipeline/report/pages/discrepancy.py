@@ -476,7 +476,8 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
     if step.effect:
         outcome = f"{step.effect} was named"
     elif data.found.verdict == "ambiguous":
-        outcome = "these data cannot tell them apart"
+        several = len(step.candidates) > 1
+        outcome = "these data cannot tell them apart" if several else "the final samples do not confirm it"
     else:
         outcome = "none of them explains it"
     title = f"Candidates, step {index + 1}" if len(data.found.steps) > 1 else "Candidates"

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from pchem_pipeline.discrepancy.by_simulation.additions import (
     unexplained_of_its_kind,
@@ -17,6 +18,7 @@ from pchem_pipeline.discrepancy.by_simulation.additions import (
 from pchem_pipeline.discrepancy.by_simulation.candidates import ReplicateSimulator
 from pchem_pipeline.discrepancy.by_simulation.comparison import (
     Comparison,
+    Witness,
     _begun,
     _of_kinds,
     compare,
@@ -104,11 +106,12 @@ class World:
         held: Sequence[Hypothesis] = (),
         before: Any = None,
         beside: Sequence[Hypothesis] = (),
+        witness: Witness = lambda one, other: None,
     ) -> Comparison | None:
         choice = self.choice(*hypotheses)
         assert choice is not None
         grown = (lambda one: self.choice(*beside, mean=one.mean)) if beside else (lambda _: None)
-        return compare(self.refitter(), held, hypotheses, choice, before, grown)
+        return compare(self.refitter(), held, hypotheses, choice, before, grown, witness)
 
 
 @pytest.mark.parametrize("strength", [0.03, 0.1, 0.4, 1.2])
@@ -240,6 +243,38 @@ def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
     assert found is not None
     assert found.chosen.tags == {"row_noise"}
     assert found.rivals_of("row_noise")[0].hypothesis.tag == "row_noise"
+
+
+def test_a_second_witness_decides_between_effects_that_the_statistics_tell_badly_apart() -> None:
+    world = World([effect("row_noise", 0.5)])
+    twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
+    row, column = TRUTH["row_noise"], TRUTH["frame_noise"]
+    asked: list[tuple[str, str]] = []
+
+    def witness(one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
+        asked.append((one[0].tag, other[0].tag))
+        return (12.0, 4.0) if one[0].tag == "frame_noise" else (-12.0, 4.0)
+
+    TRUTH["frame_noise"] = (row[0] + 0.5 * np.eye(M)[1], row[1])
+    try:
+        plain = world.compare(hypothesis("row_noise", 0.5), twin)
+        found = world.compare(hypothesis("row_noise", 0.5), twin, witness=witness)
+        never = world.compare(hypothesis("row_noise", 0.5), twin, witness=lambda one, other: None)
+        open_ = world.compare(hypothesis("row_noise", 0.5), twin, witness=lambda one, other: (-3.0, 4.0))
+    finally:
+        TRUTH["frame_noise"] = column
+    assert plain is not None
+    assert found is not None
+    assert never is not None
+    assert open_ is not None
+    assert plain.chosen.tags == never.chosen.tags == open_.chosen.tags == {"row_noise"}
+    assert found.chosen.tags == {"frame_noise"}
+    assert asked == [("frame_noise", "row_noise"), ("row_noise", "frame_noise")]
+    first, second = found.rivals_of("frame_noise")
+    assert (first.hypothesis.tag, second.hypothesis.tag) == ("frame_noise", "row_noise")
+    assert (second.score, second.stderr) == (-12.0, 4.0)
+    assert second.probability == pytest.approx(stats.norm.cdf(-3.0), rel=0.01)
+    assert open_.rivals_of("row_noise")[1].probability > 0.1
 
 
 def test_two_effects_with_signatures_of_their_own_are_found_together() -> None:

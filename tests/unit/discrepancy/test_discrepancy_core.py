@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.discrepancy.build_verdict import Added, Findings, _sentence
+from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings, _sentence
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Hypothesis,
     Noise,
@@ -22,6 +24,7 @@ from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, look_elsewhere
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
+from pchem_pipeline.discrepancy.verdict import Candidate
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_class
 
@@ -342,3 +345,26 @@ def test_what_nearly_disagrees_is_said_beside_consistent() -> None:
     assert "more frames would tell" in words[True, False]
     assert "taken together the frames" in words[True, False]
     assert "taken together the frames" not in words[False, True]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "state"), [(1e-5, 2e-5, "ambiguous"), (1e-5, 0.5e-5, "named"), (9e-5, 2e-5, "named")]
+)
+def test_what_the_final_frames_do_not_confirm_has_no_name(before: float, after: float, state: str) -> None:
+    effect = effect_class("flicker_noise")(share=0.1)
+    first, last = (Gap(value, 3e-5, (0.0, 0.0), {}) for value in (before, after))
+    rival = [
+        Candidate.of(one, 0.0, 0.0, 0.5) for one in (effect, effect_class("row_noise")(row_noise_dn=1.0))
+    ]
+    addition = Addition(effect, True, "", tuple(rival), 1e-4, first, last, (), None, ())
+    found = Findings("frames", None, None, None, first, [], False, Added((addition,), last))  # type: ignore[arg-type]
+    assert found.state == addition.verdict == state
+    assert bool(found.named) == bool(found.model((), (effect,))) == (state == "named")
+    words = _sentence(found, {})
+    assert ("do not confirm" in words) == (state == "ambiguous"), words
+    step = addition.step(None)
+    assert (step.effect, len(step.candidates)) == (("flicker_noise", 2) if state == "named" else (None, 1))
+    both = Added((addition, replace(addition, alone=False)), last)
+    words = _sentence(replace(found, added=both), {})
+    assert "cannot tell apart" in words
+    assert ("do not confirm" in words) == (state == "ambiguous"), words

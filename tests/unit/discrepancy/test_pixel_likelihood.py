@@ -1,0 +1,101 @@
+"""The likelihood of the pixels tells the numbers of an effect, and tells effects apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import PixelLikelihood, is_told, with_details
+from pchem_pipeline.discrepancy.effort import Effort
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.effects.framework.registry import effect_class
+
+SIDE, FRAMES, EXPOSURE, STEP = 16, 3000, 1.5, 8.0  # pixels, frames, e-, DN per e-
+HEAVY, SKEW = effect_class("heavy_tailed_noise"), effect_class("noise_skew")
+
+
+def frames_of(noise: NDArray[np.float64], seed: int) -> NDArray[np.uint16]:
+    """Return frames of pixels with some read noise, e-: an own simulator, independent of the product's."""
+    rng = np.random.default_rng(seed)
+    charge = rng.poisson(EXPOSURE, noise.shape)
+    return np.rint(100.0 + STEP * (charge + noise)).astype(np.uint16)
+
+
+def maps_of(read_noise_e: float) -> PixelMaps:
+    values = (EXPOSURE, 1.0 / STEP, 100.0, STEP * read_noise_e)
+    return PixelMaps.known([np.full((SIDE, SIDE), v) for v in values], np.ones((SIDE, SIDE), np.bool_))
+
+
+def mixture(rng: np.random.Generator, share: float, factor: float) -> NDArray[np.float64]:
+    shape = FRAMES, SIDE, SIDE
+    return rng.normal(0.0, 0.25, shape) * np.where(rng.random(shape) < share, factor, 1.0)
+
+
+def exgaussian(rng: np.random.Generator, share: float) -> NDArray[np.float64]:
+    shape = FRAMES, SIDE, SIDE
+    smooth = np.sqrt(1.0 - share**2) * rng.standard_normal(shape)
+    return 0.3 * (smooth + share * (rng.standard_exponential(shape) - 1.0))
+
+
+@pytest.mark.parametrize(("share", "factor"), [(0.1, 2.2), (0.4, 1.5)])
+def test_share_and_width_of_a_tail_are_found_from_afar(share: float, factor: float) -> None:
+    frames = frames_of(mixture(np.random.default_rng(3), share, factor), 4)
+    guesses = [HEAVY(share=0.02, factor=3.0), HEAVY(share=0.5, factor=1.3), SKEW(share=0.2)]
+    effort = Effort(None)
+    found, skew = with_details(guesses, frames, maps_of(0.28), (), effort)
+    assert skew == SKEW(share=0.2)  # a strength is all that it has: the statistics tell it
+    assert effort.spent > 0.0
+    likelihood = PixelLikelihood(frames, maps_of(0.28), (), effort, 256)
+    fit = likelihood._fit([found], ())
+    assert fit is not None
+    _, error = fit.coordinates("heavy_tailed_noise")
+    assert abs(found.share - share) < 4.0 * error[0]  # type: ignore[attr-defined]
+    assert abs(found.factor - factor) < 4.0 * error[1]  # type: ignore[attr-defined]
+    assert error[1] < 0.1 * factor  # the limit is worth something
+
+
+def test_guesses_that_act_in_a_part_and_other_effects_stay_as_they_are() -> None:
+    frames = frames_of(mixture(np.random.default_rng(5), 0.1, 2.2), 6)
+    placed = HEAVY(share=0.02, factor=3.0, region=Region(rows=((0, 4),)))
+    others: list[Effect] = [placed, effect_class("row_noise")(row_noise_dn=1.0), SKEW(share=0.3)]
+    assert with_details(others, frames, maps_of(0.28), (), Effort(None)) == others
+    present = (effect_class("row_noise")(row_noise_dn=1.0, region=Region(rows=((0, 4),))),)
+    everywhere = [HEAVY(share=0.02, factor=3.0)]
+    assert with_details(everywhere, frames, maps_of(0.28), present, Effort(None)) == everywhere
+    assert [is_told(each) for each in (*others, HEAVY(share=0.1))] == [False, False, True, True]
+
+
+def test_a_skew_is_told_from_tails_and_tails_from_a_skew() -> None:
+    rng = np.random.default_rng(8)
+    skew, heavy = SKEW(share=0.4), HEAVY(share=0.2, factor=1.6)
+    for noise, right, wrong in ((exgaussian(rng, 0.4), skew, heavy), (mixture(rng, 0.2, 1.8), heavy, skew)):
+        likelihood = PixelLikelihood(frames_of(noise, 9), maps_of(0.3), (), Effort(None))
+        answer, back = likelihood.behind([wrong], [right]), likelihood.behind([right], [wrong])
+        assert answer is not None
+        assert back is not None
+        assert answer[0] < -4.0 * answer[1] < 0.0
+        assert back == pytest.approx((-answer[0], answer[1]))
+
+
+def test_of_noise_without_either_nothing_is_said() -> None:
+    noise = np.random.default_rng(10).normal(0.0, 0.3, (FRAMES, SIDE, SIDE))
+    likelihood = PixelLikelihood(frames_of(noise, 11), maps_of(0.3), (), Effort(None))
+    answer = likelihood.behind([SKEW(share=0.1)], [HEAVY(share=0.05, factor=1.5)])
+    assert answer is not None
+    assert abs(answer[0]) < 4.0  # fits of nothing: chance makes a nat of each number, and of that half
+
+
+def test_what_no_law_of_a_sample_holds_is_not_told() -> None:
+    frames = frames_of(mixture(np.random.default_rng(12), 0.1, 2.2), 13)
+    likelihood = PixelLikelihood(frames, maps_of(0.28), (), Effort(None), 64)
+    row, column = (
+        effect_class("row_noise")(row_noise_dn=1.0),
+        effect_class("column_noise")(column_noise_dn=1.0),
+    )
+    heavy, skew = HEAVY(share=0.1, factor=2.0), SKEW(share=0.2)
+    assert likelihood.behind([heavy], [row]) is None
+    assert likelihood.behind([row], [column]) is None
+    assert likelihood.behind([heavy, row], [skew, row]) is not None
