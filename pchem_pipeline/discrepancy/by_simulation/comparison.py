@@ -26,6 +26,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
+from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import Witness
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import look_elsewhere
@@ -52,9 +53,7 @@ _UNTOUCHED = 0.5  # of that, the most by which the others may move it
 _NO_WORSE = 10.0  # nats by which fewer replicates may make a set look worse
 _PLACEBO_STEPS = 2  # corrections of its strength
 _NEARLY_AS_GOOD = 40.0  # nats between sets that a second witness is asked about
-
-#: Says how far a set of effects is behind another, nats, and the error of that; None where it cannot.
-Witness = Callable[[Sequence[Effect], Sequence[Effect]], tuple[float, float] | None]
+_SILENT = Witness()
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def compare(
     choice: Choice,
     before: Refitted | None = None,
     beside: Callable[[Refitted], Choice | None] = lambda _: None,
-    witness: Witness = lambda one, other: None,
+    witness: Witness = _SILENT,
 ) -> Comparison | None:
     """Refit the sets worth it, and choose the simplest that leaves nothing, else the best; None: none holds.
 
@@ -115,7 +114,7 @@ def compare(
         choice: how their sets compare by fingerprints.
         before: the effects held, at their best fit; None: not known.
         beside: compares new hypotheses by what they do beside a refitted set.
-        witness: asked about sets that the statistics tell badly apart.
+        witness: brings a set near its best, and is asked about sets that the statistics tell badly apart.
 
     Raises:
         EffortSpentError: the work is at its limit.
@@ -131,7 +130,8 @@ def compare(
             return
         best = max((one.score for one in tried), default=-np.inf)
         try:
-            tried.append(refitter.refined((*held, *members), best, whole=len(members) == 1))
+            begun = witness.begun((*held, *members))
+            tried.append(refitter.refined(begun, best, whole=len(members) == 1))
         except EffortSpentError:
             raise
         except NotFittedError:
@@ -212,7 +212,7 @@ def _witnessed(
         swapped = len(one.tags - chosen.tags) == len(chosen.tags - one.tags) == 1
         near = abs(_worth(one) - _worth(chosen)) < _NEARLY_AS_GOOD
         if swapped and near and one.tags not in found:
-            answer = witness(one.effects, chosen.effects)
+            answer = witness.behind(one.effects, chosen.effects)
             if answer is not None:
                 found[one.tags] = answer
     return found

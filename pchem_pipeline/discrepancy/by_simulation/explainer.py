@@ -52,7 +52,11 @@ from pchem_pipeline.discrepancy.by_simulation.maps import (
     learn_sensor,
     refit_maps,
 )
-from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import PixelLikelihood, with_details
+from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import (
+    PixelLikelihood,
+    Witness,
+    with_details,
+)
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.replicate import (
     Replicate,
@@ -320,7 +324,7 @@ class FrameExplainer:
                 explanation.choice,
                 self.held,
                 lambda best: self._left_by(best, refitter, z),
-                self._behind,
+                Witness(self._likelihood),
             )
         except EffortSpentError as spent:
             tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
@@ -348,13 +352,13 @@ class FrameExplainer:
         null = null.shifted(np.expm1(best.change) @ best.slopes)
         return self._asked(model, self.drawn[model], null, z, best.slopes)[1]
 
-    def _behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
-        """Return how far a set is behind another by the likelihood of the pixels; see `PixelLikelihood`."""
+    def _likelihood(self, effects: Sequence[Effect], pixels: int) -> PixelLikelihood | None:
+        """Return the likelihood of some pixels beside what the model had at first; None: not one law."""
         present = self.frames.effects([e for e in self.model if e in self.given])
-        if not all(effect.everywhere for effect in (*present, *one, *other)):
+        if not all(effect.everywhere for effect in (*present, *effects)):
             return None
-        frames = self._own_samples((*present, *one))
-        return PixelLikelihood(frames, self.plain.maps, present, self.effort).behind(one, other)
+        frames = self._own_samples((*present, *effects))
+        return PixelLikelihood(frames, self.plain.maps, present, self.effort, pixels)
 
     def _widens(self, added: Refitted, null: NullModel, z: Measured) -> bool:
         """Tell whether a set, its strengths as the data ask for, leaves a wider gap than without it."""

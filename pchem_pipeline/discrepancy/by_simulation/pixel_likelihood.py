@@ -7,22 +7,26 @@ that the histograms say, for a fraction of the cost of one simulation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, leads_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.histogram.count import histogram_frames
 
-_PIXELS = 1024
-_PIXELS_OF_GUESS = 256
+#: Pixels that tell effects apart.
+MANY_PIXELS = 1024
+#: Pixels that tell numbers well enough to begin with.
+FEW_PIXELS = 256
 _MOST_STARTS = 3  # of one effect
+_FARTHEST = 30.0  # factor of a fingerprint: beyond, it is another hypothesis
 _ALIKE = 0.5  # nats: fits that came to the same
 
 
@@ -35,7 +39,7 @@ class PixelLikelihood:
         maps: PixelMaps,
         present: Sequence[Effect],
         effort: Effort,
-        pixels: int = _PIXELS,
+        pixels: int = MANY_PIXELS,
     ) -> None:
         """Count the samples.
 
@@ -73,6 +77,17 @@ class PixelLikelihood:
         fits.sort(key=lambda item: -item[0])
         return [member.effect for _, member in fits] or list(guesses)
 
+    def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
+        """Return the effects of a set at the numbers that are likeliest together, where a law tells them."""
+        told = [h.effect for h in hypotheses if is_told(h.effect)]
+        if not told:
+            return tuple(hypotheses)
+        fit = self._fit(told, [h.effect for h in hypotheses if not is_told(h.effect)])
+        if fit is None or any(member.at_limit for member in fit.members):
+            return tuple(hypotheses)
+        likely = {member.tag: member.effect for member in fit.members}
+        return tuple(_at(h, likely[h.tag]) if h.tag in likely else h for h in hypotheses)
+
     def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
         """Return how far a set is behind another in likelihood, nats, and the standard error (Vuong 1989).
 
@@ -98,6 +113,36 @@ class PixelLikelihood:
             return None
 
 
+@dataclass(frozen=True)
+class Witness:
+    """The likelihood of the pixels where one law holds for all their samples; by default it says nothing.
+
+    Attributes:
+        of: returns it where some effects may be in the samples, of about so many pixels; None: no one law.
+    """
+
+    of: Callable[[Sequence[Effect], int], PixelLikelihood | None] = lambda effects, pixels: None
+
+    def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
+        """Return a set at its likeliest numbers; see `PixelLikelihood.begun`."""
+        pixels = self.of([h.effect for h in hypotheses], FEW_PIXELS)
+        return tuple(hypotheses) if pixels is None else pixels.begun(hypotheses)
+
+    def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
+        """Return how far a set is behind another; see `PixelLikelihood.behind`."""
+        pixels = self.of((*one, *other), MANY_PIXELS)
+        return None if pixels is None else pixels.behind(one, other)
+
+
+def _at(hypothesis: Hypothesis, effect: Effect) -> Hypothesis:
+    """Return a hypothesis with its effect at other numbers, its fingerprint in proportion to the strength."""
+    old, new = (float(getattr(e, e.strength)) for e in (hypothesis.effect, effect))
+    factor = max(new / old, 0.0) ** effect.power if old else 0.0
+    if not 1.0 / _FARTHEST < factor < _FARTHEST:
+        return hypothesis
+    return Hypothesis(effect, hypothesis.fingerprint * factor)
+
+
 def with_details(
     guesses: Sequence[Effect],
     frames: NDArray[np.unsignedinteger],
@@ -120,7 +165,7 @@ def with_details(
     detailed = {g.tag for g in guesses if is_told(g) and len(Member.of(g).coordinates) > 1}
     if not detailed or not all(effect.everywhere for effect in present):
         return list(guesses)
-    likelihood = PixelLikelihood(frames, maps, present, effort, _PIXELS_OF_GUESS)
+    likelihood = PixelLikelihood(frames, maps, present, effort, FEW_PIXELS)
     found: list[Effect] = []
     for tag in dict.fromkeys(g.tag for g in guesses):
         own = [g for g in guesses if g.tag == tag]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import PixelLikelihood, is_told, with_details
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.effect import Effect
@@ -78,6 +79,27 @@ def test_a_skew_is_told_from_tails_and_tails_from_a_skew() -> None:
         assert back is not None
         assert answer[0] < -4.0 * answer[1] < 0.0
         assert back == pytest.approx((-answer[0], answer[1]))
+
+
+def test_a_set_begins_where_its_numbers_are_likeliest_together() -> None:
+    frames = frames_of(exgaussian(np.random.default_rng(14), 0.4), 15)
+    row = Hypothesis(effect_class("row_noise")(row_noise_dn=0.5), np.ones(3))
+    skew = Hypothesis(SKEW(share=0.25), np.array([1.0, 0.0, -2.0]))
+    likelihood = PixelLikelihood(frames, maps_of(0.3), (), Effort(None))
+    same, moved = likelihood.begun([row, skew])
+    assert same is row
+    fit = likelihood._fit([skew.effect], [row.effect])
+    assert fit is not None
+    coordinate, error = fit.coordinates("noise_skew")
+    assert abs(coordinate[0] - 0.4**3) < 4.0 * error[0] < 0.05
+    share = moved.effect.share  # type: ignore[attr-defined]
+    assert share == pytest.approx(np.cbrt(coordinate[0]), rel=0.02)
+    np.testing.assert_allclose(moved.fingerprint, skew.fingerprint * (share / 0.25) ** 3)
+    [alone] = likelihood.begun([row])
+    assert alone is row
+    far = Hypothesis(SKEW(share=0.005), np.ones(3))
+    [still] = likelihood.begun([far])
+    assert still is far  # so far away it is another hypothesis
 
 
 def test_of_noise_without_either_nothing_is_said() -> None:
