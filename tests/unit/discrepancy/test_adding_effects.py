@@ -440,6 +440,7 @@ def add(
     monkeypatch.setattr(search, "_refitter", lambda *_: world.refitter())
     monkeypatch.setattr(search, "_mapped", mapped)
     monkeypatch.setattr(search, "_left_by", lambda *_: None)
+    monkeypatch.setattr(search, "_likelihood", lambda *_: None)
     shifts = (z.train - world.null.mean, z.test - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
     assert choice is not None

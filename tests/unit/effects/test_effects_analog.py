@@ -437,7 +437,6 @@ CODES = np.arange(60, 240)
         HeavyTailedNoise(share=0.05, factor=3.0),
         NoiseSkew(share=0.5),
         NoiseSkew(share=-0.7),
-        NoiseSkew(share=0.95),
         Nonlinearity(step_change=0.02),
         SignalDependentNoise(noise_e=0.1),
         SignalDependentNoise(noise_e=0.05, growth="linear"),
