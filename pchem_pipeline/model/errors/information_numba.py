@@ -20,6 +20,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     CENTRE,
     DAMPING,
     DARK,
+    DERIVATIVES,
     FIRST,
     HELD,
     HERE,
@@ -234,7 +235,7 @@ def observed_covariance(
     theta, at, held = scratch.small[HERE], scratch.evaluations[AT], scratch.flags[HELD]
     theta[0], theta[1] = math.log(parameters[0]), 1.0 / parameters[1]
     theta[2], theta[3] = parameters[2] - centre, 2.0 * math.log(parameters[3])
-    evaluate(pixel, theta, False, scratch, at)
+    evaluate(pixel, theta, DERIVATIVES, scratch, at)
     held[1 + SATELLITE] = True
     full, found = np.empty((1 + N_SHARED, 1 + N_SHARED)), np.empty(4)
     at[0, SCORE] = 0.0

@@ -15,6 +15,7 @@ from pchem_pipeline.model.law.normal_numba import add_mass
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
     CUMULATIVE,
+    DERIVATIVES,
     FIRST,
     HELD,
     HERE,
@@ -80,7 +81,7 @@ def _shift(parameters: NDArray[np.float64], n: float, evaluate: Any, shift: NDAr
     facts[VARIANCE] = variance
     theta, at, held = scratch.small[HERE], scratch.evaluations[AT], scratch.flags[HELD]
     theta[0], theta[1], theta[2], theta[3] = math.log(exposure), a, offset, 2.0 * math.log(sigma)
-    evaluate(pixel, theta, False, scratch, at)
+    evaluate(pixel, theta, DERIVATIVES, scratch, at)
     held[1 + SATELLITE] = True
     step = scratch.small[STEPS]
     covariance = np.empty((1 + N_SHARED, 1 + N_SHARED))

@@ -23,6 +23,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     AT,
     BIAS,
     DAMPING,
+    DERIVATIVES,
     FIXED,
     HELD,
     INFORMATION,
@@ -390,7 +391,7 @@ def climb(
     keep_inside(theta, limits)
     if not sensible(theta, pixel.longest_step, limits.cells):
         return DEGENERATE, -math.inf, 0
-    loglik = evaluate(pixel, theta, False, scratch, at)
+    loglik = evaluate(pixel, theta, DERIVATIVES, scratch, at)
     warm_up = limits.warm_up if goal.first else 0
     only_em = goal.first and limits.only_em
     used, damping, fresh = 1, 0.0, limits.most > 0
@@ -425,7 +426,7 @@ def climb(
         # a step out of bounds counts, too: damped and not damped in turn it may be refused for ever
         used += 1
         if sensible(trial, pixel.longest_step, limits.cells):
-            risen = evaluate(pixel, trial, False, scratch, ahead)
+            risen = evaluate(pixel, trial, DERIVATIVES, scratch, ahead)
         elif not limits.cells:
             return DEGENERATE, loglik, used - 1
         if newton and not risen >= loglik - 1e-11 * abs(loglik):

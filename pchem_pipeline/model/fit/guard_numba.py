@@ -17,6 +17,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     AT,
     CENTRE,
     COUNTED,
+    EXPECTATIONS,
     EXPECTED,
     FIRST,
     HERE,
@@ -172,7 +173,7 @@ def leave_out_tile(
         for j in range(n):  # what is far out need not be known to the last digit
             for b in range(int(pixel.facts[j, N_BINS])):
                 pixel.bins[j, WEIGHT, b] = 0.0
-        evaluate(pixel, theta, True, scratch, scratch.evaluations[AT])
+        evaluate(pixel, theta, EXPECTATIONS, scratch, scratch.evaluations[AT])
         gone[index], changed[index] = 0.0, False
         for j in range(n):
             lowest = pixel.centre + int(pixel.facts[j, CENTRE] + pixel.facts[j, FIRST])

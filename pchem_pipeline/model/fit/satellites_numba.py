@@ -23,6 +23,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     AT,
     BIAS,
     DARK,
+    DERIVATIVES,
     FIXED,
     HELD,
     HERE,
@@ -65,7 +66,15 @@ def fill_core(pixel: Pixel, theta: FloatArray, scratch: Scratch) -> None:
     for j in range(pixel.facts.shape[0]):
         own_theta(pixel, j, theta, own)
         cells = cells_of(pixel, j)
-        fill_masses(own, cells, np.int64(CORE), scratch.numbers, scratch.edges, scratch.cells[j])
+        fill_masses(
+            own,
+            cells,
+            np.int64(CORE),
+            np.int64(DERIVATIVES),
+            scratch.numbers,
+            scratch.edges,
+            scratch.cells[j],
+        )
 
 
 @kernel(borrows=True)
@@ -120,7 +129,7 @@ def _from_fit(pixel: Pixel, tools: Tools, theta: FloatArray) -> tuple[float, int
     """
     scratch = tools.scratch
     at, held = scratch.evaluations[AT], scratch.flags[HELD]
-    tools.evaluate(pixel, theta, False, scratch, at)
+    tools.evaluate(pixel, theta, DERIVATIVES, scratch, at)
     weight, rise = _weight(pixel, scratch)
     find_held(theta, at, scratch.flags[FIXED], tools.limits, held)
     expected, _ = newton_step(at, 0.0, 1.0, scratch, scratch.small[STEPS])

@@ -25,6 +25,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     AT_BEST,
     BIAS,
     DARK,
+    EXPECTATIONS,
     EXPECTED,
     HEIGHTS,
     HERE,
@@ -355,7 +356,7 @@ def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: FloatArray) -> f
     `AT_BEST`.
     """
     scratch = tools.scratch
-    loglik: float = tools.evaluate(pixel, theta, True, scratch, scratch.evaluations[AT_BEST])
+    loglik: float = tools.evaluate(pixel, theta, EXPECTATIONS, scratch, scratch.evaluations[AT_BEST])
     out[OUTLYING] = outlying(pixel, tools.limits.floor)
     out[CHI2], freedom = goodness(pixel)
     out[DEGREES] = float(freedom)

@@ -39,6 +39,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     EDGE,
     EDGE_FIRST,
     EDGES_KEPT,
+    EXPECTATIONS,
     EXPECTED,
     EXPOSURE_FACTOR,
     EXPOSURE_WEIGHT,
@@ -50,6 +51,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     LEVEL_SCALE,
     LEVEL_SHIFT,
     LOG_VARIANCE,
+    LOGLIK_ALONE,
     MARGIN,
     MASS,
     N_BINS,
@@ -421,6 +423,7 @@ def _add_component(
     part: Component,
     edges: NDArray[np.float64],
     place: int,
+    what: int,
     room: NDArray[np.float64],
 ) -> None:
     """Add what an electron number gives at one level to mass and slopes of the cells within reach."""
@@ -433,9 +436,11 @@ def _add_component(
     for i in range(part.low, part.high, SIMD_WIDTH):
         c = place + i - part.low
         d0 = simd_load(edges, TAIL, c + 1) - simd_load(edges, TAIL, c)
+        simd_store(room, MASS, i, fused(d0, w, simd_load(room, MASS, i)))
+        if what == LOGLIK_ALONE:
+            continue
         d1 = simd_load(edges, DENSITY, c + 1) - simd_load(edges, DENSITY, c)
         d2 = simd_load(edges, Z_DENSITY, c + 1) - simd_load(edges, Z_DENSITY, c)
-        simd_store(room, MASS, i, fused(d0, w, simd_load(room, MASS, i)))
         slope = fused(d0, w_exposure, simd_load(room, SLOPES + _EXPOSURE, i))
         simd_store(room, SLOPES + _EXPOSURE, i, slope)
         slope = fused(d1, step1, fused(d2, step2, simd_load(room, SLOPES + _STEP, i)))
@@ -459,6 +464,7 @@ def fill_masses(
     theta: NDArray[np.float64],
     cells: Cells,
     stage: int,
+    what: int,
     numbers: NDArray[np.float64],
     edges: NDArray[np.float64],
     room: NDArray[np.float64],
@@ -469,12 +475,13 @@ def fill_masses(
         theta: the sample's own parameters.
         cells: of the sample.
         stage: how far the tails go, see `CORE`.
+        what: `LOGLIK_ALONE`: the masses alone.
         numbers: out, electron numbers in use.
         edges: out, of the components, see :class:`.pixel_numba.Scratch`.
         room: rows of the sample in a scratch's ``cells``; out: masses and slopes.
     """
     reach, cut = _REACH[stage], _CUT[stage]
-    for row in range(N_BLOCK + 1):
+    for row in range(1 if what == LOGLIK_ALONE else N_BLOCK + 1):
         for i in range(0, cells.n_bins, SIMD_WIDTH):
             simd_store(room, MASS if row == 0 else SLOPES + row - 1, i, 0.0)
     count: int = _list_numbers(theta, cells, reach, cut, numbers)
@@ -486,7 +493,7 @@ def fill_masses(
                 continue
             place, following = _place_for(part, following)
             _fill_edges(cells.bins, part, edges, place)
-            _add_component(numbers[row], peak, theta[_SATELLITE], cells, part, edges, place, room)
+            _add_component(numbers[row], peak, theta[_SATELLITE], cells, part, edges, place, what, room)
     if cells.outlier_share > 0.0:
         rest = 1.0 - cells.outlier_share
         for i in range(cells.n_bins):
@@ -500,6 +507,7 @@ def fill_masses(
 def fill_far_enough(
     theta: NDArray[np.float64],
     cells: Cells,
+    what: int,
     numbers: NDArray[np.float64],
     edges: NDArray[np.float64],
     room: NDArray[np.float64],
@@ -511,7 +519,7 @@ def fill_far_enough(
     """
     count = stage = np.int64(0)
     while stage < len(_REACH):
-        count = fill_masses(theta, cells, stage, numbers, edges, room)
+        count = fill_masses(theta, cells, stage, what, numbers, edges, room)
         lowest = 1.0
         for i in range(cells.n_bins):
             if cells.bins[WEIGHT, i] > 0.0:
@@ -520,6 +528,20 @@ def fill_far_enough(
             break
         stage += 1
     return int(count), _REACH[stage]
+
+
+@kernel(inline=True)
+def _log_mass(cells: Cells, room: NDArray[np.float64]) -> float:
+    """Return the log-likelihood of the masses in the room."""
+    total, inside = counting() * 0.0, 1.0
+    for i in range(0, cells.n_bins, SIMD_WIDTH):
+        weight, own = simd_load(cells.bins, WEIGHT, i), most(simd_load(room, MASS, i), LEAST_MASS)
+        total = fused(weight, simd_log(own), total)
+    if cells.conditional:
+        inside = 0.0
+        for i in range(cells.n_bins):
+            inside += cells.bins[KEPT, i] * room[MASS, i]
+    return float(simd_sum(total)) - cells.frames * math.log(max(inside, LEAST_MASS))
 
 
 @kernel(inline=True)
@@ -702,14 +724,14 @@ def _expect(pixel: Pixel, j: int, cells: Cells, room: NDArray[np.float64]) -> No
 
 
 def evaluate_cells(
-    pixel: Pixel, theta: NDArray[np.float64], expect: bool, scratch: Scratch, out: NDArray[np.float64]
+    pixel: Pixel, theta: NDArray[np.float64], what: int, scratch: Scratch, out: NDArray[np.float64]
 ) -> float:
     """Evaluate log-likelihood, score, squared scores and observed information of all samples of a pixel.
 
     Args:
         pixel: histograms and law.
         theta: parameters, shape (J + N_SHARED,).
-        expect: leave the counts expected of each DN in the pixel's ``bins``.
+        what: `LOGLIK_ALONE`, `DERIVATIVES`, or `EXPECTATIONS`, left of each DN in the pixel's ``bins``.
         scratch: room to work in; its ``cells`` keep the masses and their slopes.
         out: out, the evaluation; lower triangles of the matrices.
 
@@ -721,10 +743,13 @@ def evaluate_cells(
     for j in range(pixel.facts.shape[0]):
         own_theta(pixel, j, theta, own)
         cells, room = cells_of(pixel, j), scratch.cells[j]
-        count, reach = fill_far_enough(own, cells, scratch.numbers, scratch.edges, room)
+        count, reach = fill_far_enough(own, cells, what, scratch.numbers, scratch.edges, room)
+        if what == LOGLIK_ALONE:
+            loglik += _log_mass(cells, room)
+            continue
         loglik += _sum_up(cells, room, scratch.small[RIGHT], out[j])
         _subtract_curvature(own, cells, reach, scratch.numbers[:count], scratch.edges, room, out[j])
-        if expect:
+        if what == EXPECTATIONS:
             _expect(pixel, j, cells, room)
         if pixel.facts[j, DARK] > 0.0:
             out[j, SCORE, 0] = 0.0

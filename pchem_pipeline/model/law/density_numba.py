@@ -29,10 +29,12 @@ from pchem_pipeline.model.law.pixel_numba import (
     CUMULATIVE,
     DAMPING,
     DARK,
+    EXPECTATIONS,
     EXPECTED,
     FIRST,
     INFORMATION,
     LOG_VARIANCE,
+    LOGLIK_ALONE,
     MAX_COMPONENTS,
     MEAN,
     N_BINS,
@@ -55,6 +57,7 @@ from pchem_pipeline.model.law.pixel_numba import (
 from pchem_pipeline.model.law.simd_math_numba import LN2, ROOT2, artanh_series, simd_exp, simd_log
 from pchem_pipeline.model.law.simd_numba import (
     SIMD_WIDTH,
+    Simd,
     counting,
     exponent_of,
     fused,
@@ -66,7 +69,9 @@ from pchem_pipeline.model.law.simd_numba import (
     simd_sum,
 )
 
-_DROPPED = 30.0  # nats below the nearest component at which a component is left out: exp(-30) = 1e-13
+# nats below the nearest component at which a component is left out: exp(-22) = 3e-10 moves estimates by some
+# 1e-7 standard errors; and of the log-likelihood alone
+_DROPPED, _DROPPED_ALONE = 22.0, 14.0
 _LARGEST_RATIO = 333.0  # logarithm; keeps r^2 finite when the peaks are needles
 _SMALLEST = -700.0  # logarithm of what counts as 0 beside 1
 _NOTHING = -60.0  # logarithm of a density that no number of frames makes visible
@@ -83,6 +88,8 @@ _N_TOTALS = 18
 
 # rows of `Scratch.rows`
 _TOTALS, _POWERS, _RISE, _FALL, _LOG_RISE = range(5)
+
+_NEAREST_ROW = MAX_COMPONENTS // 2  # of `Scratch.chains`
 
 LOG_2PI = math.log(2.0 * math.pi)
 
@@ -162,10 +169,10 @@ table_sums_any = _table_kernel(0)
 
 
 @kernel(inline=True)
-def _half_width(electron_noise: float, exposure: float, first: int, last: int) -> int:
-    """Return how many components matter on either side of the nearest one."""
+def _half_width(electron_noise: float, exposure: float, first: int, last: int, dropped: float) -> int:
+    """Return how many components matter on either side of the nearest one, down to so many nats below it."""
     variance = electron_noise * electron_noise
-    half = max(1, math.ceil(math.sqrt(2.0 * _DROPPED * variance + 0.25) - 0.5))
+    half = max(1, math.ceil(math.sqrt(2.0 * dropped * variance + 0.25) - 0.5))
     if electron_noise > 0.5:  # the Poisson factor moves the largest term away from the nearest component
         tilt = max(abs(math.log(exposure / (first + 1.0))), abs(math.log(exposure / (last + 1.0))))
         half += math.ceil(variance * tilt)
@@ -185,43 +192,29 @@ def _fill_steps(rows: NDArray[np.float64], first: int, count: int, log_exposure:
 
 
 @kernel(inline=True)
-def _fill_coefficients(
-    table: NDArray[np.float64],
-    filled: int,
-    n: int,
-    rows: NDArray[np.float64],
-    nearest_one: int,
-    first: int,
-    low: int,
-    width: int,
+def _fill_chains(
+    chains: NDArray[np.float64], rows: NDArray[np.float64], place: int, up: int, down: int
 ) -> None:
-    """Fill the polynomial's coefficients, relative to the nearest component, of ``n`` columns of one cell.
+    """Fill the polynomial's coefficients, relative to the nearest component, of eight successive cells.
 
     Neighbours differ by ``H / k`` and by an odd power of ``exp(-a^2/2 sigma^2)``.
 
     Args:
-        table: out.
-        filled: first of the columns.
-        n: number of columns; they are written by the eight.
+        chains: out, row `_NEAREST_ROW` + l of component j + l of the cells, a column for each cell.
         rows: the powers, and H / k and its inverse.
-        nearest_one: nearest component.
-        first: component with which those rows begin.
-        low: lowest component.
-        width: number of components.
+        place: where the first cell's component lies in those rows.
+        up: components above the nearest one.
+        down: components below it.
     """
-    powers, rise, fall = rows[_POWERS], rows[_RISE], rows[_FALL]
-    place, place_of = nearest_one - low, nearest_one - first
-    coefficient = 1.0
-    for step in range(width - place):
-        if step > 0:
-            coefficient *= powers[step] * rise[place_of + step]
-        for i in range(0, n, SIMD_WIDTH):
-            simd_store(table, _COEFFICIENT + place + step, filled + i, coefficient)
-    coefficient = 1.0
-    for step in range(1, place + 1):
-        coefficient *= powers[step] * fall[place_of - step + 1]
-        for i in range(0, n, SIMD_WIDTH):
-            simd_store(table, _COEFFICIENT + place - step, filled + i, coefficient)
+    coefficient = counting() * 0.0 + 1.0
+    simd_store(chains, _NEAREST_ROW, 0, coefficient)
+    for step in range(1, up + 1):
+        coefficient = coefficient * (simd_load(rows, _RISE, place + step) * rows[_POWERS, step])
+        simd_store(chains, _NEAREST_ROW + step, 0, coefficient)
+    coefficient = counting() * 0.0 + 1.0
+    for step in range(1, down + 1):
+        coefficient = coefficient * (simd_load(rows, _FALL, place - step + 1) * rows[_POWERS, step])
+        simd_store(chains, _NEAREST_ROW - step, 0, coefficient)
 
 
 @kernel(borrows=True)
@@ -231,6 +224,7 @@ def _sum_table(
     width: int,
     a: float,
     inverse: float,
+    what: int,
     totals: NDArray[np.float64],
     frames: float,
     expected: NDArray[np.float64],
@@ -242,7 +236,9 @@ def _sum_table(
     """
     for row in range(_COEFFICIENT + width):
         simd_store(table, row, filled, 1.0 if row == _COEFFICIENT else 0.0)
-    if width == 3:
+    if what == LOGLIK_ALONE:
+        totals[_LOGLIK] += _loglik_alone(table, filled, width, a, inverse)
+    elif width == 3:
         table_sums_3(table, filled, 3, a, inverse, totals)
     elif width == 5:
         table_sums_5(table, filled, 5, a, inverse, totals)
@@ -257,6 +253,34 @@ def _sum_table(
 
 
 @kernel(inline=True)
+def _mixture(
+    table: NDArray[np.float64], first: int, width: int, a: float, inverse: float
+) -> tuple[Simd, Simd]:
+    """Return the sum of the components of eight columns, and the logarithm of what it is in units of."""
+    half = float(width // 2)
+    offset = simd_load(table, _OFFSET, first)
+    ratio = simd_exp(most(least(offset * (a * inverse), _LARGEST_RATIO), _SMALLEST))
+    power = ratio
+    density = simd_load(table, _COEFFICIENT, first)
+    for k in range(1, width):
+        density = fused(simd_load(table, _COEFFICIENT + k, first), power, density)
+        power = power * ratio
+    shift = least(simd_load(table, _NEAREST, first), half) * a
+    level = fused(offset * (0.0 - inverse), fused(offset, 0.5, shift), simd_load(table, _LEVEL, first))
+    return density, level
+
+
+@kernel(inline=True)
+def _loglik_alone(table: NDArray[np.float64], filled: int, width: int, a: float, inverse: float) -> float:
+    """Return the log-likelihood of the DN in the table."""
+    loglik = counting() * 0.0
+    for first in range(0, filled, SIMD_WIDTH):
+        density, level = _mixture(table, first, width, a, inverse)
+        loglik = fused(simd_load(table, _WEIGHT, first), simd_log(density) + level, loglik)
+    return float(simd_sum(loglik))
+
+
+@kernel(inline=True)
 def _expect(
     table: NDArray[np.float64],
     filled: int,
@@ -268,17 +292,8 @@ def _expect(
     start: int,
 ) -> None:
     """Leave the counts expected of the DN in the table in ``out`` from ``start`` on."""
-    half = float(width // 2)
     for first in range(0, filled, SIMD_WIDTH):
-        offset = simd_load(table, _OFFSET, first)
-        ratio = simd_exp(most(least(offset * (a * inverse), _LARGEST_RATIO), _SMALLEST))
-        power = ratio
-        density = simd_load(table, _COEFFICIENT, first)
-        for k in range(1, width):
-            density = fused(simd_load(table, _COEFFICIENT + k, first), power, density)
-            power = power * ratio
-        shift = least(simd_load(table, _NEAREST, first), half) * a
-        level = fused(offset * (0.0 - inverse), fused(offset, 0.5, shift), simd_load(table, _LEVEL, first))
+        density, level = _mixture(table, first, width, a, inverse)
         level = simd_exp(most(least(level, -_SMALLEST), _SMALLEST))
         simd_store(table, _WEIGHT, first, density * frames * level)
     for i in range(filled):
@@ -356,24 +371,39 @@ def _fill_complete(n: float, of_exposure: float, inverse: float, out: NDArray[np
 def _fill(
     table: NDArray[np.float64],
     filled: int,
-    weights: NDArray[np.float64],
-    start: int,
-    stop: int,
+    bins: NDArray[np.float64],
+    ends: tuple[int, int],
     offset: float,
     place: int,
     level: float,
 ) -> None:
-    """Lay out the DN from ``start`` to ``stop``; the first is ``offset`` DN off component ``place``.
+    """Lay out the DN from one end to the other; the first is ``offset`` DN off component ``place``.
 
     Columns are written by the eight: what that writes too much, the next ones overwrite.
     """
-    n = stop - start
-    for i in range(n):
-        table[_WEIGHT, filled + i] = weights[start + i]
-    for i in range(0, n, SIMD_WIDTH):
+    start, stop = ends
+    for i in range(0, stop - start, SIMD_WIDTH):
+        simd_store(table, _WEIGHT, filled + i, simd_load(bins, WEIGHT, start + i))
         simd_store(table, _OFFSET, filled + i, counting() + (offset + i))
         simd_store(table, _NEAREST, filled + i, float(place))
         simd_store(table, _LEVEL, filled + i, level)
+
+
+@kernel(inline=True)
+def _fill_coefficients(
+    table: NDArray[np.float64],
+    filled: int,
+    n: int,
+    chains: NDArray[np.float64],
+    first: int,
+    cell: int,
+    width: int,
+) -> None:
+    """Fill the coefficients of ``n`` columns of a cell, of ``width`` components from row ``first`` on."""
+    for row in range(width):
+        coefficient = chains[first + row, cell]
+        for i in range(0, n, SIMD_WIDTH):
+            simd_store(table, _COEFFICIENT + row, filled + i, coefficient)
 
 
 @kernel(inline=True)
@@ -381,24 +411,25 @@ def _evaluate_sample(
     pixel: Pixel,
     sample: int,
     own: tuple[float, float, float, float],
-    expect: bool,
+    what: int,
     scratch: Scratch,
     out: NDArray[np.float64],
 ) -> float:
     """Evaluate one sample with electrons at its (log H, 1/g, mu - centre, log sigma^2)."""
     facts, bins = pixel.facts[sample], pixel.bins[sample]
     log_exposure, a, origin, log_variance = own
-    weights, cumulative, expected = bins[WEIGHT], bins[CUMULATIVE], bins[EXPECTED]
+    cumulative, expected = bins[CUMULATIVE], bins[EXPECTED]
     n_bins, first = int(facts[N_BINS]), facts[FIRST]
-    frames = facts[N_FRAMES] if expect else 0.0
-    rows, table = scratch.rows, scratch.table
+    frames = facts[N_FRAMES] if what == EXPECTATIONS else 0.0
+    rows, table, chains = scratch.rows, scratch.table, scratch.chains
     totals = rows[_TOTALS]
     exposure, inverse = math.exp(log_exposure), math.exp(-log_variance)
     j = max(0, math.floor((first - origin) / a + 0.5))
     last = max(j, math.floor((first + n_bins - 1 - origin) / a + 0.5))
-    half = _half_width(1.0 / math.sqrt(a * a * inverse), exposure, j, last)
+    dropped = _DROPPED_ALONE if what == LOGLIK_ALONE else _DROPPED
+    half = _half_width(1.0 / math.sqrt(a * a * inverse), exposure, j, last, dropped)
     width = 2 * half + 1
-    lowest = max(0, j - half)
+    lowest, cell = j - half, 0
     _fill_steps(rows, lowest, max(last, half) + half + 2 - lowest, log_exposure)
     power = math.exp(-0.5 * a * a * inverse)
     square = power * power
@@ -411,6 +442,8 @@ def _evaluate_sample(
     start = n_bins - n_bins  # 0 as a variable, lest a constant have its own compilation
     filled = start
     while start < n_bins:
+        if cell == 0:
+            _fill_chains(chains, rows, j - lowest, width - 1 - min(j, half), half)
         end = min(n_bins, math.ceil(origin + (j + 0.5) * a - first))
         if j == last:
             end = n_bins
@@ -422,24 +455,26 @@ def _evaluate_sample(
             while start < end:
                 stop = min(end, start + CAPACITY)
                 if filled + stop - start > CAPACITY:
-                    _sum_table(table, filled, width, a, inverse, totals, frames, expected, start)
+                    _sum_table(table, filled, width, a, inverse, what, totals, frames, expected, start)
                     filled = 0
                 offset = first + start - origin - j * a
-                _fill(table, filled, weights, start, stop, offset, j, level)
-                _fill_coefficients(table, filled, stop - start, rows, j, lowest, low, width)
+                _fill(table, filled, bins, (start, stop), offset, j, level)
+                _fill_coefficients(table, filled, stop - start, chains, _NEAREST_ROW + low - j, cell, width)
                 filled += stop - start
                 start = stop
         elif end > start:
             if frames > 0.0:
-                _sum_table(table, filled, width, a, inverse, totals, frames, expected, start)
+                _sum_table(table, filled, width, a, inverse, what, totals, frames, expected, start)
                 filled = 0
                 for i in range(start, end):
                     expected[i] = 0.0
             start = end
         j += 1
+        cell = cell + 1 if cell + 1 < SIMD_WIDTH else 0
         level += rows[_LOG_RISE, j - lowest]
-    _sum_table(table, filled, width, a, inverse, totals, frames, expected, n_bins)
-    _finish(facts, log_exposure, a, origin, inverse, totals, out)
+    _sum_table(table, filled, width, a, inverse, what, totals, frames, expected, n_bins)
+    if what != LOGLIK_ALONE:
+        _finish(facts, log_exposure, a, origin, inverse, totals, out)
     return float(totals[_LOGLIK])
 
 
@@ -471,14 +506,14 @@ def _evaluate_dark(
 
 
 def evaluate_density(
-    pixel: Pixel, theta: NDArray[np.float64], expect: bool, scratch: Scratch, out: NDArray[np.float64]
+    pixel: Pixel, theta: NDArray[np.float64], what: int, scratch: Scratch, out: NDArray[np.float64]
 ) -> float:
     """Evaluate log-likelihood, score, observed information and E-step sums of all samples of a pixel.
 
     Args:
         pixel: histograms; their moments take part, too.
         theta: parameters, shape (J + N_SHARED,).
-        expect: leave the counts expected of each DN in the pixel's ``bins``.
+        what: `LOGLIK_ALONE`, `DERIVATIVES`, or `EXPECTATIONS`, left of each DN in the pixel's ``bins``.
         scratch: room to work in.
         out: out, the evaluation; lower triangles of the matrices.
 
@@ -491,8 +526,8 @@ def evaluate_density(
     for j in range(n):
         own_bias = bias - pixel.facts[j, CENTRE]
         if pixel.facts[j, DARK] > 0.0:
-            loglik += _evaluate_dark(pixel, j, own_bias, log_variance, expect, out[j])
+            loglik += _evaluate_dark(pixel, j, own_bias, log_variance, what == EXPECTATIONS, out[j])
         else:
             own = theta[j], a, own_bias, log_variance
-            loglik += _evaluate_sample(pixel, j, own, expect, scratch, out[j])
+            loglik += _evaluate_sample(pixel, j, own, what, scratch, out[j])
     return loglik

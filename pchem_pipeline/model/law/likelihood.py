@@ -19,7 +19,7 @@ def evaluation_arguments() -> tuple[Any, ...]:
     vector, rows, stack = np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1, 1))
     pixel = Pixel(stack, rows, stack, stack, 0, 0.0)
     flags, evaluations = np.zeros((2, 1), np.bool_), np.zeros((1, 1, 1, 1))
-    return pixel, vector, False, Scratch(rows, rows, rows, stack, rows, rows, flags, evaluations), stack
+    return pixel, vector, 0, Scratch(rows, rows, rows, rows, stack, rows, rows, flags, evaluations), stack
 
 
 @functools.cache

@@ -20,7 +20,9 @@ from pchem_pipeline.model.law.cells_numba import (
     resolve,
 )
 from pchem_pipeline.model.law.pixel_numba import (
+    DERIVATIVES,
     FIRST,
+    LOGLIK_ALONE,
     MASS,
     N_BINS,
     N_BLOCK,
@@ -98,7 +100,9 @@ def score_tile(
         pixel = _at(room, centre)
         resolve(law, index, satellites[index, 0], pixel)
         cells = cells_of(pixel, np.int64(0))
-        fill_far_enough(theta, cells, scratch.numbers, scratch.edges, scratch.cells[0])
+        fill_far_enough(
+            theta, cells, np.int64(LOGLIK_ALONE), scratch.numbers, scratch.edges, scratch.cells[0]
+        )
         total = 0.0
         for i in range(cells.n_bins):
             if room.bins[0, WEIGHT, i] > 0.0:
@@ -130,7 +134,7 @@ def mass_tile(
     """
     n_codes = out.shape[1]
     room, scratch = pixel_scratch(n_codes, law)
-    theta = scratch.small[OWN]
+    theta, what = scratch.small[OWN], DERIVATIVES if slopes.shape[0] > 0 else LOGLIK_ALONE
     room.facts[0, N_BINS], room.facts[0, FIRST] = float(n_codes), 0.0
     for index in range(parameters.shape[0]):
         if not known_theta(parameters[index], first[index], satellites[index, 1], theta):
@@ -138,7 +142,7 @@ def mass_tile(
         pixel = _at(room, first[index])
         resolve(law, index, satellites[index, 0], pixel)
         cells = cells_of(pixel, np.int64(0))
-        fill_masses(theta, cells, stage, scratch.numbers, scratch.edges, scratch.cells[0])
+        fill_masses(theta, cells, stage, what, scratch.numbers, scratch.edges, scratch.cells[0])
         for i in range(n_codes):
             out[index, i] = scratch.cells[0, MASS, i]
         for j in range(N_BLOCK - 1 if slopes.shape[0] > 0 else 0):
@@ -181,13 +185,13 @@ def parabola_tile(
         pixel = _at(room, first[index])
         resolve(law, index, 0.0, pixel)
         cells = cells_of(pixel, np.int64(0))
-        fill_masses(theta, cells, CORE, scratch.numbers, scratch.edges, cell)
+        fill_masses(theta, cells, CORE, np.int64(DERIVATIVES), scratch.numbers, scratch.edges, cell)
         lowest = 1.0
         for i in range(n_bins):
             if weights[i] > 0.0:
                 lowest = min(lowest, cell[MASS, i])
         if lowest < _FAR:
-            fill_masses(theta, cells, NEAR, scratch.numbers, scratch.edges, cell)
+            fill_masses(theta, cells, NEAR, np.int64(DERIVATIVES), scratch.numbers, scratch.edges, cell)
         value[index] = 0.0
         score[index] = 0.0
         information[index] = 0.0

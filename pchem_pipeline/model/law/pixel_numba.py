@@ -34,6 +34,9 @@ SCORE, INFORMATION, DAMPING, SUMS = 0, 1, 1 + N_BLOCK, 1 + 2 * N_BLOCK
 N_ROWS = 2 + 2 * N_BLOCK
 SUM_K, SUM_KK, SUM_KE, SUM_E, SUM_EE = range(5)
 
+# what is asked of an evaluation: log-likelihood alone; its derivatives and sums, too; and the counts expected
+LOGLIK_ALONE, DERIVATIVES, EXPECTATIONS = range(3)
+
 # rows of `Pixel.bins`
 WEIGHT, CUMULATIVE, EXPECTED, EDGE, KEPT = range(5)
 N_BIN_ROWS = 5
@@ -87,7 +90,7 @@ AT, AHEAD, AT_BEST = range(3)
 N_DENSITY_ROWS = 9
 CAPACITY = 256  # columns of the table of an evaluation; a longer histogram goes through in pieces
 MAX_COMPONENTS = 201  # of which a value may be a mixture
-_MIN_COLUMNS = 256  # the frequencies of the starting points, a value's components, a table's columns
+_MIN_COLUMNS = 384  # the frequencies of the starting points, a value's components, a table's columns
 # rows of `Scratch.cells` of a sample: mass, its inverse, counts over mass, slopes in theta
 MASS, PER_MASS, RATIO, SLOPES = range(4)
 N_CELL_ROWS = 3 + N_BLOCK
@@ -146,6 +149,7 @@ class Scratch(NamedTuple):
     Attributes:
         rows: of the density and of the starts, shape (N_DENSITY_ROWS, enough).
         table: a column for each DN, of the density.
+        chains: its coefficients by component, of some cells, shape (enough, SIMD_WIDTH).
         numbers: electron numbers in use with P(k) and its two derivatives, shape (enough, 4).
         cells: of each sample, shape (J, N_CELL_ROWS, bins + 1 + SIMD_WIDTH).
         edges: of all components of a sample, one after another, as far as there is room; and then of one,
@@ -157,6 +161,7 @@ class Scratch(NamedTuple):
 
     rows: FloatArray
     table: FloatArray
+    chains: FloatArray
     numbers: FloatArray
     cells: NDArray[np.float64]
     edges: NDArray[np.float64]
@@ -172,6 +177,7 @@ def make_scratch(n_samples: int, n_bins: int, cells: bool) -> Scratch:
     return Scratch(
         np.empty((N_DENSITY_ROWS, n_bins + _MIN_COLUMNS)),
         np.empty((MAX_COMPONENTS + 5, CAPACITY + SIMD_WIDTH)),
+        np.empty((MAX_COMPONENTS // 2 + MAX_COMPONENTS, SIMD_WIDTH)),
         np.empty((n_bins + 512 if cells else 0, 4)),
         np.zeros((n_samples, N_CELL_ROWS, width)),
         np.zeros((3, EDGES_KEPT + width + SIMD_WIDTH if cells else 0)),

@@ -28,9 +28,11 @@ from pchem_pipeline.model.law import density_numba, pixel_numba, simd_math_numba
 from pchem_pipeline.model.law.likelihood import density_likelihood
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
+    DERIVATIVES,
     FIXED,
     HELD,
     INFORMATION,
+    LOGLIK_ALONE,
     SCORE,
     SUM_E,
     SUM_EE,
@@ -100,14 +102,22 @@ def internal(theta: Theta, centre: float) -> NDArray[np.float64]:
 
 
 def run(sample: Sample, theta: NDArray[np.float64]) -> float:
-    return evaluated(sample.pixel, theta, False, density_likelihood(), sample.scratch)
+    return evaluated(sample.pixel, theta, DERIVATIVES, density_likelihood(), sample.scratch)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_e_step_sums_and_likelihood(case: tuple[float, float, float]) -> None:
     histogram, centre, x, theta = prepare(case)
     loglik = run(histogram, internal(theta, centre))
-    total = histogram.at[SUMS]
+    total = histogram.at[SUMS].copy()
+    arguments = (
+        histogram.pixel,
+        internal(theta, centre),
+        LOGLIK_ALONE,
+        density_likelihood(),
+        histogram.scratch,
+    )
+    assert evaluated(*arguments) == pytest.approx(loglik, rel=1e-6)  # without components further down
     assert loglik == pytest.approx(log_likelihood(x, theta), rel=1e-11)
     sums = e_step(x, theta)
     mean_k, mean_kk = total[SUM_K] / N, total[SUM_KK] / N
@@ -169,7 +179,7 @@ def test_compiled_evaluation_equals_plain() -> None:
     loglik = run(sample, point)
     compiled = sample.at.copy()
     plain = density_numba.evaluate_density(
-        sample.pixel, point, False, sample.scratch, sample.scratch.evaluations[AT]
+        sample.pixel, point, DERIVATIVES, sample.scratch, sample.scratch.evaluations[AT]
     )
     assert plain == pytest.approx(loglik, rel=1e-13)
     np.testing.assert_allclose(sample.at, compiled, rtol=1e-9, atol=1e-7)

@@ -25,6 +25,8 @@ from pchem_pipeline.model.law.pixel_numba import (
     AT,
     CENTRE,
     DAMPING,
+    DERIVATIVES,
+    EXPECTATIONS,
     EXPECTED,
     FIRST,
     HELD,
@@ -69,7 +71,7 @@ class Series:
 
     def __call__(self, theta, exact):
         likelihood = cells_likelihood() if exact else density_likelihood()
-        return evaluated(self.pixel, theta, False, likelihood, self.scratch)
+        return evaluated(self.pixel, theta, DERIVATIVES, likelihood, self.scratch)
 
     def dense(self):
         """Score and information of all but the weight of satellites as one vector and matrix."""
@@ -128,7 +130,7 @@ def test_the_plain_loop_does_what_the_compiled_one_does():
     theta = tiny.theta([0.6, 0.0], 4.2, 100.0, np.log(1.6))
     value = tiny(theta, True)
     at = tiny.at.copy()
-    plain = cells_numba.evaluate_cells(tiny.pixel, theta, True, tiny.scratch, tiny.at)
+    plain = cells_numba.evaluate_cells(tiny.pixel, theta, EXPECTATIONS, tiny.scratch, tiny.at)
     assert plain == pytest.approx(value, rel=1e-12)
     np.testing.assert_allclose(tiny.at[:, :DAMPING], at[:, :DAMPING], rtol=1e-9, atol=1e-9)
     for j in range(2):

@@ -113,12 +113,14 @@ def test_score_and_information_are_the_derivatives(law: str, satellite: float, a
     at = scratch.evaluations[pixel_numba.AT]
 
     def evaluate(point):
-        value = evaluated(pixel, point, False, cells_likelihood(), scratch)
+        value = evaluated(pixel, point, pixel_numba.DERIVATIVES, cells_likelihood(), scratch)
         lower = np.tril(at[0, pixel_numba.INFORMATION : pixel_numba.DAMPING])
         return value, at[0, pixel_numba.SCORE].copy(), lower + np.tril(lower, -1).T
 
     here = np.array([np.log(1.7), 12.0, 99.7 - centre, np.log(10.0), 0.2 if satellite else 0.0])
-    _, score, information = evaluate(here)
+    value, score, information = evaluate(here)
+    alone = evaluated(pixel, here, pixel_numba.LOGLIK_ALONE, cells_likelihood(), scratch)
+    assert alone == pytest.approx(value, rel=1e-12)
     for i in range(5 if satellite else 4):
         step = np.zeros(5)
         step[i] = (1e-5, 1e-4, 1e-4, 1e-5, 1e-5)[i]
