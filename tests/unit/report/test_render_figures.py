@@ -37,6 +37,7 @@ from pchem_pipeline.report.figures.pixels import (
     draw_pixels,
     shown_bins,
 )
+from pchem_pipeline.report.style import style
 from pchem_pipeline.report.style.palette import DARK, LIGHT, palette_of
 from pchem_pipeline.report.style.style import COLUMN_MM, PAGE_MM, Drawing, Look, drawing_bytes, small_png
 
@@ -351,3 +352,27 @@ def test_dark_paper_has_light_ink() -> None:
     assert dark.axes[0].lines[0].get_color() == DARK.ink
     assert palette_of(mpl.style.library["dark_background"]).ink == "#ffffff"
     assert palette_of({}) == LIGHT
+
+
+@pytest.mark.parametrize("direction", ["out", "in"])
+def test_joined_minor_ticks_look_as_those_of_matplotlib(
+    monkeypatch: pytest.MonkeyPatch, direction: str
+) -> None:
+    def draw(look: style.Look) -> style.Drawing:
+        figure = look.empty(60.0)
+        for axes in figure.subplots(1, 2, sharey=True):
+            axes.loglog([1.0, 3e3], [1e-4, 20.0])
+        return figure
+
+    def pixels() -> np.ndarray:
+        drawing = style.styled(draw)(style.Look(sheet={"ytick.direction": direction}))
+        with Image.open(io.BytesIO(style.drawing_bytes(drawing, "png", dpi=200))) as image:
+            return np.asarray(image.convert("L"), dtype=np.int64)
+
+    joined = pixels()
+    monkeypatch.setattr(style, "_join_minor_ticks", lambda drawing: None)
+    plain = pixels()
+    differ = np.abs(joined - plain) > 40
+    assert differ.mean() < 1e-4
+    monkeypatch.setitem(style._STYLE, "xtick.minor.size", 0.0)  # the test can fail
+    assert (np.abs(joined - pixels()) > 40).mean() > 3e-4
