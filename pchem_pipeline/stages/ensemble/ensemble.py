@@ -39,6 +39,7 @@ from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.bands import tile_bands
 from pchem_pipeline.stages.electrons.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile
+from pchem_pipeline.stages.fit.code_sums import on_axis
 from pchem_pipeline.stages.fit.fitted_model import (
     fitted_effects,
     fitted_law,
@@ -74,6 +75,8 @@ class _Job:
         axes: axes of the ensemble.
         tiles: number and place of each tile by its key.
         frames: the chosen frames (first, end), or None for all of the histogram.
+        codes: by tile the samples of all frames, where the fit has counted them; see `CodeSums`.
+        n_frames: of the run.
         source: where frames come from, if any are read.
         truth: first row, first column and first frame of the input in the true electron numbers, or None.
         effects: with which the maps were fitted.
@@ -83,6 +86,8 @@ class _Job:
     axes: EnsembleAxes
     tiles: dict[str, tuple[int, Tile]]
     frames: tuple[int, int] | None
+    codes: dict[str, dict[str, Any]]
+    n_frames: int
     source: FrameSource | None
     truth: tuple[int, int, int] | None
     effects: tuple[Effect, ...]
@@ -183,7 +188,9 @@ def run(context: StageContext) -> None:
         return
     _create(context, axes, len(tiles))
     numbered = {tile.key: (number, tile) for number, tile in enumerate(tiles)}
-    job = _Job(store.path, axes, numbered, None if everything else frames, source, truth, effects)
+    codes = {} if frames is None or everything else _codes(context)
+    chosen = None if everything else frames
+    job = _Job(store.path, axes, numbered, chosen, codes, sensor.n_frames, source, truth, effects)
     rows = max(1, _BAND_BYTES // (sensor.nx * fitted.bins * 4))
     bands = tiles if source is None else tile_bands(context, "fit", rows, source.rows_per_read)
     task = functools.partial(_do_band, job=job)
@@ -219,6 +226,13 @@ class _Asked:
     frames: tuple[int, int] | None
     truth: tuple[int, int, int] | None
     sensor: SensorInfo
+
+
+def _codes(context: StageContext) -> dict[str, dict[str, Any]]:
+    """Return the samples of each code that the fit counted, by tile."""
+    record = context.store.records.read("fit")
+    made = {} if record is None else context.store.records.summaries("fit", record.fingerprint)
+    return {key: summary["codes"] for key, summary in made.items() if "codes" in summary}
 
 
 def _leave_out(tile: Tile) -> dict[str, Any]:
@@ -343,10 +357,8 @@ def _sum_tile(
     """
     maps = [store.read(f"fit/{name}", tile.region) for name in PARAMETERS]
     origin, low, high = _ranges(store, tile.region)
-    counts, under, over = (
-        store.read(f"histogram/{name}", tile.region) for name in ("counts", "under", "over")
-    )
-    counted = _Counted(counts, origin, under + over)
+    codes = None if chosen is None else job.codes.get(tile.key)
+    counted = _read_counted(store, tile, origin) if codes is None else _uncounted(origin, job.n_frames)
     errors = _errors(store, tile)
     rows = []
     for part in parts_told(tile.parts()):
@@ -363,7 +375,27 @@ def _sum_tile(
             None if errors is None else errors.of(_inside(tile, part)),
         )
         rows.append(row)
-    return np.sum([row[0] for row in rows], axis=0), np.sum([row[1] for row in rows], axis=0)
+    integers, floats = (np.sum(each, axis=0) for each in zip(*rows, strict=True))
+    if codes is not None:
+        samples, outside = on_axis(codes, job.axes.dn)
+        integers[job.axes.integers["counts_all"]] = samples
+        integers[job.axes.integers["outside_all"]] = outside
+        floats[job.axes.floats["share_all"]] = samples / job.n_frames
+    return integers, floats
+
+
+def _read_counted(store: RunStore, tile: Tile, origin: NDArray[np.int64]) -> _Counted:
+    """Read the histograms of a tile."""
+    counts, under, over = (
+        store.read(f"histogram/{name}", tile.region) for name in ("counts", "under", "over")
+    )
+    return _Counted(counts, origin, under + over)
+
+
+def _uncounted(origin: NDArray[np.int64], n_frames: int) -> _Counted:
+    """Return pixels of whose samples only the number is known."""
+    outside = np.full(origin.shape, n_frames, np.uint32)
+    return _Counted(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
 
 
 def _ranges(store: RunStore, region: tuple[slice, slice]) -> list[NDArray[np.int64]]:

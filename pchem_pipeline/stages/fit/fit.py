@@ -23,6 +23,7 @@ from pchem_pipeline.run.model_versions import ModelVersion, read_added_exposure
 from pchem_pipeline.run.progress import parts_told
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.fit.arrays import create_fit_maps
+from pchem_pipeline.stages.fit.code_sums import CodeSums
 from pchem_pipeline.stages.fit.fitted_model import pixel_places
 from pchem_pipeline.stages.fit.model_fit import fit_arrays, fit_model
 from pchem_pipeline.stages.fit.samples import fit_samples
@@ -127,16 +128,18 @@ def _do_tile(
     adc_limits: tuple[int, int] | None,
     model: ModelVersion,
 ) -> dict[str, Any]:
-    """Fit one tile of the store; the summary counts its pixels."""
+    """Fit one tile of the store; the summary counts its pixels, and the samples of each code."""
     run_store = open_store(store)
     histogram = {name: run_store.read(f"histogram/{name}", tile.region) for name in _HISTOGRAM}
     start = kept_fit(store, tile.region)
     effects, set_aside = model.effects, model.settings.set_aside_e
     added = read_added_exposure(run_store, model, tile.region)
     arrays: dict[str, NDArray[Any]] = {}
+    codes = CodeSums(histogram["origin"], histogram["counts"].shape[2])
     for part in parts_told(tile.parts()):
+        some = {name: values[part] for name, values in histogram.items()}
         found = fit_tile(
-            {name: values[part] for name, values in histogram.items()},
+            some,
             settings,
             adc_limits,
             effects,
@@ -145,13 +148,18 @@ def _do_tile(
             None if added is None else added.of(part),
             pixel_places(run_store, tile.within(part)),
         )
+        codes.add(some, found)
         for name, values in found.items():
             whole = arrays.setdefault(name, np.empty(tile.shape + values.shape[2:], values.dtype))
             whole[part] = values
     for name, array in arrays.items():
         run_store.write(f"fit/{name}", tile.region, array)
     words = arrays["fit_status"]
-    summary = {"pixels": int(words.size), "failed": int(np.count_nonzero(words & np.uint16(int(FAILED))))}
+    summary: dict[str, Any] = {
+        "pixels": int(words.size),
+        "failed": int(np.count_nonzero(words & np.uint16(int(FAILED)))),
+        "codes": codes.content(),
+    }
     if settings.likelihood == "density" and not effects:
         counts = histogram["counts"].sum(axis=2, dtype=np.float64)
         biased = biased_by_rounding([arrays[name].ravel() for name in PARAMETERS], counts.ravel())

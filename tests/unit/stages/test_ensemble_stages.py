@@ -6,6 +6,7 @@ import csv
 import pickle
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.electrons.electrons import NO_NUMBER
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
+from pchem_pipeline.model.ensemble.ensemble import DnAxis
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import thresholds
 from pchem_pipeline.report.pages.summary import key_numbers, sentence
@@ -28,6 +30,7 @@ from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import Options, StageContext
 from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
+from pchem_pipeline.stages.fit.code_sums import CodeSums, on_axis
 from pchem_pipeline.stages.report.report import report_data
 from pchem_pipeline.stages.report.stored import read_run
 from pchem_pipeline.stages.table import STAGES
@@ -35,6 +38,7 @@ from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 
 NY, NX, FRAMES = 40, 48, 400
+HISTOGRAM = ("counts", "origin", "under", "over")
 FAILED_PIXEL = (3, 5)
 
 
@@ -328,6 +332,48 @@ def test_tiles_that_the_fit_finishes_later_are_added(
     again = make_context(tmp_path, frames=250)
     assert execute("ensemble", again).state == "complete"
     assert_same(ensemble_of(again.store), ensemble_of(finished.store))
+
+
+def test_samples_that_the_fit_counted_need_no_histograms(
+    finished: StageContext, prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fresh_copy(prepared, tmp_path)
+    context = make_context(tmp_path, frames=250)
+    write_fit(context)
+    store = context.store
+    for tile in context.tiles():
+        read = {name: store.read(f"histogram/{name}", tile.region) for name in HISTOGRAM}
+        fit = {name: store.read(f"fit/{name}", tile.region) for name in PARAMETERS}
+        codes = CodeSums(read["origin"], read["counts"].shape[2])
+        for rows in (slice(0, 7), slice(7, None)):
+            codes.add(*({name: values[rows] for name, values in each.items()} for each in (read, fit)))
+        store.records.mark("fit", "truth", tile.key, {"codes": codes.content()})
+    plain_read = RunStore.read
+
+    def read_little(self: RunStore, name: str, *region: Any) -> Any:
+        assert name != "histogram/counts"
+        return plain_read(self, name, *region)
+
+    assert execute("maps", context).state == "complete"
+    monkeypatch.setattr(RunStore, "read", read_little)
+    assert execute("ensemble", context).state == "complete"
+    assert_same(ensemble_of(store), ensemble_of(finished.store))
+    found, expected = (each.attributes("ensemble") for each in (store, finished.store))
+    assert found["samples_beyond_dn_all_frames"] == expected["samples_beyond_dn_all_frames"]
+
+
+def test_code_sums_leave_out_pixels_without_a_value_and_what_lies_off_the_axis() -> None:
+    counts = np.arange(12, dtype=np.uint16).reshape(1, 3, 4)
+    origin = np.array([[100, 100, 102]], np.int32)
+    outside = {"under": np.array([[1, 10, 100]], np.uint32), "over": np.array([[0, 1, 0]], np.uint32)}
+    fit = {name: np.array([[1.0, np.nan, 1.0]]) for name in PARAMETERS}
+    codes = CodeSums(origin, 4)
+    codes.add({"counts": counts, "origin": origin, **outside}, fit)
+    content = codes.content()
+    assert content == {"dn": [101, 102, 103, 104, 105], "samples": [1, 10, 12, 10, 11], "outside": 101}
+    samples, beyond = on_axis(content, DnAxis(102, 3))
+    assert samples.tolist() == [10, 12, 10]
+    assert beyond == 101 + 1 + 11
 
 
 def test_all_frames_need_no_frames(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
