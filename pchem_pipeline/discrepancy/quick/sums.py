@@ -111,16 +111,17 @@ class StackSums:
         """The same of all blocks, within which the covariances are taken."""
         return float(self.n_frames - self.n_blocks)
 
-    @property
-    def within(self) -> FloatArray:
-        """Sum of squares of each pixel about its mean over the block, (b, y, x), DN^2."""
-        sums = self.block_sum.astype(np.float64)
-        return np.asarray(self.block_sum_square - sums**2 / self.lengths[:, None, None])
+    def _variance(self, blocks: IntArray | slice) -> FloatArray:
+        """Return the variance of each pixel about its mean over the block, of some blocks, (y, x), DN^2."""
+        lengths = self.lengths[blocks]
+        sums = self.block_sum[blocks].astype(np.float64)
+        within = self.block_sum_square[blocks] - sums**2 / lengths[:, None, None]
+        return np.asarray(within.sum(axis=0) / float(lengths.sum() - lengths.size))
 
     @cached_property
     def variance(self) -> FloatArray:
         """Variance of each pixel within blocks, (y, x), DN^2."""
-        return np.asarray(self.within.sum(axis=0) / self.freedom)
+        return self._variance(slice(None))
 
     @cached_property
     def rows(self) -> Lines:
@@ -144,7 +145,8 @@ class StackSums:
         lengths = self.lengths[self.column_blocks]
         starts = np.cumsum(lengths) - lengths
         freedom = float(lengths.sum() - lengths.size)
-        v = self.within[self.column_blocks].sum(axis=0) / freedom
+        everywhere = self.column_blocks.size == self.lengths.size
+        v = self.variance if everywhere else self._variance(self.column_blocks)
         tops = np.arange(0, ny, ROW_GROUP)
         total, square = (np.add.reduceat(values, tops, axis=0) for values in (v, v**2))
         product, inside = np.zeros_like(v), np.zeros_like(v)

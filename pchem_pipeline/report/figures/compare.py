@@ -136,8 +136,8 @@ def draw_difference(look: Look, *, z: FloatArray, n_far: int, title: str, same_d
         top.plot(np.arange(z.size), z.ravel() / unit, "o", color=colours.blue, markersize=3)
         top.set(xlabel="channel", ylabel=label, xlim=(-0.5, z.size - 0.5))
     else:
-        ends = {"vmin": -limit / unit, "vmax": limit / unit}
-        image = show_map(top, shown_pixels(look, z) / unit, z.shape, cmap=DIVERGING, **ends)
+        end = limit / unit
+        image = show_map(top, shown_pixels(look, z) / unit, z.shape, cmap=DIVERGING, vmin=-end, vmax=end)
         bar = figure.colorbar(image, ax=top, fraction=0.05, pad=0.02, aspect=25, extend="both")
         bar.set_label(label)
     top.set_title(plain(title), fontsize=7.5)

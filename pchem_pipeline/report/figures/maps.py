@@ -254,26 +254,35 @@ def _draw_image(
         bar.set_label(label)
 
 
-def shown_pixels(look: Look, values: NDArray[Any]) -> NDArray[Any]:
-    """Return the rows and columns of a map that an image can show: every k-th where there are more."""
-    step = _step(look, values.shape)
+def shown_pixels(look: Look, values: NDArray[Any], *, panels: int = 1) -> NDArray[Any]:
+    """Return the rows and columns of a map that an image can show: every k-th where there are more.
+
+    Args:
+        look: of the figure.
+        values: the map, (y, x).
+        panels: side by side in the figure.
+    """
+    step = _step(look, values.shape, panels)
     return values[::step, ::step]
 
 
-def _step(look: Look, shape: tuple[int, ...]) -> int:
+def _step(look: Look, shape: tuple[int, ...], panels: int) -> int:
     """Return k; it is odd, so that what differs from one row or column to the next is seen."""
-    dots = inches(look.width_mm) * look.dpi
+    dots = inches(look.width_mm) * look.dpi / panels
     step = max(1, int(shape[1] / dots), int(shape[0] / (_TALLEST * dots)))
     return step if step % 2 else step - 1
 
 
-def show_map(axes: Axes, colour: NDArray[Any], shape: tuple[int, ...], **options: Any) -> AxesImage:
+def show_map(
+    axes: Axes, colour: NDArray[Any], shape: tuple[int, ...], *, panels: int = 1, **options: Any
+) -> AxesImage:
     """Draw an image of the pixels, square unless the sensor is very long; NaN has the colour of no value.
 
     Args:
         axes: where.
         colour: what the colour stands for, (y, x), of the pixels of :func:`shown_pixels`.
         shape: of the sensor.
+        panels: side by side in the figure.
         options: of matplotlib's ``imshow``.
     """
     ny, nx = shape
@@ -281,7 +290,7 @@ def show_map(axes: Axes, colour: NDArray[Any], shape: tuple[int, ...], **options
     axes.set_facecolor(colours_of(axes).no_value)
     # a vector file keeps the pixels as they are, but for more of them than it can show
     kept = "none" if max(ny, nx) <= _MOST_KEPT else "nearest"
-    step = _step(look_of(axes), shape)
+    step = _step(look_of(axes), shape, panels)
     bottom, right = (step * n - 0.5 for n in colour.shape)
     image = axes.imshow(
         colour,

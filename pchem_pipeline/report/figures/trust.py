@@ -171,8 +171,8 @@ def draw_goodness(look: Look, *, table: DataTable, false_discovery_rate: float) 
         right.set(xlabel="channel", ylabel="misfit (σ)")
         right.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         return figure
-    shown = np.clip(shown_pixels(look, deviate), *_DEVIATES)
-    image = show_map(right, shown, deviate.shape, vmin=-4.0, vmax=6.0)
+    shown = np.clip(shown_pixels(look, deviate, panels=_panels(look)), *_DEVIATES)
+    image = show_map(right, shown, deviate.shape, panels=_panels(look), vmin=-4.0, vmax=6.0)
     if len(marked) <= _MOST_MARKS:
         right.plot(marked[:, 1], marked[:, 0], "o", markersize=5, mec=colours.vermilion, mfc="none", mew=0.8)
     bar = figure.colorbar(image, ax=right, fraction=0.06, pad=0.02, aspect=25)
@@ -180,9 +180,14 @@ def draw_goodness(look: Look, *, table: DataTable, false_discovery_rate: float) 
     return figure
 
 
+def _panels(look: Look) -> int:
+    """Return how many axes of two stand side by side."""
+    return 2 if look.wide else 1
+
+
 def _two(look: Look, shape: tuple[int, ...]) -> tuple[Axes, Axes, Drawing]:
     """Return two axes, side by side on a page, one above the other in a column."""
-    if look.wide:
+    if _panels(look) > 1:
         figure = look.empty(62.0)
         left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
     else:
@@ -223,10 +228,11 @@ def draw_left_out(look: Look, *, share: FloatArray, n_frames: int | None) -> Dra
         right.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         return figure
     # nothing is white, a single sample is seen
-    some = shown_pixels(look, samples)
+    some = shown_pixels(look, samples, panels=_panels(look))
     shown = np.where(some > 0, some, np.nan)
     top = max(float(np.max(hit, initial=1.0)), 1.0)
-    image = show_map(right, shown, samples.shape, cmap=colours.from_paper, vmin=0.0, vmax=top)
+    options = {"cmap": colours.from_paper, "vmin": 0.0, "vmax": top}
+    image = show_map(right, shown, samples.shape, panels=_panels(look), **options)
     right.set_facecolor(colours.paper)
     bar = figure.colorbar(image, ax=right, fraction=0.06, pad=0.02, aspect=25)
     bar.set_label(label)

@@ -200,7 +200,7 @@ def _join_minor_ticks(drawing: Drawing) -> None:
             clip_on=False,
             in_layout=False,
         )
-        axes.add_artist(marks)
+        drawing.add_artist(marks)  # not of the axes, whose lines are data
 
 
 def _bare_minor_ticks(axes: Axes, kind: str) -> NDArray[np.float64]:

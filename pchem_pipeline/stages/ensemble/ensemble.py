@@ -327,9 +327,10 @@ class _Counted:
             low: smallest DN of each pixel, shape (y, x).
             high: largest.
         """
-        first, size = _occupied(self.origin, low, high, self.counts.shape[2])
+        bins = self.counts.shape[2]
+        first, size = _occupied(self.origin, low, high, bins)
         y, x = np.ogrid[: first.shape[0], : first.shape[1]]
-        kept = sliding_window_view(self.counts, size, axis=2)[y, x, first]
+        kept = self.counts if size == bins else sliding_window_view(self.counts, size, axis=2)[y, x, first]
         return PixelHistograms(
             kernel_counts(kept).reshape(first.size, size), (self.origin + first).ravel(), self.outside.ravel()
         )

@@ -157,10 +157,7 @@ def read_maps(
     Raises:
         StoreError: an array is missing or corrupt.
     """
-    maps = StoredMaps(store, loaded)
-    entries = _packed(maps, listed_maps(store, shape), shape)
-    here = [entry.path for entry in entries if entry.packed is not None or entry.same_as is not None]
-    return entries, {path: maps.read(path).reshape(-1)[index].astype(np.float64) for path in here}
+    return _packed(StoredMaps(store, loaded), listed_maps(store, shape), shape, index)
 
 
 class StoredMaps:
@@ -201,25 +198,32 @@ def inspector_data(
     )
 
 
-def _packed(maps: StoredMaps, listed: Sequence[Listed], shape: tuple[int, int]) -> list[MapEntry]:
-    """Pack maps, the important ones first, until the budget is spent."""
+def _packed(
+    maps: StoredMaps, listed: Sequence[Listed], shape: tuple[int, int], index: NDArray[np.int64]
+) -> tuple[list[MapEntry], dict[str, NDArray[np.float64]]]:
+    """Pack maps, the important ones first, until the budget is spent; see `read_maps`."""
     n = shape[0] * shape[1]
     budget = min(_MAPS_BUDGET * max(1.0, n / _PAPER_PIXELS) ** _MAPS_POWER, _MOST_BYTES)
     order = sorted(listed, key=lambda each: _importance(each.variable.path))
     found: dict[str, MapEntry] = {}
+    exact: dict[str, NDArray[np.float64]] = {}
     for each in order:
         entry = map_entry(each)
         alike = _multiple_of_exposure(maps, each.variable)
         if alike is not None and alike[0] in found and found[alike[0]].packed is not None:
             found[entry.path] = replace(entry, same_as=alike)
-            continue
-        # packing takes long where pixels are many: there the first map that does not fit is the last tried
-        packed = packed_map(maps, each.variable) if budget > 0 else None
-        size = math.inf if packed is None else 4 * len(packed.data) / 3
-        fits = size <= budget
-        budget -= size if fits else math.inf if n > _MANY_PIXELS else 0.0
-        found[entry.path] = replace(entry, packed=packed) if fits else entry
-    return [found[each.variable.path] for each in listed]
+        else:
+            # packing many pixels takes long: there the first map that does not fit is the last tried
+            packed = packed_map(maps, each.variable) if budget > 0 else None
+            size = math.inf if packed is None else 4 * len(packed.data) / 3
+            fits = size <= budget
+            budget -= size if fits else math.inf if n > _MANY_PIXELS else 0.0
+            found[entry.path] = replace(entry, packed=packed) if fits else entry
+            if not fits:
+                continue
+        exact[entry.path] = maps.read(entry.path).reshape(-1)[index].astype(np.float64)
+    paths = [each.variable.path for each in listed]
+    return [found[path] for path in paths], {path: exact[path] for path in paths if path in exact}
 
 
 def _importance(path: str) -> tuple[int, int]:

@@ -199,6 +199,7 @@ def test_a_map_of_more_pixels_than_an_image_can_show_has_every_odd_th_of_them() 
     assert axes.images[0].get_extent() == [-0.5, 3 * 434 - 0.5, 89.5, -0.5]
     assert "no value: 1 pixel" in texts(figure)
     assert shown_pixels(Look(dpi=300), values).shape == values.shape
+    assert shown_pixels(Look(dpi=300), values, panels=3).shape == (30, 434)
 
 
 def test_pixels_without_a_value_are_counted_in_the_map() -> None:
