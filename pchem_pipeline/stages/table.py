@@ -89,7 +89,7 @@ _ALL = (
     ),
     Stage(
         "fit",
-        version=5,
+        version=6,
         upstream=("histogram",),
         settings=("fit", "run.tile"),
         reads=("histogram/counts", "histogram/origin", "histogram/under", "histogram/over"),

@@ -121,6 +121,7 @@ class Goal(NamedTuple):
     Attributes:
         first: it comes from a start, not from a neighbour: it may warm up by EM steps.
         to_beat: give up once twice the expected rise would leave the log-likelihood below.
+        to_pass: give up once four times the expected rise would: a lower maximum says nothing new.
         known: log-likelihood of a maximum known already: the climb ends where it heads for that one, or
             has all but reached a lower one; infinite without one.
         tied: 1/g moves sigma with it, so that ``sigma g`` stays: the profile of the read noise in e-.
@@ -128,6 +129,7 @@ class Goal(NamedTuple):
 
     first: bool | np.bool_
     to_beat: float
+    to_pass: float
     known: float
     tied: bool | np.bool_
 
@@ -342,7 +344,7 @@ def _end_of(
         return CONVERGED
     if rise < _SURELY_LOWER and loglik + 2.0 * _SURELY_LOWER < goal.known < math.inf:
         return CONVERGED
-    if loglik + 2.0 * rise + 1.0 < goal.to_beat:
+    if loglik + 2.0 * rise + 1.0 < goal.to_beat or loglik + 4.0 * rise + 3.0 < goal.to_pass:
         return FAR_BELOW
     if loglik + rise > goal.known - 1.0 and same_place(known, theta, limits.cells):
         return _AT_KNOWN

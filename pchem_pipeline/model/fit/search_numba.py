@@ -137,7 +137,13 @@ def climb_on(
 @kernel(inline=True)
 def from_start() -> Goal:
     """Return the goal of a climb from a start."""
-    return Goal(np.bool_(True), -math.inf, math.inf, np.bool_(False))
+    return Goal(np.bool_(True), -math.inf, -math.inf, math.inf, np.bool_(False))
+
+
+@kernel(inline=True)
+def goal_beside(first: bool, loglik: float, runner_up: float) -> Goal:
+    """Return the goal of a climb from a start, or from a neighbour, the best and the next known."""
+    return Goal(np.bool_(first), loglik - CLEAR_GAP, runner_up, loglik, np.bool_(False))
 
 
 @kernel(inline=True)
@@ -193,7 +199,7 @@ def climb_neighbours(
         if which == came_from or not _neighbour(which, pixel, best, trial):
             which += 1
             continue
-        goal = Goal(np.bool_(False), best_loglik - CLEAR_GAP, best_loglik, np.bool_(False))
+        goal = goal_beside(False, best_loglik, runner_up)
         outcome, loglik, count = climb_on(pixel, tools, goal, best, trial)
         used += count
         higher = outcome == CONVERGED and loglik > best_loglik
@@ -453,7 +459,7 @@ def _climb_start(
     n, cells = pixel.facts.shape[0], tools.limits.cells
     known, goal = best[n + STEP] > 0.0, from_start()
     if known and n == 1:  # of several samples, one comb may have two maxima
-        goal = Goal(np.bool_(True), found.loglik - CLEAR_GAP, found.loglik, np.bool_(False))
+        goal = goal_beside(True, found.loglik, found.runner_up)
     outcome, loglik, count = climb_on(pixel, tools, goal, best, trial)
     used = found.used + count
     if outcome == DEGENERATE:

@@ -84,11 +84,11 @@ def test_density_is_left_alone_and_auto_refits_only_what_rounding_biases():
     assert (plain.fit_status & FitStatus.COARSE_STEPS == 0).all() or (exact.fit_status == 0).all()
 
 
-def few_electrons(seed, n, n_frames=2000):
+def few_electrons(seed, n, n_frames=2000, steps=(3.3, 3.7), exposure=0.1):
     """Return histograms by plain numpy, where a DN is coarse and few frames hold electrons."""
     rng = np.random.default_rng(seed)
-    step, bias = rng.uniform(3.3, 3.7, n), rng.uniform(95.0, 105.0, n)
-    electrons = rng.poisson(0.1, (n_frames, n)) + 0.2 * rng.standard_normal((n_frames, n))
+    step, bias = rng.uniform(*steps, n), rng.uniform(95.0, 105.0, n)
+    electrons = rng.poisson(exposure, (n_frames, n)) + 0.2 * rng.standard_normal((n_frames, n))
     codes = np.rint(bias + step * electrons).astype(np.int64) - 85
     return np.stack([np.bincount(pixel, minlength=60) for pixel in codes.T]).astype(np.uint32), step
 
@@ -163,6 +163,17 @@ def test_few_dn_per_electron_have_their_own_starts():
     known = np.isfinite(before)
     assert known.sum() >= 4
     assert abs(before[known].mean()) * np.sqrt(known.sum()) > 5  # rounding biases the density
+
+
+def test_sound_fits_of_few_dn_are_not_started_anew():
+    """Other starts are a hundred evaluations, and find combs of whole numbers where none is called for."""
+    counts, step = few_electrons(9, 300, 600, (2.3, 2.7), 0.3)
+    found = fit_histograms(counts, np.full(300, 85))
+    sound = (found.goodness_p > 0.6) & (found.conversion_gain < 1 / 2.05)
+    assert 100 < sound.sum() < 290
+    assert np.median(found.n_iterations[sound]) < 60
+    assert np.median(found.n_iterations[found.goodness_p < 0.1]) > 100
+    assert (abs((found.conversion_gain * step)[sound] - 1) < 0.25).mean() > 0.97
 
 
 def test_nothing_to_fit_stays_nothing():
