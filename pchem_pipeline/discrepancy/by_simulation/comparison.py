@@ -119,47 +119,27 @@ def compare(
     Raises:
         EffortSpentError: the work is at its limit.
     """
-    tried: list[Refitted] = []
-    failed: dict[str, str] = {}
-
-    def refit(members: Sequence[Hypothesis]) -> None:
-        if share_place(h.effect for h in (*held, *members)):
-            return
-        dear = [one for one in tried if is_dear(one.effects)]
-        if is_dear(h.effect for h in members) and len(dear) >= _MOST_DEAR:
-            return
-        best = max((one.score for one in tried), default=-np.inf)
-        try:
-            begun = witness.begun((*held, *members))
-            tried.append(refitter.refined(begun, best, whole=len(members) == 1))
-        except EffortSpentError:
-            raise
-        except NotFittedError:
-            return
-        # whatever a stranger's effect raises must not stop the others
-        except Exception as error:
-            failed[members[-1].tag] = error_words(error)
-
+    trials = _Trials(refitter, tuple(held), witness)
+    tried = trials.tried
+    singles = _singles(hypotheses, choice)
+    # what the likeliest set is made of, then that set: it may leave no others worth a refit
+    first = len(choice.best.hypotheses)
+    for hypothesis in _dear_last(singles[:first]):
+        trials.refit((hypothesis,))
+    if tried and first > 1 and not trials.complete:
+        trials.refit(_begun(_sets(choice, tried)[0], tried))
     # dear ones last: they may be beaten by then
-    for hypothesis in sorted(_singles(hypotheses, choice), key=lambda h: is_dear([h.effect])):
-        if not tried or not _beaten(refitter, hypothesis, max(tried, key=_worth)):
-            refit((hypothesis,))
+    for hypothesis in _dear_last(singles[first:]):
+        if not trials.refit((hypothesis,)):
+            break
     if not tried:
         return None
-    best = max(tried, key=_worth)
     if before is not None and max(one.score for one in tried) < before.score - _NO_WORSE:
         return None  # nothing beside the effects held explains more than they do by themselves
-    if not leaves_nothing(refitter, best):
-        sets = _of_different_effects([*_grown(refitter, tried, len(held), beside), *_sets(choice, tried)])
-        for number, members in enumerate(sets[:_MOST_SETS]):
-            best = max(tried, key=_worth)
-            if len(held) + len(members) > len(best.hypotheses) and leaves_nothing(refitter, best):
-                continue
-            try:
-                refit(_begun(members, tried))
-            except EffortSpentError:
-                if not number:
-                    raise
+    if len(trials.best.hypotheses) > len(held) + 1 or not trials.complete:
+        grown = [] if trials.complete else _grown(refitter, tried, len(held), beside)
+        for members in _of_different_effects([*grown, *_sets(choice, tried)])[:_MOST_SETS]:
+            if not trials.refit(_begun(members, tried)):
                 break
     # the work that led here must not be lost for the little that is left: no limit
     to_choose = replace(refitter, allow=lambda _: None)
@@ -174,7 +154,81 @@ def compare(
     for member in chosen.hypotheses:
         if member.tag not in known:
             tried += _placebo(refitter, hypotheses, chosen, member, tried)
-    return Comparison(chosen, tuple(tried), failed, witnessed)
+    return Comparison(chosen, tuple(tried), trials.failed, witnessed)
+
+
+@dataclass
+class _Trials:
+    """Sets that are refitted, as far as they are worth it.
+
+    Attributes:
+        refitter: fits sets.
+        held: effects that are fitted with each.
+        witness: brings a set near its best.
+        tried: sets at their best fit, in the order in which they were tried.
+        failed: effects of which the refit failed, and why.
+    """
+
+    refitter: Refitter
+    held: tuple[Hypothesis, ...]
+    witness: Witness
+    tried: list[Refitted] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def best(self) -> Refitted:
+        """The best so far."""
+        return max(self.tried, key=_worth)
+
+    @property
+    def complete(self) -> bool:
+        """Whether that leaves nothing."""
+        return bool(self.tried) and leaves_nothing(self.refitter, self.best)
+
+    def refit(self, members: Sequence[Hypothesis]) -> bool:
+        """Refit a set unless it is in vain; return False at the limit of the work, where sets are known.
+
+        Raises:
+            EffortSpentError: at that limit, no set of several has been refitted.
+        """
+        if not self._worth_it(members):
+            return True
+        best = max((one.score for one in self.tried), default=-np.inf)
+        try:
+            begun = self.witness.begun((*self.held, *members))
+            self.tried.append(self.refitter.refined(begun, best, whole=len(members) == 1))
+        except EffortSpentError:
+            if all(len(one.hypotheses) <= len(self.held) + 1 for one in self.tried):
+                raise
+            return False
+        except NotFittedError:
+            pass
+        # whatever a stranger's effect raises must not stop the others
+        except Exception as error:
+            self.failed[members[-1].tag] = error_words(error)
+        return True
+
+    def _worth_it(self, members: Sequence[Hypothesis]) -> bool:
+        """Tell whether a set may come near the best one, and was not refitted before."""
+        tags = frozenset(h.tag for h in (*self.held, *members))
+        if share_place(h.effect for h in (*self.held, *members)):
+            return False
+        dear = [one for one in self.tried if is_dear(one.effects)]
+        if is_dear(h.effect for h in members) and len(dear) >= _MOST_DEAR:
+            return False
+        if len(members) > 1 and any(one.tags == tags for one in self.tried):
+            return False
+        if self.complete and len(tags) > len(self.best.tags):
+            return False
+        alone = len(members) == 1 and bool(self.tried)
+        if not (alone or self.complete):
+            return True
+        return not _beaten(self.refitter, (*self.held, *members), self.best)
+
+
+def _dear_last(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return hypotheses, those last whose refit takes long."""
+    return sorted(hypotheses, key=lambda h: is_dear([h.effect]))
 
 
 def _chosen(refitter: Refitter, tried: list[Refitted], before: Sequence[Refitted]) -> Refitted | None:
@@ -267,16 +321,16 @@ def leaves_nothing(refitter: Refitter, one: Refitted) -> bool:
     return look_elsewhere(p, refitter.null.effective_tests) > _LEFT
 
 
-def _beaten(refitter: Refitter, hypothesis: Hypothesis, best: Refitted) -> bool:
-    """Tell whether a refit of a hypothesis is in vain: far behind the best set.
+def _beaten(refitter: Refitter, members: Sequence[Hypothesis], best: Refitted) -> bool:
+    """Tell whether a refit of hypotheses is in vain: far behind the best set.
 
-    By its fingerprint at the best strength; how far that is trusted goes with what there is to explain, and
-    is less where the best set leaves something.
+    By their fingerprints at the best strengths; how far these are trusted goes with what there is to explain,
+    and is less where the best set leaves something.
     """
     trust = _FAR_SHARE if leaves_nothing(refitter, best) else _FAR_SHARE_OF_PART
     shift = refitter.target - refitter.null.mean
     noise = replace(refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=_LOOSE)
-    score = fit_set([hypothesis], shift, noise).log_score(shift, noise)
+    score = fit_set(members, shift, noise).log_score(shift, noise)
     return score < best.score - _FAR - trust * (best.score - refitter.nothing)
 
 
@@ -408,7 +462,7 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
         members = [h for h in one.hypotheses if h.tag != hypothesis.tag]
         # the same kinds: another kind of one that mimics both is another set
         others = next((other for other in known if _of_kinds(other, members)), None)
-        if others is None and is_dear(h.effect for h in one.hypotheses):
+        if others is None and is_dear(h.effect for h in members):
             return False
         if others is None:
             try:

@@ -223,6 +223,38 @@ def test_a_choice_among_sets_that_were_refitted_is_made_at_the_limit_too(
     assert found.chosen.tags == set(tags)
 
 
+def test_the_likeliest_set_is_fitted_before_other_effects_and_kept_at_the_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(TRUTH, "exposure_drift", (np.eye(M)[0] * 30.0 + np.eye(M)[2] * 20.0, 1.0))
+    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.1)])
+    asked: list[str] = []
+
+    def allow(words: str) -> None:
+        asked.append(words)
+        if "exposure_drift" in words:
+            raise EffortSpentError(words)
+
+    plain = world.refitter()
+    monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
+    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.comparison._FAR", 1e9)  # nothing is in vain
+    found = world.compare(*(hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift")))
+    assert found is not None
+    assert found.chosen.tags == {"row_noise", "frame_noise"}
+    assert "exposure_drift" in asked
+
+
+def test_an_effect_of_a_later_round_is_judged_beside_those_held() -> None:
+    world = World([effect("row_noise", 0.9), effect("frame_noise", 0.1), effect("exposure_drift", 0.05)])
+    first = world.refitter().refined([hypothesis("row_noise", 0.9)])
+    likely = world.choice(hypothesis("exposure_drift", 0.05), mean=first.mean)
+    assert likely is not None
+    others = [hypothesis("exposure_drift", 0.05), hypothesis("frame_noise")]
+    found = compare(world.refitter(), first.hypotheses, others, likely, first)
+    assert found is not None
+    assert found.chosen.tags == {"row_noise", "frame_noise"}
+
+
 def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> None:
     world = World([effect("row_noise", 0.5), effect("frame_noise", 0.3)])
     known = world.refitter().refined([hypothesis("row_noise"), hypothesis("frame_noise")])
