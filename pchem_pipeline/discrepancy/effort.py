@@ -10,16 +10,18 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 # CPU seconds on a core of about 2020: of a simulated sample with all that is looked at, of the fit of a
-# pixel, of its fit with effects by components of the law, of what is learnt of the sensor from a pixel,
-# and of the mass of a code under one component
-_SAMPLE, _FIT, _REFIT, _LEARN, _MASS = 5.0e-8, 4.0e-5, 4.0e-5, 3.0e-4, 1.0e-7
+# pixel, and of the mass of a code under one component
+_SAMPLE, _FIT, _MASS = 2.5e-7, 4.0e-5, 1.0e-7
+# of the fit of a pixel with effects, by components of the law, and the same by evaluations of its likelihood
+_REFIT, _REFIT_BY = 3.5e-5, 6.0e-7
+# of what is learnt of the sensor from a pixel, and the same by components
+_LEARN, _LEARN_BY = 4.0e-4, 1.0e-4
 _MOST_LEARNT_FROM = 1000  # pixels
-_USUAL_EVALUATIONS = 15.0  # of the likelihood, in that fit with effects; more of them count for more
 #: By how many times as long the fit of a pixel takes more where its bias may be off by an electron: more
 #: starts, flat maxima and more electron numbers.
 _AMBIGUOUS = 4.0
 #: CPU seconds, by count, that a search has at least, and what it has of the cost of the null distribution.
-_LEAST, _OF_NULL = 100.0, 6.0
+_LEAST, _OF_NULL = 140.0, 6.0
 #: Share of that which is kept for measuring what no effect explains.
 _KEPT = 0.25
 
@@ -85,8 +87,8 @@ class Effort:
             evaluations: of the likelihood of a pixel, on average.
             tags: of the effects.
         """
-        work = _REFIT * self._hard * pixels * components * max(1.0, evaluations / _USUAL_EVALUATIONS)
-        self.spent += work + _LEARN * min(pixels, _MOST_LEARNT_FROM)
+        work = self._hard * pixels * components * (_REFIT + _REFIT_BY * evaluations)
+        self.spent += work + (_LEARN + _LEARN_BY * components) * min(pixels, _MOST_LEARNT_FROM)
         self.tried |= set(tags)
 
     def evaluate(self, masses: int, components: int, tags: Iterable[str]) -> None:

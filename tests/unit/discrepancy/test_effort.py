@@ -65,7 +65,7 @@ def test_a_fit_that_hardly_arrives_costs_more():
     usual, lost = Effort(1.0), Effort(1.0)
     usual.refit(10**6, 1, 8.0, [])
     lost.refit(10**6, 1, 1000.0, [])
-    assert lost.spent > 20.0 * usual.spent
+    assert lost.spent > 10.0 * usual.spent
 
 
 def test_fits_of_pixels_that_are_not_identified_cost_more():
