@@ -127,7 +127,7 @@ def compare(
     for hypothesis in _dear_last(singles[:first]):
         trials.refit((hypothesis,))
     if tried and first > 1 and not trials.complete:
-        trials.refit(_begun(_sets(choice, tried)[0], tried))
+        trials.refit(_begun(_sets(choice, tried)[0], tried, held))
     # dear ones last: they may be beaten by then
     for hypothesis in _dear_last(singles[first:]):
         if not trials.refit((hypothesis,)):
@@ -139,7 +139,7 @@ def compare(
     if len(trials.best.hypotheses) > len(held) + 1 or not trials.complete:
         grown = [] if trials.complete else _grown(refitter, tried, len(held), beside)
         for members in _of_different_effects([*grown, *_sets(choice, tried)])[:_MOST_SETS]:
-            if not trials.refit(_begun(members, tried)):
+            if not trials.refit(_begun(members, tried, held)):
                 break
     # the work that led here must not be lost for the little that is left: no limit
     to_choose = replace(refitter, allow=lambda _: None)
@@ -431,9 +431,16 @@ def _alike(one: Hypothesis, other: Hypothesis) -> bool:
     return one.effect.model_dump(exclude=without) == other.effect.model_dump(exclude=without)
 
 
-def _begun(members: Sequence[Hypothesis], tried: Sequence[Refitted]) -> tuple[Hypothesis, ...]:
-    """Return a set at the strengths of the best refitted one of several that differs in one effect."""
-    near = [one for one in tried if sum(h.tag in one.tags for h in members) >= max(2, len(members) - 1)]
+def _begun(
+    members: Sequence[Hypothesis], tried: Sequence[Refitted], held: Sequence[Hypothesis] = ()
+) -> tuple[Hypothesis, ...]:
+    """Return a set at the strengths of the best refitted one that is a part of it or differs in one effect.
+
+    A strong effect alone is nearer to its strength in the set than its fingerprint can tell.
+    """
+    tags = {h.tag for h in (*held, *members)}
+    common = max(2, len(members) - 1)
+    near = [one for one in tried if one.tags < tags or sum(h.tag in one.tags for h in members) >= common]
     if not near:
         return tuple(members)
     own = {h.tag: h for h in max(near, key=_worth).hypotheses}

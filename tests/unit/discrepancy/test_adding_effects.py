@@ -265,6 +265,8 @@ def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> No
     begun = _begun(members, [known])
     assert {begun[0].effect, begun[2].effect} == set(known.effects)
     assert begun[1] is drift
+    alone = world.refitter().refined([hypothesis("row_noise")])
+    assert _begun(members[:2], [known, alone])[0].effect == alone.effects[0]
 
 
 def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
