@@ -81,7 +81,8 @@ def _pack_one(model: SampleLaw, n: int) -> _Part:
 
     peaks = per_pixel(*(f"satellite_{name}" for name in _PEAK_FIELDS))
     added = per_pixel("added_weights", "added_exposure")
-    exposures = np.stack([np.atleast_2d(v) for v in (model.exposure_weights, model.exposure_factors)], axis=1)
+    mixture = np.broadcast_arrays(*np.atleast_2d(model.exposure_weights, model.exposure_factors))
+    exposures = np.stack(mixture, axis=1)
     for weights in (exposures[:, 0], added[:, 0], peaks[:, 0]):
         if not np.allclose(weights.sum(axis=1), 1.0, rtol=0, atol=1e-6):
             raise ValueError("the weights of a mixture do not sum to 1")

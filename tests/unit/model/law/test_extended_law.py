@@ -211,3 +211,13 @@ def test_a_parabola_is_made_of_masses_and_slopes(name: str) -> None:
     np.testing.assert_allclose(score, np.einsum("nab,nb->na", relative, counts), rtol=1e-6, atol=1e-6)
     expected = counts.sum(axis=1)[:, None, None] * (slopes @ relative.transpose(0, 2, 1))
     np.testing.assert_allclose(information, expected, rtol=1e-6, atol=1e-6)
+
+
+def test_the_weights_of_exposures_may_differ_by_pixel_where_the_exposures_do_not():
+    weights, factors = np.array([[0.5, 0.5], [0.9, 0.1]]), np.array([0.8, 1.2])
+    maps = tuple(np.full(2, value) for value in (2.0, 0.1, 100.0, 3.0))
+    codes = np.arange(60, 220)
+    both = sample_mass(SampleLaw(exposure_weights=weights, exposure_factors=factors), maps, codes)
+    for row in range(2):
+        one = SampleLaw(exposure_weights=weights[row], exposure_factors=factors)
+        np.testing.assert_array_equal(sample_mass(one, maps, codes)[row], both[row])
