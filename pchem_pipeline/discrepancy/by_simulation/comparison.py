@@ -3,7 +3,8 @@
 The fingerprints say which sets are worth a refit (:mod:`.fingerprints`). One effect that leaves nothing
 beyond chance after its best fit is all there is; only where every single one leaves something are sets of
 several compared, and each of their effects must have a signature of its own: statistics that the others, at
-their best fit, do not account for and do not touch.
+their best fit, do not account for and do not touch, or at least do not account for where the set leaves
+nothing.
 """
 
 from __future__ import annotations
@@ -325,9 +326,10 @@ def _beaten(refitter: Refitter, members: Sequence[Hypothesis], best: Refitted) -
     """Tell whether a refit of hypotheses is in vain: far behind the best set.
 
     By their fingerprints at the best strengths; how far these are trusted goes with what there is to explain,
-    and is less where the best set leaves something.
+    and is less where the best set leaves something, or has more effects.
     """
-    trust = _FAR_SHARE if leaves_nothing(refitter, best) else _FAR_SHARE_OF_PART
+    settled = len(members) >= len(best.hypotheses) and leaves_nothing(refitter, best)
+    trust = _FAR_SHARE if settled else _FAR_SHARE_OF_PART
     shift = refitter.target - refitter.null.mean
     noise = replace(refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=_LOOSE)
     score = fit_set(members, shift, noise).log_score(shift, noise)
