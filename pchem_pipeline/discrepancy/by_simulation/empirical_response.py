@@ -27,10 +27,11 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 Place = tuple[int, int, int]
 
-_CLEAR = 10.0  # nats that a term must be worth beyond the number of those that are tried
+_CLEAR = 20.0  # nats that a term must be worth beyond the number of those that are tried
 _CERTAIN = 3.0  # standard errors of a model's, in simulated frames: less is taken for none
 _DETAIL = 1e-3  # of the nats of the first term: less may be how the pixels differ in it
 _MOST_TERMS = 16
+_NEARLY_ALL = 0.7  # of the columns
 
 
 class Responses(NamedTuple):
@@ -153,7 +154,7 @@ class _Left:
 
 
 def _in_columns(samples: FollowingSamples, term: _Term) -> _Term:
-    """Return a term with the range of columns that follow, where that is clearer than that all do."""
+    """Return a term with the columns that follow, where others have no sample there or clearly do not."""
     if term.of != "sample":
         return term
     products, pairs = samples.by_column(term.place)
@@ -163,7 +164,9 @@ def _in_columns(samples: FollowingSamples, term: _Term) -> _Term:
     gains = 0.5 * (sums[last] - sums[first]) ** 2 / number
     best = int(np.argmax(gains))
     if gains[best] < 0.5 * sums[-1] ** 2 / max(counts[-1], 1.0) + _CLEAR + np.log(first.size):
-        return term
+        some = np.flatnonzero(pairs)
+        few = some.size < _NEARLY_ALL * pairs.size
+        return term._replace(columns=(int(some[0]), int(some[-1]) + 1)) if few else term
     a, b = int(first[best]), int(last[best])
     return term._replace(
         value=float((sums[b] - sums[a]) / number[best]), gain=float(gains[best]), columns=(a, b)

@@ -391,7 +391,7 @@ class FrameExplainer:
         Without the effects that were added, since one that merely mimics has no place beside it, and with
         those of them that account for what they move themselves: what closes the gap, then in the fewest
         forms, and where both do as well with the effects, which have a name. None where it closes less than
-        half of what is left.
+        half of what is left, or of what there was if none of the effects does.
 
         Raises:
             EffortSpentError: the work is at its limit; nothing was added.
@@ -412,7 +412,13 @@ class FrameExplainer:
             if found is None:
                 continue
             gap = self._gap_of(found, z)
-            most = _DESCRIBED * (left.value if kept else min(left.value, before.value))
+            # effects none of which accounts for what it moves lose their names: then less is better
+            alone = (
+                _DESCRIBED * min(left.value, before.value)
+                if sure
+                else min(left.value, _DESCRIBED * before.value)
+            )
+            most = _DESCRIBED * left.value if kept else alone
             forms = sum(e.measured_parts for e in found.effects)
             rank = (not gap.at_floor, float(forms) if gap.at_floor else gap.value)
             if (gap.at_floor or gap.value < most) and (best is None or rank <= best[0]):

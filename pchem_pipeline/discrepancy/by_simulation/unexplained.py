@@ -88,6 +88,7 @@ class Unexplained:
         replicates: of what is measured.
         effort: counts what is simulated.
         defects: forms that failed, and why.
+        instead: what leaves little by itself, once it is known.
     """
 
     frames: FrameStack
@@ -100,6 +101,7 @@ class Unexplained:
     replicates: int
     effort: Effort
     defects: dict[str, str] = field(default_factory=dict)
+    instead: Refitted | None = None
 
     @functools.cached_property
     def _forms(self) -> dict[str, Measure]:
@@ -121,13 +123,21 @@ class Unexplained:
 
     def by_itself(self) -> Refitted | None:
         """Return what no known effect makes, where it leaves little by itself; None where it does not."""
+        if self.instead is not None:
+            return self.instead
+        best: Refitted | None = None
         for likely in self._of_all:
             clear = likely.measured.gain > _WORTHWHILE * self._of_all[0].measured.gain
             if clear and likely.measured.unlisted:
                 found = self._tried((), likely, whole=True)
-                if found is not None and found.effects[0].unlisted and self._leaves_little(found):
-                    return found
-        return None
+                if found is None or not found.effects[0].unlisted or not self._leaves_little(found):
+                    continue
+                if best is None or found.score > best.score:
+                    best = found
+                if self.leaves_nothing(best):
+                    break
+        self.instead = best
+        return best
 
     def leaves_nothing(self, one: Refitted) -> bool:
         """Tell whether a set leaves no statistic beyond chance."""
@@ -141,6 +151,8 @@ class Unexplained:
 
     def measured(self, kept: tuple[Hypothesis, ...]) -> Refitted | None:
         """Return effects with what is best measured beside them, and with other forms beside all of these."""
+        if not kept and self.instead is not None:
+            return self.instead
         forms = dict(self._forms)
         found: Refitted | None = None
         while forms and not (found is not None and self._leaves_little(found)):

@@ -91,6 +91,7 @@ def _time() -> list[Statistic]:
         Statistic("time.cross.charge_readout", "cross", "charge follows the residual of the frame before"),
     ]
     found += [
+        Statistic("time.nearer", "digital", "samples are nearer to the one before than to others"),
         Statistic(
             "time.follows.sample", "cross", "residuals follow the charge of another pixel one frame before"
         ),

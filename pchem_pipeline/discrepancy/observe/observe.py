@@ -19,6 +19,7 @@ from pchem_pipeline.discrepancy.observe.equal_squares import equal_squares, squa
 from pchem_pipeline.discrepancy.observe.follows import follow_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
 from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines
+from pchem_pipeline.discrepancy.observe.nearer import nearer_statistics
 from pchem_pipeline.discrepancy.observe.predicted import predicted_samples, predicted_statistics
 from pchem_pipeline.discrepancy.observe.previous_bits import bit_statistics, previous_bits
 from pchem_pipeline.discrepancy.observe.repeated_lines import line_statistics, repeated_lines
@@ -119,6 +120,7 @@ def observe(
         **space_statistics(view),
         **predicted_statistics(predicted),
         **bit_statistics(bits),
+        **nearer_statistics(frames, edges, maps),
         **follow_statistics(frames, edges, laws, maps),
         **line_statistics(lines, alike, len(frames)),
         **square_statistics(squares, counts, origin, maps.usable),

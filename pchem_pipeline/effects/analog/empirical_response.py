@@ -156,10 +156,19 @@ class EmpiricalResponse(Effect):
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the variance of what samples follow, of electrons as many as the pixel's own.
 
-        Terms of some columns only are left out: the pixels of the others have none of it.
+        Terms of some columns count as their mean over the columns of the region; without one they are left
+        out, since the pixels of other columns have none of it.
         """
-        power = sum(term.number * term.weight**2 for term in self.terms if term.columns is None)
+        power = sum(term.number * term.weight**2 * self._part(term) for term in self.terms)
         return model.with_variance(e2=self.response**2 * power * np.nan_to_num(maps.quanta_exposure))
+
+    def _part(self, term: ResponseTerm) -> float:
+        """Return the part of the pixels that follow by a term."""
+        if term.columns is None:
+            return 1.0
+        if self.region is None or not self.region.columns:
+            return 0.0
+        return (term.columns[1] - term.columns[0]) / sum(end - first for first, end in self.region.columns)
 
     def words(self) -> str:
         """Return what is known of it."""

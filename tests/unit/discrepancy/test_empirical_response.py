@@ -18,7 +18,9 @@ from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.size import size_of
 from pchem_pipeline.effects.analog.empirical_response import EmpiricalResponse, ResponseTerm
+from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
@@ -112,7 +114,7 @@ def test_what_only_some_columns_follow_is_told_with_these() -> None:
     first, second = found.effect.terms
     last = SHAPE[1] - 1
     # at the first distance the sensor has one pair of columns only
-    assert (first.place, first.columns) == ((0, -1, last), None)
+    assert (first.place, first.columns) == ((0, -1, last), (0, 1))
     assert (second.place, second.columns) == ((0, -1, last - 1), (1, 2))
     assert second.weight == pytest.approx(0.5, rel=0.2)
 
@@ -193,6 +195,19 @@ def test_simulated_samples_follow_what_is_told(term: ResponseTerm, power: int) -
     assert change[inner].std() == pytest.approx(
         0.02 * np.sqrt(2.0 * power), abs=rounding + 0.1 * 0.02 * power**0.5
     )
+
+
+def test_the_law_has_the_variance_of_the_pixels_that_follow() -> None:
+    maps = pixel_maps(tuple(np.full(3, v) for v in (2.0, 1 / STEP, 100.0, 4.0)), np.ones(3, bool))
+    row, few = ResponseTerm(of="row", number=18), ResponseTerm(place=(0, -1, 17), columns=(0, 1))
+    for terms, region, power in (
+        ((row,), None, 18.0),
+        ((few,), None, 0.0),
+        ((few,), Region(columns=((0, 4),)), 0.25),
+    ):
+        effect = EmpiricalResponse(response=0.1, terms=terms, region=region)
+        law = effect.sample_law(sample_law((), maps), maps)
+        np.testing.assert_allclose(law.extra_variance_e2, 0.01 * power * 2.0, rtol=1e-12)
 
 
 def test_its_size_is_that_of_all_the_sensor() -> None:

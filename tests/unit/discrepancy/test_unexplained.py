@@ -15,6 +15,7 @@ from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode
+from pchem_pipeline.effects.analog.empirical_response import EmpiricalResponse, ResponseTerm
 from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.readout.empirical import Empirical, Move
@@ -71,11 +72,35 @@ def test_by_itself_only_what_no_named_effect_makes_is_tried_and_kept_where_it_le
         return SimpleNamespace(effects=(one.measured.effect,))
 
     monkeypatch.setattr(unexplained, "_tried", described)
+    monkeypatch.setattr(unexplained, "leaves_nothing", lambda _: True)
     for little in (False, True):
         monkeypatch.setattr(unexplained, "_leaves_little", lambda _, answer=little: answer)
         found = unexplained.by_itself()
         assert (found is not None and found.effects == (gain,)) is little
     assert tried == ["gain", "gain"]
+    # what is known is measured once
+    assert unexplained.measured(()) is unexplained.by_itself() is unexplained.instead
+    assert tried == ["gain", "gain"]
+
+
+def test_of_what_leaves_little_by_itself_the_better_one_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing: Any = None
+    unexplained = Unexplained(*[nothing] * 9)
+    effects = [
+        EmpiricalResponse(response=0.1, terms=(ResponseTerm(of=of),)) for of in ("row", "column", "frame")
+    ]
+    scores = dict(zip(effects, (-9.0, -3.0, -5.0), strict=True))
+    unexplained.__dict__["_of_all"] = [_Likely(Part(), "response", Measurement(e, 9.0)) for e in effects]
+
+    def described(_: Any, one: _Likely, **__: Any) -> Any:
+        return SimpleNamespace(effects=(one.measured.effect,), score=scores[one.measured.effect])
+
+    monkeypatch.setattr(unexplained, "_tried", described)
+    monkeypatch.setattr(unexplained, "leaves_nothing", lambda _: False)
+    monkeypatch.setattr(unexplained, "_leaves_little", lambda _: True)
+    found = unexplained.by_itself()
+    assert found is not None
+    assert found.effects == (effects[1],)
 
 
 @pytest.mark.parametrize(

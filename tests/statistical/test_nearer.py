@@ -1,0 +1,51 @@
+"""Samples that are nearer to the one before are told from chance, whatever the law of the pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.discrepancy.observe.nearer import nearer_statistics
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+
+SHAPE, FRAMES, STACKS = (12, 12), 400, 80
+EDGES = np.arange(0, FRAMES + 1, 50)
+
+
+def drawn(seed: int, exposure: float, noise: float, step: float) -> np.ndarray:
+    """Return frames of pixels of equal law, and their maps."""
+    rng = np.random.default_rng(seed)
+    signal = rng.poisson(exposure, (FRAMES, *SHAPE)) + noise * rng.standard_normal((FRAMES, *SHAPE))
+    return np.floor(100.5 + step * signal).astype(np.uint16)
+
+
+def statistic(frames: np.ndarray, exposure: float, noise: float, step: float) -> float:
+    """Return how much nearer samples are than by chance."""
+    maps = PixelMaps.known(
+        (np.full(SHAPE, v) for v in (exposure, 1 / step, 100.0, noise * step)), np.ones(SHAPE, bool)
+    )
+    return nearer_statistics(frames, EDGES, maps)["time.nearer"]
+
+
+@pytest.mark.parametrize("law", [(1.5, 0.27, 11.0), (0.1, 0.3, 11.0), (3.0, 0.6, 5.0), (15.0, 0.4, 4.0)])
+def test_it_is_standard_normal_without_effects(law: tuple[float, float, float]) -> None:
+    z = np.array([statistic(drawn(seed, *law), *law) for seed in range(STACKS)])
+    # the best of few that are alike: its quantile is nearly that of independent ones
+    assert abs(z.mean()) < 0.3 + 5.0 / np.sqrt(STACKS)
+    assert 0.6 < z.std(ddof=1) < 1.4
+    assert z.max() < 5.0
+
+
+def test_samples_averaged_with_those_before_them_are_nearer() -> None:
+    law = 2.0, 0.3, 11.0
+    frames = drawn(1, *law)
+    chosen = np.random.default_rng(2).random(frames[1:].shape) < 0.4
+    alike = abs(frames[1:].astype(int) - frames[:-1]) < 5
+    frames[1:][chosen & alike] = ((frames[1:] + frames[:-1]) // 2)[chosen & alike]
+    assert statistic(frames, *law) > 8.0
+
+
+def test_frames_too_few_or_samples_that_always_agree_give_none() -> None:
+    maps = PixelMaps.known((np.full(SHAPE, v) for v in (1.0, 0.1, 100.0, 3.0)), np.ones(SHAPE, bool))
+    assert nearer_statistics(drawn(1, 1.0, 0.3, 10.0)[:5], np.array([0, 5]), maps) == {}
+    assert nearer_statistics(np.full((FRAMES, *SHAPE), 7, np.uint16), EDGES, maps) == {}
