@@ -67,7 +67,7 @@ from pchem_pipeline.discrepancy.by_simulation.unexplained import Unexplained
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, free_of_parameters, suspicious
-from pchem_pipeline.discrepancy.observe.misplaced import own_lines
+from pchem_pipeline.discrepancy.observe.digital.misplaced import own_lines
 from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import search, silent

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel_cache import in_any_order
+from pchem_pipeline.discrepancy.observe.digital.misplaced import misplaced_lines
 from pchem_pipeline.discrepancy.observe.law_numba import N_TESTS
-from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines
 from pchem_pipeline.discrepancy.observe.sums import pixel_statistics, sum_frames
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import N_MOMENTS

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe import tables_numba as column
-from pchem_pipeline.discrepancy.observe.equal_squares import equal_squares, square_statistics
+from pchem_pipeline.discrepancy.observe.digital.equal_squares import equal_squares, square_statistics
+from pchem_pipeline.discrepancy.observe.digital.misplaced import misplaced_lines
+from pchem_pipeline.discrepancy.observe.digital.nearer import nearer_statistics
+from pchem_pipeline.discrepancy.observe.digital.predicted import predicted_samples, predicted_statistics
+from pchem_pipeline.discrepancy.observe.digital.previous_bits import bit_statistics, previous_bits
+from pchem_pipeline.discrepancy.observe.digital.repeated_lines import line_statistics, repeated_lines
 from pchem_pipeline.discrepancy.observe.follows import follow_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
-from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines
-from pchem_pipeline.discrepancy.observe.nearer import nearer_statistics
-from pchem_pipeline.discrepancy.observe.predicted import predicted_samples, predicted_statistics
-from pchem_pipeline.discrepancy.observe.previous_bits import bit_statistics, previous_bits
-from pchem_pipeline.discrepancy.observe.repeated_lines import line_statistics, repeated_lines
 from pchem_pipeline.discrepancy.observe.sums import blocks_of, pixel_statistics, sum_frames
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of, in_order, sample_statistics

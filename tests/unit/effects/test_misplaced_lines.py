@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
 
-from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines, own_lines
+from pchem_pipeline.discrepancy.observe.digital.misplaced import misplaced_lines, own_lines
 from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.readout.misplaced_lines import MisplacedLines

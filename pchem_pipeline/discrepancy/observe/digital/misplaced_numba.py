@@ -1,4 +1,4 @@
-"""Loops of :mod:`pchem_pipeline.discrepancy.observe.misplaced`: likelihood ratios of rows at other places."""
+"""Loops of :mod:`.misplaced`: likelihood ratios of rows at other places."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import laws
-from pchem_pipeline.discrepancy.observe.predicted import groups_of
+from pchem_pipeline.discrepancy.observe.digital.predicted import groups_of
 from pchem_pipeline.effects.framework.evidence import PreviousBits
 
 FloatArray = NDArray[np.float64]

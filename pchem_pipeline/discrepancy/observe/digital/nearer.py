@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import laws
-from pchem_pipeline.discrepancy.observe.predicted import groups_of
+from pchem_pipeline.discrepancy.observe.digital.predicted import groups_of
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 _MOST_SAMPLES = 1 << 19
