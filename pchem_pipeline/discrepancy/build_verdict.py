@@ -200,8 +200,9 @@ class Findings:
             return "named_in_part" if self.named else "unexplained"
         if any(not each.named for each in additions):
             return "ambiguous"
-        # what was not tried may be missing as well
-        return "named" if self.added.after.at_floor and not self.limit else "named_in_part"
+        # what was not tried may be missing as well, and so is what shows in a single statistic
+        whole = self.added.after.at_floor and not self.limit and not self.still
+        return "named" if whole else "named_in_part"
 
     @property
     def named(self) -> tuple[Effect, ...]:
@@ -348,7 +349,7 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
     if found.before.at_floor:
         return f"The model was missing {_and(titles)}, too little for the final {data} alone to show."
     if state == "named_in_part":
-        words = f"{_rest(found)}{_nearest(found)}{_left(added)}{_doubts(added)}"
+        words = f"{_rest(found)}{_shown(found)}{_nearest(found)}{_left(added)}{_doubts(added)}"
         return f"A part of what the model was missing is {_and(titles)}{words}."
     them = "them" if len(titles) > 1 else "it"
     words = f"with {them}, no more of the gap is left than chance makes{_left(added)}{_doubts(added)}"
@@ -430,6 +431,16 @@ def _rest(found: Findings) -> str:
     if after.at_floor or found.before.value <= 0.0:
         return ""
     return f"; {_share(max(after.value, 0.0) / found.before.value)} of the gap is left unexplained"
+
+
+def _shown(found: Findings) -> str:
+    """Return what one statistic shows still though the whole gap is at its floor, in words."""
+    if not found.still or not found.added.after.at_floor:
+        return ""
+    pulls = found.last.pulls(found.z.both, splits=2)
+    worst = int(np.argmax(np.abs(pulls)))
+    name = found.last.names[worst]
+    return f"; beside it {Place.of(name, z=0.0).sentence or name} ({pulls[worst]:+.1f} sd)"
 
 
 def _doubts(added: Added) -> str:

@@ -368,3 +368,19 @@ def test_what_the_final_frames_do_not_confirm_has_no_name(before: float, after: 
     words = _sentence(replace(found, added=both), {})
     assert "cannot tell apart" in words
     assert ("do not confirm" in words) == (state == "ambiguous"), words
+
+
+def test_what_one_statistic_shows_still_is_a_part_that_has_no_name() -> None:
+    """Quadrants that wandered apart were 7.5 sd beside the wrong one of two effects, the gap at its floor."""
+    null = _null(np.random.default_rng(5))
+    z = null.mean.copy()
+    z[7] += 7.5 * null.std[7]
+    effect = effect_class("row_noise")(row_noise_dn=1.0)
+    first, last = (Gap(value, 3e-5, (0.0, 0.0), {}) for value in (9e-5, 1e-5))
+    addition = Addition(effect, True, "", (), 0.1, first, last, (), None, ())
+    found = Findings("frames", Measured(z, z, z), null, null, first, [], True, Added((addition,), last))
+    assert (found.state, found.named) == ("named_in_part", (effect,))
+    assert STATISTICS[NAMES[7]].sentence in _sentence(found, {})
+    calm = replace(found, still=False)
+    assert calm.state == "named"
+    assert STATISTICS[NAMES[7]].sentence not in _sentence(calm, {})
