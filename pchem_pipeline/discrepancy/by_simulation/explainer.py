@@ -330,6 +330,8 @@ class FrameExplainer:
             tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
             raise EffortSpentError(spent.doing, (t for t in tags if t not in self.effort.tried)) from spent
         self.defects |= {} if found is None else found.failed
+        # what was chosen is not lost for the little that is left to do: no limit
+        refitter = replace(refitter, allow=lambda _: None)
         added = None if found is None else refitter.sharpened(found.chosen, self.settings.extended_replicates)
         while found is not None and added is not None:
             kept = self._established(added, z)

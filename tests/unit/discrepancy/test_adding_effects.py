@@ -481,6 +481,29 @@ def add(
     return search, search.add(_Explanation(hypotheses, choice), world.null, z)
 
 
+def test_what_was_chosen_enters_the_model_though_the_limit_is_reached(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Sharpening the slopes of a strong set was the last work, and lost all that had led there."""
+    world, spent = World([effect("row_noise", 0.5)]), []
+
+    def allow(words: str) -> None:
+        if spent:
+            raise EffortSpentError(words)
+
+    def compared(*given: Any) -> Comparison | None:
+        found = compare(*given)
+        spent.append(True)
+        return found
+
+    plain = world.refitter()
+    monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
+    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.explainer.compare", compared)
+    search, _ = add(world, monkeypatch, hypothesis("row_noise"))
+    assert spent
+    assert [e.tag for e in search.model] == ["row_noise"]
+
+
 def test_what_is_found_enters_the_model_at_its_best_strength(monkeypatch: pytest.MonkeyPatch) -> None:
     search, extended = add(World([effect("row_noise", 0.5)]), monkeypatch, hypothesis("row_noise"))
     assert [e.tag for e in search.model] == ["row_noise"]
