@@ -110,7 +110,8 @@ def regrouped(
     drop, grow = (np.broadcast_to(np.asarray(p, np.float64), v.shape) for p in law(index))
     lost = binomial_upper(v, n, drop)
     # where nothing is lost the rest of the number is uniform again
-    rest = np.minimum((1.0 - v) / np.exp(n * np.log1p(-drop)), 1.0)
+    with np.errstate(divide="ignore"):  # many electrons are all kept with a chance of 0: some are lost
+        rest = np.minimum((1.0 - v) / np.exp(n * np.log1p(-drop)), 1.0)
     more = binomial_upper(np.where(lost > 0, further_uniform(v, 0), rest), n - lost, grow)
     owner, number = numbered(more)
     more = extra(further_uniform(v[owner], 1 + number), index[owner])

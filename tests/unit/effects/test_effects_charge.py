@@ -20,7 +20,7 @@ from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
 from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
 from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
 from pchem_pipeline.effects.estimators.charge_sums import exposure_nodes
-from pchem_pipeline.effects.estimators.electrons import binomial_upper, further_uniform
+from pchem_pipeline.effects.estimators.electrons import binomial_upper, further_uniform, regrouped
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
 from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
@@ -395,3 +395,17 @@ def test_a_run_of_one_frame_and_a_sensor_of_one_pixel():
     truth = a_sensor((1, 1))
     for effect in KINDS:
         assert simulated(truth, effect, n_frames=1)[0].shape == (1, 1, 1)
+
+
+def test_of_very_many_electrons_of_which_nearly_all_are_lost_the_few_are_left():
+    """The chance that none is lost is 0 in doubles, which is no reason for a warning."""
+    electrons, rng = np.full(2000, 900), np.random.default_rng(4)
+    left = regrouped(
+        electrons,
+        rng.random(2000),
+        1.0,
+        lambda index: (0.9, 0.0),
+        lambda u, index: np.zeros(u.size, np.int64),
+    )
+    assert abs(left.mean() - 90.0) < 4.0 * np.sqrt(900 * 0.09 / 2000)
+    assert left.var() == pytest.approx(81.0, rel=4.0 * np.sqrt(2.0 / 2000))
