@@ -105,12 +105,18 @@ class PixelLikelihood:
         return rise - (fits[0].fit.shared.size - fits[1].fit.shared.size), error
 
     def _fit(self, effects: Sequence[Effect], besides: Sequence[Effect]) -> FittedSet | None:
+        """Fit effects; None where that cannot be done, or led to less than there is without them."""
         # its numbers may not go together where the fit leads, and a stranger's law may raise anything
         try:
             sets = replace(self._sets, present=(*self._sets.present, *besides))
-            return sets.fit([Member.of(effect) for effect in effects])
+            fitted = sets.fit([Member.of(effect) for effect in effects])
+            if not fitted.fit.converged:
+                fitted = sets.fit(fitted.members, fitted.fit.parameters)
+            without = sets.fit(())
         except Exception:
             return None
+        lost = without.fit.log_likelihood.sum() - fitted.fit.log_likelihood.sum()
+        return None if lost > _ALIKE else fitted
 
 
 @dataclass(frozen=True)

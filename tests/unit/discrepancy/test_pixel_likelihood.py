@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.by_likelihood.members import Member
+from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import PixelLikelihood, is_told, with_details
 from pchem_pipeline.discrepancy.effort import Effort
@@ -121,3 +127,24 @@ def test_what_no_law_of_a_sample_holds_is_not_told() -> None:
     assert likelihood.behind([heavy], [row]) is None
     assert likelihood.behind([row], [column]) is None
     assert likelihood.behind([heavy, row], [skew, row]) is not None
+
+
+def test_a_fit_that_went_astray_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was 23,000 nats below the plain one, and another effect took the place of the true one."""
+    likelihood = PixelLikelihood(
+        frames_of(exgaussian(np.random.default_rng(17), 0.4), 18), maps_of(0.3), (), Effort(None), 64
+    )
+    heavy, skew = HEAVY(share=0.1, factor=2.0), SKEW(share=0.3)
+    assert likelihood.behind([heavy], [skew]) is not None
+    plain = SetComparison.fit
+
+    def astray(self: SetComparison, members: Sequence[Member], *rest: Any) -> FittedSet:
+        found = plain(self, members, *rest)
+        if "noise_skew" not in found.tags:
+            return found
+        return replace(found, fit=replace(found.fit, log_likelihood=found.fit.log_likelihood - 100.0))
+
+    monkeypatch.setattr(SetComparison, "fit", astray)
+    assert likelihood.behind([heavy], [skew]) is None
+    hypothesis = Hypothesis(skew, np.ones(2))
+    assert likelihood.begun([hypothesis]) == (hypothesis,)
