@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement
-from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples, Follows, Source
+from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples, Follows
 from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
-from pchem_pipeline.effects.analog.empirical_response import EmpiricalResponse, ResponseTerm
+from pchem_pipeline.effects.analog.empirical_response import EmpiricalResponse, ResponseTerm, Source
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.neighbours import neighbours
 

@@ -63,6 +63,7 @@ class PixelLikelihood:
             np.stack([values[y[some], x[some]] for values in maps.maps], axis=1),
             effort=effort,
         )
+        self._without: dict[tuple[Effect, ...], float] = {}  # log-likelihood, by what is present
 
     def detailed(self, guesses: Sequence[Effect]) -> list[Effect]:
         """Return an effect as fitted from several starts, the likeliest first, each once; else as guessed."""
@@ -80,8 +81,6 @@ class PixelLikelihood:
     def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         """Return the effects of a set at the numbers that are likeliest together, where a law tells them."""
         told = [h.effect for h in hypotheses if is_told(h.effect)]
-        if not told:
-            return tuple(hypotheses)
         fit = self._fit(told, [h.effect for h in hypotheses if not is_told(h.effect)])
         if fit is None or any(member.at_limit for member in fit.members):
             return tuple(hypotheses)
@@ -91,12 +90,12 @@ class PixelLikelihood:
     def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
         """Return how far a set is behind another in likelihood, nats, and the standard error (Vuong 1989).
 
-        Each number of an effect costs a nat (Akaike 1974). None where they differ in what no law of a sample
-        holds, or cannot be fitted.
+        Each number of an effect costs a nat (Akaike 1974). None where they cannot be fitted.
+
+        Args:
+            one: effects.
+            other: the same but for those that `is_told`.
         """
-        tags = {e.tag for e in one} ^ {e.tag for e in other}
-        if not all(is_told(e) for e in (*one, *other) if e.tag in tags):
-            return None
         besides = [e for e in one if not is_told(e)]
         fits = [self._fit([e for e in each if is_told(e)], besides) for each in (one, other)]
         if fits[0] is None or fits[1] is None:
@@ -112,11 +111,13 @@ class PixelLikelihood:
             fitted = sets.fit([Member.of(effect) for effect in effects])
             if not fitted.fit.converged:
                 fitted = sets.fit(fitted.members, fitted.fit.parameters)
-            without = sets.fit(())
+            without = self._without.get(sets.present)
+            if without is None:
+                without = float(sets.fit(()).fit.log_likelihood.sum())
+                self._without[sets.present] = without
         except Exception:
             return None
-        lost = without.fit.log_likelihood.sum() - fitted.fit.log_likelihood.sum()
-        return None if lost > _ALIKE else fitted
+        return None if without - float(fitted.fit.log_likelihood.sum()) > _ALIKE else fitted
 
 
 @dataclass(frozen=True)
@@ -131,11 +132,19 @@ class Witness:
 
     def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         """Return a set at its likeliest numbers; see `PixelLikelihood.begun`."""
+        if not any(is_told(h.effect) for h in hypotheses):
+            return tuple(hypotheses)
         pixels = self.of([h.effect for h in hypotheses], FEW_PIXELS)
         return tuple(hypotheses) if pixels is None else pixels.begun(hypotheses)
 
     def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
-        """Return how far a set is behind another; see `PixelLikelihood.behind`."""
+        """Return how far a set is behind another; see `PixelLikelihood.behind`.
+
+        None also where they differ in what no law of a sample holds.
+        """
+        tags = {e.tag for e in one} ^ {e.tag for e in other}
+        if not all(is_told(e) for e in (*one, *other) if e.tag in tags):
+            return None
         pixels = self.of((*one, *other), MANY_PIXELS)
         return None if pixels is None else pixels.behind(one, other)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +22,15 @@ from pchem_pipeline.discrepancy.observe.digital.predicted import GROUP, groups_o
 from pchem_pipeline.discrepancy.observe.pairs import Samples
 from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
+from pchem_pipeline.effects.analog.empirical_response import Source
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-Source = Literal["sample", "row", "column", "frame"]
 
-SOURCES: tuple[Source, ...] = ("sample", "row", "column", "frame")
+SOURCES: tuple[Source, ...] = get_args(Source)
 STEPS = 2  # the same frame, and the one before
 _MOST_SAMPLES = 1 << 18
 _AT_ONCE = 1 << 18  # samples that are transformed together

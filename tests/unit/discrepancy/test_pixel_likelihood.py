@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis
-from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import PixelLikelihood, is_told, with_details
+from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import (
+    PixelLikelihood,
+    Witness,
+    is_told,
+    with_details,
+)
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -124,9 +129,18 @@ def test_what_no_law_of_a_sample_holds_is_not_told() -> None:
         effect_class("column_noise")(column_noise_dn=1.0),
     )
     heavy, skew = HEAVY(share=0.1, factor=2.0), SKEW(share=0.2)
-    assert likelihood.behind([heavy], [row]) is None
-    assert likelihood.behind([row], [column]) is None
-    assert likelihood.behind([heavy, row], [skew, row]) is not None
+    asked: list[Sequence[Effect]] = []
+
+    def of(effects: Sequence[Effect], pixels: int) -> PixelLikelihood:
+        asked.append(effects)
+        return likelihood
+
+    witness = Witness(of)
+    assert witness.behind([heavy], [row]) is None
+    assert witness.behind([row], [column]) is None
+    assert witness.begun([Hypothesis(row, np.ones(2))])[0].effect is row
+    assert asked == []  # nothing is counted in vain
+    assert witness.behind([heavy, row], [skew, row]) is not None
 
 
 def test_a_fit_that_went_astray_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
