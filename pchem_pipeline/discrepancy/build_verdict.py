@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -44,6 +45,8 @@ LARGEST_REST = 0.2
 _MOST_PULLS = 12
 _MOST_UNEXPLAINED = 8
 _MOST_RESIDUALS = 3
+_DECIDED = 3.0  # standard errors of a difference of scores that tells two effects apart
+_MOST_LONGER = 30.0  # times the samples that anyone will take
 _RARE = 0.02  # a chance that is worth telling though it is no disagreement
 
 
@@ -104,8 +107,6 @@ class Addition:
 
     def step(self, size: Size | None) -> Step:
         """Return it as ``discrepancy.json`` holds it."""
-        rivals = {c.effect for c in self.candidates}
-        separate = dict(type(self.effect).separate)
         return Step(
             effect=self.effect.tag if self.named else None,
             verdict=self.verdict,
@@ -122,9 +123,23 @@ class Addition:
             rivals=self.rivals,
             placebo=self.placebo,
             moved={name: Moved(**change) for name, change in self.moved.items()},
-            separate={tag: text for tag, text in separate.items() if tag in rivals or self.named},
+            separate=self._separate(),
             pulls=self.pulls,
         )
+
+    def _separate(self) -> dict[str, str]:
+        """Return by effect what would tell it from this one: of those known, or of the candidates."""
+        known = dict(type(self.effect).separate)
+        if self.named:
+            return known
+        found = {}
+        for each in self.candidates:
+            other = effect_classes().get(each.effect)
+            back = {} if other is None else other.separate
+            if each.effect != self.effect.tag and not self.alone:
+                text = known.get(each.effect) or back.get(self.effect.tag) or _more_samples(each)
+                found[each.effect] = text
+        return found
 
 
 @dataclass(frozen=True)
@@ -288,7 +303,7 @@ def largest_pulls(
     return tuple(
         Pull(
             statistic=names[i],
-            sentence=STATISTICS[names[i]].sentence,
+            sentence=STATISTICS[names[i]].says(float(before[i])),
             before=float(before[i]),
             after=float(after[i]),
         )
@@ -311,15 +326,25 @@ def _gap_change(before: Gap, added: Added) -> GapChange:
     )
 
 
+def _more_samples(other: Candidate) -> str:
+    """Return the run that tells a candidate from the best: scores grow with it, their errors as its root."""
+    lead = abs(other.score)
+    longer = (_DECIDED * other.stderr / lead) ** 2 if lead > 0.0 else math.inf
+    if not longer <= _MOST_LONGER:
+        return (
+            "another exposure, or frames without any, as a second stack (pchem joint); hardly more of these"
+        )
+    return f"{max(longer, 1.5):.2g} times as many samples, if their scores go on to differ as they do"
+
+
 def _nearly(found: Findings) -> str:
     """Return what comes near to a disagreement without being one; empty where nothing does."""
     words = []
     p = found.first.global_p(found.z.both, 2)
     if p < _RARE:
-        name = found.first.names[int(np.argmin(found.first.p_values(found.z.both, 2)))]
-        words.append(
-            f"{Place.of(name, z=0.0).sentence or name}, by chance in one of {1.0 / p:,.0f} such runs"
-        )
+        least = int(np.argmin(found.first.p_values(found.z.both, 2)))
+        says = STATISTICS[found.first.names[least]].says(float(found.first.pulls(found.z.both, 2)[least]))
+        words.append(f"{says}, by chance in one of {1.0 / p:,.0f} such runs")
     if not found.before.at_floor:
         words.append(f"taken together the {found.samples} are farther from it than in 19 of 20 such runs")
     return f"; near the limit: {'; '.join(words)}; more frames would tell" if words else ""
@@ -440,7 +465,7 @@ def _shown(found: Findings) -> str:
     pulls = found.last.pulls(found.z.both, splits=2)
     worst = int(np.argmax(np.abs(pulls)))
     name = found.last.names[worst]
-    return f"; beside it {Place.of(name, z=0.0).sentence or name} ({pulls[worst]:+.1f} sd)"
+    return f"; beside it {STATISTICS[name].says(float(pulls[worst]))} ({pulls[worst]:+.1f} sd)"
 
 
 def _doubts(added: Added) -> str:

@@ -201,14 +201,16 @@ class Place(_Part):
     def of(cls, statistic: str, z: float, **more: Any) -> Place:
         """Return a place with the sentence and the channel that the catalogue has for its statistic."""
         known = STATISTICS[statistic]
-        words = {"sentence": known.sentence, "channel": known.channel, "direction": "+" if z > 0 else "-"}
+        words = {"sentence": known.says(z), "channel": known.channel, "direction": "+" if z > 0 else "-"}
         return cls(statistic=statistic, z=z, **{**words, **more})
 
     def spot(self) -> str:
         """Return region and frames in words; empty where it is everywhere and always alike."""
         parts = [] if self.region is None else [Region.model_validate(self.region).words()]
         parts += [] if self.when is None else [When.model_validate(self.when).words()]
-        return ", ".join(parts)
+        # a statistic of a part has only that; another one may be there elsewhere, too, and weaker
+        most = "most in " if parts and "@" not in self.statistic else ""
+        return f"{most}{', '.join(parts)}"
 
     def shifted(self, shape: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int]) -> Place:
         """Return it with its region counted from the corner of a sensor of some shape."""

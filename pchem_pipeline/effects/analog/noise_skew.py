@@ -47,6 +47,8 @@ class NoiseSkew(Effect):
     strength: ClassVar[str] = "share"
     power: ClassVar[float] = 3.0
     separate: ClassVar[Mapping[str, str]] = {
+        "heavy_tailed_noise": "frames without any exposure: a skew shows on one side of the peak, "
+        "heavy tails on both",
         "signal_dependent_noise": "frames without any exposure: the skew remains there",
         "nonlinearity": "a sweep of the exposure: the skew does not grow with the signal",
         "adc_inl": "a sweep of the bias: the skew moves along with the peaks, wrong codes do not",

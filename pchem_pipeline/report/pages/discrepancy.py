@@ -566,7 +566,7 @@ def _moved(steps: Sequence[Step]) -> Table:
             rows.append(
                 (
                     f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
-                    step.effect or "",
+                    step.effect or f"{step.likeliest} (the likeliest)",
                     short(each.median) if math.isfinite(each.median) else "not known",
                     signed(each.in_stderr),
                 )

@@ -24,7 +24,7 @@ from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, look_elsewhere
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
-from pchem_pipeline.discrepancy.verdict import Candidate
+from pchem_pipeline.discrepancy.verdict import Candidate, Place
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_class
 
@@ -345,6 +345,35 @@ def test_what_nearly_disagrees_is_said_beside_consistent() -> None:
     assert "more frames would tell" in words[True, False]
     assert "taken together the frames" in words[True, False]
     assert "taken together the frames" not in words[False, True]
+
+
+@pytest.mark.parametrize(
+    ("effect", "rival", "score", "says"),
+    [
+        ("noise_skew", "heavy_tailed_noise", -3.0, "heavy tails on both"),
+        ("heavy_tailed_noise", "noise_skew", -3.0, "heavy tails on both"),  # known to the rival alone
+        ("noise_skew", "row_noise", -4.0, "9 times as many samples"),
+        ("noise_skew", "row_noise", -0.1, "another exposure"),
+        ("noise_skew", "row_noise", 0.0, "another exposure"),
+    ],
+)
+def test_rivals_that_frames_cannot_tell_apart_come_with_the_measurement_that_can(
+    effect: str, rival: str, score: float, says: str
+) -> None:
+    first, other = (effect_class(tag).typical()[0] for tag in (effect, rival))
+    candidates = (Candidate.of(first, 0.0, 0.0, 0.6), Candidate.of(other, score, 4.0, 0.4))
+    gap = Gap(9e-5, 3e-5, (0.0, 0.0), {})
+    addition = Addition(first, False, "", candidates, 1e-4, gap, gap, (), None, ())
+    assert list(addition.step(None).separate) == [rival]
+    assert says in addition.step(None).separate[rival]
+
+
+def test_a_statistic_says_what_its_sign_says() -> None:
+    assert "skewed to low DN" in Place.of("shape.He3.mean", z=-17.0).sentence
+    assert "skewed to high DN" in Place.of("shape.He3.mean", z=17.0).sentence
+    assert "less than the model makes it" in Place.of("space.follows.line", z=-5.0).sentence
+    part = STATISTICS["space.x.rr@columns=24:28"]
+    assert "anticorrelated, along x (in columns 24 to 27)" in part.says(-5.0)
 
 
 @pytest.mark.parametrize(

@@ -135,7 +135,7 @@ def test_a_run_without_a_verdict_has_none(tmp_path: Path) -> None:
 def test_a_place_takes_its_words_from_the_catalogue() -> None:
     place = Place.of("code.alternating", z=-3.0, dn=(148, 152))
     assert (place.direction, place.channel, place.dn) == ("-", "digital", (148, 152))
-    assert "opposite signs" in place.sentence
+    assert "the same sign" in place.sentence
     assert Place.of("code.smooth", z=1.0, sentence="other").sentence == "other"
 
 
