@@ -44,6 +44,7 @@ _MOST_BEGINNINGS, _REACH_SHARE = 2, 0.05
 _MOST_GROWN = {1: 2, 2: 1}
 _MOST_DEAR = 2  # sets whose refit takes long
 _LOOSE = 0.1  # relative error of a fingerprint before its refit
+_HARDLY = 0.1  # of a deviation, what effects may move the statistic by that cannot account for it
 # nats behind, and share of what there is to explain, from which on a fingerprint is no rival of a right set
 _FAR, _FAR_SHARE = 40.0, 0.25
 _FAR_SHARE_OF_PART = 0.5  # the same of a set that leaves something
@@ -129,6 +130,7 @@ def compare(
         trials.refit((hypothesis,))
     if tried and first > 1 and not trials.complete:
         trials.refit(_begun(_sets(choice, tried)[0], tried, held))
+        trials.thin()
     # dear ones last: they may be beaten by then
     for hypothesis in _dear_last(singles[first:]):
         if not trials.refit((hypothesis,)):
@@ -140,7 +142,7 @@ def compare(
     if len(trials.best.hypotheses) > len(held) + 1 or not trials.complete:
         grown = [] if trials.complete else _grown(refitter, tried, len(held), beside)
         for members in _of_different_effects([*grown, *_sets(choice, tried)])[:_MOST_SETS]:
-            if not trials.refit(_begun(members, tried, held)):
+            if not (trials.refit(_begun(members, tried, held)) and trials.thin()):
                 break
     # the work that led here must not be lost for the little that is left: no limit
     to_choose = replace(refitter, allow=lambda _: None)
@@ -207,6 +209,24 @@ class _Trials:
         # whatever a stranger's effect raises must not stop the others
         except Exception as error:
             self.failed[members[-1].tag] = error_words(error)
+        return True
+
+    def thin(self) -> bool:
+        """Refit the best set without each of its effects where it leaves nothing; return False at the limit.
+
+        The weakest first. Fewer may leave nothing, too; and what they leave tells in the end whether each is
+        seen.
+        """
+        best = self.best
+        new = best.hypotheses[len(self.held) :]
+        if len(new) < 3 or not self.complete:
+            return True
+        scale = self.refitter.null.std
+        for weakest in sorted(new, key=lambda h: float(np.sum((h.fingerprint / scale) ** 2))):
+            if not self.refit([h for h in new if h is not weakest]):
+                return False
+            if self.best is not best:
+                return self.thin()
         return True
 
     def _worth_it(self, members: Sequence[Hypothesis]) -> bool:
@@ -323,16 +343,22 @@ def leaves_nothing(refitter: Refitter, one: Refitted) -> bool:
 
 
 def _beaten(refitter: Refitter, members: Sequence[Hypothesis], best: Refitted) -> bool:
-    """Tell whether a refit of hypotheses is in vain: far behind the best set.
+    """Tell whether a refit of hypotheses is in vain: far behind the best set, or blind where that is not.
 
     By their fingerprints at the best strengths; how far these are trusted goes with what there is to explain,
-    and is less where the best set leaves something, or has more effects.
+    and is less where the best set leaves something, or has more effects. Where that leaves nothing, a
+    statistic that stands out and that they hardly move says enough: a refit does not change them so much.
     """
-    settled = len(members) >= len(best.hypotheses) and leaves_nothing(refitter, best)
-    trust = _FAR_SHARE if settled else _FAR_SHARE_OF_PART
+    complete = leaves_nothing(refitter, best)
+    trust = _FAR_SHARE if complete and len(members) >= len(best.hypotheses) else _FAR_SHARE_OF_PART
     shift = refitter.target - refitter.null.mean
     noise = replace(refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=_LOOSE)
-    score = fit_set(members, shift, noise).log_score(shift, noise)
+    fit = fit_set(members, shift, noise)
+    parts = fit.parts
+    left = np.abs(shift - parts.sum(axis=0)) / np.sqrt(np.diag(noise.of(parts)))
+    if complete and np.any((left > _SEEN) & (np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift))):
+        return True
+    score = fit.log_score(shift, noise)
     return score < best.score - _FAR - trust * (best.score - refitter.nothing)
 
 

@@ -24,7 +24,7 @@ from pchem_pipeline.discrepancy.by_simulation.comparison import (
     own_signature,
 )
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer, _Explanation
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Choice, Hypothesis, choose
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Choice, Hypothesis, choose, score_set
 from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import Witness
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitter
@@ -237,11 +237,54 @@ def test_the_likeliest_set_is_fitted_before_other_effects_and_kept_at_the_limit(
 
     plain = world.refitter()
     monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
-    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.comparison._FAR", 1e9)  # nothing is in vain
+    for name, value in (("_FAR", 1e9), ("_HARDLY", 0.0)):  # nothing is in vain
+        monkeypatch.setattr(f"pchem_pipeline.discrepancy.by_simulation.comparison.{name}", value)
     found = world.compare(*(hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift")))
     assert found is not None
     assert found.chosen.tags == {"row_noise", "frame_noise"}
     assert "exposure_drift" in asked
+
+
+def asked_by_refits(world: World, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return the list that hears which sets are simulated."""
+    asked: list[str] = []
+    plain = world.refitter()
+    monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=asked.append))
+    return asked
+
+
+def test_fewer_effects_are_tried_before_rivals_of_a_set_of_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.1)])
+    asked = asked_by_refits(world, monkeypatch)
+    # nothing is in vain
+    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.comparison._beaten", lambda *_: False)
+    row, frame, drift, coupling = (hypothesis(tag) for tag in TRUTH)
+    drift, coupling = (replace(h, fingerprint=0.02 * h.fingerprint) for h in (drift, coupling))
+    noise = world.refitter().noise(world.null.covariance, 40)
+    shifts = (world.z.train - world.null.mean, world.z.test - world.null.mean)
+    tried = tuple(score_set([row, frame, more], shifts, noise) for more in (drift, coupling))
+    choice = Choice(tried[0], ((),) * 3, (1.0,) * 3, tried, 100.0)
+    found = compare(world.refitter(), [], [row, frame, drift, coupling], choice)
+    assert found is not None
+    assert found.chosen.tags == {"row_noise", "frame_noise"}
+    sets = list(dict.fromkeys(words for words in asked if "+" in words))
+    assert sets[:2] == ["row_noise + frame_noise + exposure_drift", "row_noise + frame_noise"]
+    assert "row_noise + frame_noise + interpixel_capacitance" not in sets
+
+
+def test_what_does_not_move_a_statistic_that_stands_out_is_no_rival_of_what_leaves_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World([effect("row_noise", 0.3), effect("frame_noise", 0.05)])
+    twin = replace(hypothesis("row_noise", 0.3), effect=effect("exposure_drift", 0.3))
+    asked = asked_by_refits(world, monkeypatch)
+    guesses = [hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.05)]
+    likely = world.choice(*guesses)
+    assert likely is not None
+    found = compare(world.refitter(), [], [*guesses, twin], likely)
+    assert found is not None
+    assert found.chosen.tags == {"row_noise", "frame_noise"}
+    assert "exposure_drift" not in asked  # as near as row noise by itself, which leaves what frame noise does
 
 
 def test_an_effect_of_a_later_round_is_judged_beside_those_held() -> None:
