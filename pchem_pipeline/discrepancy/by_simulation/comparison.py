@@ -494,6 +494,8 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
     if not complete and not all(_untouched(one, place, noise) for place in range(len(one.hypotheses))):
         return False
     for place, hypothesis in enumerate(one.hypotheses):
+        if _beyond_others(refitter, one, place):
+            continue
         members = [h for h in one.hypotheses if h.tag != hypothesis.tag]
         # the same kinds: another kind of one that mimics both is another set
         others = next((other for other in known if _of_kinds(other, members)), None)
@@ -511,6 +513,23 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
         if not seen and not (complete and _seen_beside(refitter, part, others)):
             return False
     return True
+
+
+def _beyond_others(refitter: Refitter, one: Refitted, place: int) -> bool:
+    """Tell whether an effect of a set has a signature that the others leave at any strength.
+
+    Fitted without it they may be stronger, but at most until one alone makes all of what it moves most. What
+    stands out beyond that needs no refit of the others.
+    """
+    own, others = one.parts[place], np.delete(one.parts, place, axis=0)
+    seen = refitter.target - refitter.null.mean
+    most = np.argmax(np.abs(others) / refitter.null.std, axis=1)
+    largest = np.abs(others[np.arange(len(others)), most])
+    others = np.abs(others) * np.maximum(np.abs(seen[most]) / np.maximum(largest, 1e-12), 1.0)[:, None]
+    noise = refitter.noise(one.covariance, len(one.vectors))
+    left = np.maximum(np.abs(seen) - others.sum(axis=0), 0.0) / np.sqrt(np.diag(noise.of(others)))
+    left *= np.sign(seen)
+    return own_signature(own, others, left, np.sqrt(np.diag(noise.covariance)))
 
 
 def _seen_beside(refitter: Refitter, part: FloatArray, others: Refitted) -> bool:

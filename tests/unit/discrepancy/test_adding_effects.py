@@ -18,6 +18,7 @@ from pchem_pipeline.discrepancy.by_simulation.additions import (
 from pchem_pipeline.discrepancy.by_simulation.candidates import ReplicateSimulator
 from pchem_pipeline.discrepancy.by_simulation.comparison import (
     Comparison,
+    _all_seen,
     _begun,
     _of_kinds,
     compare,
@@ -285,6 +286,22 @@ def test_what_does_not_move_a_statistic_that_stands_out_is_no_rival_of_what_leav
     assert found is not None
     assert found.chosen.tags == {"row_noise", "frame_noise"}
     assert "exposure_drift" not in asked  # as near as row noise by itself, which leaves what frame noise does
+
+
+@pytest.mark.parametrize(("share", "refits"), [(0.0, 0), (0.4, 3)])
+def test_others_are_not_refitted_where_no_strength_of_theirs_makes_what_an_effect_does(
+    monkeypatch: pytest.MonkeyPatch, share: float, refits: int
+) -> None:
+    """Where each moves the statistic of the next one a little, only a refit tells by how much."""
+    tags = ("row_noise", "frame_noise", "exposure_drift")
+    for place, tag in enumerate(tags):
+        form = 40.0 * np.eye(M)[place] + 40.0 * share * np.eye(M)[(place + 1) % 3]
+        monkeypatch.setitem(TRUTH, tag, (form, 1.0))
+    world = World([effect(tag, 0.1) for tag in tags])
+    one = world.refitter().refined([hypothesis(tag) for tag in tags])
+    asked = asked_by_refits(world, monkeypatch)
+    assert _all_seen(world.refitter(), one, [])
+    assert len({words for words in asked if words.count("+") == 1}) == refits
 
 
 def test_an_effect_of_a_later_round_is_judged_beside_those_held() -> None:
@@ -629,7 +646,13 @@ def test_strengths_that_no_pixel_can_be_fitted_with_end_no_search(monkeypatch: p
     assert refitter.sharpened(near, 24).effects != near.effects
 
 
-def test_a_set_of_which_a_part_cannot_be_fitted_is_not_chosen_and_the_others_are() -> None:
+def test_a_set_of_which_a_part_cannot_be_fitted_is_not_chosen_and_the_others_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # only a refit of the part says what it leaves
+    monkeypatch.setattr(
+        "pchem_pipeline.discrepancy.by_simulation.comparison._beyond_others", lambda *_: False
+    )
     world = World([effect("row_noise", 0.1), effect("frame_noise", 0.06)])
     pair = hypothesis("row_noise"), hypothesis("frame_noise")
     world.unfit = lambda effects: [e.tag for e in effects] == ["frame_noise"]
