@@ -128,7 +128,7 @@ def _excess(frames: NDArray[np.unsignedinteger], maps: PixelMaps, inside: BoolAr
     own = frames.reshape(len(frames), -1)[:, pixels]
     first = own.min(axis=0).astype(np.int64)
     length = int((own.max(axis=0) - first).max()) + 1
-    table = score_tables(maps, pixels, first, length)[3]
+    table = score_tables(maps, pixels, first, length)[-1]
     score = table[np.arange(pixels.size), own - first].sum(axis=0)
     exposure, gain, _, sigma = (values.ravel()[pixels] for values in maps.maps)
     number = len(frames) * charlier_information(exposure, gain * sigma)

@@ -1,9 +1,10 @@
-"""The empirical component: gain or light that the samples of a frame, row or column share.
+"""The empirical component: gain, light or size of the noise that samples of a frame, row or column share.
 
-To first order a common change of the offset, the gain or the light moves the sum of the samples' scores for
-it, by the information that they have of it. Where there is none such a sum is Gaussian, of a variance that
-is the information; the excess of its variance is the power of the change, and of several changes that are
-correlated in the samples the one that is there has the clearest excess (Rao 1948: the score test).
+To first order a common change of the offset, the gain, the light or the read noise moves the sum of the
+samples' scores for it, by the information that they have of it. Where there is none such a sum is Gaussian,
+of a variance that is the information; the excess of its variance is the power of the change, and of several
+changes that are correlated in the samples the one that is there has the clearest excess (Rao 1948: the score
+test).
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_CHANGED: tuple[Changed, ...] = ("offset", "gain", "light")
+_CHANGED: tuple[Changed, ...] = ("offset", "gain", "light", "noise")
 _OF: tuple[Shared, ...] = ("frame", "row", "column")
 _CLEAR = 15.0  # nats
 _NEARLY = 0.5  # of the nats of the clearest change: another one may be it as well
@@ -110,21 +111,23 @@ def _in_blocks(values: FloatArray) -> FloatArray:
 
 
 def score_tables(maps: PixelMaps, pixels: IntArray, first: IntArray, length: int) -> FloatArray:
-    """Return the scores of codes for changes of their law, shape (4, n, c).
+    """Return the scores of codes for changes of their law, shape (5, n, c).
 
-    Of an offset (1/DN), a relative gain, a relative light, and a in the variance ``H + a H^2`` of electrons.
+    Of an offset (1/DN), a relative gain, a relative light, a relative read noise, and a in the variance
+    ``H + a H^2`` of electrons.
     """
     exposure, gain, bias, sigma = (values.ravel()[pixels][:, None] for values in maps.maps)
     most = int(np.ceil(exposure.max() + 8.0 * np.sqrt(exposure.max()) + 4.0))
     signal = first[:, None] + np.arange(length) - bias
-    total, sums = np.zeros(signal.shape), np.zeros((4, *signal.shape))
+    total, sums = np.zeros(signal.shape), np.zeros((5, *signal.shape))
     chance = np.exp(-exposure)
     for k in range(most + 1):
         chance = chance * exposure / k if k else chance
         rest = (signal - k / gain) / sigma**2
         weight = chance * np.exp(-0.5 * np.minimum((signal - k / gain) ** 2 / sigma**2, 200.0))
         total += weight
-        scores = rest, rest * k / gain, k - exposure, 0.5 * ((k - exposure) ** 2 - k)
+        noise = rest**2 * sigma**2 - 1.0
+        scores = rest, rest * k / gain, k - exposure, noise, 0.5 * ((k - exposure) ** 2 - k)
         for one, score in zip(sums, scores, strict=True):
             one += weight * score
     return np.asarray(sums / np.maximum(total, np.finfo(np.float64).tiny))
@@ -136,7 +139,7 @@ def measured_mode(
     maps: PixelMaps,
     inside: BoolArray,
 ) -> Measurement | None:
-    """Return the common change of gain or light beyond what a model makes; None where an offset is clearer.
+    """Return the common change of gain, light or noise beyond a model's; None where an offset is clearer.
 
     Args:
         data: sums of the frames.
@@ -178,8 +181,12 @@ def _of_change(
     one, blocks = _shaped(data)
     power = (one.ratio - max(model.ratio, 1.0)) / float(np.mean(one.information[one.information > 0.0]))
     inside = inside & maps.usable
-    signal = float(np.median((maps.quanta_exposure / maps.conversion_gain)[inside]))
-    burst, size = _bursts(one, gain)
+    of_noise = what[1] == "noise"
+    scale = maps.read_noise_dn if of_noise else maps.quanta_exposure / maps.conversion_gain
+    signal = float(np.median(scale[inside]))
+    burst, size = _bursts(_from_quiet(one) if of_noise else one, gain)
+    if of_noise and size > 0.0:
+        size = np.sqrt(1.0 + 2.0 * size) - 1.0  # the score of a variance goes with the square
     lags, correlation = ((), ()) if burst else _correlation(one, power)
     mode = NoiseMode(
         of=what[0], share=1.0, changes=what[1], signal_dn=round(signal, 3), lags=lags,
@@ -226,6 +233,11 @@ def _correlation(one: Sums, power: float) -> tuple[tuple[Lag, ...], tuple[float,
             lags.append((step, 0, 0))
             found.append(round(float(np.clip(value / power, -0.99, 0.99)), 4))
     return tuple(lags), tuple(found)
+
+
+def _from_quiet(one: Sums) -> Sums:
+    """Return sums from those of most lines on: loud ones had their part in the noise of the pixels."""
+    return one._replace(sums=one.sums - np.median(one.sums, axis=0))
 
 
 def _bursts(one: Sums, gaussian: float) -> tuple[float | None, float]:

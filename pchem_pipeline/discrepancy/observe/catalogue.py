@@ -215,6 +215,13 @@ def _frame() -> list[Statistic]:
             "the gain rises along the run (residuals follow H)",
             "the gain falls along the run (residuals oppose H)",
         ),
+        Statistic(
+            "frame.noise.variance",
+            "readout",
+            "single frames are noisier than others",
+            "frames are too equally noisy",
+        ),
+        Statistic("frame.noise.slow", "readout", "the read noise wanders slowly (blocks)"),
         Statistic("frame.repeated", "digital", "frames repeat the one before exactly"),
         Statistic("frame.repeated_rows", "digital", "rows repeat those of the frame before exactly"),
     ]
@@ -261,6 +268,15 @@ def _space() -> list[Statistic]:
         ]
     return [
         *found,
+        *(
+            Statistic(
+                f"space.{line}.noise.variance",
+                "readout",
+                f"single {line}s of frames are noisier than others",
+                f"{line}s of frames are too equally noisy",
+            )
+            for line in ("row", "column")
+        ),
         Statistic(
             "space.predicted.equal",
             "digital",

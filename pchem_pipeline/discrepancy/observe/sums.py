@@ -39,6 +39,7 @@ class PixelStatistics:
             ``gain_norm`` times the relative deviation of the gain: least squares of r on k / g, what is
             common to all pixels taken away.
         gain_variance: variance of that sum in one frame.
+        noise: variance of r^2 in the variance of r, 2 for Gaussian residuals.
     """
 
     usable: NDArray[np.bool_]
@@ -52,6 +53,7 @@ class PixelStatistics:
     gain_offset: float
     gain_norm: float
     gain_variance: float
+    noise: FloatArray
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,9 @@ class FrameSums:
         blocks: sums of k and r in each block, (b, 2, y, x).
         lags: mean products after removal of the frames' common modes: kk and rr at lags 1, 2, 3, then r with
             the k before, k with the r before, (8, y, x).
+        row_noise: sums of r^2 of each row, in the variance of its pixels, after removal of the common mode,
+            less their means, (n, y).
+        column_noise: the same of each column, (n, x).
         n_pairs: number of products behind lags 1, 2, 3.
         next_column, next_row: mean products kk, rr and rk + kr with the next column or row, (3, y, x).
         repeated: positions of frames equal to the one before.
@@ -78,6 +83,8 @@ class FrameSums:
     gain: FloatArray
     blocks: FloatArray
     lags: FloatArray
+    row_noise: FloatArray
+    column_noise: FloatArray
     n_pairs: tuple[int, int, int]
     next_column: FloatArray
     next_row: FloatArray
@@ -121,6 +128,7 @@ def pixel_statistics(
         gain_offset=float((factor * kr).sum()),
         gain_norm=float((factor * step * kk).sum() + shift.ravel() @ pattern),
         gain_variance=float(masked(spread).sum()),
+        noise=masked(moments[:, columns_of.MEAN_RRRR] * weight**2 - 1.0).reshape(shape),
     )  # fmt: skip
 
 
@@ -136,13 +144,15 @@ def sum_frames(
     blocks = np.zeros((edges.size - 1, 2, ny, nx))
     lags, next_column, next_row = np.zeros((8, ny, nx)), np.zeros((3, ny, nx)), np.zeros((3, ny, nx))
     modes = np.stack([pixels.exposure, pixels.usable]).astype(np.float32)
-    weights = np.stack([pixels.factor, pixels.shift]).astype(np.float32)
+    inverse = pixels.usable / np.where(pixels.usable, pixels.readout, 1.0)
+    weights = np.stack([pixels.factor, pixels.shift, inverse]).astype(np.float32)
+    row_noise, column_noise = np.zeros((n, ny)), np.zeros((n, nx), np.float32)
     norms = np.array([pixels.exposure.sum(), pixels.usable.sum()], np.float64)
     for b, (first, last) in enumerate(pairwise(edges)):
         kernel.sum_block(
             frames[first:last], support, laws.tables, modes, weights, norms, charge, readout,
             rows[:, first:last], columns[first:last], gain[first:last], blocks[b], lags,
-            next_column, next_row,
+            next_column, next_row, row_noise[first:last], column_noise[first:last],
         )  # fmt: skip
     lengths = np.diff(edges)
     pairs = [int(np.maximum(lengths - lag, 0).sum()) for lag in (1, 2, 3)]
@@ -153,6 +163,7 @@ def sum_frames(
     gain = (gain - pixels.gain_offset) / max(pixels.gain_norm, 1e-300)
     return FrameSums(
         rows, columns.transpose(1, 0, 2), gain, blocks, lags,
+        row_noise - row_noise.mean(axis=0), column_noise - column_noise.mean(axis=0, dtype=np.float64),
         (pairs[0], pairs[1], pairs[2]), next_column / n, next_row / n, np.flatnonzero(repeated),
         int(repeated_rows), int(consecutive.sum()), _hits(frames, laws, pixels.usable),
     )  # fmt: skip

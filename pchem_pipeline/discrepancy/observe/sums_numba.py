@@ -131,6 +131,26 @@ def _add_lagged(
 
 
 @kernel
+def _add_squares(
+    readout: Float32Array,
+    weight: Float32Array,
+    y: int,
+    done: int,
+    size: int,
+    rows: FloatArray,
+    columns: Float32Array,
+) -> None:
+    """Add the weighted squares of a row of a chunk to the sums of rows and columns, frame by frame."""
+    for j in range(size):
+        total = np.float32(0.0)
+        for x in range(readout.shape[2]):
+            square = weight[y, x] * readout[LAGS + j, y, x] * readout[LAGS + j, y, x]
+            columns[done + j, x] += square
+            total += square
+        rows[done + j, y] = total
+
+
+@kernel
 def _add_neighbours(
     charge: Float32Array, readout: Float32Array, y: int, dy: int, dx: int, size: int, total: FloatArray
 ) -> None:
@@ -171,6 +191,8 @@ def sum_block(
     lags: FloatArray,
     next_column: FloatArray,
     next_row: FloatArray,
+    row_noise: FloatArray,
+    column_noise: Float32Array,
 ) -> None:
     """Add one block of consecutive frames to the sums.
 
@@ -179,7 +201,7 @@ def sum_block(
         support: first code, last code, row of the first one in ``tables``, (y, 3, x).
         tables: k and r, (rows, 2).
         modes: H, and 1, in usable pixels, else 0, (2, y, x).
-        weights: of r k and of r in the gain, (2, y, x).
+        weights: of r k and of r in the gain, and of r^2 in the noise, (3, y, x).
         norms: sum of H, number of usable pixels.
         charge: workspace (LAGS + frames in a chunk, y, x).
         readout: the same.
@@ -190,6 +212,8 @@ def sum_block(
         lags: products kk and rr at lags 1 to 3, then r k(-1), k r(-1), (8, y, x); to add to.
         next_column: products kk, rr, rk + kr with the next column, (3, y, x); to add to.
         next_row: the same with the next row.
+        row_noise: sums of r^2 of each row, (frame, y); to fill.
+        column_noise: of each column, (frame, x); to add to.
     """
     n, ny, _ = frames.shape
     chunk = charge.shape[0] - LAGS
@@ -214,6 +238,7 @@ def sum_block(
                 _add_lagged(readout, readout, lag, y, done, size, LAGS + lag - 1, lags)
             _add_lagged(readout, charge, 1, y, done, size, 2 * LAGS, lags)
             _add_lagged(charge, readout, 1, y, done, size, 2 * LAGS + 1, lags)
+            _add_squares(readout, weights[2], y, done, size, row_noise, column_noise)
             _add_neighbours(charge, readout, y, 0, 1, size, next_column)
             if y < ny - 1:
                 _add_neighbours(charge, readout, y, 1, 0, size, next_row)

@@ -162,6 +162,9 @@ def frame_statistics(view: FrameView, expected_repeats: tuple[float, float]) -> 
     gain = view.sums.gain * pixels.gain_norm / np.sqrt(max(pixels.gain_variance, 1e-300))
     found["frame.gain.slow"] = view.slow(view.block_sums(gain)[:, None])
     found["frame.gain.trend"] = _trend(view, gain)
+    noise = view.sums.row_noise.sum(axis=1) / np.sqrt(max(float(pixels.noise.sum()), 1e-300))
+    found["frame.noise.variance"] = float(laws.chi_square(noise @ noise, view.n))
+    found["frame.noise.slow"] = view.slow(view.block_sums(noise)[:, None])
     found["frame.repeated"] = laws.repeats(view.sums.repeated.size, expected_repeats[0])
     found["frame.repeated_rows"] = laws.repeats(view.sums.repeated_rows, expected_repeats[1])
     return found
@@ -263,6 +266,11 @@ def space_statistics(view: FrameView) -> dict[str, float]:
                 f"space.{line}.{what}": z
                 for what, z in _line_statistics(view, values, variance, mode, name).items()
             }
+    for line, values, axis in (("row", view.sums.row_noise, 1), ("column", view.sums.column_noise, 0)):
+        variance = view.pixels.noise.sum(axis)
+        lines = _line_statistics(view, values, variance, view.pixels.usable.sum(axis), "noise")
+        if lines:
+            found[f"space.{line}.noise.variance"] = lines["noise.variance"]
     for along in ("x", "y"):
         for pair, seen in neighbour_sums(view, along).items():
             if seen.products and np.isfinite(seen.correlation):

@@ -33,13 +33,14 @@ FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 #: A distance: frames, rows, columns.
 Lag = tuple[int, int, int]
 Shared = Literal["sample", "row", "column", "frame"]
-Changed = Literal["offset", "gain", "light"]
+Changed = Literal["offset", "gain", "light", "noise"]
 _DIMS: dict[Shared, tuple[Dim, ...]] = {
     "sample": ("frame", "y", "x"), "row": ("frame", "y"), "column": ("frame", "x"), "frame": ("frame",),
 }  # fmt: skip
 _POINTS = 8  # of the spectrum's grid along an axis, for each unit of the largest distance
 _REACH = 3  # of the moving average along an axis, for each of them
 _MOST_TAPS, _SMALLEST_TAP = 200, 0.01  # of the moving average; of the largest weight
+_NODES, _NARROWEST = 5, 0.05  # of the law of noise of changing size; relative, to be a law
 _FEW = 4  # distances that are told in words
 
 
@@ -55,9 +56,15 @@ class NoiseMode(Section):
     correlation: tuple[float, ...] = Field(
         default=(), max_length=64, description="correlation of the values at each of them, no unit"
     )
-    changes: Changed = Field(default="offset", description="what it moves: the offset, the gain or the light")
+    changes: Changed = Field(
+        default="offset",
+        description="what it changes: the offset, the gain, the light, or the size of the read noise",
+    )
     signal_dn: float = Field(
-        default=1.0, gt=0, description="gain, light: mean signal over the bias at which it has its size, DN"
+        default=1.0,
+        gt=0,
+        description="gain, light: mean signal over the bias at which it has its size; noise: read noise at "
+        "which it has, DN",
     )
     burst: float | None = Field(
         default=None,
@@ -106,7 +113,8 @@ class NoiseMode(Section):
             whole = f"of one shape in each {self.of} ({', '.join(f'{p:+.2g}' for p in self.profile)})"
         if self.shape:
             whole += f", strongest in {self.strongest()}"
-        what = "" if self.changes == "offset" else f"of the {self.changes} at {self.signal_dn:.3g} DN"
+        of = {"gain": "of the gain at", "light": "of the light at", "noise": "of the size of a read noise of"}
+        what = "" if self.changes == "offset" else f"{of[self.changes]} {self.signal_dn:.3g} DN"
         burst = "" if self.burst is None else f"in {100 * self.burst:.2g} % of the {self.of}s only"
         return ", ".join(part for part in (what, whole, burst, shared) if part)
 
@@ -116,6 +124,14 @@ class NoiseMode(Section):
             return _field(self, number, context)
         some = context.random.uniform(_DIMS[self.of], number) < self.burst
         return np.asarray(some * (-1.0 if self.negative else 1.0) / np.sqrt(self.burst))
+
+    def widths(self, rms: float) -> tuple[FloatArray, FloatArray]:
+        """Return how often the read noise is so many times as large, where it changes by ``rms``."""
+        if self.burst is not None:
+            size = rms * (-1.0 if self.negative else 1.0) / np.sqrt(self.burst)
+            return np.array([1.0 - self.burst, self.burst]), np.array([1.0, abs(1.0 + size)])
+        nodes, weights = np.polynomial.hermite_e.hermegauss(_NODES)
+        return weights / weights.sum(), np.maximum(np.abs(1.0 + rms * nodes), _NARROWEST)
 
     def strongest(self) -> str:
         """Return in words where a change of a frame has more than half of its largest size."""
@@ -194,6 +210,9 @@ class EmpiricalNoise(Effect):
                 total = total + field
             elif mode.changes == "gain":
                 electrons = electrons + field / mode.signal_dn * np.asarray(context.charge)
+            elif mode.changes == "noise":
+                if context.read_noise is not None:
+                    electrons = electrons + field / mode.signal_dn * context.read_noise
             else:
                 electrons = electrons + _of_light(field / mode.signal_dn, number, context)
         return add_offset(values + electrons, total, context)
@@ -216,9 +235,10 @@ class EmpiricalNoise(Effect):
 
     @property
     def unlisted(self) -> bool:
-        """Whether it is a gain without a memory, or light that a row or column shares."""
+        """Whether it is a gain or a size of the noise without a memory, or light that a line shares."""
         return all(
-            not mode.lags and (mode.changes == "gain" or (mode.changes == "light" and mode.of != "frame"))
+            not mode.lags
+            and (mode.changes in ("gain", "noise") or (mode.changes == "light" and mode.of != "frame"))
             for mode in self.modes
         )
 
@@ -246,6 +266,9 @@ class EmpiricalNoise(Effect):
                 model = model.with_variance(dn2=power)
             elif mode.changes == "gain":
                 model = model.with_variance(per_electron2=power / mode.signal_dn**2)
+            elif mode.changes == "noise":
+                weights, widths = mode.widths(self.share_of(mode) / mode.signal_dn)
+                model = model.with_noise(weights, width=widths)
         return model
 
     def words(self) -> str:

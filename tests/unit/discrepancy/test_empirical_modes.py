@@ -1,4 +1,4 @@
-"""Gain or light that samples share: measured by the sums of their scores, and simulated as it is told."""
+"""Gain, light or noise that samples share: measured by the sums of their scores, simulated as it is told."""
 
 from __future__ import annotations
 
@@ -20,12 +20,15 @@ SIGNAL = 1.5 * STEP
 EVERYWHERE = np.ones(SHAPE, bool)
 
 
-def frames(seed: int, gain: Any = 1.0, light: Any = 1.0, offset: Any = 0.0) -> tuple[np.ndarray, PixelMaps]:
-    """Return frames of a sensor of 1.5 e- whose gain, light or offset moves, and its parameters."""
+def frames(
+    seed: int, gain: Any = 1.0, light: Any = 1.0, offset: Any = 0.0, loud: Any = 1.0
+) -> tuple[np.ndarray, PixelMaps]:
+    """Return frames of a sensor of 1.5 e- whose gain, light, offset or noise moves, and its parameters."""
     rng = np.random.default_rng(seed)
     exposure = np.broadcast_to(1.5 * np.asarray(light), (FRAMES, *SHAPE))
     noise = 0.25 * STEP
-    dn = 100.0 + STEP * gain * rng.poisson(exposure) + offset + noise * rng.standard_normal(exposure.shape)
+    own = noise * loud * rng.standard_normal(exposure.shape)
+    dn = 100.0 + STEP * gain * rng.poisson(exposure) + offset + own
     maps = (np.full(SHAPE, v) for v in (1.5, 1 / STEP, 100.0, np.sqrt(noise**2 + 1 / 12)))
     return np.floor(dn + 0.5).astype(np.uint16), PixelMaps(*maps, EVERYWHERE)
 
@@ -74,6 +77,34 @@ def test_light_in_bursts_in_a_corner_is_told_with_its_place() -> None:
     assert "strongest in the rows from 0 to 25 %" in found.words()
 
 
+def test_frames_that_are_noisier_are_told_with_how_many_they_are() -> None:
+    some = np.random.default_rng(3).random((FRAMES, 1, 1)) < 0.05
+    found = measured(frames(7, loud=1.0 + 0.5 * some))
+    assert found is not None
+    (mode,) = found.modes
+    assert (mode.of, mode.changes, mode.negative) == ("frame", "noise", False)
+    # of one frame the size is known to sqrt(1 / (2 * 320)) of itself: hardly any is taken for another
+    assert mode.burst == pytest.approx(some.mean(), rel=0.1)
+    # too small, since loud samples scatter more than the scores should: where a fit to all statistics begins
+    assert 0.5 < found.noise_dn / (0.5 * np.sqrt(some.mean()) * 0.25 * STEP) < 1.2
+    assert found.unlisted
+    assert "of the size of a read noise of 3.51 DN" in found.words()
+
+
+def test_noise_of_changing_size_has_the_law_that_is_simulated() -> None:
+    mode = NoiseMode(of="frame", share=1.0, changes="noise", signal_dn=2.0, burst=0.1)
+    weights, widths = mode.widths(0.2)
+    np.testing.assert_allclose([*weights, *widths], [0.9, 0.1, 1.0, 1.0 + 0.2 / np.sqrt(0.1)])
+    weights, widths = mode.model_copy(update={"burst": None}).widths(0.2)
+    # of 1 + 0.2 x, x normal: its mean square is 1 + 0.2^2
+    assert weights @ widths**2 == pytest.approx(1.04, rel=1e-6)
+    quiet, loud = (
+        simulated(mode, size, read_noise=0.3, light=1e-9).std(axis=(1, 2)) for size in (0.0, 2.0 * 0.2)
+    )
+    ratio = np.sort(loud**2 / quiet.mean() ** 2)
+    assert abs(np.mean(ratio > 1.25) - 0.1) < 5 * np.sqrt(0.09 / FRAMES)
+
+
 def test_a_change_that_has_a_memory_is_told_with_it() -> None:
     white = drawn(FRAMES + 1, 1, 1)
     found = measured(frames(4, gain=1.0 + 0.03 * (white[1:] + 0.7 * white[:-1])))
@@ -94,9 +125,9 @@ def test_what_a_model_makes_is_taken_off() -> None:
     assert measured_mode(data, data, stack[1], EVERYWHERE) is None
 
 
-def simulated(mode: NoiseMode, noise_dn: float) -> np.ndarray:
-    """Return frames of a sensor of next to no read noise in which something is shared."""
-    values = (4.0, 1 / STEP, 100.0, 1e-6)
+def simulated(mode: NoiseMode, noise_dn: float, read_noise: float = 1e-6, light: float = 4.0) -> np.ndarray:
+    """Return frames of a sensor, with next to no read noise (e-), in which something is shared."""
+    values = (light, 1 / STEP, 100.0, read_noise)
     truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
     effect = EmpiricalNoise(noise_dn=noise_dn, modes=(mode,))
     how = SimulateSettings(shape=SHAPE, n_frames=FRAMES, seed=5, bit_depth=14, effects=(effect,))

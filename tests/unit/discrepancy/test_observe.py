@@ -286,19 +286,47 @@ def test_loops_are_the_same_uncompiled() -> None:
     support = np.array([[[90, 90, 90], [130, 130, 130], [0, 41, 82]]] * 2, np.int32)
     tables = np.random.default_rng(1).normal(size=(123, 2)).astype(np.float32)
     modes, weights = (
-        np.array([[[one] * 3] * 2, [[two] * 3] * 2], np.float32) for one, two in ((1.5, 1.0), (0.3, 0.1))
+        np.array([[[one] * 3] * 2 for one in values], np.float32) for values in ((1.5, 1.0), (0.3, 0.1, 0.7))
     )
     results = []
     for sum_block in (sums_numba.sum_block, sums_numba.sum_block.py_func):
         arrays = [
             np.zeros((7, 2, 3), np.float32), np.zeros((7, 2, 3), np.float32), np.zeros((4, 10, 2)),
             np.zeros((10, 2, 3), np.float32), np.zeros(10), np.zeros((2, 2, 3)), np.zeros((8, 2, 3)),
-            np.zeros((3, 2, 3)), np.zeros((3, 2, 3)),
+            np.zeros((3, 2, 3)), np.zeros((3, 2, 3)), np.zeros((10, 2)), np.zeros((10, 3), np.float32),
         ]  # fmt: skip
         sum_block(frames[:10], support, tables, modes, weights, np.array([9.0, 6.0]), *arrays)
         results.append(arrays)
     for one, other in zip(*results, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+
+
+def _noise_statistics(loud: np.ndarray | float, seed: int) -> dict[str, float]:
+    rng = np.random.default_rng(seed)
+    noise = 2.0 * loud * rng.standard_normal((400, 12, 14))
+    frames = np.floor(100.5 + 9.0 * rng.poisson(1.5, noise.shape) + noise).astype(np.uint16)
+    z = observe(frames, np.arange(400), n_run=400, block_frames=20).z
+    return {name: value for name, value in z.items() if ".noise." in name}
+
+
+def test_noise_that_is_larger_in_some_frames_or_rows_stands_out_where_it_is() -> None:
+    rng = np.random.default_rng(0)
+    frames = _noise_statistics(1.0 + 0.5 * (rng.random((400, 1, 1)) < 0.1), 1)
+    assert frames["frame.noise.variance"] > 8
+    assert abs(frames["space.row.noise.variance"]) < 4
+    rows = _noise_statistics(1.0 + 0.8 * (rng.random((400, 12, 1)) < 0.1), 2)
+    assert rows["space.row.noise.variance"] > 6
+    assert abs(rows["space.column.noise.variance"]) < 4
+    slow = _noise_statistics(np.linspace(0.9, 1.1, 400)[:, None, None], 3)
+    assert slow["frame.noise.slow"] > 6
+
+
+def test_statistics_of_the_noise_are_normal_where_it_is_the_same() -> None:
+    found = [list(_noise_statistics(1.0, seed).values()) for seed in range(10, 30)]
+    assert len(found[0]) == 4
+    # 20 stacks: the mean to 5 / sqrt(20), the spread to 5 / sqrt(40)
+    assert np.abs(np.mean(found, axis=0)).max() < 5 / np.sqrt(20)
+    assert 0.4 < np.std(found, axis=0).min() <= np.std(found, axis=0).max() < 1.8
 
 
 def test_names_come_in_the_order_of_the_catalogue_and_all_are_there() -> None:
