@@ -106,8 +106,12 @@ def compare(
     before: Refitted | None = None,
     beside: Callable[[Refitted], Choice | None] = lambda _: None,
     witness: Witness = _SILENT,
+    unlisted: Callable[[], bool] = lambda: False,
 ) -> Comparison | None:
     """Refit the sets worth it, and choose the simplest that leaves nothing, else the best; None: none holds.
+
+    Where what no known effect makes leaves nothing by itself, only single effects and the likeliest set come
+    before it.
 
     Args:
         refitter: fits sets.
@@ -117,6 +121,7 @@ def compare(
         before: the effects held, at their best fit; None: not known.
         beside: compares new hypotheses by what they do beside a refitted set.
         witness: brings a set near its best, and is asked about sets that the statistics tell badly apart.
+        unlisted: tells whether what no known effect makes leaves nothing by itself.
 
     Raises:
         EffortSpentError: the work is at its limit.
@@ -139,6 +144,8 @@ def compare(
         return None
     if before is not None and max(one.score for one in tried) < before.score - _NO_WORSE:
         return None  # nothing beside the effects held explains more than they do by themselves
+    if not held and not trials.complete and unlisted():
+        return None
     if len(trials.best.hypotheses) > len(held) + 1 or not trials.complete:
         grown = [] if trials.complete else _grown(refitter, tried, len(held), beside)
         for members in _of_different_effects([*grown, *_sets(choice, tried)])[:_MOST_SETS]:

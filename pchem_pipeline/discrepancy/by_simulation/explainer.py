@@ -315,6 +315,7 @@ class FrameExplainer:
             EffortSpentError: the work is at its limit; nothing was added.
         """
         held = tuple(h for this in self.rounds for h in this.added.hypotheses)
+        self.drawn = {}
         refitter = self._refitter(z, held)
         try:
             found = compare(
@@ -325,6 +326,7 @@ class FrameExplainer:
                 self.held,
                 lambda best: self._left_by(best, refitter, z),
                 Witness(self._likelihood),
+                lambda: self._unexplained(z).explains_all(),
             )
         except EffortSpentError as spent:
             tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
@@ -622,8 +624,6 @@ class FrameExplainer:
         """Return what fits effects beside those that the model had before the search."""
         found = {h.tag for h in held}
         present = tuple(e for e in self.model if e.tag not in found)
-
-        self.drawn = {}
 
         def draw(effects: tuple[Effect, ...], count: int) -> tuple[Refit, FloatArray]:
             model = (*present, *effects)

@@ -89,6 +89,7 @@ class Unexplained:
         effort: counts what is simulated.
         defects: forms that failed, and why.
         instead: what leaves little by itself, once it is known.
+        alone: what explains most, at its best fit, once it is known; None: it failed or is not certain.
     """
 
     frames: FrameStack
@@ -102,6 +103,7 @@ class Unexplained:
     effort: Effort
     defects: dict[str, str] = field(default_factory=dict)
     instead: Refitted | None = None
+    alone: dict[int, Refitted | None] = field(default_factory=dict)
 
     @functools.cached_property
     def _forms(self) -> dict[str, Measure]:
@@ -126,10 +128,10 @@ class Unexplained:
         if self.instead is not None:
             return self.instead
         best: Refitted | None = None
-        for likely in self._of_all:
+        for number, likely in enumerate(self._of_all):
             clear = likely.measured.gain > _WORTHWHILE * self._of_all[0].measured.gain
             if clear and likely.measured.unlisted:
-                found = self._tried((), likely, whole=True)
+                found = self._alone(number)
                 if found is None or not found.effects[0].unlisted or not self._leaves_little(found):
                     continue
                 if best is None or found.score > best.score:
@@ -138,6 +140,19 @@ class Unexplained:
                     break
         self.instead = best
         return best
+
+    def explains_all(self) -> bool:
+        """Tell whether the clearest of what no known effect makes leaves nothing by itself."""
+        if not self._of_all or not self._of_all[0].measured.unlisted:
+            return False
+        found = self._alone(0)
+        return found is not None and found.effects[0].unlisted and self.leaves_nothing(found)
+
+    def _alone(self, number: int) -> Refitted | None:
+        """Return one of what explains most without any effect, at its best fit; it is fitted once."""
+        if number not in self.alone:
+            self.alone[number] = self._tried((), self._of_all[number], whole=True)
+        return self.alone[number]
 
     def leaves_nothing(self, one: Refitted) -> bool:
         """Tell whether a set leaves no statistic beyond chance."""

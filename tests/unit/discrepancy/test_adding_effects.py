@@ -108,11 +108,14 @@ class World:
         before: Any = None,
         beside: Sequence[Hypothesis] = (),
         witness: Witness | None = None,
+        unlisted: Callable[[], bool] = lambda: False,
     ) -> Comparison | None:
         choice = self.choice(*hypotheses)
         assert choice is not None
         grown = (lambda one: self.choice(*beside, mean=one.mean)) if beside else (lambda _: None)
-        return compare(self.refitter(), held, hypotheses, choice, before, grown, witness or Witness())
+        return compare(
+            self.refitter(), held, hypotheses, choice, before, grown, witness or Witness(), unlisted
+        )
 
 
 @pytest.mark.parametrize("strength", [0.03, 0.1, 0.4, 1.2])
@@ -395,6 +398,18 @@ def test_what_a_strong_effect_hides_is_asked_for_beside_it() -> None:
     grown = world.compare(hypothesis("row_noise"), beside=[hypothesis("frame_noise", 0.04)])
     assert grown is not None
     assert grown.chosen.tags == {"row_noise", "frame_noise"}
+
+
+def test_where_what_no_effect_makes_leaves_nothing_no_set_is_grown() -> None:
+    world = World([effect("row_noise", 0.3), effect("frame_noise", 0.04)])
+    beside = [hypothesis("frame_noise", 0.04)]
+    assert world.compare(hypothesis("row_noise"), beside=beside, unlisted=lambda: True) is None
+
+    def never() -> bool:
+        raise AssertionError("a single effect leaves nothing")
+
+    single = World([effect("row_noise", 0.3)]).compare(hypothesis("row_noise"), unlisted=never)
+    assert single is not None
 
 
 def test_a_signature_is_asked_of_the_same_kind_of_the_others() -> None:

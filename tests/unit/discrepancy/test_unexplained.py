@@ -73,14 +73,21 @@ def test_by_itself_only_what_no_named_effect_makes_is_tried_and_kept_where_it_le
 
     monkeypatch.setattr(unexplained, "_tried", described)
     monkeypatch.setattr(unexplained, "leaves_nothing", lambda _: True)
+    assert not unexplained.explains_all()  # what is clearest has a name
+    assert not tried
     for little in (False, True):
         monkeypatch.setattr(unexplained, "_leaves_little", lambda _, answer=little: answer)
         found = unexplained.by_itself()
         assert (found is not None and found.effects == (gain,)) is little
-    assert tried == ["gain", "gain"]
+    assert tried == ["gain"]
+    assert not unexplained.explains_all()
+    unexplained.__dict__["_of_all"] = likely[1:]
+    unexplained.alone.clear()
+    assert unexplained.explains_all()
+    assert tried.pop() == "gain"
     # what is known is measured once
     assert unexplained.measured(()) is unexplained.by_itself() is unexplained.instead
-    assert tried == ["gain", "gain"]
+    assert tried == ["gain"]
 
 
 def test_of_what_leaves_little_by_itself_the_better_one_stays(monkeypatch: pytest.MonkeyPatch) -> None:
