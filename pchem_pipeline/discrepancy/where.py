@@ -121,9 +121,9 @@ def _block_maps(
 def frame_series(evidence: Evidence) -> dict[str, FloatArray]:
     """Return the series behind the statistics, each about N(0, 1) where nothing is wrong, (n,).
 
-    ``frame.charge`` and ``frame.readout`` (means of the frames), ``scatter.charge`` and ``scatter.readout``
-    (how far each mean is off, to either side), ``row.readout`` and so on: how much the means of the rows
-    (columns) of a frame scatter.
+    ``frame.charge`` and ``frame.readout`` (means of the frames), ``frame.noise`` (of the squares of their
+    residuals), ``scatter.charge`` and ``scatter.readout`` (how far each mean is off, to either side),
+    ``row.readout`` and so on: how much the means of the rows (columns) of a frame scatter.
     """
     time, usable = evidence.time, evidence.maps.usable
     if time is None:
@@ -134,6 +134,8 @@ def frame_series(evidence: Evidence) -> dict[str, FloatArray]:
         "frame.charge": time.frame_charge * exposure / np.sqrt(charge.sum()),
         "frame.readout": time.frame_readout * usable.sum() / np.sqrt(readout.sum()),
     }
+    if time.frame_noise is not None:
+        found["frame.noise"] = time.frame_noise
     for channel in ("charge", "readout"):
         found[f"scatter.{channel}"] = chi_square(found[f"frame.{channel}"] ** 2, 1.0)
     for line, axis, channel, values, variance in (
@@ -181,6 +183,9 @@ _SERIES_OF = {
     "frame.charge.variance": "scatter.charge",
     "frame.readout.variance": "scatter.readout",
     "frame.covariance": "scatter.charge",
+    "frame.noise": "frame.noise",
+    "space.row.noise": "frame.noise",
+    "space.column.noise": "frame.noise",
     "space.row.charge": "row.charge",
     "space.row.readout": "row.readout",
     "space.x.rr": "row.readout",

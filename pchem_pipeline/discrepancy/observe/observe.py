@@ -360,5 +360,6 @@ def _time_series(view: FrameView, lags: FloatArray, n_run: int) -> TimeSeries:
         neighbour_maps={name: seen.deviation.astype(np.float32) for name, seen in found.items()},
         repeated=view.numbers[sums.repeated],
         repeated_rows=sums.repeated_rows,
+        frame_noise=view.frame_noise,
         hits=np.column_stack([view.numbers[sums.hits[:, 0]], sums.hits[:, 1:]]).astype(np.int64),
     )

@@ -69,6 +69,13 @@ class FrameView:
         left = v * (1.0 - 2.0 * share) + share**2 * v.sum()
         return np.where(self.pixels.usable, np.maximum(left, 1e-3 * np.where(v > 0, v, 1.0)), 1.0)
 
+    @property
+    def frame_noise(self) -> FloatArray:
+        """By how much the squares of r of each frame exceed their mean, of variance 1 by chance, (n,)."""
+        return np.asarray(
+            self.sums.row_noise.sum(axis=1) / np.sqrt(max(float(self.pixels.noise.sum()), 1e-300))
+        )
+
     def full_blocks(self, series: FloatArray) -> FloatArray:
         """Return the full blocks of a series (n, ...) as (blocks, block_frames, ...)."""
         starts = self.edges[:-1][np.diff(self.edges) == self.block_frames]
@@ -162,7 +169,7 @@ def frame_statistics(view: FrameView, expected_repeats: tuple[float, float]) -> 
     gain = view.sums.gain * pixels.gain_norm / np.sqrt(max(pixels.gain_variance, 1e-300))
     found["frame.gain.slow"] = view.slow(view.block_sums(gain)[:, None])
     found["frame.gain.trend"] = _trend(view, gain)
-    noise = view.sums.row_noise.sum(axis=1) / np.sqrt(max(float(pixels.noise.sum()), 1e-300))
+    noise = view.frame_noise
     found["frame.noise.variance"] = float(laws.chi_square(noise @ noise, view.n))
     found["frame.noise.slow"] = view.slow(view.block_sums(noise)[:, None])
     found["frame.repeated"] = laws.repeats(view.sums.repeated.size, expected_repeats[0])

@@ -158,6 +158,8 @@ class TimeSeries:
         repeated_lines: number of "rows" and of "columns" that are the one before them in the same frame.
         misplaced_lines: likeliest share of "rows" and of "columns" that hold the samples of other pixels, by
             :data:`PLACES`, shape (6,); none where chance explains them.
+        frame_noise: by how much the squares of r of each frame exceed their mean, over their standard
+            deviation by chance, shape (n,); None: not known.
         hits: samples above a pixel's support: columns frame, y, x, DN; int64, shape (n_hits, 4), at most
             20,000.
     """
@@ -188,6 +190,7 @@ class TimeSeries:
     repeated_rows: int
     hits: NDArray[np.int64]
     neighbour_maps: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    frame_noise: NDArray[np.float64] | None = None
     predicted: Mapping[str, PredictedSamples] = field(default_factory=dict)
     previous_bits: PreviousBits | None = None
     repeated_lines: Mapping[str, int] = field(default_factory=dict)

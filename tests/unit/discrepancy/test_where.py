@@ -89,6 +89,16 @@ def test_row_noise_of_some_frames_is_told_by_its_frames() -> None:
     assert found["row.readout"][0].when.numbers() == {"range": [[200, 260]]}
 
 
+def test_frames_that_are_noisier_in_every_sample_by_itself_are_told() -> None:
+    def moved(dn: Array, rng: np.random.Generator) -> Array:
+        dn[200:280] += 0.6 * rng.standard_normal(dn[200:280].shape)
+        return dn
+
+    found = suspected_frames(seen(moved))
+    [[first, last]] = found["frame.noise"][0].when.numbers()["range"]
+    assert abs(first - 200) + abs(last - 280) <= 8
+
+
 def test_clean_frames_have_no_place_and_no_time() -> None:
     for seed in range(2):
         evidence = seen(None, seed)
