@@ -23,6 +23,7 @@ IntArray = NDArray[np.int64]
 
 MOST_HITS = 20_000
 _CHUNK_SAMPLES = 1 << 16
+_LEAST_NOISE = 0.5  # of the variance of r^2: residuals of hardly two values tell nothing of their size
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,8 @@ class PixelStatistics:
             ``gain_norm`` times the relative deviation of the gain: least squares of r on k / g, what is
             common to all pixels taken away.
         gain_variance: variance of that sum in one frame.
-        noise: variance of r^2 in the variance of r, 2 for Gaussian residuals.
+        noise: variance of r^2, in that of r squared: 2 for Gaussian residuals.
+        square: weights of r^2 by which a common relative change of the noise is told best.
     """
 
     usable: NDArray[np.bool_]
@@ -54,6 +56,7 @@ class PixelStatistics:
     gain_norm: float
     gain_variance: float
     noise: FloatArray
+    square: FloatArray
 
 
 @dataclass(frozen=True)
@@ -67,8 +70,7 @@ class FrameSums:
         blocks: sums of k and r in each block, (b, 2, y, x).
         lags: mean products after removal of the frames' common modes: kk and rr at lags 1, 2, 3, then r with
             the k before, k with the r before, (8, y, x).
-        row_noise: sums of r^2 of each row, in the variance of its pixels, after removal of the common mode,
-            less their means, (n, y).
+        row_noise: weighted sums of r^2 of each row, less their means, (n, y).
         column_noise: the same of each column, (n, x).
         n_pairs: number of products behind lags 1, 2, 3.
         next_column, next_row: mean products kk, rr and rk + kr with the next column or row, (3, y, x).
@@ -120,6 +122,7 @@ def pixel_statistics(
     shift = pattern * weight
     krr, kkrr = moments[:, columns_of.MEAN_KRR], moments[:, columns_of.MEAN_KKRR]
     spread = factor**2 * (kkrr - kr**2) + 2.0 * factor * shift * krr + shift**2 * rr
+    noise = masked(np.maximum(moments[:, columns_of.MEAN_RRRR] * weight**2 - 1.0, 0.0))
     h, step, kk, rr, kr, factor, shift = (
         values.reshape(shape) for values in (h, step, masked(kk), masked(rr), masked(kr), factor, shift)
     )
@@ -128,7 +131,8 @@ def pixel_statistics(
         gain_offset=float((factor * kr).sum()),
         gain_norm=float((factor * step * kk).sum() + shift.ravel() @ pattern),
         gain_variance=float(masked(spread).sum()),
-        noise=masked(moments[:, columns_of.MEAN_RRRR] * weight**2 - 1.0).reshape(shape),
+        noise=noise.reshape(shape),
+        square=masked(weight / np.maximum(noise, _LEAST_NOISE)).reshape(shape),
     )  # fmt: skip
 
 
@@ -144,8 +148,7 @@ def sum_frames(
     blocks = np.zeros((edges.size - 1, 2, ny, nx))
     lags, next_column, next_row = np.zeros((8, ny, nx)), np.zeros((3, ny, nx)), np.zeros((3, ny, nx))
     modes = np.stack([pixels.exposure, pixels.usable]).astype(np.float32)
-    inverse = pixels.usable / np.where(pixels.usable, pixels.readout, 1.0)
-    weights = np.stack([pixels.factor, pixels.shift, inverse]).astype(np.float32)
+    weights = np.stack([pixels.factor, pixels.shift, pixels.square]).astype(np.float32)
     row_noise, column_noise = np.zeros((n, ny)), np.zeros((n, nx), np.float32)
     norms = np.array([pixels.exposure.sum(), pixels.usable.sum()], np.float64)
     for b, (first, last) in enumerate(pairwise(edges)):

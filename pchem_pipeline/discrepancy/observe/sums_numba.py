@@ -225,6 +225,7 @@ def sum_block(
             _sum_rows(charge, readout, weights, y, done, size, rows, gain)
             _add(charge, 0, y, done, size, columns, block)
             _add(readout, 1, y, done, size, columns, block)
+            _add_squares(readout, weights[2], y, done, size, row_noise, column_noise)
         for j in range(size):
             common_k = common_r = 0.0
             for y in range(ny):
@@ -238,7 +239,6 @@ def sum_block(
                 _add_lagged(readout, readout, lag, y, done, size, LAGS + lag - 1, lags)
             _add_lagged(readout, charge, 1, y, done, size, 2 * LAGS, lags)
             _add_lagged(charge, readout, 1, y, done, size, 2 * LAGS + 1, lags)
-            _add_squares(readout, weights[2], y, done, size, row_noise, column_noise)
             _add_neighbours(charge, readout, y, 0, 1, size, next_column)
             if y < ny - 1:
                 _add_neighbours(charge, readout, y, 1, 0, size, next_row)

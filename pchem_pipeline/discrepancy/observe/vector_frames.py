@@ -70,11 +70,14 @@ class FrameView:
         return np.where(self.pixels.usable, np.maximum(left, 1e-3 * np.where(v > 0, v, 1.0)), 1.0)
 
     @property
+    def noise_variance(self) -> FloatArray:
+        """Variance of the weighted squares of r in each pixel, (y, x)."""
+        return np.asarray((self.pixels.square * self.pixels.readout) ** 2 * self.pixels.noise)
+
+    @property
     def frame_noise(self) -> FloatArray:
         """By how much the squares of r of each frame exceed their mean, of variance 1 by chance, (n,)."""
-        return np.asarray(
-            self.sums.row_noise.sum(axis=1) / np.sqrt(max(float(self.pixels.noise.sum()), 1e-300))
-        )
+        return np.asarray(self.sums.row_noise.sum(axis=1) / np.sqrt(max(self.noise_variance.sum(), 1e-300)))
 
     def full_blocks(self, series: FloatArray) -> FloatArray:
         """Return the full blocks of a series (n, ...) as (blocks, block_frames, ...)."""
@@ -274,8 +277,9 @@ def space_statistics(view: FrameView) -> dict[str, float]:
                 for what, z in _line_statistics(view, values, variance, mode, name).items()
             }
     for line, values, axis in (("row", view.sums.row_noise, 1), ("column", view.sums.column_noise, 0)):
-        variance = view.pixels.noise.sum(axis)
-        lines = _line_statistics(view, values, variance, view.pixels.usable.sum(axis), "noise")
+        # of a common relative change of the noise
+        mode = (view.pixels.square * view.pixels.readout).sum(axis)
+        lines = _line_statistics(view, values, view.noise_variance.sum(axis), mode, "noise")
         if lines:
             found[f"space.{line}.noise.variance"] = lines["noise.variance"]
     for along in ("x", "y"):

@@ -329,6 +329,19 @@ def test_statistics_of_the_noise_are_normal_where_it_is_the_same() -> None:
     assert 0.4 < np.std(found, axis=0).min() <= np.std(found, axis=0).max() < 1.8
 
 
+def test_a_pixel_whose_residuals_hardly_vary_does_not_speak_for_all() -> None:
+    """In sensors of which the fits go astray some pixels have next to no readout noise left."""
+    rng = np.random.default_rng(6)
+    exposure = 0.07 * np.exp(0.2 * rng.standard_normal((16, 16)))
+    electrons = rng.poisson(np.broadcast_to(exposure, (400, 16, 16)))
+    frames = np.floor(200.5 + 20.0 * (electrons + 0.6 * rng.standard_normal(electrons.shape))).astype(
+        np.uint16
+    )
+    z = observe(frames, np.arange(400), n_run=400, block_frames=20).z
+    found = [value for name, value in z.items() if ".noise." in name]
+    assert np.abs(found).max() < 5
+
+
 def test_names_come_in_the_order_of_the_catalogue_and_all_are_there() -> None:
     frames = small_stack((12, 12), 300, 1)
     evidence = observe(frames, np.arange(300), n_run=300, block_frames=20)
