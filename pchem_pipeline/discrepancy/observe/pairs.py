@@ -34,7 +34,7 @@ PERIOD = 32
 #: Cells along an edge of the sensor, for lines; half as many for frames.
 _CELLS = 64
 #: Of each table of sums of products: two channels and the counts, as gathered and as told.
-_COPIES = 11
+_COPIES = 9
 #: Samples count as no more than so many standard deviations: a track of a particle is no common mode.
 _CLIP = 6.0
 
@@ -108,7 +108,7 @@ class Samples:
     start: NDArray[np.int32]
     tables: Float32Array
     usable: BoolArray
-    most: int = 1 << 22
+    most: int = 1 << 20
 
     @classmethod
     def of(cls, frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> Samples:
@@ -236,7 +236,10 @@ def pairs_of(samples: Samples) -> list[dict[str, Pairs]]:
     for chunk in samples.chunks():
         for each, u in zip(gathered, chunk, strict=True):
             each.add(u)
-    return [_told(each, counted, samples.n_frames) for each in gathered]
+    n = samples.n_frames
+    counts = {mode: n * table for mode, table in counted.tables().items()}
+    numbers = {mode: tuple(n * each for each in every) for mode, every in counted.by_number().items()}
+    return [_told(each, counts, numbers) for each in gathered]
 
 
 def pairs_bytes(shape: tuple[int, int]) -> int:
@@ -336,10 +339,11 @@ class _Gathered:
         return {"row": (rows,), "column": (columns,), "frame": frames}
 
 
-def _told(gathered: _Gathered, counted: _Gathered, n: int) -> dict[str, Pairs]:
-    """Return the sums by what pixels share, with the counts of the usable pixels in n frames."""
-    sums, counts = gathered.tables(), counted.tables()
-    phases, numbers = gathered.by_number(), counted.by_number()
+def _told(
+    gathered: _Gathered, counts: dict[str, FloatArray], numbers: dict[str, tuple[FloatArray, ...]]
+) -> dict[str, Pairs]:
+    """Return the sums by what pixels share, with the counts of the usable pixels in all frames."""
+    sums, phases = gathered.tables(), gathered.by_number()
     whole = gathered.rows, gathered.columns
     ends = gathered.rows[-1:], gathered.columns[-1:]
     wide = tuple(
@@ -349,9 +353,9 @@ def _told(gathered: _Gathered, counted: _Gathered, n: int) -> dict[str, Pairs]:
         mode: Pairs(
             mode,
             sums[mode],
-            n * counts[mode],
+            counts[mode],
             phases[mode],
-            tuple(n * each for each in numbers[mode]),
+            numbers[mode],
             *(wide if mode == "frame" else whole),
         )
         for mode in MODES

@@ -16,20 +16,25 @@ from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancie
 from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate
 from pchem_pipeline.discrepancy.observe.compilation import compile_observation
 from pchem_pipeline.discrepancy.observe.places import SensorWindow
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
 from pchem_pipeline.simulate.chain import dn_dtype
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
-from pchem_pipeline.stages.discrepancy.survey import survey
-from pchem_pipeline.stages.discrepancy.window import choose_window, read_window
+from pchem_pipeline.stages.discrepancy.survey import Survey, mean_codes, survey
+from pchem_pipeline.stages.discrepancy.window import choose_window, read_window, within_memory
 from pchem_pipeline.stages.samples import open_samples
 from pchem_pipeline.store.run_store import RunStore
 
 _STAGE = "discrepancy"
+#: Settings that the memory may lower.
+_TAKEN = ("max_samples", "max_pixels")
+_USUAL_CODES = 128.0  # of the law of a pixel, where there are no histograms yet
 
 
 def compile_kernels(config: RunConfig) -> None:
@@ -76,12 +81,10 @@ def run(context: StageContext) -> None:
 def _run_frames(
     context: StageContext, before: Sequence[Effect], roi: tuple[int, ...] | None, tell: Callable[[str], None]
 ) -> None:
-    settings, sensor = context.config.discrepancy, context.sensor
-    source = open_source(context)
-    block_length(source.shape[0], settings.block_frames)
-    tell("looking at every pixel and every frame")
+    sensor, source = context.sensor, open_source(context)
+    block_length(source.shape[0], context.config.discrepancy.block_frames)
     compile_observation(source.dtype)
-    seen = survey(context, source, min(settings.max_samples, settings.max_pixels * source.shape[0]))
+    settings, seen = _surveyed(context, source, roi, tell)
     window = choose_window(source.shape, settings, roi, seen.places)
     found = find_discrepancies(
         read_window(source, window),
@@ -104,6 +107,37 @@ def _run_frames(
     found = replace(found, verdict=seen.told(verdict, window.share(source.shape)))
     _write(context, found)
     write_added_exposure(context.store, _STAGE, found.added, found.model, window.rows, window.columns)
+
+
+def _surveyed(
+    context: StageContext, source: FrameSource, roi: tuple[int, ...] | None, tell: Callable[[str], None]
+) -> tuple[DiscrepancySettings, Survey]:
+    """Look at the whole sensor, once; return that, and the settings with as much as the memory allows.
+
+    Its marker keeps both: a search that was stopped goes on in the same window, whatever it may take then.
+
+    Raises:
+        ConfigError: the memory is not enough for any window.
+    """
+    settings, store = context.config.discrepancy, context.store
+    known = store.records.summaries(_STAGE, context.fingerprint).get(WHOLE.key)
+    if known is None:
+        limit = context.config.compute.max_memory
+        if limit is not None:
+            codes = mean_codes(store) if store.has("histogram/counts") else _USUAL_CODES
+            less = within_memory(settings, source.shape, roi, codes, limit << 20)
+            if less != settings:
+                context.note(
+                    f"compute.max_memory (--max-memory) allows {less.max_pixels} pixels in the comparison "
+                    f"with simulations, {settings.max_pixels} without a limit"
+                )
+            settings = less
+        tell("looking at every pixel and every frame")
+        seen = survey(context, source, min(settings.max_samples, settings.max_pixels * source.shape[0]))
+        taken = {name: getattr(settings, name) for name in _TAKEN}
+        known = {"window": taken, **seen.numbers()}
+        context.run_units([WHOLE], lambda _: known, by_tiles=False, total=1)
+    return settings.model_copy(update=known["window"]), Survey.of_numbers(known)
 
 
 def _start(context: StageContext) -> tuple[tuple[Effect, ...], tuple[int, ...] | None]:
@@ -167,7 +201,7 @@ class _Mapper:
     """Runs replicates as units of the stage; those done before an interruption are not done again."""
 
     context: StageContext
-    total: int = 0
+    total: int = 1  # with what was done before
 
     def __call__(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:
         """Return the statistics of each replicate, or what it raised."""

@@ -46,7 +46,7 @@ _SIGNIFICANCE = 1e-3
 #: The same of shapes: they rest on fits, whose errors are not quite normal.
 _SIGNIFICANCE_OF_SHAPES = 1e-6
 #: Codes of the tables of a band at most, and rows at least.
-_MOST_CODES, _FEWEST_ROWS = 1 << 26, 16
+_MOST_CODES, _FEWEST_ROWS = 1 << 26, 8
 #: Bytes of a band for each code of a law, for each pixel, and for each sample that is looked at at once.
 _CODE_BYTES, _PIXEL_BYTES, _SAMPLE_BYTES = 20, 800, 28
 #: Codes of a law: so many times those between the smallest and the largest sample, and some more.
@@ -76,6 +76,22 @@ class Survey:
 
     places: Mapping[str, SensorPlace] = field(default_factory=dict)
     shares: Mapping[str, float] = field(default_factory=dict)
+
+    def numbers(self) -> dict[str, Any]:
+        """Return it as JSON data, of which :meth:`of_numbers` makes it again."""
+        places = {
+            name: {**vars(place), "region": place.region.numbers()} for name, place in self.places.items()
+        }
+        return {"places": places, "shares": dict(self.shares)}
+
+    @classmethod
+    def of_numbers(cls, numbers: Mapping[str, Any]) -> Survey:
+        """Return it as :meth:`numbers` gave it."""
+        places = {
+            name: SensorPlace(**{**place, "region": Region.model_validate(place["region"])})
+            for name, place in numbers["places"].items()
+        }
+        return cls(places, numbers["shares"])
 
     def told(self, verdict: Verdict, share: float) -> Verdict:
         """Return a verdict that says on what share of the samples it rests, and on what else."""
@@ -209,19 +225,29 @@ def _band_size(store: RunStore, shape: tuple[int, int], memory: int | None) -> t
     rows = max(fewest, min(ny, _MOST_CODES // (nx * counts.shape[2])))
     if memory is None:
         return rows, _MOST_AT_ONCE
-    span = store.read("histogram/maximum") - store.read("histogram/minimum")
-    codes = float(span.mean(axis=1).max()) * _SUPPORT + _PEAK_CODES
+    codes = mean_codes(store)
     pixel = counts.shape[2] * counts.dtype.itemsize + codes * _CODE_BYTES + _PIXEL_BYTES + _SAMPLE_BYTES
-    left = memory - pairs_bytes((rows, nx))
-    at_once = min(_MOST_AT_ONCE, max(left, 0) // 4 // _SAMPLE_BYTES)
-    rows = min(rows, int((left - at_once * _SAMPLE_BYTES) / (nx * pixel)))
-    if rows < fewest:
-        lacking = math.ceil((fewest * nx * pixel * 4 / 3 - left) / 2**20)
-        raise ConfigError(
-            f"discrepancy looks at {fewest} rows of the sensor at least, and lacks {lacking} MiB "
-            "for them: raise compute.max_memory (--max-memory)"
-        )
-    return rows, at_once
+    while True:
+        left = memory - pairs_bytes((rows, nx))
+        at_once = min(_MOST_AT_ONCE, max(left, 0) // 4 // _SAMPLE_BYTES)
+        affordable = int((left - at_once * _SAMPLE_BYTES) / (nx * pixel))
+        if affordable >= rows:
+            return rows, at_once
+        if rows == fewest:
+            break
+        # lower bands have smaller tables of pairs, too
+        rows = max(fewest, min(affordable, rows * 3 // 4))
+    lacking = math.ceil((fewest * nx * pixel * 4 / 3 - left) / 2**20)
+    raise ConfigError(
+        f"discrepancy looks at {fewest} rows of the sensor at least, and lacks {lacking} MiB "
+        "for them: raise compute.max_memory (--max-memory)"
+    )
+
+
+def mean_codes(store: RunStore) -> float:
+    """Return how many codes the law of a pixel has, on average in the row with the most."""
+    span = store.read("histogram/maximum") - store.read("histogram/minimum")
+    return float(span.mean(axis=1).max()) * _SUPPORT + _PEAK_CODES
 
 
 def _spread_frames(n: int, most: int) -> IntArray:

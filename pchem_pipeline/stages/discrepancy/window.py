@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.quick.places import SensorPlace
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
@@ -18,6 +19,11 @@ from pchem_pipeline.frames.stream import FrameSource, FrameStream
 _FRAMES_WANTED = 6000
 #: Windows tried along each edge of the sensor.
 _TRIED = 64
+#: Bytes of a search: with its program and kernels, however small the window; of a sample; of a pixel, and of
+#: each code of its law. Measured with one worker, 256 to 8190 pixels and 1000 to 6000 frames.
+_PROGRAM_BYTES, _SAMPLE_BYTES, _PIXEL_BYTES, _CODE_BYTES = 290 << 20, 8, 12 << 10, 75
+#: Pixels that a window has at least, and the steps in which it is made smaller.
+_FEWEST_PIXELS, _SMALLER = 256, 0.9
 
 
 @dataclass(frozen=True)
@@ -76,6 +82,52 @@ def choose_window(
         starts = np.linspace(0, n_frames - length, frames // length).astype(np.int64)
         numbers = (starts[:, None] + np.arange(length)).ravel()
     return Window(numbers, (y0, y1), (x0, x1))
+
+
+def search_bytes(window: Window, codes: float) -> int:
+    """Return the memory that a search in a window takes with one worker, about.
+
+    Args:
+        window: that is looked at.
+        codes: of the law of a pixel.
+    """
+    pixels = (window.rows[1] - window.rows[0]) * (window.columns[1] - window.columns[0])
+    each = _PIXEL_BYTES + codes * _CODE_BYTES + window.numbers.size * _SAMPLE_BYTES
+    return _PROGRAM_BYTES + int(pixels * each)
+
+
+def within_memory(
+    settings: DiscrepancySettings,
+    shape: tuple[int, int, int],
+    roi: Sequence[int] | None,
+    codes: float,
+    limit: int,
+) -> DiscrepancySettings:
+    """Return the settings with as many samples and pixels as the memory allows.
+
+    Args:
+        settings: as configured.
+        shape: frames, rows, columns of the stack.
+        roi: rows and columns that the user asked for.
+        codes: of the law of a pixel.
+        limit: bytes that the search may take.
+
+    Raises:
+        ConfigError: it is not enough for the smallest window.
+    """
+    window = choose_window(shape, settings, roi)
+    while (least := search_bytes(window, codes)) > limit:
+        (y0, y1), (x0, x1) = window.rows, window.columns
+        pixels = int((y1 - y0) * (x1 - x0) * _SMALLER)
+        if pixels < _FEWEST_PIXELS:
+            raise ConfigError(
+                f"discrepancy takes {-(-least >> 20)} MiB for the smallest part of these frames that it "
+                f"compares, compute.max_memory (--max-memory) allows {limit >> 20}: raise it"
+            )
+        samples = min(settings.max_samples, pixels * window.numbers.size)
+        settings = settings.model_copy(update={"max_samples": samples, "max_pixels": pixels})
+        window = choose_window(shape, settings, roi)
+    return settings
 
 
 def _worst(places: Mapping[str, SensorPlace], shape: tuple[int, int]) -> NDArray[np.bool_] | None:

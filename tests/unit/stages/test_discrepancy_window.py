@@ -1,12 +1,18 @@
 """Which part of a stack is looked at."""
 
+import json
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.quick.places import SensorPlace
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.region import Region
-from pchem_pipeline.stages.discrepancy.window import choose_window, read_window
+from pchem_pipeline.stages.discrepancy import discrepancy
+from pchem_pipeline.stages.discrepancy.survey import Survey
+from pchem_pipeline.stages.discrepancy.window import choose_window, read_window, search_bytes, within_memory
 
 WHOLE = DiscrepancySettings(max_pixels=1 << 25)
 
@@ -48,6 +54,57 @@ def test_of_a_large_sensor_no_more_pixels_than_allowed():
     assert window.numbers.size == 1000
     smaller = choose_window((1000, 512, 512), DiscrepancySettings(max_pixels=400))
     assert np.ptp(smaller.rows) * np.ptp(smaller.columns) <= 400
+
+
+@pytest.mark.parametrize("shape", [(1000, 512, 512), (6000, 64, 64), (17750, 512, 512), (400, 60, 80)])
+def test_the_window_becomes_smaller_with_the_memory(shape):
+    settings, sizes = DiscrepancySettings(), []
+    full = choose_window(shape, settings)
+    assert within_memory(settings, shape, None, 100.0, search_bytes(full, 100.0)) == settings
+    for limit in (320, 360, 400):
+        window = choose_window(shape, within_memory(settings, shape, None, 100.0, limit << 20))
+        assert search_bytes(window, 100.0) <= limit << 20
+        # frames stay: slow effects need the whole run, and pixels resemble each other
+        assert window.numbers.size == full.numbers.size
+        sizes.append(np.ptp(window.rows) * np.ptp(window.columns))
+    assert sizes[0] < sizes[1] < sizes[2] or shape == (400, 60, 80)
+    with pytest.raises(ConfigError, match=r"takes \d+ MiB .*--max-memory.* allows 290: raise it"):
+        within_memory(settings, shape, None, 100.0, 290 << 20)
+
+
+def test_a_search_that_was_stopped_goes_on_in_the_window_that_it_had(monkeypatch):
+    """With other memory, too: its simulated stacks are of that window."""
+    markers, looked = {}, []
+
+    def seen(*_):
+        looked.append(1)
+        return Survey({"next_x": place(columns=[[3, 8]])}, {"neighbours": 0.3})
+
+    def run_units(units, task, **_):
+        markers.update({unit.key: json.loads(json.dumps(task(unit))) for unit in units})
+
+    def context(limit):
+        return SimpleNamespace(
+            config=SimpleNamespace(
+                discrepancy=DiscrepancySettings(), compute=SimpleNamespace(max_memory=limit)
+            ),
+            store=SimpleNamespace(
+                records=SimpleNamespace(summaries=lambda *_: markers), has=lambda name: False
+            ),
+            fingerprint="x",
+            note=notes.append,
+            run_units=run_units,
+        )
+
+    notes: list[str] = []
+    monkeypatch.setattr(discrepancy, "survey", seen)
+    source = SimpleNamespace(shape=(1000, 512, 512))
+    first = discrepancy._surveyed(context(400), source, None, lambda _: None)
+    assert first[0].max_pixels < 8192
+    assert len(notes) == 1
+    again = discrepancy._surveyed(context(None), source, None, lambda _: None)
+    assert again == first
+    assert (len(looked), len(notes)) == (1, 1)
 
 
 def test_the_region_asked_for_is_looked_at():

@@ -144,7 +144,10 @@ class _Table:
         some = np.flatnonzero((counts > 0).any(axis=0))
         # one more on either side stands for all codes beyond
         real = np.pad(counts[:, some[0] : some[-1] + 1], ((0, 0), (1, 1))) + np.float32(0.5)
-        logs = np.log(real / real.sum(axis=1, keepdims=True)).astype(np.float32).reshape(*usable.shape, -1)
+        # in place: of a window of many pixels these are the largest arrays of all that observe it
+        real /= real.sum(axis=1, keepdims=True)
+        logs = np.log(real, out=real).astype(np.float32).reshape(*usable.shape, -1)
+        del real
         first = (origin + some[0] - 1).reshape(usable.shape)
         axis = _LINES.index(lines)
         own, begin, count = (np.ascontiguousarray(a.swapaxes(0, axis)) for a in (logs, first, usable))
