@@ -9,6 +9,7 @@ test).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -26,8 +27,8 @@ _CHANGED: tuple[Changed, ...] = ("offset", "gain", "light", "noise")
 _OF: tuple[Shared, ...] = ("frame", "row", "column")
 _CLEAR = 15.0  # nats
 _NEARLY = 0.5  # of the nats of the clearest change: another one may be it as well
-# times what a Gaussian explains that bursts must, and nats: the scores are skewed themselves
-_OF_GAUSSIAN, _BURST = 1.3, 10.0
+# by how much bursts must explain more than a Gaussian, of what there is to win, and nats: scores are skewed
+_OF_GAUSSIAN, _BURST = 0.3, 10.0
 _CHUNK = 256  # frames at once
 _FARTHEST = 3  # frames
 _MOST_BLOCKS, _SMALLEST_BLOCK = 8, 4  # along an axis; px
@@ -35,6 +36,7 @@ _UNEVEN = 5.0  # standard errors of its power by which a shape must be clearer t
 _OF_ERROR = 2.0  # standard errors: blocks of less have none
 _CERTAIN = 4.0  # standard errors of a correlation
 _SIZES = (0.02, 0.03, 0.05, 0.08, 0.12, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.0)  # relative changes in bursts
+_BETWEEN = (0.7, 0.8, 0.9, 1.1, 1.2, 1.35)  # of the likeliest of them
 _MOST_IN_BURSTS = 0.3
 
 
@@ -245,10 +247,19 @@ def _bursts(one: Sums, gaussian: float) -> tuple[float | None, float]:
     known = one.information > 0.0
     sums = one.sums[:, known].ravel()
     information = np.broadcast_to(one.information[known], one.sums[:, known].shape).ravel()
-    best = _OF_GAUSSIAN * gaussian + _BURST
-    found: tuple[float | None, float] = (None, 0.0)
-    for size in (sign * size for sign in (1.0, -1.0) for size in _SIZES):
-        shares, gain = shares_of((size * sums - 0.5 * size**2 * information)[None])
-        if gain > best and shares[0] < _MOST_IN_BURSTS:
-            best, found = gain, (float(shares[0]), size)
-    return found
+    # of a change far beyond chance a Gaussian explains all but what its spread costs: no more can be won
+    most = min(gaussian, 0.5 * one.number * float(np.log(max(one.ratio, 1.0))))
+    found: list[tuple[float, float, float]] = []
+
+    def try_sizes(sizes: Iterable[float]) -> None:
+        for size in sizes:
+            shares, gain = shares_of((size * sums - 0.5 * size**2 * information)[None])
+            if shares[0] < _MOST_IN_BURSTS:
+                found.append((gain, float(shares[0]), size))
+
+    try_sizes(sign * size for sign in (1.0, -1.0) for size in _SIZES)
+    if found:
+        nearest = max(found)[2]
+        try_sizes(nearest * factor for factor in _BETWEEN)
+    gain, share, size = max(found, default=(0.0, 0.0, 0.0))
+    return (share, size) if gain > gaussian + _OF_GAUSSIAN * most + _BURST else (None, 0.0)

@@ -91,6 +91,31 @@ def test_frames_that_are_noisier_are_told_with_how_many_they_are() -> None:
     assert "of the size of a read noise of 3.51 DN" in found.words()
 
 
+@pytest.mark.parametrize("size", [0.3, 1.0, 2.5])
+def test_bursts_are_told_however_strong_they_are(size: float) -> None:
+    """Far beyond chance a Gaussian of the same power explains nearly as much as bursts do."""
+    rng = np.random.default_rng(int(10 * size))
+    some = rng.random((FRAMES, 1)) < 0.03
+    data = {
+        ("frame", "noise"): Sums(
+            rng.standard_normal((FRAMES, 1)) * 10.0 + 100.0 * size * some, np.full(1, 100.0)
+        )
+    }
+    nothing = {key: Sums(np.ones((1, 1)), np.ones(1)) for key in data}
+    found = measured_mode(data, nothing, frames(1)[1], EVERYWHERE)
+    assert found is not None
+    assert found.effect.modes[0].burst == pytest.approx(some.mean(), rel=0.2)
+
+
+def test_a_strong_gaussian_change_is_no_burst() -> None:
+    sums = np.random.default_rng(8).standard_normal((FRAMES, 1))
+    data = {("frame", "noise"): Sums(80.0 * sums, np.full(1, 100.0))}
+    nothing = {key: Sums(np.ones((1, 1)), np.ones(1)) for key in data}
+    found = measured_mode(data, nothing, frames(1)[1], EVERYWHERE)
+    assert found is not None
+    assert found.effect.modes[0].burst is None
+
+
 def test_noise_of_changing_size_has_the_law_that_is_simulated() -> None:
     mode = NoiseMode(of="frame", share=1.0, changes="noise", signal_dn=2.0, burst=0.1)
     weights, widths = mode.widths(0.2)
