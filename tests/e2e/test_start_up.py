@@ -68,6 +68,15 @@ def test_fit_imports_its_kernels_and_not_those_who_draw_or_read_cameras(librarie
     assert not found & (HEAVY - {"numba", "scipy"})
 
 
+def test_a_command_that_knows_of_effects_does_not_import_what_few_of_them_call():
+    code = (
+        "import sys\nfrom pchem_pipeline.effects.framework.registry import effect_classes\n"
+        "assert effect_classes()\nprint({'scipy.stats', 'scipy.optimize', 'scipy.signal'} & set(sys.modules))"
+    )
+    outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=200)
+    assert outcome.stdout == "set()\n", outcome.stdout + outcome.stderr
+
+
 @pytest.mark.parametrize("name", STAGES)
 def test_every_function_that_a_row_names_is_there(name):
     stage = STAGES[name]

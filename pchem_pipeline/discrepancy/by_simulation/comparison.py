@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
@@ -88,7 +88,7 @@ class Comparison:
             if one.tags in self.witnessed:
                 behind, error = self.witnessed[one.tags]
                 # neither need be the very law of the samples
-                probability = float(stats.norm.cdf(behind / max(error, 1e-9)))
+                probability = float(special.ndtr(behind / max(error, 1e-9)))
             else:
                 behind, error = _worth(one) - _worth(self.chosen), _apart(one, self.chosen)
                 probability = float(np.exp(min(behind, 0.0)))

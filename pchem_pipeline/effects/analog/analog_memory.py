@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
-from scipy import optimize, special
+from scipy import special
 
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
@@ -168,6 +168,8 @@ def _lognormal(
         pairs: of frames, the inverse of the variance of a correlation.
         memory: of all pixels alike.
     """
+    from scipy import optimize  # not for every command that knows of effects
+
     nodes, weights = np.polynomial.hermite_e.hermegauss(_NODES)
     weights = weights / weights.sum()
     sign, root = np.sign(memory), np.sqrt(pairs)

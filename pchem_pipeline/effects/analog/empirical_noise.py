@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy import stats
 
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.estimators.common_modes import add_offset
@@ -326,6 +325,8 @@ def _of_light(change: FloatArray, number: int, context: EffectContext) -> FloatA
     more = context.random.poisson(np.maximum(change, 0.0) * context.exposure, number)
     if change.min() >= 0.0:
         return more.astype(np.float64)
+    from scipy import stats  # takes half a second, and every command that knows of effects imports this
+
     drawn = context.random.uniform(("frame", "y", "x"), len(_DIMS) + number)
     lost = stats.binom.ppf(drawn, context.charge, np.clip(-change, 0.0, 1.0))
     return np.asarray(more - np.nan_to_num(lost), np.float64)

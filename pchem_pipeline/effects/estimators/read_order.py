@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import optimize
 
 from pchem_pipeline.effects.estimators.common_modes import mean_variance, responsivity
 
@@ -65,6 +64,8 @@ def pink_noise_of(evidence: Evidence) -> list[tuple[float, int]]:
     by_rows = _fitted(seen, alone, error)[0]
     if gain >= max(_LEAST**2, by_rows + _LEAST_SHAPE):
         return [(float(np.sqrt(variance)), taps)]
+    from scipy import optimize  # not for every command that knows of effects
+
     # both at once, by whole rows: coupled neighbours are alike, too
     in_rows = slice(0, _LAGS + 1)
     wanted, by_rows = (seen / error)[in_rows], _fitted(seen[in_rows], alone[in_rows], error[in_rows])[0]
