@@ -310,7 +310,7 @@ def test_a_map_with_a_place_comes_first_with_its_outline() -> None:
     outlines = [a for axes in drawing.axes for a in axes.collections if isinstance(a, LineCollection)]
     # two edges of each row and two of each column; colour bars have lines of their own
     assert 2 * first.z.shape[0] + 2 * 4 in [len(lines.get_segments()) for lines in outlines]
-    assert place_text(moved) == f"columns {origin[1] + 3} to {origin[1] + 6}"
+    assert place_text(moved) == f"most in columns {origin[1] + 3} to {origin[1] + 6}"
 
 
 def test_a_place_that_goes_on_beyond_the_part_examined_is_drawn_as_far_as_that_goes() -> None:
