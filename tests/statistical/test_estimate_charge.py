@@ -20,6 +20,8 @@ from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCoun
 from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
 from pchem_pipeline.effects.estimators.charge_sums import block_charge, exposure_profile
 from pchem_pipeline.effects.estimators.count_scores import count_excess
+from pchem_pipeline.effects.estimators.fading_images import Fading
+from pchem_pipeline.effects.exposure import persistence
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
 from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
@@ -189,6 +191,12 @@ def test_blinking_pixels(low, high):
     assert abs(equal.step_e / 1.2 - 1) < 5 * np.hypot(0.5 / np.sqrt(independent), 0.5 / n**0.5)
     seen_tau = 1 / (1 / equal.dwell_low_frames + 1 / equal.dwell_high_frames)
     assert abs(np.log(seen_tau / tau)) < 5 * np.hypot(2 / np.sqrt(independent), 0.1)
+
+
+def test_what_would_begin_brighter_than_any_scene_is_no_afterglow(monkeypatch):
+    truth = Persistence(peak_e=0.5, decay_frames=600.0, centre_y=0.3, centre_x=0.6, radius=0.13)
+    monkeypatch.setattr(persistence, "fading_of", lambda *_: Fading(600.0, None, 0.5, scale=1e9))
+    assert not Persistence.estimate(seen(truth))
 
 
 def test_persistence():

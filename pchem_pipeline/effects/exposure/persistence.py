@@ -34,6 +34,7 @@ _GRIDS = (8, 16)
 _MOST_CELLS = 48
 # by how many times as clearly the samples must show it as the charge
 _MORE = 1.25
+_BRIGHTEST = 1e6  # e- per frame that an afterglow begins with
 # time constants tried, in lengths of the run
 _DECAYS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0)
 
@@ -65,7 +66,7 @@ class Persistence(Effect):
         "bias_drift": "frames without exposure: the residual stays here",
     }
     peak_e: float = Field(
-        ge=0, le=1e6, description="largest additional exposure in the first frame, e- per frame"
+        ge=0, le=_BRIGHTEST, description="largest additional exposure in the first frame, e- per frame"
     )
     decay_frames: float = Field(gt=0, description="time constant of the fading, frames")
     slow_decay_frames: float | None = Field(
@@ -227,10 +228,11 @@ class Persistence(Effect):
         found: list[Self] = []
         bright = finer.image()
         peak = float(bright.max())
-        if peak > 0:
+        # an afterglow brighter than any scene is only extrapolated to the first frame
+        if 0.0 < peak * fading.scale <= _BRIGHTEST:
             found.append(cls(peak_e=peak * fading.scale, image=_numbers(bright / peak), **fields))
         spot = best_spot(finer.amplitude, finer.noise, finer.exposure, exposure.shape)
-        if spot is not None:
+        if spot is not None and spot.peak * fading.scale <= _BRIGHTEST:
             found.append(cls(peak_e=spot.peak * fading.scale, **(fields | spot.place)))
         return found
 
