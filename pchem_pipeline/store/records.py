@@ -91,7 +91,13 @@ class Records:
         self._forgotten(self._folder / "done")
 
     def mark(self, stage: str, fingerprint: str, key: str, summary: dict[str, Any]) -> None:
-        """Say that a unit of a stage is whole in the store."""
+        """Say that a unit of a stage is whole in the store.
+
+        Raises:
+            ValueError: the key is no name of a file; its marker would never be found again.
+        """
+        if "/" in key or key.startswith("."):
+            raise ValueError(f"stage {stage}: the key {key!r} of a unit is no name of a file")
         write_json(self._marker(stage, fingerprint, key), summary, sync=self._sync)
 
     def unmark(self, stage: str, fingerprint: str, keys: Iterable[str]) -> None:

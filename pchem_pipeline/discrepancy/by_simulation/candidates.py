@@ -259,10 +259,11 @@ class ReplicateSimulator:
         return [state.best for state in states]
 
     def _replicate(self, effect: Effect | None, repeat: int) -> Replicate:
-        text = json.dumps([] if effect is None else [effect.model_dump(mode="json")], sort_keys=True)
+        effects = self.model if effect is None else (*self.model, effect)
+        # of the model and its purpose, too: the same effects come with other strengths in one round
+        text = json.dumps([self.seed, *(each.model_dump(mode="json") for each in effects)], sort_keys=True)
         digest = hashlib.sha256(text.encode()).hexdigest()[:10]
         label = f"{'base' if effect is None else effect.tag}-{digest}-{repeat}"
-        effects = self.model if effect is None else (*self.model, effect)
         return Replicate(f"{self.prefix}-{label}", self.maps, effects, self.seed + repeat, self.acquisition)
 
     def _row(self, vector: Vector) -> FloatArray:

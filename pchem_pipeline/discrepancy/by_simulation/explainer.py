@@ -276,7 +276,7 @@ class FrameExplainer:
             self.frames.acquisition(),
             null.names,
             self._counted,
-            f"r{purpose}",
+            f"r{len(self.rounds)}",
             self._seed(f"fingerprint/{purpose}"),
             dict(self.defects),
         )

@@ -493,6 +493,17 @@ def test_what_the_model_leaves_is_asked_for_guesses_before_what_the_frames_show(
     assert guesses(classes, [frames]) == [effect("row_noise", 0.2)]
 
 
+def test_a_simulated_stack_is_known_by_all_that_makes_it_under_a_name_that_a_file_can_have() -> None:
+    keys = [
+        ReplicateSimulator(None, model, None, (), list, "r0", seed)._replicate(one, 0).key  # type: ignore[arg-type]
+        for model in ((), (effect("row_noise", 0.1),), (effect("row_noise", 0.2),))
+        for one in (None, effect("frame_noise", 0.3))
+        for seed in (1, 2)
+    ]
+    assert len(set(keys)) == len(keys)
+    assert not any("/" in key for key in keys)
+
+
 def test_a_signature_is_its_own_where_the_others_leave_it_and_do_not_touch_it() -> None:
     own, noise = np.eye(M)[1] * 10.0, np.ones(M)
     left = np.eye(M)[1] * 8.0

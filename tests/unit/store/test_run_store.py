@@ -208,6 +208,13 @@ def test_fingerprint_depends_on_content_not_on_order():
     assert fingerprint_of({"a": 1}) != fingerprint_of({"a": 2})
 
 
+@pytest.mark.parametrize("key", ["r0/row_noise-0", "../0.1", ".0"])
+def test_a_key_that_is_no_name_of_a_file_is_refused(tmp_path, key):
+    records = Records(tmp_path, lambda part: None)
+    with pytest.raises(ValueError, match="no name of a file"):
+        records.mark("discrepancy", "f" * 64, key, {})
+
+
 def test_markers_belong_to_one_fingerprint(tmp_path):
     records = Records(tmp_path, lambda part: None)
     records.mark("fit", "f" * 64, "0.1", {"pixels": 5})
