@@ -623,7 +623,7 @@ def _surveyed(name: str, data: DiscrepancyData) -> str:
         return f"pixels of a {mode} move together ({'charge' if channel == 'charge' else 'readout'})"
     if kind in ("score", "goodness"):
         _, sentence = data.statistics.get(f"shape.{rest or kind}.mean", ("", name))
-        return sentence.removesuffix(", in all pixels alike")
+        return sentence.removesuffix(", in the mean of the pixels")
     return _SURVEYED.get(name, name)
 
 

@@ -37,10 +37,11 @@ def verdict_data(found: Verdict, arrays: Mapping[str, NDArray[Any]]) -> Discrepa
     from pchem_pipeline.effects.framework.registry import effect_classes
 
     effects = effect_classes()
+    signs = dict(zip(STATISTICS, arrays.get("z_before", ()), strict=False))
     return DiscrepancyData(
         found=found,
         arrays=arrays,
-        statistics={name: (s.channel, s.sentence) for name, s in STATISTICS.items()},
+        statistics={name: (s.channel, s.says(signs.get(name, 1.0))) for name, s in STATISTICS.items()},
         titles={tag: effect.title for tag, effect in effects.items() if effect.title},
         sources={tag: effect.source for tag, effect in effects.items() if effect.source},
     )

@@ -448,3 +448,14 @@ def test_pixels_that_are_not_identified_are_said_beside_a_name() -> None:
     flags = [flag for flag in remarks(data) if "93 %" in flag.text]
     assert [flag.level for flag in flags] == ["caution"]
     assert not any("no size is given" in flag.text for flag in remarks(discrepancy_data("named")))
+
+
+def test_a_statistic_of_the_report_says_what_its_sign_says() -> None:
+    from pchem_pipeline.stages.discrepancy.result import verdict_data
+
+    found = discrepancy_data("named").found
+    names = list(verdict_data(found, {}).statistics)
+    before = np.where(np.array(names) == "shape.He3.mean", -5.0, 5.0)
+    words = verdict_data(found, {"z_before": before}).statistics
+    assert "skewed to low DN" in words["shape.He3.mean"][1]
+    assert "has heavy tails" in words["shape.He4.mean"][1]
