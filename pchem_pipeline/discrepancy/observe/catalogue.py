@@ -227,7 +227,7 @@ def _frame() -> list[Statistic]:
     ]
 
 
-def _space() -> list[Statistic]:
+def _lines() -> list[Statistic]:
     found: list[Statistic] = []
     for line in ("row", "column"):
         found += _of_channels(
@@ -244,6 +244,10 @@ def _space() -> list[Statistic]:
         Statistic("space.row.readout.line", "readout", "the rows of a frame hold a periodic component"),
         Statistic("space.column.readout.line", "readout", "the columns of a frame hold a periodic component"),
     ]
+    return found
+
+
+def _neighbours() -> list[Statistic]:
     pairs: dict[str, tuple[Channel, str, str]] = {
         "kk": (
             "charge",
@@ -261,13 +265,15 @@ def _space() -> list[Statistic]:
             "residuals oppose the charge of the neighbour",
         ),
     }
-    for axis in ("x", "y"):
-        found += [
-            Statistic(f"space.{axis}.{p}", c, f"{more}, along {axis}", f"{less}, along {axis}")
-            for p, (c, more, less) in pairs.items()
-        ]
     return [
-        *found,
+        Statistic(f"space.{axis}.{p}", c, f"{more}, along {axis}", f"{less}, along {axis}")
+        for axis in ("x", "y")
+        for p, (c, more, less) in pairs.items()
+    ]
+
+
+def _samples_of_others() -> list[Statistic]:
+    return [
         *(
             Statistic(
                 f"space.{line}.noise.variance",
@@ -375,7 +381,18 @@ class _Catalogue(dict[str, Statistic]):
 
 #: Every statistic by name, in the order of the vector.
 STATISTICS: dict[str, Statistic] = _Catalogue(
-    (s.name, s) for s in [*_scores(), *_deviations(), *_CODE, *_TAIL, *_time(), *_frame(), *_space()]
+    (s.name, s)
+    for s in [
+        *_scores(),
+        *_deviations(),
+        *_CODE,
+        *_TAIL,
+        *_time(),
+        *_frame(),
+        *_lines(),
+        *_neighbours(),
+        *_samples_of_others(),
+    ]
 )
 
 #: Statistics that are exact tests, never positive by chance, and by how much each event raises them (rows
