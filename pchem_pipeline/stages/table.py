@@ -146,7 +146,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=4,
+        version=5,
         upstream=("ingest",),
         settings=("discrepancy",),
         reads=("frames", "summary", "histogram", "fit"),

@@ -12,7 +12,7 @@ from typing import Literal
 from pchem_pipeline.effects.framework.evidence import SCORES
 from pchem_pipeline.effects.framework.region import parse_place
 
-VERSION = 1
+VERSION = 2
 
 Family = Literal["shape", "code", "tail", "time", "frame", "space"]
 FAMILIES: tuple[Family, ...] = ("shape", "code", "tail", "time", "frame", "space")

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
 
 _STAGE = "discrepancy"
+_VECTORS = ("z_before", "z_after")  # a number for each statistic
 
 
 def discrepancy_state(store: RunStore) -> str | None:
@@ -37,6 +38,9 @@ def verdict_data(found: Verdict, arrays: Mapping[str, NDArray[Any]]) -> Discrepa
     from pchem_pipeline.effects.framework.registry import effect_classes
 
     effects = effect_classes()
+    # those of a search with other statistics are in another order: what its JSON tells is left
+    of_others = [name for name in _VECTORS if name in arrays and len(arrays[name]) != len(STATISTICS)]
+    arrays = {name: array for name, array in arrays.items() if name not in of_others}
     signs = dict(zip(STATISTICS, arrays.get("z_before", ()), strict=False))
     return DiscrepancyData(
         found=found,

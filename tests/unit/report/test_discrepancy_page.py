@@ -459,3 +459,5 @@ def test_a_statistic_of_the_report_says_what_its_sign_says() -> None:
     words = verdict_data(found, {"z_before": before}).statistics
     assert "skewed to low DN" in words["shape.He3.mean"][1]
     assert "has heavy tails" in words["shape.He4.mean"][1]
+    fewer = verdict_data(found, {"z_before": before[:-4], "score": before})
+    assert set(fewer.arrays) == {"score"}  # of a search with other statistics
