@@ -169,6 +169,41 @@ def test_a_killed_search_goes_on_to_the_same_verdict(searched, fitted, tmp_path,
     assert (tmp_path / "run.yaml").read_text() == CAMERA  # --no-refit leaves the model alone
 
 
+def test_effects_beside_one_that_is_no_candidate_are_named_in_part_and_a_killed_search_goes_on(
+    kernels, tmp_path
+):
+    """Sets of effects, and what stands out beside one: stacks of many models, each under its own name."""
+    hidden = "{tag: row_noise, row_noise_dn: 1.2}"
+    others = "{tag: frame_noise, frame_noise_dn: 0.8}, {tag: exposure_flicker, rms: 0.05}"
+    text = CAMERA.replace(hidden, f"{hidden}, {others}").replace("[16, 16]", "[12, 12]")
+    shell = Shell(tmp_path / "whole", {**os.environ, "NUMBA_CACHE_DIR": kernels})
+    shell.folder.mkdir()
+    (shell.folder / "run.yaml").write_text(text.replace("1800", "1000"))
+    shell.ok("simulate", "run.yaml")
+    shell.ok("run", "run.yaml", "--until", "fit")
+    other = copy_of(shell, tmp_path / "killed")
+    shell.ok("discrepancy", "run.yaml", "--no-refit")
+    found = verdict(shell)
+    assert found["verdict"] == "named_in_part"
+    assert set(found["effects"]) == {"row_noise", "frame_noise"}
+    noise = next(s["parameters"]["row_noise_dn"] for s in found["steps"] if s["effect"] == "row_noise")
+    assert abs(noise["value"] - 1.2) < 5 * noise["stderr"] + 0.05 * 1.2
+
+    markers = other.folder / "run.zarr" / ".pchem" / "done" / "discrepancy"
+
+    def asked_beside():
+        return len({path.name.split("-")[2] for path in markers.glob("*/r0-base-*")}) > 1
+
+    with other.start("discrepancy", "run.yaml", "--no-refit") as process:
+        while process.poll() is None and not asked_beside():
+            time.sleep(0.02)
+        process.kill()
+    assert asked_beside()
+    assert not (other.folder / "run.zarr" / "discrepancy.json").exists()
+    other.ok("discrepancy", "run.yaml", "--no-refit")
+    assert verdict(other) == found
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
