@@ -49,20 +49,30 @@ def run_case(case: Case, options: dict[str, Any], with_bias: bool) -> dict[str, 
 
 
 def make(
-    hidden: tuple[str, ...], level: float, seed: int, shape: tuple[int, int, int], out: Path, key: Path
+    hidden: tuple[str, ...],
+    level: float,
+    seed: int,
+    shape: tuple[int, int, int],
+    out: Path,
+    key: Path,
+    take: int = 0,
 ) -> None:
     """Write a stack and its sealed key with the independent chain."""
     command = [sys.executable, str(MAKE), "--effect", ",".join(hidden) or "none", "--level", str(level)]
     command += ["--seed", str(seed), "--out", str(out), "--key", str(key), "--frames", str(shape[2])]
-    command += ["--shape", str(shape[0]), str(shape[1])]
+    command += ["--shape", str(shape[0]), str(shape[1]), "--take", str(take)]
     subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ)
 
 
 def _in_place(case: Case, frames: NDArray[np.uint16], folder: Path) -> NDArray[np.uint16]:
-    """Return the stack with the effect in its place, and the same stack without it elsewhere."""
+    """Return the stack with the effect in its place, and the same sensor without it elsewhere.
+
+    With electrons of its own: an effect on the light makes the same random numbers those of other pixels,
+    and pixels of the two stacks would go together in a frame.
+    """
     assert case.place is not None
     axis, begin, end = case.place
-    make((), case.level, case.seed, case.shape, folder / "twin", folder / "twin" / "key.json")
+    make((), case.level, case.seed, case.shape, folder / "twin", folder / "twin" / "key.json", take=1)
     placed = np.load(folder / "twin" / "frames.npy")
     index = [slice(None)] * 3
     index[("frames", "rows", "columns").index(axis)] = slice(begin, end)

@@ -77,22 +77,28 @@ class Hiding:
 
 
 def hide(
-    tags: tuple[str, ...], level: float, seed: int, shape: tuple[int, int] = (64, 64), n_frames: int = 4000
+    tags: tuple[str, ...],
+    level: float,
+    seed: int,
+    shape: tuple[int, int] = (64, 64),
+    n_frames: int = 4000,
+    take: int = 0,
 ) -> Hiding:
     """Make a stack with the named effects in it.
 
-    The sensor and the random numbers of the plain chain depend on the seed alone, not on what is hidden.
+    The sensor and the random numbers of the plain chain depend on the seed alone, not on what is hidden;
+    another ``take`` is the same sensor with other electrons and other noise.
     """
     unknown = [tag for tag in tags if tag not in ALL]
     if unknown:
         raise SystemExit(f"nothing known as {', '.join(unknown)}; there are {', '.join(sorted(ALL))}")
-    streams = np.random.SeedSequence(seed).spawn(3)
+    streams = np.random.SeedSequence(seed).spawn(3 + 2 * take)
     sensor = draw_sensor(np.random.default_rng(streams[0]), shape, n_frames)
     # each effect has the same numbers whatever it is hidden with
     hidden = (ALL[tag](np.random.default_rng([seed, *tag.encode()]), sensor, level) for tag in tags)
     # lines that are repeated are codes, and not converted again
     effects = tuple(sorted(hidden, key=lambda effect: effect.order))
-    light, dark = (np.random.default_rng(stream) for stream in streams[1:])
+    light, dark = (np.random.default_rng(stream) for stream in streams[-2:])
     frames = np.zeros((n_frames, *shape), np.uint16)
     for t in range(-max([e.warmup for e in effects], default=0), n_frames):
         code = _one_frame(t, sensor, effects, light, dark)

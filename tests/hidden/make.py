@@ -33,13 +33,15 @@ def main() -> None:
     parser.add_argument("--key", type=Path)
     parser.add_argument("--shape", type=int, nargs=2, default=(64, 64), metavar=("ROWS", "COLUMNS"))
     parser.add_argument("--frames", type=int, default=4000)
+    parser.add_argument("--take", type=int, default=0, help="of the same sensor, its electrons and noise")
     options = parser.parse_args()
     tags = tuple(options.effect.split(","))
     if options.effect == "none":
         tags = ()
     elif options.effect == "random":
         tags = (str(np.random.default_rng([options.seed, 1]).choice(sorted(LIBRARY))),)
-    hiding = hide(tags, options.level, options.seed, tuple(options.shape), options.frames)
+    shape = tuple(options.shape)
+    hiding = hide(tags, options.level, options.seed, shape, options.frames, options.take)
     options.out.mkdir(parents=True, exist_ok=True)
     np.save(options.out / "frames.npy", hiding.frames)
     hiding.seal(options.key or options.out.parent / "sealed" / f"{options.out.name}.json")

@@ -20,6 +20,23 @@ def made(tag=None, seed=SEED):
     return hide((tag,) if tag else (), 4.0, seed, SHAPE, FRAMES)
 
 
+def test_another_take_is_the_same_sensor_with_other_electrons_even_beside_an_effect_on_the_light():
+    """Rows of one stack in another: where both used the same numbers, pixels of a frame went together."""
+    one, other = made("overdispersed_counts"), hide((), 4.0, SEED, SHAPE, FRAMES, take=1)
+    assert np.array_equal(one.sensor.exposure, other.sensor.exposure)
+
+    def common(other):
+        """Sum of the correlations of all different pixels, in its standard deviations."""
+        first, second = (each.frames.reshape(FRAMES, -1).astype(float) for each in (one, other))
+        first, second = ((each - each.mean(axis=0)) / each.std(axis=0) for each in (first, second))
+        product = first.T @ second / np.sqrt(FRAMES)
+        np.fill_diagonal(product, 0.0)
+        return product.sum() / np.sqrt(product.size)
+
+    assert abs(common(other)) < 5.0
+    assert common(made()) > 5.0
+
+
 class View:
     """Deviations of a stack from what the true maps say, and their variance."""
 
