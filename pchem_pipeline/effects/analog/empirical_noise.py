@@ -41,6 +41,7 @@ _REACH = 3  # of the moving average along an axis, for each of them
 _MOST_TAPS, _SMALLEST_TAP = 200, 0.01  # of the moving average; of the largest weight
 _NODES, _NARROWEST = 5, 0.05  # of the law of noise of changing size; relative, to be a law
 _FEW = 4  # distances that are told in words
+_CHANGED = {"gain": "gain", "light": "light", "noise": "read noise"}
 
 
 class NoiseMode(Section):
@@ -101,8 +102,8 @@ class NoiseMode(Section):
             raise ValueError("burst: each by itself; leave lags out")
         return self
 
-    def words(self) -> str:
-        """Return in words what is shared."""
+    def words(self, rms: float) -> str:
+        """Return in words what varies by so many DN, and who shares it."""
         whole = "" if self.of == "sample" and self.lags else f"the same in a whole {self.of}"
         order = np.argsort(-np.abs(self.correlation))[:_FEW]
         apart = [f"{self.correlation[i]:.2g} {_lag_words(self.lags[i])}" for i in order]
@@ -112,8 +113,13 @@ class NoiseMode(Section):
             whole = f"of one shape in each {self.of} ({', '.join(f'{p:+.2g}' for p in self.profile)})"
         if self.shape:
             whole += f", strongest in {self.strongest()}"
-        of = {"gain": "of the gain at", "light": "of the light at", "noise": "of the size of a read noise of"}
-        what = "" if self.changes == "offset" else f"{of[self.changes]} {self.signal_dn:.3g} DN"
+        # of bursts their size, not that of all the time
+        size = rms if self.burst is None else rms * (-1.0 if self.negative else 1.0) / np.sqrt(self.burst)
+        what = f"{size:.2g} DN"
+        if self.changes != "offset":
+            share, of = 100.0 * size / self.signal_dn, _CHANGED[self.changes]
+            at = "" if self.changes == "noise" else "at a signal "
+            what = f"{share:.2g} % of the {of}, {what} {at}of {self.signal_dn:.3g} DN"
         burst = "" if self.burst is None else f"in {100 * self.burst:.2g} % of the {self.of}s only"
         return ", ".join(part for part in (what, whole, burst, shared) if part)
 
@@ -273,9 +279,10 @@ class EmpiricalNoise(Effect):
     def words(self) -> str:
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
-        parts = [f"{self.share_of(mode):.2g} DN {mode.words()}" for mode in self.modes]
-        total = f"noise of {self.noise_dn:.2g} DN{place} that samples share"
-        return f"{total} before the converter ({'; '.join(parts)})"
+        parts = "; ".join(mode.words(self.share_of(mode)) for mode in self.modes)
+        if all(mode.changes == "offset" for mode in self.modes):
+            return f"noise of {self.noise_dn:.2g} DN{place} that samples share before the converter ({parts})"
+        return f"a variation{place} that samples share before the converter ({parts})"
 
 
 class _Average(NamedTuple):
