@@ -62,7 +62,7 @@ _COMMON: tuple[tuple[str, Any, Any], ...] = (
         "max_memory",
         Annotated[
             int | None,
-            typer.Option(min=64, help="memory that it may take, MiB [default: compute.max_memory]"),
+            typer.Option(help="memory that it may take, MiB, 300 or more [default: compute.max_memory]"),
         ],
         None,
     ),

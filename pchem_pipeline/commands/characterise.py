@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.commands.new_run import other_settings
+from pchem_pipeline.commands.new_run import other_settings, settings_of
 from pchem_pipeline.commands.notebook import open_run, require_xarray
 from pchem_pipeline.config.load import dump_config, make_config
 from pchem_pipeline.frames.writing import write_frames
@@ -140,7 +140,7 @@ def _target(place: Path, given: Mapping[str, Any], settings: Mapping[str, Mappin
     Raises:
         ConfigError: a setting is wrong, or the YAML is there with others.
     """
-    path = place.with_suffix(".yaml")
+    path = settings_of(place)
     content: dict[str, Any] = {name: dict(section) for name, section in settings.items()}
     content["run"] = {**content.get("run", {}), "store": place.name}
     known = {"files": [f"{place.stem}-frames.npy"], "mode": "reference", **given}

@@ -57,9 +57,8 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
     """
     unknown = [name for name in formats if name not in FORMATS]
     if unknown or not formats:
-        raise ConfigError(
-            f"--format: {', '.join(unknown) or 'nothing'} cannot be written; choose from {', '.join(FORMATS)}"
-        )
+        what = f"{', '.join(unknown)} cannot be written" if unknown else "none is given"
+        raise ConfigError(f"--format: {what}; choose from {', '.join(FORMATS)}")
     target = find_run(path)
     store = RunStore.open(target.store)
     if "summary" not in store.attributes("maps"):

@@ -95,9 +95,8 @@ def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:
     """
     unknown = [name for name in wanted.formats if name not in FORMATS]
     if unknown or not wanted.formats:
-        raise ConfigError(
-            f"--format: {', '.join(unknown) or 'nothing'} cannot be drawn; choose from {', '.join(FORMATS)}"
-        )
+        what = f"{', '.join(unknown)} cannot be drawn" if unknown else "none is given"
+        raise ConfigError(f"--format: {what}; choose from {', '.join(FORMATS)}")
     width = None if wanted.width is None else millimetres(wanted.width)
     sheet = {} if wanted.style is None else read_style_sheet(wanted.style)
     target = find_run(path)

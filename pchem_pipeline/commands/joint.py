@@ -9,7 +9,7 @@ from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.commands.first_screen import run_to_first_screen
-from pchem_pipeline.commands.new_run import other_settings
+from pchem_pipeline.commands.new_run import other_settings, settings_of
 from pchem_pipeline.config.load import dump_config, make_config
 from pchem_pipeline.run.session import Command
 from pchem_pipeline.run.target import Target, find_run
@@ -40,8 +40,7 @@ def find_joint(
             raise ConfigError(f"--store: only for runs; {targets[0]} has its own run.store, change it there")
         return found, False
     place = place_of(store or Path("joint.zarr")).resolve()
-    remote = isinstance(place, RemotePath)  # there the YAML would be out of reach: it is written here
-    path = Path(place.with_suffix(".yaml").name).resolve() if remote else place.with_suffix(".yaml")
+    remote, path = isinstance(place, RemotePath), settings_of(place)
     runs = [*targets, *bias]
     samples: list[dict[str, Any]] = [{"run": os.path.relpath(each, path.parent)} for each in runs]
     for sample in samples[len(targets) :]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -78,8 +79,7 @@ def find_or_start(
             f"{missing[0]} does not exist; give camera files, a folder of them, or a config.yaml"
         )
     place = place_of(store or Path("run.zarr")).resolve()
-    remote = isinstance(place, RemotePath)  # there the YAML would be out of reach: it is written here
-    path = Path(place.with_suffix(".yaml").name).resolve() if remote else place.with_suffix(".yaml")
+    remote, path = isinstance(place, RemotePath), settings_of(place)
     config = make_config(
         {
             "run": {"store": str(place) if remote else place.name},
@@ -93,6 +93,18 @@ def find_or_start(
     if write:
         write_atomic(path, text.encode())
     return Target(config, path.parent, place, path), True
+
+
+def settings_of(store: Path) -> Path:
+    """Return the YAML file of a run whose store is given: beside it; of a remote one, in this folder.
+
+    Raises:
+        ConfigError: the store has the name of a YAML file.
+    """
+    if store.suffix.lower() in _YAML:
+        raise ConfigError(f"--store {store.name}: that is the name of a YAML file; give NAME.zarr")
+    name = store.name.removesuffix(".zarr") + ".yaml"
+    return Path(name).resolve() if isinstance(store, RemotePath) else store.with_name(name)
 
 
 def other_settings(path: Path, config: RunConfig, command: str) -> str:
@@ -165,5 +177,5 @@ def _file_list(targets: Sequence[Path], base_dir: Path) -> list[str]:
         pattern = f"*{suffixes.pop()}"
         folder = folders.pop()
         if len(list((base_dir / folder).glob(pattern))) == len(files):
-            return [str(folder / pattern)]
+            return [str(Path(glob.escape(str(folder))) / pattern)]
     return [str(path) for path in files]

@@ -30,9 +30,9 @@ class ComputeSettings(Section):
     )
     max_memory: int | None = Field(
         default=None,
-        ge=64,
-        description="memory that a run may take on this machine, MiB; null: half of what is free. Too little "
-        "for the whole sensor at once: the camera files are read twice, by bands of rows",
+        gt=0,
+        description="memory that a run may take on this machine, MiB, 300 or more; null: half of what is "
+        "free. Too little for the whole sensor at once: the camera files are read twice, by bands of rows",
     )
     scheduler: str | None = Field(
         default=None,

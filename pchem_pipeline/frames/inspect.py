@@ -184,7 +184,8 @@ def _gaps(paths: list[Path]) -> list[str]:
         usual = min(steps, default=1)
         missing = sum((step // usual - 1) * count for step, count in steps.items())
         if missing:
+            are = "is" if missing == 1 else "are"
             notes.append(
-                f"{missing} of the numbered files {pattern} are missing between the first and the last"
+                f"{missing} of the numbered files {pattern} {are} missing between the first and the last"
             )
     return notes

@@ -62,7 +62,7 @@ def fetch(url: str) -> list[Path]:
             f"{url}: cannot be read ({' '.join(str(error).split())}); check address, keys and network"
         ) from error
     if not found:
-        raise InputError(f"{url}: no such file; correct input.files")
+        raise InputError(f"{url}: no such file; correct the address (input.files)")
     return found
 
 

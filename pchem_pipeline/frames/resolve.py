@@ -19,7 +19,7 @@ _NUMBER = re.compile(r"(\d+)")
 def natural_key(path: Path) -> tuple[tuple[tuple[int, int | str], ...], str]:
     """Return a key that sorts frame2 before frame10, folders first."""
     pieces = _NUMBER.split(str(path).casefold())
-    return tuple((0, int(p)) if p.isdigit() else (1, p) for p in pieces if p), str(path)
+    return tuple((0, int(p)) if p.isdecimal() else (1, p) for p in pieces if p), str(path)
 
 
 def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
@@ -48,9 +48,9 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
         elif path.exists():
             found.append(path)
         elif _GLOB.search(entry):
-            found += _glob(path, entry, settings)
+            found += _glob(Path(entry).expanduser(), base_dir, entry)
         else:
-            raise InputError(f"{path}: no such file or folder; correct input.files")
+            raise InputError(f"{path}: no such file or folder; correct the path (input.files)")
     return sorted(found, key=natural_key)
 
 
@@ -74,13 +74,15 @@ def _is_zarr(path: Path) -> bool:
     return any((path / name).exists() for name in ("zarr.json", ".zarray", ".zgroup"))
 
 
-def _glob(pattern: Path, entry: str, settings: InputSettings) -> list[Path]:
-    relative = pattern.relative_to(pattern.anchor)
-    matches = list(Path(pattern.anchor).glob(str(relative)))
+def _glob(pattern: Path, base_dir: Path, entry: str) -> list[Path]:
+    """Return the files that a pattern names; in the names of ``base_dir`` nothing is a pattern."""
+    whole = pattern.is_absolute()
+    folder = Path(pattern.anchor) if whole else base_dir
+    matches = folder.glob(str(pattern.relative_to(pattern.anchor) if whole else pattern))
     files = [path for path in matches if not path.name.startswith(".") and not _is_sidecar(path)]
     plain = [path for path in files if path.is_file() or _is_zarr(path)]
     if not plain:
-        raise InputError(f"{entry}: matches no file; correct input.files")
+        raise InputError(f"{entry}: matches no file; correct the pattern (input.files)")
     return plain
 
 
@@ -105,7 +107,8 @@ def _folder(folder: Path, settings: InputSettings) -> list[Path]:
     if not files:
         kinds = ", ".join(sorted(suffixes))
         raise InputError(
-            f"{folder}: the folder holds no camera files ({kinds}); correct input.files or input.format"
+            f"{folder}: the folder holds no camera files ({kinds}); correct the path (input.files), or set "
+            "input.format"
         )
     formats = sorted({suffixes.get(path.suffix.lower(), "zarr") for path in files})
     if len(formats) > 1:

@@ -73,8 +73,6 @@ def _perform(
     context.stage, context.failed, context.notes, context.n_keys = stage.name, {}, [], 0
     context.fingerprint = old.fingerprint if resumes and old is not None else fingerprint_of(content)
     context.fresh = not resumes and not context.is_prepared
-    if context.fresh:
-        records.unmark_all(stage.name)
     record = StageRecord(
         stage.name,
         stage.version,
@@ -85,11 +83,24 @@ def _perform(
         versions=_versions(),
     )
     record = replace(record, model=rests_on(record, context.store))
-    # markers went first and arrays go last: a stage that is killed in between is still known to have begun
-    records.write(record)
-    if context.fresh:
-        for path in stage.writes:
+    begun = False
+
+    def begin() -> None:
+        """Give up what the stage left before.
+
+        Markers go first and arrays last: a stage that is killed in between is still known to have begun.
+        """
+        nonlocal begun
+        begun = True
+        if context.fresh:
+            records.unmark_all(stage.name)
+        records.write(record)
+        for path in stage.writes if context.fresh else ():
             context.store.delete(path)
+
+    context.begin = begin
+    if not stage.looks_first:
+        begin()
     context.reporter.event("start", stage=stage.name, why=before.words())
     wall, cpu = clock
     try:
@@ -105,9 +116,9 @@ def _perform(
             failed=context.failed,
             notes=tuple(context.notes),
         )
-        if old is None and not record.finished and not record.keys:
-            records.forget(stage.name)  # it was refused before it began, and leaves no trace
-        else:
+        if begun and old is None and not record.finished and not record.keys:
+            records.forget(stage.name)  # it was refused before it did anything, and leaves no trace
+        elif begun:
             records.write(record)
     return _finish(stage, context, record, time.perf_counter() - wall, cpu_seconds() - cpu)
 

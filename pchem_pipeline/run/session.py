@@ -135,7 +135,8 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
         LockedError: another process works on the run.
         PchEmError: the store or the workers cannot be had.
     """
-    target = with_overrides(target, command)
+    own, target = target.config, with_overrides(target, command)
+    keep_to_limit(target.config.compute.max_memory)
     store = RunStore.create(target.store)
     progress_file = ProgressFile(store.path)
     reporter = Reporter(
@@ -146,10 +147,9 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
         stack.enter_context(store.locked())
         progress_file.show({"stage": ""})
         stop = stack.enter_context(stop_on_signals())
-        store.write_config(dump_config(target.config))
+        store.write_config(dump_config(own))  # what a single command was given is no setting of the run
         keep_in_force(store, model_in_force(store, target.config.model))
         write_json(store.path / ".pchem" / "location.json", _location(target))
-        keep_to_limit(target.config.compute.max_memory)
         executor = make_executor(target.config.compute, Notices(reporter.warning, stop.check))
         stack.callback(executor.close)
         yield StageContext(

@@ -130,6 +130,10 @@ class Prepared:
     clock: tuple[float, float] | None = None
 
 
+def _nothing() -> None:
+    """Do nothing."""
+
+
 def nothing_left(unit: Any) -> dict[str, Any]:
     """Do nothing: the task of units whose work was done beforehand."""
     return {}
@@ -155,6 +159,7 @@ class StageContext:
         config_path: the YAML file of the run, where it has one.
         notes: remarks for the report, filled by the stage.
         prepared: the stages whose arrays a single pass over the input has made.
+        begin: gives up what the running stage left before; called for it unless it looks at its input first.
     """
 
     config: RunConfig
@@ -172,6 +177,7 @@ class StageContext:
     config_path: Path | None = None
     notes: list[str] = field(default_factory=list)
     prepared: Mapping[str, Prepared] = field(default_factory=dict)
+    begin: Callable[[], None] = _nothing
 
     @property
     def is_prepared(self) -> bool:

@@ -69,6 +69,7 @@ def run(context: StageContext) -> None:
     """
     if context.config.input.samples:
         samples = check_samples(context.config, context.base_dir)
+        context.begin()
         sample_sensor(context.config, samples).write(context.store)
         _run_whole(context)
         return
@@ -78,6 +79,7 @@ def run(context: StageContext) -> None:
     settings = context.config.input
     done = context.prepared.get(context.stage)
     reader = open_frames(settings, context.base_dir) if done is None else done.frames
+    context.begin()
     if message := reader.report.message():
         context.note(message)
     sensor_of(reader, context, shortened(known_identity(context))).write(context.store)
@@ -184,6 +186,7 @@ def _run_whole(context: StageContext) -> None:
 def _record_histograms(context: StageContext) -> None:
     """Record ready-made histograms: each channel is a pixel of a sensor of one row."""
     given = read_histograms(context.config.input, context.base_dir)
+    context.begin()
     for note in given.notes:
         context.note(note)
     lowest, highest = int(given.origin.min()), int(given.origin.max()) + given.counts.shape[2] - 1

@@ -28,9 +28,20 @@ if TYPE_CHECKING:
 _SUMMARISED = (*PARAMETERS, "read_noise_e", "analog_read_noise_e")
 #: of the arrays of a tile that are read and made
 _PIXEL_BYTES = 80 * 8
-_NO_TIME = (
-    "integration time is not known: no charge rate; give --integration-time (input.integration_time), s"
-)
+#: Relative; times are written with few digits.
+_SAME_TIME = 1e-3
+
+
+def _tell_time(context: StageContext) -> None:
+    """Say where the integration time is not known, or is not what the files say."""
+    time, stated = context.integration_time, context.sensor.integration_time
+    if time is None:
+        where = "" if context.config_path is None else f" in {context.config_path.name}"
+        context.note(f"integration time is not known: no charge rate; set input.integration_time{where}, s")
+    elif stated is not None and abs(time - stated) > _SAME_TIME * stated:
+        context.note(
+            f"the files say an integration time of {stated:g} s; input.integration_time, {time:g} s, counts"
+        )
 
 
 def maps_tile(
@@ -77,8 +88,8 @@ def run(context: StageContext) -> None:
     context.create_maps(["maps/quality", "maps/goodness_q"])
     if line is not None:
         _create_residuals(context, len(line.x))
-    elif time is None and not context.sensor.samples:
-        context.note(_NO_TIME)
+    elif not context.sensor.samples:
+        _tell_time(context)
     task = functools.partial(
         _do_tile, store=context.store.path, integration_time=time, rate=context.charge_rate, line=line
     )

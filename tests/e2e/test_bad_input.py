@@ -165,6 +165,36 @@ def test_another_schema_version_is_refused(shell, frames):
     assert "schema version 7" in result.last
 
 
+@pytest.mark.parametrize("bad", ["empty", "twice", "none"])
+def test_input_that_is_refused_costs_a_finished_run_nothing(shell, bad):
+    """A cron job meets a half-written file: the frames copied the night before are the only ones left."""
+    night = shell.folder / "night"
+    night.mkdir()
+    for name, part in (("a", GOOD[:20]), ("b", GOOD[20:])):
+        tiff(night / f"{name}.tif", np.tile(part, (10, 1, 1)) + (name == "b"))
+    (shell.folder / "run.yaml").write_text(OF_ONE_FILE.replace("a.npy", "night/*.tif"))
+    shell.ok("run", "run.yaml", "--until", "maps")
+    store = shell.folder / "run.zarr"
+    before = {name: RunStore.open(store).read(name) for name in ("frames/dn", "fit/bias")}
+    content = (night / "b.tif").read_bytes()
+    (night / "a.tif").unlink()
+    if bad == "none":
+        (night / "b.tif").unlink()
+    else:
+        (night / "c.tif").write_bytes(b"" if bad == "empty" else content)
+    result = shell("run", "run.yaml", "--until", "maps")
+    # without files at all what was copied stays valid
+    assert result.code == (0 if bad == "none" else 4)
+    for name, values in before.items():
+        assert np.array_equal(RunStore.open(store).read(name), values, equal_nan=True)
+    shell.ok("status", "run.yaml")
+    shell.ok("export", "run.zarr", "--format", "npz", "--output", "maps")
+    (night / "c.tif").unlink(missing_ok=True)
+    (night / "b.tif").write_bytes(content)
+    shell.ok("run", "run.yaml", "--until", "maps")
+    assert len(RunStore.open(store).read("frames/dn")) == 200
+
+
 def test_changed_camera_files_make_the_run_stale(shell, frames):
     (shell.folder / "run.yaml").write_text(RUN)
     shell.ok("ingest", "run.yaml")

@@ -102,7 +102,7 @@ def comparison_of(
 ) -> Comparison:
     """Return how the runs differ from the first of them; see :func:`compare_runs`."""
     if len(paths) < 2:
-        raise ConfigError(f"compare: {len(paths)} runs given; give two or more")
+        raise ConfigError("compare: give two runs or more")
     if not 0 <= tolerance < 1:
         raise ConfigError(f"--tolerance {tolerance:g}: a relative difference from 0 to below 1 is meant")
     targets = [find_run(path) for path in paths]

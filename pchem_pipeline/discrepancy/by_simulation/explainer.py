@@ -189,6 +189,10 @@ class FrameExplainer:
         self.plain = self.frames.observe(self.frames.seen)
         self.effort.ambiguous = self.plain.ambiguous
         usable = self.plain.maps.usable
+        if usable.size < _FEWEST_PIXELS:
+            raise InputError(
+                f"a sensor of {usable.size} pixels, fewer than {_FEWEST_PIXELS}: nothing can be compared"
+            )
         if usable.sum() < _FEWEST_PIXELS:
             raise InputError(
                 f"{int(usable.sum())} of {usable.size} pixels have a usable fit, "
@@ -223,7 +227,7 @@ class FrameExplainer:
         share, usable = self.plain.ambiguous, float(np.mean(self.plain.maps.usable))
         if share < _NOT_IDENTIFIED and usable > 1.0 - _NOT_IDENTIFIED:
             return ""
-        maps, frames = self.plain.maps, self.frames.seen.size
+        maps, frames = self.plain.maps, self.frames.numbers.size
         noise = np.nanmedian(maps.read_noise_dn * maps.conversion_gain)
         lost = (
             f"the bias of {100 * share:.0f} % of the pixels may be off by an electron"
@@ -232,7 +236,7 @@ class FrameExplainer:
         )
         return (
             f"{lost} (fitted read noise {noise:.2f} e-, {frames} frames): several exposures fitted together "
-            "(pchem joint) identify them, so may many more frames or a lower read noise"
+            "(pchem joint) identify them; many more frames or a lower read noise may do so, too"
         )
 
     def gap(self, null: NullModel, z: Measured) -> Gap:

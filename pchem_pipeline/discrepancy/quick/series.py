@@ -176,7 +176,7 @@ def _single(series: FloatArray, spread: float, error: float, skewness: float) ->
         of_many(float(p[largest]), p.size),
         max(out.size, 1) / series.size,
         "1",
-        effects=("cosmic_rays", "bias_jumps", "readout_glitches"),
+        effects=("cosmic_rays", "bias_jumps"),
         where=f"frame{'s' if shown.size > 1 else ''} {', '.join(str(i) for i in np.sort(shown))}{more}",
         advice="leave them out (input.frame_range), or see what happened there",
     )

@@ -264,7 +264,9 @@ def draw_spectra(look: Look, *, fixed: tuple[DataTable, ...], temporal: tuple[Da
         for table in tables:
             line = table.part.split("_")[1]
             colour = look.palette.blue if line == "row" else look.palette.vermilion
-            axes.semilogy(table["frequency"], table["power"], color=colour, linewidth=0.8, label=f"{line}s")
+            # where nothing ever changes there is no power, and no logarithm of it
+            power = np.where(table["power"] > 0.0, table["power"], np.nan)
+            axes.semilogy(table["frequency"], power, color=colour, linewidth=0.8, label=f"{line}s")
         _one(axes)
         axes.set(xlabel="frequency (1/row, 1/column)", ylabel="power / chance", xlim=(0.0, 0.5))
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=2)

@@ -38,7 +38,7 @@ def test_figures_are_asked_for_as_given(monkeypatch: pytest.MonkeyPatch) -> None
     ("wanted", "words"),
     [
         (Wanted(("pdf", "jpg")), "--format: jpg cannot be drawn; choose from pdf, svg, png"),
-        (Wanted(()), "--format: nothing cannot be drawn"),
+        (Wanted(()), "--format: none is given"),
         (Wanted(width="88 px"), "--width '88 px': write a length such as 88mm"),
         (Wanted(style="none.mplstyle"), "--style none.mplstyle: no such file"),
     ],
