@@ -18,18 +18,8 @@ from pchem_pipeline.use.calibration import Calibration
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
 
-FRAME, ROW, COLUMN, WAVE = range(4)
+_AXES = ("frame", "row", "column")
 _LEAST_SCENE = 0.02  # e-
-#: Effects that shift many pixels alike.
-_OFFSETS = (
-    "frame_noise",
-    "row_noise",
-    "column_noise",
-    "bias_drift",
-    "bias_jumps",
-    "readout_alternation",
-    "periodic_pickup",
-)
 
 
 @dataclass(frozen=True)
@@ -54,31 +44,32 @@ class CommonModes:
     @classmethod
     def of_model(cls, effects: Sequence[Effect], shape: tuple[int, int]) -> CommonModes:
         """Return those of the effects of a model of a sensor of (rows, columns)."""
-        found = [(effect, *_mode(effect)) for effect in effects]
-        # of a tag that is there several times, all or none
-        left = dict.fromkeys(effect.tag for effect, axis, _ in found if axis is None)
+        found = [(effect, shared) for effect in effects if (shared := effect.shared_offset()) is not None]
+        # other frames are taken at other times; of a tag that is there several times, all or none
+        left = {
+            effect.tag: None for effect, shared in found if shared.variance is None or effect.when is not None
+        }
         parts: dict[bytes, NDArray[np.bool_]] = {}
         variances: dict[bytes, FloatArray] = {}
         waves = []
-        for effect, axis, variance in found:
-            if axis is None or effect.tag in left:
+        for effect, shared in found:
+            if effect.tag in left or shared.variance is None:
                 continue
             mask = np.ones(shape, np.bool_) if effect.region is None else effect.region.mask(shape)
             key = mask.tobytes()
             parts[key] = mask
             own = variances.setdefault(key, np.zeros(3))
-            if axis == WAVE and variance > 0.0:
-                fields = effect.model_dump()
+            if shared.of != "wave":
+                own[_AXES.index(shared.of)] += shared.variance
+            elif shared.variance > 0.0:
                 place = float(list(parts).index(key))
-                waves.append([fields["cycles_per_row"], fields["cycles_per_column"], variance, place])
-            elif axis != WAVE:
-                own[axis] += variance
-        removed = dict.fromkeys(effect.tag for effect, _, _ in found if effect.tag not in left)
+                waves.append([shared.cycles_per_row, shared.cycles_per_column, shared.variance, place])
+        removed = dict.fromkeys(effect.tag for effect, _ in found if effect.tag not in left)
         return cls(
             tuple(removed),
             np.array(list(parts.values()), np.bool_).reshape(-1, *shape),
             np.array(list(variances.values())).reshape(-1, 3),
-            tuple(tag for tag in left if tag in _OFFSETS),
+            tuple(left),
             np.array(waves).reshape(-1, 4),
         )
 
@@ -87,28 +78,6 @@ class CommonModes:
         turn = 2j * np.pi
         rows, columns = (turn * self.waves[:, axis, None] * np.arange(shape[axis]) for axis in (0, 1))
         return np.exp(rows), np.exp(columns)
-
-
-def _mode(effect: Effect) -> tuple[int | None, float]:
-    """Return which offset an effect is, and its variance, DN^2; None where it is none."""
-    if effect.when is not None:  # other frames are taken at other times
-        return None, 0.0
-    values: dict[str, Any] = effect.model_dump()
-    match effect.tag:
-        case "frame_noise":
-            return FRAME, values["frame_noise_dn"] ** 2
-        case "row_noise":
-            return ROW, values["row_noise_dn"] ** 2
-        case "column_noise":
-            return COLUMN, values["column_noise_dn"] ** 2
-        case "bias_drift":
-            return FRAME, values["drift_dn"] ** 2  # other frames may be at any place of the drift
-        case "readout_alternation":
-            return FRAME, values["alternation_dn"] ** 2
-        case "periodic_pickup":
-            still = values["cycles_per_row"] == 0.0 and values["cycles_per_column"] == 0.0
-            return FRAME if still else WAVE, values["amplitude_dn"] ** 2 / 2.0
-    return None, 0.0
 
 
 @dataclass(frozen=True)

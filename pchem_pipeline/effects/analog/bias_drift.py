@@ -25,6 +25,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
 )
 from pchem_pipeline.effects.estimators.time_profiles import SETTLING, along_path, check_path, settling
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -138,6 +139,10 @@ class BiasDrift(Effect):
         if settled is not None and settled.criterion < path.criterion:
             return [*linear, bent, walk]
         return [bent, *linear, walk]
+
+    def shared_offset(self) -> SharedOffset:
+        """Return the offset of a frame: others may be at any place of the drift."""
+        return SharedOffset("frame", self.drift_dn**2)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law smeared over the path (a variance where the drift is small against the noise)."""

@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.effects.estimators.change_points import Steps, find_steps, noise_variance
 from pchem_pipeline.effects.estimators.common_modes import quantile_means, responsivity, with_offsets
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -162,6 +163,10 @@ class BiasJumps(Effect):
         path = tuple(_as_path(time, steps, size) for steps in found)
         size /= alpha
         return [cls(amplitude_dn=size, rate=rate, path=path), cls(amplitude_dn=size, rate=rate), *random]
+
+    def shared_offset(self) -> SharedOffset:
+        """Return that frames have one: at which level others are is not known."""
+        return SharedOffset("frame", None)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law of copies at the levels (a variance where they are close against the noise).

@@ -20,6 +20,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
     responsivity,
 )
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -70,6 +71,10 @@ class ColumnNoise(Effect):
         if excess < WORTH_A_GUESS * error:
             return ()
         return (cls(column_noise_dn=excess**0.5 / responsivity(evidence)),)
+
+    def shared_offset(self) -> SharedOffset:
+        """Return the offset of a column."""
+        return SharedOffset("column", self.column_noise_dn**2)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the variance of the offsets: exact, a Gaussian on a Gaussian."""

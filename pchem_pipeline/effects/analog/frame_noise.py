@@ -23,6 +23,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
     successive,
 )
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -89,6 +90,10 @@ class FrameNoise(Effect):
         if excess < WORTH_A_GUESS * error:
             return ()
         return (cls(frame_noise_dn=float(np.sqrt(excess)) / responsivity(evidence)),)
+
+    def shared_offset(self) -> SharedOffset:
+        """Return the offset of a frame."""
+        return SharedOffset("frame", self.frame_noise_dn**2)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the variance of the offsets: exact, a Gaussian on a Gaussian."""

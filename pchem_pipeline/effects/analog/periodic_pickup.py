@@ -22,6 +22,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
 )
 from pchem_pipeline.effects.estimators.lines import coherent_line, incoherent_line
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -124,6 +125,13 @@ class PeriodicPickup(Effect):
                 fields = {name: loose.along, "amplitude_dn": loose.amplitude / alpha, "random_phase": True}
                 found.append((loose.excess, cls(**fields)))
         return _without_doubles(found)
+
+    def shared_offset(self) -> SharedOffset:
+        """Return the wave: in other frames its phase is another one."""
+        variance = self.amplitude_dn**2 / 2.0
+        if self.cycles_per_row == 0.0 and self.cycles_per_column == 0.0:
+            return SharedOffset("frame", variance)
+        return SharedOffset("wave", variance, self.cycles_per_row, self.cycles_per_column)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law smeared by the arcsine law (a variance where the amplitude is small)."""

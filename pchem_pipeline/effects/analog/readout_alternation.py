@@ -21,6 +21,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
     with_offsets,
 )
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -81,6 +82,10 @@ class ReadoutAlternation(Effect):
         if abs(size) < WORTH_A_GUESS * error:
             return ()
         return (cls(alternation_dn=size / responsivity(evidence)),)
+
+    def shared_offset(self) -> SharedOffset:
+        """Return the offset of a frame, either of two."""
+        return SharedOffset("frame", self.alternation_dn**2)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law of two copies, equally likely (a variance where they are close together)."""

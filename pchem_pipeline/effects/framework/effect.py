@@ -25,7 +25,8 @@ The same class says what is known of the effect (:attr:`~Effect.title`, :attr:`~
 :attr:`~Effect.signature`, :attr:`~Effect.separate`), guesses its own parameters from what a stack shows
 (:meth:`~Effect.estimate`), and changes the law of a pixel's samples (:meth:`~Effect.sample_law`), so that the
 fit of the four parameters can run with it. What it adds to the exposure of single pixels, it finds in the
-frames (:meth:`~Effect.added_exposure`).
+frames (:meth:`~Effect.added_exposure`). What many pixels share is taken from calibrated frames
+(:meth:`~Effect.shared_offset`).
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.added_exposure import AddedExposure
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.effects.framework.shared_offset import SharedOffset
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
 __all__ = ["Effect", "Plane", "register_effect", "registered_effects"]
@@ -247,6 +249,13 @@ class Effect(Section):
 
         Returns:
             Levels and weights, (j, y, x) each; None where it adds nothing, or only in proportion to H.
+        """
+        return None
+
+    def shared_offset(self) -> SharedOffset | None:
+        """Return the offset that it gives to many pixels of a frame alike: calibrated frames are freed of it.
+
+        None where it gives none.
         """
         return None
 
