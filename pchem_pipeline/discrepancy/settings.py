@@ -31,6 +31,12 @@ class DiscrepancySettings(Section):
         description="frames x pixels compared with simulations; of a larger stack, a window where it stands "
         "out most, else its middle, and blocks of frames spread over the run",
     )
+    clear_samples: int = Field(
+        default=1 << 22,
+        ge=1 << 14,
+        description="the same where so few already disagree by 30 standard deviations with a model without "
+        "effects: more would take longer and name nothing else",
+    )
     max_pixels: int = Field(
         default=1 << 13,
         ge=256,

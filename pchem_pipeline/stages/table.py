@@ -147,7 +147,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=5,
+        version=6,
         upstream=("ingest",),
         settings=("discrepancy",),
         reads=("frames", "summary", "histogram", "fit"),

@@ -8,7 +8,8 @@ longer one takes over what is there. Every beginning of the study is balanced.
     python scripts/bench/bench_discrepancy.py FOLDER --minutes 30    # as far as it gets, and the figures
     python scripts/bench/bench_discrepancy.py FOLDER --report        # the figures of what is there
     python scripts/bench/bench_discrepancy.py FOLDER --table --minutes 60    # all rows of the table in turn
-    python scripts/bench/bench_discrepancy.py FOLDER --command 3     # the installed command, with its cost
+    python scripts/bench/bench_discrepancy.py FOLDER --table --installed    # of the installed command
+    python scripts/bench/bench_discrepancy.py FOLDER --command 3     # what the installed command costs
     python scripts/bench/bench_discrepancy.py FOLDER --null-range --minutes 30    # nothing hidden, any sensor
     python scripts/bench/bench_discrepancy.py FOLDER --null-tails --minutes 15    # only its p-values
 """
@@ -94,8 +95,8 @@ def _results(
             case = next(waiting, None)
             if case is None:
                 break
-            bias = not (options.no_bias or options.table) and case.kind == "single"
-            running.add(pool.submit(run_case, case, options.settings, bias))
+            bias = not (options.no_bias or options.table or options.installed) and case.kind == "single"
+            running.add(pool.submit(run_case, case, options.settings, bias, options.installed))
         if not running:
             return
         done, running = wait(running, return_when=FIRST_COMPLETED)
@@ -147,6 +148,9 @@ def parse() -> argparse.Namespace:
         help="a stack for each row of the table of figures in turn, and the table",
     )
     parser.add_argument("--sealed-decoys", action="store_true", help="in --table: those of the sealed half")
+    parser.add_argument(
+        "--installed", action="store_true", help="each stack through the installed command, from its file on"
+    )
     parser.add_argument(
         "--null-range", action="store_true", help="nothing hidden, sensors of the whole range, in one process"
     )

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import os
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
+MAKE = Path(__file__).resolve().parents[2] / "tests" / "hidden" / "make.py"
 EFFECTS = (
     "rts_noise", "bias_drift", "bias_jumps", "frame_noise", "row_noise", "column_noise",
     "periodic_pickup", "readout_alternation", "flicker_noise", "heavy_tailed_noise", "noise_skew",
@@ -238,3 +243,19 @@ def remaining(cases: Iterable[Case], done: Iterable[str]) -> list[Case]:
     """Return the cases without a result."""
     finished = set(done)
     return [case for case in cases if case.key not in finished]
+
+
+def make(
+    hidden: tuple[str, ...],
+    level: float,
+    seed: int,
+    shape: tuple[int, int, int],
+    out: Path,
+    key: Path,
+    take: int = 0,
+) -> None:
+    """Write a stack and its sealed key with the independent chain."""
+    command = [sys.executable, str(MAKE), "--effect", ",".join(hidden) or "none", "--level", str(level)]
+    command += ["--seed", str(seed), "--out", str(out), "--key", str(key), "--frames", str(shape[2])]
+    command += ["--shape", str(shape[0]), str(shape[1]), "--take", str(take)]
+    subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ)

@@ -10,17 +10,30 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from discrepancy_cases import EFFECTS, Case
+from discrepancy_cases import EFFECTS, Case, make
 from discrepancy_figures import Answer
-from discrepancy_worker import make
+from numpy.typing import NDArray
 
 PCHEM = Path(sys.executable).with_name("pchem")
 RUN = """run: {{store: run.zarr}}
 compute: {{workers: {workers}}}
 input: {{files: [frames.npy], integration_time: 1.0}}
 """
+
+
+def command_verdict(frames: NDArray[np.uint16], folder: Path) -> dict[str, Any]:
+    """Return the verdict of ``pchem discrepancy`` on frames in a file, and what that took."""
+    place = folder / "run"
+    place.mkdir()
+    np.save(place / "frames.npy", frames)
+    (place / "run.yaml").write_text(RUN.format(workers=1))
+    _timed(place, "run", "--until", "fit")
+    wall, cpu, _ = _timed(place, "discrepancy", "--no-refit")
+    verdict = json.loads((place / "run.zarr" / "discrepancy.json").read_text())
+    return {"seconds": wall, "cpu_seconds": cpu, "verdict": verdict}
 
 
 def run_commands(count: int, first: int, shape: tuple[int, int, int], folder: Path, workers: int) -> None:
@@ -36,8 +49,8 @@ def run_commands(count: int, first: int, shape: tuple[int, int, int], folder: Pa
         shutil.rmtree(place, ignore_errors=True)
         make(case.hidden, case.level, case.seed, shape, place, folder / "sealed" / f"{place.name}.json")
         (place / "run.yaml").write_text(RUN.format(workers=workers))
-        run = _timed("run", place)
-        search = _timed("discrepancy", place)
+        run = _timed(place, "run")
+        search = _timed(place, "discrepancy")
         verdict = json.loads((place / "run.zarr" / "discrepancy.json").read_text())
         answer = Answer({"case": case.to_json(), "verdict": verdict})
         ratios.append(search[0] / run[0])
@@ -52,11 +65,11 @@ def run_commands(count: int, first: int, shape: tuple[int, int, int], folder: Pa
     )
 
 
-def _timed(stage: str, place: Path) -> tuple[float, float, float]:
+def _timed(place: Path, stage: str, *options: str) -> tuple[float, float, float]:
     """Return wall seconds, CPU seconds and peak memory (MB, of all such commands so far) of a command."""
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     done = subprocess.run(
-        [str(PCHEM), stage, "run.yaml"],
+        [str(PCHEM), stage, "run.yaml", *options],
         cwd=place,
         env=os.environ,
         capture_output=True,

@@ -26,13 +26,14 @@ from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
 from pchem_pipeline.simulate.chain import dn_dtype
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
+from pchem_pipeline.stages.discrepancy.clear import is_clear
 from pchem_pipeline.stages.discrepancy.survey import Survey, mean_codes, survey
 from pchem_pipeline.stages.discrepancy.window import choose_window, read_window, within_memory
 from pchem_pipeline.stages.samples import open_samples
 from pchem_pipeline.store.run_store import RunStore
 
 _STAGE = "discrepancy"
-#: Settings that the memory may lower.
+#: Settings that the memory, or a clear disagreement, may lower.
 _TAKEN = ("max_samples", "max_pixels")
 _USUAL_CODES = 128.0  # of the law of a pixel, where there are no histograms yet
 
@@ -84,7 +85,7 @@ def _run_frames(
     sensor, source = context.sensor, open_source(context)
     block_length(source.shape[0], context.config.discrepancy.block_frames)
     compile_observation(source.dtype)
-    settings, seen = _surveyed(context, source, roi, tell)
+    settings, seen = _surveyed(context, source, before, roi, tell)
     window = choose_window(source.shape, settings, roi, seen.places)
     found = find_discrepancies(
         read_window(source, window),
@@ -110,9 +111,13 @@ def _run_frames(
 
 
 def _surveyed(
-    context: StageContext, source: FrameSource, roi: tuple[int, ...] | None, tell: Callable[[str], None]
+    context: StageContext,
+    source: FrameSource,
+    before: Sequence[Effect],
+    roi: tuple[int, ...] | None,
+    tell: Callable[[str], None],
 ) -> tuple[DiscrepancySettings, Survey]:
-    """Look at the whole sensor, once; return that, and the settings with as much as the memory allows.
+    """Look at the whole sensor, once; return that, and the settings with as much as is compared closely.
 
     Its marker keeps both: a search that was stopped goes on in the same window, whatever it may take then.
 
@@ -133,11 +138,34 @@ def _surveyed(
                 )
             settings = less
         tell("looking at every pixel and every frame")
-        seen = survey(context, source, min(settings.max_samples, settings.max_pixels * source.shape[0]))
+        few = settings.model_copy(update={"max_samples": min(settings.clear_samples, settings.max_samples)})
+        closely = settings if before else few
+        seen = survey(context, source, min(closely.max_samples, settings.max_pixels * source.shape[0]))
+        if not before and _is_clear(source, few, settings, roi, seen):
+            settings = few
         taken = {name: getattr(settings, name) for name in _TAKEN}
         known = {"window": taken, **seen.numbers()}
         context.run_units([WHOLE], lambda _: known, by_tiles=False, total=1)
     return settings.model_copy(update=known["window"]), Survey.of_numbers(known)
+
+
+def _is_clear(
+    source: FrameSource,
+    few: DiscrepancySettings,
+    settings: DiscrepancySettings,
+    roi: tuple[int, ...] | None,
+    seen: Survey,
+) -> bool:
+    """Tell whether a smaller window than the settings allow shows all that there is."""
+    small, large = (choose_window(source.shape, each, roi, seen.places) for each in (few, settings))
+    if small.share(source.shape) >= large.share(source.shape):
+        return False
+    return is_clear(
+        read_window(source, small),
+        small.numbers,
+        n_run=source.shape[0],
+        block_frames=block_length(small.numbers.size, settings.block_frames),
+    )
 
 
 def _start(context: StageContext) -> tuple[tuple[Effect, ...], tuple[int, ...] | None]:

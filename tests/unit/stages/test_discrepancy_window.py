@@ -11,6 +11,7 @@ from pchem_pipeline.discrepancy.quick.places import SensorPlace
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.stages.discrepancy import discrepancy
+from pchem_pipeline.stages.discrepancy.clear import is_clear
 from pchem_pipeline.stages.discrepancy.survey import Survey
 from pchem_pipeline.stages.discrepancy.window import choose_window, read_window, search_bytes, within_memory
 
@@ -98,11 +99,13 @@ def test_a_search_that_was_stopped_goes_on_in_the_window_that_it_had(monkeypatch
 
     notes: list[str] = []
     monkeypatch.setattr(discrepancy, "survey", seen)
+    monkeypatch.setattr(discrepancy, "_is_clear", lambda *_: True)
     source = SimpleNamespace(shape=(1000, 512, 512))
-    first = discrepancy._surveyed(context(400), source, None, lambda _: None)
+    first = discrepancy._surveyed(context(400), source, (), None, lambda _: None)
     assert first[0].max_pixels < 8192
+    assert first[0].max_samples <= first[0].clear_samples < DiscrepancySettings().max_samples
     assert len(notes) == 1
-    again = discrepancy._surveyed(context(None), source, None, lambda _: None)
+    again = discrepancy._surveyed(context(None), source, (), None, lambda _: None)
     assert again == first
     assert (len(looked), len(notes)) == (1, 1)
 
@@ -144,3 +147,31 @@ def test_without_a_place_or_outside_of_the_region_asked_for_the_middle_is_looked
     elsewhere = {"lag": place(rows=[500, 512])}
     asked = choose_window((17750, 512, 512), WHOLE, (0, 256, 0, 256), elsewhere)
     assert asked.rows == choose_window((17750, 512, 512), WHOLE, (0, 256, 0, 256)).rows
+
+
+class Stack:
+    """Frames in memory."""
+
+    def __init__(self, values):
+        self.values, self.shape, self.dtype, self.rows_per_read = values, values.shape, values.dtype, 1
+
+    def read_into(self, buffer, t0, t1, y0=0, y1=None):
+        buffer[...] = self.values[t0:t1, y0:y1]
+
+
+@pytest.mark.parametrize(
+    ("row_noise", "fewest", "clear"),
+    [(0.0, 1 << 17, False), (0.25, 1 << 17, False), (3.0, 1 << 17, True), (3.0, 1 << 25, False)],
+)
+def test_few_samples_are_compared_where_they_disagree_clearly(row_noise, fewest, clear):
+    rng = np.random.default_rng(5)
+    light = 11.0 * (rng.poisson(2.0, (900, 16, 24)) + 0.3 * rng.standard_normal((900, 16, 24)))
+    stack = np.rint(100.0 + light + row_noise * rng.standard_normal((900, 16, 1))).astype(np.uint16)
+    settings = DiscrepancySettings(clear_samples=fewest)
+    few = settings.model_copy(update={"max_samples": fewest})
+    assert discrepancy._is_clear(Stack(stack), few, settings, None, Survey()) is clear
+
+
+def test_what_is_wrong_with_frames_is_no_clear_disagreement():
+    stack = np.full((400, 16, 16), 7, np.uint16)
+    assert not is_clear(stack, np.arange(400), n_run=400, block_frames=20)
