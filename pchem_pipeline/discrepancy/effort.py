@@ -17,6 +17,8 @@ _REFIT, _REFIT_BY = 3.5e-5, 6.0e-7
 # of what is learnt of the sensor from a pixel, and the same by components
 _LEARN, _LEARN_BY = 4.0e-4, 1.0e-4
 _MOST_LEARNT_FROM = 1000  # pixels
+# of a sample that is asked for guesses of all effects, or for all forms of what no effect explains
+_ASKED = 2.0e-6
 #: By how many times as long the fit of a pixel takes more where its bias may be off by an electron: more
 #: starts, flat maxima and more electron numbers.
 _AMBIGUOUS = 4.0
@@ -78,7 +80,9 @@ class Effort:
         """Count a simulated stack, whose pixels are fitted so many times."""
         self.spent += _SAMPLE * samples + _FIT * self._hard * pixels * fits
 
-    def refit(self, pixels: int, components: int, evaluations: float, tags: Iterable[str]) -> None:
+    def refit(
+        self, pixels: int, components: int, evaluations: float, tags: Iterable[str], *, learnt: bool = True
+    ) -> None:
         """Count a fit of all pixels with effects, and what it teaches.
 
         Args:
@@ -86,10 +90,16 @@ class Effort:
             components: of their law.
             evaluations: of the likelihood of a pixel, on average.
             tags: of the effects.
+            learnt: whether a sensor is learnt by that law; from maps alone that costs next to nothing.
         """
         work = self._hard * pixels * components * (_REFIT + _REFIT_BY * evaluations)
-        self.spent += work + (_LEARN + _LEARN_BY * components) * min(pixels, _MOST_LEARNT_FROM)
+        learning = (_LEARN + _LEARN_BY * components) * min(pixels, _MOST_LEARNT_FROM)
+        self.spent += work + (learning if learnt else 0.0)
         self.tried |= set(tags)
+
+    def ask(self, samples: int) -> None:
+        """Count a look at samples for guesses of all effects, or for what none of them explains."""
+        self.spent += _ASKED * samples
 
     def evaluate(self, masses: int, components: int, tags: Iterable[str]) -> None:
         """Count the masses of so many codes under effects, whose law has so many components."""

@@ -36,6 +36,7 @@ Mapper = Callable[[Sequence[Replicate]], "list[Vector | Exception]"]
 _log = logging.getLogger(__name__)
 MOST_HYPOTHESES = 6  # of one effect
 _MOST_IN_A_PART = 2
+_MOST_IN_PARTS = 36  # hypotheses of all effects in all parts: each is a simulation, and most are in vain
 _LEFT = 4.0  # deviations that the model leaves of a leading statistic for its effect to be asked for
 _REFINED = 12  # hypotheses of which the strength is refined by a second simulation
 # nats behind the best, and share of what that explains, from which on an effect is not worth more by itself
@@ -143,10 +144,13 @@ class ReplicateSimulator:
         the sensor or run gives hypotheses that act there only. Beside the effects of the model others stand
         out that the frames hide: that evidence comes first, and where an estimator sees nothing although the
         leading statistics of its effect deviate, what is typical is a guess. Of one effect, everywhere, there
-        are ``most`` at most.
+        are ``most`` at most. Of those in parts, the likeliest of each effect come first, and of these the
+        ones whose leading statistics stand out most: where much is wrong, all parts ask for nearly all
+        effects.
         """
         known = [] if beside is None else [beside]
         found: list[Effect] = []
+        placed: list[tuple[int, float, Effect]] = []
         window = self.acquisition.window or SensorWindow.whole(self.maps.bias.shape)
         for tag, effect in classes.items():
             if tag in {present.tag for present in self.model} | self.defects.keys():
@@ -157,12 +161,16 @@ class ReplicateSimulator:
                     guessed = list(effect.typical())
                 found += [window.found(each) for each in guessed[:most]]
                 for part, own in parts:
-                    placed = list(effect.estimate(own))[:_MOST_IN_A_PART]
-                    found += [window.found(each, part) for each in placed]
+                    clear = own.strongest(*effect.signature[:2])
+                    for rank, each in enumerate(list(effect.estimate(own))[:_MOST_IN_A_PART]):
+                        found.append(window.found(each, part))
+                        placed.append((rank, -clear, found[-1]))
             # whatever a stranger's estimator raises must not stop the others
             except Exception as error:
                 self._note_defect(tag, error)
-        return found
+        placed.sort(key=lambda item: item[:2])
+        left_out = {id(each) for _, _, each in placed[_MOST_IN_PARTS:]}
+        return [each for each in found if id(each) not in left_out]
 
     def fingerprints(self, effects: Sequence[Effect], repeats: int = 1) -> list[Hypothesis]:
         """Simulate effects on the random numbers of the model without them; failures are defects.

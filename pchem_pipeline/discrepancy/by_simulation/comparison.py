@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import linalg, special
 
 from pchem_pipeline.base.errors import error_words
+from pchem_pipeline.discrepancy.by_simulation.details import has_numbers, may_be_tuned, tuned
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     PRICE_OF_MORE,
     Choice,
@@ -144,13 +145,19 @@ def compare(
         return None
     if before is not None and max(one.score for one in tried) < before.score - _NO_WORSE:
         return None  # nothing beside the effects held explains more than they do by themselves
-    if not held and not trials.complete and unlisted():
+    if tried and first > 1 and not trials.complete:
+        # the same of the kinds that have done best
+        trials.refit(_begun(_sets(choice, tried)[0], tried, held))
+        trials.thin()
+    trials.tune()
+    if not held and not trials.complete and _within(unlisted):
         return None
     if len(trials.best.hypotheses) > len(held) + 1 or not trials.complete:
         grown = [] if trials.complete else _grown(refitter, tried, len(held), beside)
         for members in _of_different_effects([*grown, *_sets(choice, tried)])[:_MOST_SETS]:
             if not (trials.refit(_begun(members, tried, held)) and trials.thin()):
                 break
+            trials.tune()
     # the work that led here must not be lost for the little that is left: no limit
     to_choose = replace(refitter, allow=lambda _: None)
     chosen = _chosen(to_choose, tried, [] if before is None else [before])
@@ -167,6 +174,14 @@ def compare(
     return Comparison(chosen, tuple(tried), trials.failed, witnessed)
 
 
+def _within(asked: Callable[[], bool]) -> bool:
+    """Return an answer, False where the work is at its limit: sets that are known are not lost for it."""
+    try:
+        return asked()
+    except EffortSpentError:
+        return False
+
+
 @dataclass
 class _Trials:
     """Sets that are refitted, as far as they are worth it.
@@ -177,6 +192,8 @@ class _Trials:
         witness: brings a set near its best.
         tried: sets at their best fit, in the order in which they were tried.
         failed: effects of which the refit failed, and why.
+        settled: tags of the sets whose numbers were tuned.
+        asked: sets as they were begun.
     """
 
     refitter: Refitter
@@ -184,6 +201,8 @@ class _Trials:
     witness: Witness
     tried: list[Refitted] = field(default_factory=list)
     failed: dict[str, str] = field(default_factory=dict)
+    settled: set[frozenset[str]] = field(default_factory=set)
+    asked: list[tuple[Hypothesis, ...]] = field(default_factory=list)
 
     @property
     def best(self) -> Refitted:
@@ -203,6 +222,7 @@ class _Trials:
         """
         if not self._worth_it(members):
             return True
+        self.asked.append(tuple(members))
         best = max((one.score for one in self.tried), default=-np.inf)
         try:
             begun = self.witness.begun((*self.held, *members))
@@ -218,20 +238,51 @@ class _Trials:
             self.failed[members[-1].tag] = error_words(error)
         return True
 
-    def thin(self) -> bool:
-        """Refit the best set without each of its effects where it leaves nothing; return False at the limit.
+    def tune(self) -> None:
+        """Tune the numbers of the best set where it leaves something, then of those as good until then."""
+        gained = 0.0
+        while self.tried and not self.complete:
+            near = _worth(self.best) - gained
+            open_ = [one for one in self.tried if _worth(one) >= near and self._may_be_tuned(one)]
+            if not open_:
+                return
+            one = max(open_, key=_worth)
+            gained = max(gained, self._tuned(one).score - one.score)
 
-        The weakest first. Fewer may leave nothing, too; and what they leave tells in the end whether each is
-        seen.
+    def _may_be_tuned(self, one: Refitted) -> bool:
+        return one.tags not in self.settled and may_be_tuned(self.refitter, one)
+
+    def _tuned(self, one: Refitted) -> Refitted:
+        """Tune the numbers of a set, once; at the limit of the work they stay as they are."""
+        self.settled.add(one.tags)
+        try:
+            better = tuned(self.refitter, one)
+        except EffortSpentError:
+            return one
+        if better is not one:
+            self.tried.append(better)
+        return better
+
+    def thin(self) -> bool:
+        """Refit the best set without each of its effects; return False at the limit.
+
+        The weakest first. Where the set leaves nothing, fewer may leave nothing, too; and what they leave
+        tells in the end whether each is seen. Where it leaves something, others at their own numbers may
+        account for what an effect was brought in for.
         """
         best = self.best
         new = best.hypotheses[len(self.held) :]
-        if len(new) < 3 or not self.complete:
-            return True
         scale = self.refitter.null.std
         for weakest in sorted(new, key=lambda h: float(np.sum((h.fingerprint / scale) ** 2))):
-            if not self.refit([h for h in new if h is not weakest]):
+            fewer = [h for h in new if h is not weakest]
+            if not fewer or not (has_numbers(fewer) or (len(new) > 2 and self.complete)):
+                continue
+            if len(new) > 2 and not self.refit(fewer):
                 return False
+            tags = best.tags - {weakest.tag}
+            same = [one for one in self.tried if one.tags == tags]
+            if same and not self.complete and self._may_be_tuned(max(same, key=_worth)):
+                self._tuned(max(same, key=_worth))
             if self.best is not best:
                 return self.thin()
         return True
@@ -244,7 +295,7 @@ class _Trials:
         dear = [one for one in self.tried if is_dear(one.effects)]
         if is_dear(h.effect for h in members) and len(dear) >= _MOST_DEAR:
             return False
-        if len(members) > 1 and any(one.tags == tags for one in self.tried):
+        if len(members) > 1 and any(_same_kinds(members, others) for others in self.asked):
             return False
         if self.complete and len(tags) > len(self.best.tags):
             return False
@@ -437,7 +488,9 @@ def _grown(
 def _sets(choice: Choice, singles: Sequence[Refitted]) -> list[tuple[Hypothesis, ...]]:
     """Return sets of several, the likeliest first, with the better kind of what was refitted alone."""
     kinds: dict[str, Hypothesis] = {}
-    for one in sorted(singles, key=_worth, reverse=True):
+    least = min(len(one.hypotheses) for one in singles)
+    alone = [one for one in singles if len(one.hypotheses) == least]
+    for one in sorted(alone, key=lambda one: one.promise, reverse=True):
         kinds.setdefault(one.hypotheses[-1].tag, one.hypotheses[-1])
     # of an effect that was refitted alone, the kind that did best; its strength is that of the set
     return [
@@ -478,8 +531,10 @@ def _begun(
     near = [one for one in tried if one.tags < tags or sum(h.tag in one.tags for h in members) >= common]
     if not near:
         return tuple(members)
-    own = {h.tag: h for h in max(near, key=_worth).hypotheses}
-    return tuple(own[h.tag] if h.tag in own and _alike(h, own[h.tag]) else h for h in members)
+    best = max(near, key=_worth)
+    own = {h.tag: h for h in best.hypotheses}
+    better = best.tuned and best.tags != tags
+    return tuple(own[h.tag] if h.tag in own and (better or _alike(h, own[h.tag])) else h for h in members)
 
 
 def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
@@ -501,11 +556,14 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
     if not complete and not all(_untouched(one, place, noise) for place in range(len(one.hypotheses))):
         return False
     for place, hypothesis in enumerate(one.hypotheses):
-        if _beyond_others(refitter, one, place):
-            continue
         members = [h for h in one.hypotheses if h.tag != hypothesis.tag]
+        if not has_numbers(members) and _beyond_others(refitter, one, place):
+            continue
         # the same kinds: another kind of one that mimics both is another set
         others = next((other for other in known if _of_kinds(other, members)), None)
+        tags = {h.tag for h in members}
+        # but for what these make of it at numbers of their own
+        others = next((other for other in known if other.tuned and other.tags == tags), others)
         if others is None and is_dear(h.effect for h in members):
             return False
         if others is None:
@@ -552,8 +610,13 @@ def _seen_beside(refitter: Refitter, part: FloatArray, others: Refitted) -> bool
 
 def _of_kinds(one: Refitted, members: Sequence[Hypothesis]) -> bool:
     """Tell whether a set is of these effects, differing in their strengths only."""
-    own = {h.tag: h for h in one.hypotheses}
-    return own.keys() == {h.tag for h in members} and all(_alike(own[h.tag], h) for h in members)
+    return _same_kinds(one.hypotheses, members)
+
+
+def _same_kinds(one: Sequence[Hypothesis], other: Sequence[Hypothesis]) -> bool:
+    """Tell whether two sets differ in the strengths of their effects only."""
+    own = {h.tag: h for h in one}
+    return own.keys() == {h.tag for h in other} and all(_alike(own[h.tag], h) for h in other)
 
 
 def _untouched(one: Refitted, place: int, noise: FloatArray) -> bool:

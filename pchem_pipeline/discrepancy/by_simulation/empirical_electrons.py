@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement
-from pchem_pipeline.discrepancy.by_simulation.empirical_modes import score_tables
+from pchem_pipeline.discrepancy.by_simulation.empirical_modes import codes_within_reach, score_tables
 from pchem_pipeline.discrepancy.observe.pairs import Samples
 from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons, Fate
 from pchem_pipeline.effects.estimators.count_scores import charlier_information
@@ -127,9 +127,9 @@ def _excess(frames: NDArray[np.unsignedinteger], maps: PixelMaps, inside: BoolAr
     pixels = np.flatnonzero(inside.ravel())
     own = frames.reshape(len(frames), -1)[:, pixels]
     first = own.min(axis=0).astype(np.int64)
-    length = int((own.max(axis=0) - first).max()) + 1
+    length = codes_within_reach(maps, pixels, first, own.max(axis=0))
     table = score_tables(maps, pixels, first, length)[-1]
-    score = table[np.arange(pixels.size), own - first].sum(axis=0)
+    score = table[np.arange(pixels.size), np.minimum(own - first, length - 1)].sum(axis=0)
     exposure, gain, _, sigma = (values.ravel()[pixels] for values in maps.maps)
     number = len(frames) * charlier_information(exposure, gain * sigma)
     # of further electrons Var K = H + 2 c H, of pairs H + 2 c H^2

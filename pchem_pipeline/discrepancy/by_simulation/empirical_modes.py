@@ -29,6 +29,7 @@ _CLEAR = 15.0  # nats
 _NEARLY = 0.5  # of the nats of the clearest change: another one may be it as well
 # by how much bursts must explain more than a Gaussian, of what there is to win, and nats: scores are skewed
 _OF_GAUSSIAN, _BURST = 0.3, 10.0
+_REACH = 20.0  # widths of the highest peak from it, up to where scores are told apart
 _CHUNK = 256  # frames at once
 _FARTHEST = 3  # frames
 _MOST_BLOCKS, _SMALLEST_BLOCK = 8, 4  # along an axis; px
@@ -82,13 +83,14 @@ def common_scores(
         return found
     flat = frames.reshape(len(frames), -1)
     first = flat.min(axis=0)[pixels].astype(np.int64)
-    length = int((flat.max(axis=0)[pixels] - first).max()) + 1
+    length = codes_within_reach(maps, pixels, first, flat.max(axis=0)[pixels])
     for changed, table in zip(_CHANGED, score_tables(maps, pixels, first, length), strict=False):
         gathered: list[tuple[FloatArray, ...]] = []
         mean, square = np.zeros(inside.shape), np.zeros(inside.shape)
         for begin in range(0, len(flat), _CHUNK):
             u = np.zeros((len(flat[begin : begin + _CHUNK]), *inside.shape))
-            u[:, inside] = table[np.arange(pixels.size), flat[begin : begin + _CHUNK, pixels] - first]
+            codes = np.minimum(flat[begin : begin + _CHUNK, pixels] - first, length - 1)
+            u[:, inside] = table[np.arange(pixels.size), codes]
             gathered.append((u.sum(axis=(1, 2))[:, None], u.sum(axis=2), u.sum(axis=1), _in_blocks(u)))
             mean += u.sum(axis=0) / len(flat)
             square += np.einsum("tyx,tyx->yx", u, u) / len(flat)
@@ -112,6 +114,28 @@ def _in_blocks(values: FloatArray) -> FloatArray:
     return values
 
 
+def codes_within_reach(maps: PixelMaps, pixels: IntArray, first: IntArray, last: IntArray) -> int:
+    """Return how many codes from the first on tables need, at most up to far above the highest peak.
+
+    A sample beyond, which no law made, counts as the last of them: a single hit by a particle would have
+    tables of its thousands of codes, and outweigh all other samples.
+
+    Args:
+        maps: parameters of the pixels.
+        pixels: positions of those that are looked at, shape (n,).
+        first: their lowest codes, shape (n,).
+        last: their highest codes, shape (n,).
+    """
+    exposure, gain, bias, sigma = (values.ravel()[pixels] for values in maps.maps)
+    reach = bias + _most_electrons(exposure) / gain + _REACH * sigma
+    return max(int(np.ceil((np.minimum(last, reach) - first).max())), 0) + 1
+
+
+def _most_electrons(exposure: FloatArray) -> int:
+    """Return the largest number of electrons that samples of such exposures hold."""
+    return int(np.ceil(exposure.max() + 8.0 * np.sqrt(exposure.max()) + 4.0))
+
+
 def score_tables(maps: PixelMaps, pixels: IntArray, first: IntArray, length: int) -> FloatArray:
     """Return the scores of codes for changes of their law, shape (5, n, c).
 
@@ -119,7 +143,7 @@ def score_tables(maps: PixelMaps, pixels: IntArray, first: IntArray, length: int
     ``H + a H^2`` of electrons.
     """
     exposure, gain, bias, sigma = (values.ravel()[pixels][:, None] for values in maps.maps)
-    most = int(np.ceil(exposure.max() + 8.0 * np.sqrt(exposure.max()) + 4.0))
+    most = _most_electrons(exposure)
     signal = first[:, None] + np.arange(length) - bias
     total, sums = np.zeros(signal.shape), np.zeros((5, *signal.shape))
     chance = np.exp(-exposure)

@@ -68,7 +68,7 @@ from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, free_of_parameters, suspicious
 from pchem_pipeline.discrepancy.observe.digital.misplaced import own_lines
-from pchem_pipeline.discrepancy.observe.places import SensorWindow
+from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import search, silent
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
@@ -293,6 +293,7 @@ class FrameExplainer:
             evidence, most = (), _MOST_BESIDE
         beside = self._beside(model, drawn.fit, null, z)
         found = [effect for effect in model if effect not in self.given]
+        self.effort.ask(sum(self.frames.samples(part) for part in (Part(), *self.frames.parts)))
         guesses = [
             guess
             for guess in simulator.guesses(self.classes, evidence, apart, beside, most)
@@ -555,7 +556,7 @@ class FrameExplainer:
         added = added_exposures(steady, frames, numbers, plain.maps)
         fit = refit_maps(frames, plain.maps, own, plain.covariance, added, numbers)
         tags = (effect.tag for effect in model)
-        self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags)
+        self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags, learnt=fit.learnt)
         return fit
 
     def _own_samples(self, model: tuple[Effect, ...]) -> NDArray[np.unsignedinteger]:

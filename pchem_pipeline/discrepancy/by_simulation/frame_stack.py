@@ -154,6 +154,10 @@ class FrameStack:
             window=self.window,
         )
 
+    def samples(self, part: Part) -> int:
+        """Return how many samples of the train and test frames are in a part."""
+        return int(part.frames(self.numbers[self.seen]).sum()) * int(self.inside(part).sum())
+
     def inside(self, part: Part) -> NDArray[np.bool_]:
         """Return which of the pixels lie in a part, (y, x)."""
         window = self.window or SensorWindow.whole(self.stack.shape)

@@ -62,6 +62,7 @@ class Refit:
         components: of the law of a sample, with all effects.
         evaluations: of the likelihood of a pixel, on average.
         added: exposure beside H that the effects add to each pixel, (j, y, x); None: it counts as part of H.
+        learnt: whether the sensor is learnt by the law.
     """
 
     maps: PixelMaps
@@ -70,6 +71,7 @@ class Refit:
     components: int = 1
     evaluations: float = 0.0
     added: AddedExposure | None = None
+    learnt: bool = True
 
 
 def refit_maps(
@@ -136,7 +138,8 @@ def refit_maps(
     }
     new_maps = PixelMaps.known(new, good.reshape(shape))
     covariance = fit.covariance[:, :4, :4].reshape(*shape, 4, 4)
-    return Refit(new_maps, moved, covariance, law.components, float(fit.n_iterations.mean()), added)
+    evaluations, learnt = float(fit.n_iterations.mean()), not law.free_satellites
+    return Refit(new_maps, moved, covariance, law.components, evaluations, added, learnt)
 
 
 def _off_by(start: FloatArray, electrons: float) -> FloatArray:

@@ -65,6 +65,7 @@ class Refitted:
         promise: the same where the strengths are changed as the data ask for, if all goes in proportion.
         chance: the same of a rest that chance leaves.
         short: the strengths were not brought to their best, at which much would be left, too.
+        tuned: other numbers of the effects were brought to theirs.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -79,6 +80,7 @@ class Refitted:
     promise: float
     chance: float
     short: bool = False
+    tuned: bool = False
 
     @property
     def tags(self) -> frozenset[str]:
@@ -152,7 +154,7 @@ class Refitter:
         """
         words = " + ".join(h.tag for h in hypotheses)
         self.allow(words)
-        best = now = self._simulated(tuple(hypotheses), None, replicates)
+        best = now = self.simulated(tuple(hypotheses), None, replicates)
         shortened, gained = 0, np.inf
         dear = is_dear(h.effect for h in hypotheses)
         for step_number in range(self.steps):
@@ -168,7 +170,7 @@ class Refitter:
                 break
             self.allow(words)
             try:
-                now = self._simulated(moved, best, replicates)
+                now = self.simulated(moved, best, replicates)
             except NotFittedError:
                 now = best  # a step too far
             if now.score > best.score:
@@ -214,13 +216,13 @@ class Refitter:
         slopes, hypotheses = self._slopes(one), one.hypotheses
         if slopes is not None:
             noise = self.noise(one.covariance, len(one.vectors))
-            kept = self._kept(hypotheses)
+            kept = self.kept(hypotheses)
             change, _ = correction(slopes[:, kept], (self.target - one.mean)[kept], noise.among(kept))
             hypotheses = _moved(hypotheses, np.log1p(np.maximum(change, -_LARGEST_SHARE))) or hypotheses
         try:
-            return self._simulated(hypotheses, one, replicates, slopes)
+            return self.simulated(hypotheses, one, replicates, slopes)
         except NotFittedError:  # a step too far
-            return self._simulated(one.hypotheses, one, replicates)
+            return self.simulated(one.hypotheses, one, replicates)
 
     def _slopes(self, one: Refitted) -> FloatArray | None:
         """Return the slopes of effects that are strong, each from a step beside it; None where none is.
@@ -254,10 +256,10 @@ class Refitter:
         # a shift in proportion to the factor has this slope between the two
         middle = np.exp(step / 2.0)
         foreseen = middle * one.parts[place]
-        slope = foreseen + _beyond_chance(apart.mean(axis=0) - foreseen, error)
+        slope = foreseen + beyond_chance(apart.mean(axis=0) - foreseen, error)
         return np.asarray(slope / middle)
 
-    def _kept(self, hypotheses: Sequence[Hypothesis]) -> NDArray[np.bool_]:
+    def kept(self, hypotheses: Sequence[Hypothesis]) -> NDArray[np.bool_]:
         """Return which statistics tell strengths.
 
         A part was chosen because it stands out: what acts everywhere would come out too strong by it.
@@ -273,14 +275,14 @@ class Refitter:
         """Return standard deviations of the same, by chance alone, shape (m,)."""
         return np.asarray(np.sqrt(np.diag(self.noise(covariance, replicates).covariance)))
 
-    def _simulated(
+    def simulated(
         self,
         hypotheses: tuple[Hypothesis, ...],
         before: Refitted | None,
         replicates: int,
         slopes: FloatArray | None = None,
     ) -> Refitted:
-        """Simulate effects at their strengths; ``before`` is the same set at other strengths."""
+        """Simulate effects at their strengths; ``before`` is the same set at other strengths, if known."""
         fit, vectors = self.draw(tuple(h.effect for h in hypotheses), replicates)
         mean = vectors.mean(axis=0)
         covariance = self._covariance(vectors)
@@ -291,7 +293,7 @@ class Refitter:
         scatter = None
         if replicates >= _ENOUGH:
             scatter = (vectors - mean) * np.sqrt(1.0 / self.splits + 1.0 / replicates)
-        slopes, kept = parts if slopes is None else slopes, self._kept(hypotheses)
+        slopes, kept = parts if slopes is None else slopes, self.kept(hypotheses)
         change, stderr = correction(
             slopes[:, kept], residual[kept], noise.among(kept), None if scatter is None else scatter[:, kept]
         )
@@ -331,13 +333,13 @@ class Refitter:
         parts = np.array([h.fingerprint for h in hypotheses])
         if before is None:
             error = np.sqrt(np.diag(covariance) * (1.0 / replicates + 1.0 / self.null.n_replicates))
-            return _spread(parts, _beyond_chance(mean - self.null.mean - parts.sum(axis=0), error))
+            return _spread(parts, beyond_chance(mean - self.null.mean - parts.sum(axis=0), error))
         step = _step(before.effects, tuple(h.effect for h in hypotheses))
         length = float(step @ step)
         if length < _SMALLEST_SECANT**2:
             return parts
         old, error = before.parts, np.sqrt(np.diag(covariance) * 2.0 / replicates)
-        unforeseen = _beyond_chance(mean - before.mean - step @ old, error)
+        unforeseen = beyond_chance(mean - before.mean - step @ old, error)
         slope = old + np.outer(step, unforeseen / length)
         # a secant holds between the two; a shift in proportion to the factor has its end's slope
         return np.asarray(slope * np.exp(step / 2.0)[:, None])
@@ -373,7 +375,7 @@ def _step(before: Sequence[Effect], after: Sequence[Effect]) -> FloatArray:
     return np.array(found)
 
 
-def _beyond_chance(difference: FloatArray, error: FloatArray) -> FloatArray:
+def beyond_chance(difference: FloatArray, error: FloatArray) -> FloatArray:
     """Return differences of means where they are beyond chance, 0 elsewhere."""
     return np.asarray(np.where(np.abs(difference) > _CERTAIN * error, difference, 0.0))
 

@@ -208,6 +208,7 @@ class Unexplained:
         """Return the parts and forms that explain most beside effects, what is everywhere included."""
         model = self.refitter.model(effects)
         found: list[_Likely] = []
+        self.effort.ask(sum(self.frames.samples(part) for part in (Part(), *self.frames.parts)))
         for part, form in itertools.product((Part(), *self.frames.parts), forms):
             try:
                 one = forms[form](part, model, model)

@@ -274,6 +274,13 @@ class RtsNoise(Effect):
         ]
         return [alike, *differing]
 
+    def details(self) -> tuple[str, ...]:
+        """Return the step, how often it comes, and how long a slow trap takes."""
+        found = ["amplitude_e", "probability"]
+        if self.sampling == "single":
+            found += ["correlation_frames"]
+        return tuple(name for name in found if getattr(self, name) > 0.0)
+
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law that looks for such levels in every pixel, with a weight of its own.
 

@@ -148,6 +148,12 @@ class CosmicRays(Effect):
         i, j = np.nonzero(electrons)
         return rows[i], columns[j], electrons[i, j]
 
+    def details(self) -> tuple[str, ...]:
+        """Return what tracks are like, and clouds if there are any."""
+        tracks = ("length_um", "electrons_per_um") if self.cloud_share < 1.0 else ()
+        clouds = ("cloud_share", "cloud_electrons", "cloud_um") if self.cloud_share > 0.0 else ()
+        return tracks + clouds
+
     @classmethod
     def typical(cls) -> Sequence[Self]:
         """Return it at one track in 80 frames."""

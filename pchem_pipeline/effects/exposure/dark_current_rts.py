@@ -140,6 +140,10 @@ class DarkCurrentRts(Effect):
             exposure[own], weight[own] = telegraph.added, telegraph.weight
         return AddedExposure(exposure, weight)
 
+    def details(self) -> tuple[str, ...]:
+        """Return the step and both dwell times: second moments tell only what they come to together."""
+        return ("step_e", "dwell_low_frames", "dwell_high_frames") if self.step_e > 0.0 else ()
+
     @classmethod
     def typical(cls) -> Sequence[Self]:
         """Return it in 1.1 % of the pixels, slow and fast."""

@@ -187,6 +187,14 @@ class Effect(Section):
         """
         return self, 1.0
 
+    def details(self) -> tuple[str, ...]:
+        """Return positive numbers beside the strength with which the statistics go smoothly.
+
+        A search tunes them by simulation where a set with the effect leaves something; those that the law of
+        a sample tells, it takes from the histograms.
+        """
+        return ()
+
     def scaled(self, factor: float) -> Self:
         """Return a copy of ``factor`` times the strength, kept within the limits of its field.
 
@@ -195,8 +203,12 @@ class Effect(Section):
         """
         if not self.strength:
             raise ConfigError(f"effect {self.tag!r} has no strength to scale")
+        return self.times(self.strength, factor)
+
+    def times(self, name: str, factor: float) -> Self:
+        """Return a copy with ``factor`` times a number of it, kept within the limits of its field."""
         values = self.model_dump()
-        values[self.strength] = _within(type(self), self.strength, values[self.strength] * factor)
+        values[name] = _within(type(self), name, values[name] * factor)
         return type(self).model_validate(values)
 
     def stuck_words(self) -> str:

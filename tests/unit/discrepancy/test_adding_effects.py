@@ -21,6 +21,7 @@ from pchem_pipeline.discrepancy.by_simulation.comparison import (
     _all_seen,
     _begun,
     _of_kinds,
+    _Trials,
     compare,
     own_signature,
 )
@@ -33,7 +34,7 @@ from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.gap import StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.observe.places import SensorWindow
+from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
@@ -491,6 +492,47 @@ def test_what_the_model_leaves_is_asked_for_guesses_before_what_the_frames_show(
     guesses: Any = simulator.guesses
     assert guesses(classes, [frames], (), beside) == [effect("row_noise", 0.1), effect("frame_noise", 0.3)]
     assert guesses(classes, [frames]) == [effect("row_noise", 0.2)]
+
+
+def test_of_guesses_in_parts_those_that_stand_out_most_are_kept() -> None:
+    """Much is wrong everywhere: all parts ask for nearly all effects, and each is a simulation."""
+    loud, quiet = (SimpleNamespace(strongest=lambda *_, z=z: z) for z in (9.0, 4.0))
+    parts: Any = [(Part(Region(rows=((i, i + 1),))), loud if i < 15 else quiet) for i in range(30)]
+
+    class Seen:
+        signature = ("shape.He3.mean",)
+
+        @staticmethod
+        def estimate(_: Any) -> list[Effect]:
+            return [effect("row_noise", 0.1), effect("row_noise", 0.2)]
+
+    taken: Any = SimpleNamespace(window=SensorWindow.whole((30, 4)))
+    simulator = ReplicateSimulator(None, (), taken, (), list, "", 1)  # type: ignore[arg-type]
+    classes: Any = {"seen": Seen}
+    found = simulator.guesses(classes, [quiet], parts)  # type: ignore[list-item]
+    assert found[:2] == [effect("row_noise", 0.1), effect("row_noise", 0.2)]
+    placed = found[2:]
+    assert len(placed) == 36
+    # the likeliest in every part, then the next ones where most is wrong
+    assert {each.region for each in placed if each == effect("row_noise", 0.1).at_place(each.region)} == {
+        part.region for part, _ in parts
+    }
+    second = [each.region for each in placed if each == effect("row_noise", 0.2).at_place(each.region)]
+    assert set(second) <= {part.region for part, own in parts if own is loud}
+
+
+def test_a_set_is_fitted_again_with_the_kind_of_an_effect_that_does_better() -> None:
+    world = World([effect(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift")])
+    row, frame, other = (
+        hypothesis("row_noise"), hypothesis("frame_noise"), hypothesis("frame_noise").effect
+    )  # fmt: skip
+    trials = _Trials(world.refitter(), (), Witness())
+    for members in ((row,), (frame,), (row, frame), (row, frame)):
+        trials.refit(members)
+    assert len(trials.tried) == 3
+    elsewhere = Hypothesis(other.at_place(Region(rows=((1, 2),))), frame.fingerprint)
+    trials.refit((row, elsewhere))
+    assert len(trials.tried) == 4
 
 
 def test_a_simulated_stack_is_known_by_all_that_makes_it_under_a_name_that_a_file_can_have() -> None:

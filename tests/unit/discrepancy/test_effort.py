@@ -120,3 +120,17 @@ def test_a_law_that_fits_hardly_a_pixel_is_given_up_after_some():
     assert 1.0 < little.evaluations < 15.0
     with pytest.raises(NotFittedError):
         refit_maps(frames, seen.maps, [InterpixelCapacitance(coupling=0.1)], seen.covariance)
+
+
+def test_a_fit_whose_law_teaches_no_sensor_costs_less():
+    """Levels that every pixel is free to have: the sensor is taken from the maps."""
+    learnt, free = Effort(1.0), Effort(1.0)
+    learnt.refit(1000, 15, 20.0, [])
+    free.refit(1000, 15, 20.0, [], learnt=False)
+    assert free.spent < 0.4 * learnt.spent
+
+
+def test_a_look_for_guesses_is_counted():
+    effort = Effort(1.0)
+    effort.ask(10**6)
+    assert 1.0 < effort.spent < 5.0

@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pchem_pipeline.discrepancy.by_simulation.empirical_modes import Sums, common_scores, measured_mode
+from pchem_pipeline.discrepancy.by_simulation.empirical_modes import (
+    Sums,
+    codes_within_reach,
+    common_scores,
+    measured_mode,
+)
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.simulate.chain import simulate_block
@@ -190,3 +195,19 @@ def test_half_a_mode_is_refused() -> None:
         NoiseMode(of="frame", share=1.0, burst=0.1, lags=((1, 0, 0),), correlation=(0.1,))
     with pytest.raises(ValidationError, match="equally many"):
         NoiseMode(of="row", share=1.0, shape=((1.0,),))
+
+
+def test_a_hit_by_a_particle_needs_no_tables_of_its_codes_and_outweighs_no_other_sample() -> None:
+    """As many codes as the law reaches; what lies beyond counts as the last of them."""
+    stack, maps = frames(1, gain=1.0 + 0.02 * drawn(FRAMES, 1, 1))
+    hit = stack.copy()
+    hit[700, 3, 4] = 60000
+    pixels = np.arange(stack[0].size)
+    first, last = (hit.reshape(FRAMES, -1).astype(np.int64).take(pixels, axis=1).min(axis=0), hit.max(axis=0))
+    length = codes_within_reach(maps, pixels, first, last.ravel().astype(np.int64))
+    assert int(stack.max() - stack.min()) <= length < 1000
+    found, usual = measured((hit, maps)), measured((stack, maps))
+    assert found is not None
+    assert usual is not None
+    assert found.modes[0].changes == usual.modes[0].changes
+    assert found.noise_dn == pytest.approx(usual.noise_dn, rel=0.1)

@@ -1,0 +1,186 @@
+"""Numbers of effects beside their strengths, tuned to what the data ask for by simulation.
+
+A time constant or a step that no law of a sample tells is at first what an estimator made of it. Where the
+rest that a set leaves lies in statistics that such an effect moves, its numbers are measured as strengths
+are: a small step of each shows how the statistics go with it (replicates share their random numbers), and all
+of them and the strengths are corrected together (Gauss-Newton, damped as by Levenberg 1944), the slopes by
+secants from step to step (Broyden 1965).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, log_density
+from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
+from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import is_told
+from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, beyond_chance
+from pchem_pipeline.discrepancy.effort import EffortSpentError
+from pchem_pipeline.effects.framework.effect import Effect
+
+FloatArray = NDArray[np.float64]
+
+_TRIAL = 0.25  # step of the logarithm of a number by which its slope is measured
+_SMALLEST = 0.05  # of such a step: shorter ones say nothing about the slope
+_MOST = 6  # numbers of a set
+_STEPS = 4
+_USUAL_ERROR = 0.5  # of the logarithm of a number as it is guessed
+_LARGEST_STEP, _LARGEST_OF_STRENGTH = np.log(2.0), np.log(4.0)
+_FARTHEST = np.log(4.0)  # from the guess: beyond, it is another hypothesis
+_WORTHWHILE = 5.0  # nats that a step must promise
+_SEEN = 4.0  # deviations that a set leaves of a statistic
+_MOVED = 1.0  # by which an effect must move it for its numbers to matter there
+_ELSEWHERE = 0.5  # of the squares of what is left, the most where its effects move nothing
+
+
+@dataclass(frozen=True)
+class _Detail:
+    """A number of an effect of a set, and how the statistics go with its logarithm.
+
+    Attributes:
+        place: of the effect in the set.
+        name: of the number.
+        slope: shape (m,).
+    """
+
+    place: int
+    name: str
+    slope: FloatArray
+
+
+def has_numbers(hypotheses: Sequence[Hypothesis]) -> bool:
+    """Tell whether effects have numbers that are tuned by simulation."""
+    return bool(_numbers(hypotheses))
+
+
+def may_be_tuned(refitter: Refitter, one: Refitted) -> bool:
+    """Tell whether what a set leaves lies where effects move it whose numbers are not known."""
+    places = sorted({place for place, _ in _numbers(one.hypotheses)})
+    if not places:
+        return False
+    scatter = refitter.scatter(one.covariance, len(one.vectors))
+    left = np.where(np.abs(one.rest) > _SEEN, one.rest**2, 0.0)
+    moved = np.abs(one.parts[places]).max(axis=0) > _MOVED * scatter
+    return bool(left.sum() > 0.0 and left[~moved].sum() < _ELSEWHERE * left.sum())
+
+
+def tuned(refitter: Refitter, one: Refitted) -> Refitted:
+    """Return a set at the numbers and strengths that explain the data best, or itself.
+
+    Raises:
+        EffortSpentError: the work is at its limit, and nothing was tuned.
+    """
+    words = " + ".join(h.tag for h in one.hypotheses)
+    measured = [_measured(refitter, one, place, name) for place, name in _numbers(one.hypotheses)]
+    details = [detail for detail in measured if detail is not None]
+    if not details:
+        return one
+    best, length = one, 1.0
+    for _ in range(_STEPS):
+        step, promise = _correction(refitter, best, details)
+        moved, taken = _moved(best, one, details, length * step)
+        if promise - best.score < _WORTHWHILE or np.abs(taken).max() < _SMALLEST:
+            break
+        try:
+            refitter.allow(words)
+            now = refitter.simulated(moved, None, len(best.vectors))
+        except NotFittedError:  # a step too far
+            length *= 0.5
+            continue
+        except EffortSpentError:
+            return best
+        # a step in vain tells how the statistics go, too
+        details = _secant(best, now, details, taken)
+        if now.score > best.score:
+            best, length = replace(now, tuned=True), 1.0
+        else:
+            length *= 0.5
+    return best
+
+
+def _numbers(hypotheses: Sequence[Hypothesis]) -> list[tuple[int, str]]:
+    """Return the numbers that may be tuned, by the place of their effect; a law tells those of others."""
+    found = [
+        (place, name)
+        for place, h in enumerate(hypotheses)
+        if h.effect.strength and not is_told(h.effect)
+        for name in h.effect.details()
+    ]
+    return found[:_MOST]
+
+
+def _measured(refitter: Refitter, one: Refitted, place: int, name: str) -> _Detail | None:
+    """Return a number with its slope, from a step of it alone; None: it cannot be moved, or moves nothing."""
+    for ahead in (_TRIAL, -_TRIAL):
+        effects = list(one.effects)
+        effects[place] = effects[place].times(name, float(np.exp(ahead)))
+        step = _logarithm(one.effects[place], effects[place], name)
+        if abs(step) < _SMALLEST:
+            continue
+        refitter.allow(" + ".join(h.tag for h in one.hypotheses))
+        try:
+            _, vectors = refitter.draw(tuple(effects), len(one.vectors))
+        except NotFittedError:
+            continue
+        apart = (vectors - one.vectors) / step
+        error = apart.std(axis=0, ddof=1) / np.sqrt(len(apart))
+        slope = beyond_chance(apart.mean(axis=0), error)
+        return _Detail(place, name, slope) if slope.any() else None
+    return None
+
+
+def _correction(refitter: Refitter, one: Refitted, details: Sequence[_Detail]) -> tuple[FloatArray, float]:
+    """Return changes of the logarithms of factors and numbers, (e + d,), and the score that they promise."""
+    noise, kept = refitter.noise(one.covariance, len(one.vectors)), refitter.kept(one.hypotheses)
+    slopes = np.concatenate([one.slopes, [detail.slope for detail in details]])
+    residual = refitter.target - one.mean
+    factor = linalg.cholesky(noise.among(kept).of(one.parts[:, kept]), lower=True)
+    design = linalg.solve_triangular(factor, slopes[:, kept].T, lower=True)
+    left = linalg.solve_triangular(factor, residual[kept], lower=True)
+    n = len(one.hypotheses)
+    scaling = [bool(h.effect.strength) for h in one.hypotheses]
+    damping = np.where(np.arange(len(slopes)) < n, 1e-6, _USUAL_ERROR**-2.0)
+    step = np.linalg.solve(design.T @ design + np.diag(damping), design.T @ left)
+    step[:n] = np.where(scaling, np.clip(step[:n], -_LARGEST_OF_STRENGTH, _LARGEST_OF_STRENGTH), 0.0)
+    step[n:] = np.clip(step[n:], -_LARGEST_STEP, _LARGEST_STEP)
+    return step, log_density(residual - step @ slopes, noise.of(one.parts))
+
+
+def _moved(
+    one: Refitted, guessed: Refitted, details: Sequence[_Detail], step: FloatArray
+) -> tuple[tuple[Hypothesis, ...], FloatArray]:
+    """Return a set so many logarithms away, as far as its limits let it, and the step that was taken."""
+    n = len(one.hypotheses)
+    taken = step.copy()
+    found = [h.times(float(np.exp(s))) for h, s in zip(one.hypotheses, step[:n], strict=True)]
+    for at, detail in enumerate(details, n):
+        now, first = found[detail.place], guessed.effects[detail.place]
+        so_far = _logarithm(first, now.effect, detail.name)
+        ahead = float(np.clip(so_far + step[at], -_FARTHEST, _FARTHEST)) - so_far
+        effect = now.effect.times(detail.name, float(np.exp(ahead)))
+        taken[at] = _logarithm(now.effect, effect, detail.name)
+        found[detail.place] = Hypothesis(effect, now.fingerprint + taken[at] * detail.slope)
+    return tuple(found), taken
+
+
+def _secant(before: Refitted, after: Refitted, details: Sequence[_Detail], step: FloatArray) -> list[_Detail]:
+    """Return the numbers with the slopes that account for what a step has done, too."""
+    slopes = np.concatenate([before.slopes, [detail.slope for detail in details]])
+    difference = after.vectors - before.vectors
+    error = difference.std(axis=0, ddof=1) / np.sqrt(len(difference))
+    unforeseen = beyond_chance(difference.mean(axis=0) - step @ slopes, error)
+    shares = step[len(before.hypotheses) :] / float(step @ step)
+    return [
+        replace(detail, slope=detail.slope + share * unforeseen)
+        for detail, share in zip(details, shares, strict=True)
+    ]
+
+
+def _logarithm(one: Effect, other: Effect, name: str) -> float:
+    """Return the logarithm of the factor between a number of two effects."""
+    return float(np.log(getattr(other, name) / getattr(one, name)))

@@ -1,0 +1,128 @@
+"""Numbers of effects beside their strengths are tuned to the statistics of the data."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.discrepancy.by_simulation.comparison import compare
+from pchem_pipeline.discrepancy.by_simulation.details import has_numbers, may_be_tuned, tuned
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, choose
+from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
+from pchem_pipeline.discrepancy.effort import EffortSpentError
+from pchem_pipeline.discrepancy.null import NullModel
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.registry import effect_classes
+
+NAMES = tuple(name for name in STATISTICS if not name.startswith("frame.repeated"))[:24]
+M = len(NAMES)
+UNIT = np.eye(M)
+BLINKING = DarkCurrentRts(fraction=0.1, step_e=1.0, dwell_low_frames=200.0, dwell_high_frames=200.0)
+TRUE = DarkCurrentRts(fraction=0.12, step_e=1.4, dwell_low_frames=120.0, dwell_high_frames=200.0)
+
+
+def statistics(effects: Sequence[Effect]) -> np.ndarray:
+    """Return the mean: the form of what blinking does goes with its numbers, its size with the fraction."""
+    mean = np.zeros(M)
+    for one in effects:
+        if isinstance(one, DarkCurrentRts):
+            form = 40.0 * UNIT[0] + 30.0 * one.step_e**1.5 * UNIT[1]
+            form += 20.0 * (one.dwell_low_frames / 200.0) ** -0.8 * UNIT[2]
+            form += (4.0 + 40.0 * np.log(200.0 / one.dwell_low_frames)) * UNIT[4]
+            mean += one.fraction / 0.1 * (form + 15.0 * (one.dwell_high_frames / 200.0) ** 0.5 * UNIT[3])
+        if isinstance(one, RowNoise):
+            # what wrong numbers of the blinking leave, and little of its own
+            mean += one.row_noise_dn**2 * (60.0 * UNIT[4] + 20.0 * UNIT[1])
+    return mean
+
+
+class World:
+    """Refitted models that can be drawn from."""
+
+    def __init__(self, truth: Sequence[Effect], beside: np.ndarray | float = 0.0) -> None:
+        rng = np.random.default_rng(1)
+        self.null = NullModel.from_replicates(NAMES, rng.standard_normal((40, M)))
+        mean = statistics(truth) + beside
+        self.parts = [mean + rng.standard_normal(M) for _ in range(2)]
+        self.drawn = 0
+
+    def draw(self, effects: tuple[Effect, ...], count: int) -> tuple[Any, np.ndarray]:
+        self.drawn += 1
+        vectors = statistics(effects) + np.random.default_rng(7).standard_normal((count, M))
+        return SimpleNamespace(moved={}), vectors
+
+    def refitter(self) -> Refitter:
+        return Refitter(self.draw, self.null, (self.parts[0] + self.parts[1]) / 2.0, np.zeros(M))
+
+    def refined(self, effect: Effect) -> Refitted:
+        return self.refitter().refined([Hypothesis(effect, statistics([effect]))])
+
+
+def test_numbers_are_brought_to_what_the_data_ask_for() -> None:
+    world = World([TRUE])
+    begun = world.refined(BLINKING)
+    assert may_be_tuned(world.refitter(), begun)
+    found = tuned(world.refitter(), begun)
+    [effect] = found.effects
+    assert isinstance(effect, DarkCurrentRts)
+    assert found.tuned
+    assert begun.chance - begun.score > 40.0
+    assert found.chance - found.score < 15.0
+    assert effect.fraction == pytest.approx(TRUE.fraction, rel=0.15)
+    assert effect.step_e == pytest.approx(TRUE.step_e, rel=0.15)
+    assert effect.dwell_low_frames == pytest.approx(TRUE.dwell_low_frames, rel=0.3)
+
+
+def test_what_is_left_where_the_effect_moves_nothing_is_no_reason_to_tune() -> None:
+    world = World([TRUE], beside=60.0 * UNIT[9])
+    assert not may_be_tuned(world.refitter(), world.refined(BLINKING))
+    # nor is it where nothing is left
+    world = World([TRUE])
+    assert not may_be_tuned(world.refitter(), world.refined(TRUE))
+
+
+def test_effects_without_such_numbers_stay_as_they_are() -> None:
+    noise = Hypothesis(RowNoise(row_noise_dn=1.0), UNIT[1])
+    assert not has_numbers([noise])
+    assert has_numbers([noise, Hypothesis(BLINKING, UNIT[0])])
+
+
+def test_nothing_is_simulated_at_the_limit() -> None:
+    world = World([TRUE])
+    begun = world.refined(BLINKING)
+    drawn = world.drawn
+
+    def refuse(_: str) -> None:
+        raise EffortSpentError("it")
+
+    with pytest.raises(EffortSpentError):
+        tuned(replace(world.refitter(), allow=refuse), begun)
+    assert world.drawn == drawn
+
+
+def test_an_effect_that_wrong_numbers_of_another_brought_in_is_not_kept() -> None:
+    """Row noise explains what blinking leaves at the guessed numbers; at its own it leaves nothing."""
+    world = World([TRUE])
+    hypotheses = [Hypothesis(e, statistics([e])) for e in (BLINKING, RowNoise(row_noise_dn=0.6))]
+    shifts = (world.parts[0] - world.null.mean, world.parts[1] - world.null.mean)
+    choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
+    assert choice is not None
+    assert choice.best.tags == {"dark_current_rts", "row_noise"}
+    found = compare(world.refitter(), [], hypotheses, choice)
+    assert found is not None
+    assert found.chosen.tags == {"dark_current_rts"}
+
+
+@pytest.mark.parametrize("tag", sorted(effect_classes()))
+def test_numbers_that_are_tuned_are_positive_and_none_is_the_strength(tag: str) -> None:
+    for effect in effect_classes()[tag].typical():
+        for name in effect.details():
+            assert getattr(effect, name) > 0.0
+            assert name != effect.strength
+            assert getattr(effect.times(name, 0.9), name) == pytest.approx(0.9 * getattr(effect, name))
