@@ -11,6 +11,7 @@ from pchem_pipeline.discrepancy.by_simulation.additions import leaves_too_much
 from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
 from pchem_pipeline.discrepancy.by_simulation.unexplained import Unexplained, _Likely
+from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
@@ -35,16 +36,20 @@ def test_the_form_and_part_that_explain_most_come_first() -> None:
     def broken(*_: Any) -> Measurement:
         raise ValueError("no such line")
 
-    frames = SimpleNamespace(parts=(TAP,))
+    frames = SimpleNamespace(parts=(TAP,), samples=lambda part: 300 if part == TAP else 1000)
     refitter = SimpleNamespace(model=lambda effects: effects)
     nothing: Any = None
+    effort = Effort(1.0)
     unexplained = Unexplained(
-        frames, nothing, refitter, nothing, nothing, nothing, 0, 0, nothing  # type: ignore[arg-type]
+        frames, nothing, refitter, nothing, nothing, nothing, 0, 0, effort  # type: ignore[arg-type]
     )  # fmt: skip
     forms = {"moves": moves, "noise": noise, "broken": broken}
     found = [(one.part, one.form) for one in unexplained._likeliest((), forms)]
     assert found == [(TAP, "noise"), (Part(), "moves"), (Part(), "noise")]
     assert "no such line" in unexplained.defects["broken"]
+    counted = Effort(1.0)
+    counted.ask(1300)
+    assert effort.spent == counted.spent > 0.0
 
 
 def test_effects_that_leave_a_tenth_of_what_they_closed_get_no_name_where_the_final_frames_prove_it() -> None:
