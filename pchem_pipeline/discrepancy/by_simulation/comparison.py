@@ -557,7 +557,9 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
         return False
     for place, hypothesis in enumerate(one.hypotheses):
         members = [h for h in one.hypotheses if h.tag != hypothesis.tag]
-        if not has_numbers(members) and _beyond_others(refitter, one, place):
+        # at numbers of their own the others may move other statistics
+        fixed = not has_numbers(members) or is_dear(h.effect for h in members)
+        if fixed and _beyond_others(refitter, one, place):
             continue
         # the same kinds: another kind of one that mimics both is another set
         others = next((other for other in known if _of_kinds(other, members)), None)
