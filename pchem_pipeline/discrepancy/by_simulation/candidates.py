@@ -36,7 +36,8 @@ Mapper = Callable[[Sequence[Replicate]], "list[Vector | Exception]"]
 _log = logging.getLogger(__name__)
 MOST_HYPOTHESES = 6  # of one effect
 _MOST_IN_A_PART = 2
-_MOST_IN_PARTS = 36  # hypotheses of all effects in all parts: each is a simulation, and most are in vain
+# times as many hypotheses of all effects in all parts: each is a simulation, and most are in vain
+_MOST_IN_PARTS = 6
 _LEFT = 4.0  # deviations that the model leaves of a leading statistic for its effect to be asked for
 _REFINED = 12  # hypotheses of which the strength is refined by a second simulation
 # nats behind the best, and share of what that explains, from which on an effect is not worth more by itself
@@ -144,9 +145,9 @@ class ReplicateSimulator:
         the sensor or run gives hypotheses that act there only. Beside the effects of the model others stand
         out that the frames hide: that evidence comes first, and where an estimator sees nothing although the
         leading statistics of its effect deviate, what is typical is a guess. Of one effect, everywhere, there
-        are ``most`` at most. Of those in parts, the likeliest of each effect come first, and of these the
-        ones whose leading statistics stand out most: where much is wrong, all parts ask for nearly all
-        effects.
+        are ``most`` at most. In parts there are six times as many of all effects together: the likeliest of
+        each first, and of these the ones whose leading statistics stand out most; where much is wrong, all
+        parts ask for nearly all effects.
         """
         known = [] if beside is None else [beside]
         found: list[Effect] = []
@@ -169,7 +170,7 @@ class ReplicateSimulator:
             except Exception as error:
                 self._note_defect(tag, error)
         placed.sort(key=lambda item: item[:2])
-        left_out = {id(each) for _, _, each in placed[_MOST_IN_PARTS:]}
+        left_out = {id(each) for _, _, each in placed[_MOST_IN_PARTS * most :]}
         return [each for each in found if id(each) not in left_out]
 
     def fingerprints(self, effects: Sequence[Effect], repeats: int = 1) -> list[Hypothesis]:

@@ -43,7 +43,7 @@ _MOST_SETS = 5
 # as good a beginning; how many of these sets are refitted, by how many effects they have besides
 _MOST_BEGINNINGS, _REACH_SHARE = 2, 0.05
 _MOST_GROWN = {1: 2, 2: 1}
-_MOST_DEAR = 2  # sets whose refit takes long
+_MOST_DEAR = 4  # sets whose refit takes long
 _LOOSE = 0.1  # relative error of a fingerprint before its refit
 _HARDLY = 0.1  # of a deviation, what effects may move the statistic by that cannot account for it
 # nats behind, and share of what there is to explain, from which on a fingerprint is no rival of a right set
