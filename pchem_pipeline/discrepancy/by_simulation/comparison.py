@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
-from pchem_pipeline.base.errors import error_words
-from pchem_pipeline.discrepancy.by_simulation.details import has_numbers, may_be_tuned, tuned
+from pchem_pipeline.discrepancy.by_simulation.details import has_numbers
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     PRICE_OF_MORE,
     Choice,
@@ -30,8 +29,14 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
 from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import Witness
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
+from pchem_pipeline.discrepancy.by_simulation.trials import (
+    Trials,
+    alike,
+    leaves_nothing,
+    of_kinds,
+    worth,
+)
 from pchem_pipeline.discrepancy.effort import EffortSpentError
-from pchem_pipeline.discrepancy.null import look_elsewhere
 from pchem_pipeline.effects.framework.effect import Effect
 
 FloatArray = NDArray[np.float64]
@@ -43,13 +48,7 @@ _MOST_SETS = 5
 # as good a beginning; how many of these sets are refitted, by how many effects they have besides
 _MOST_BEGINNINGS, _REACH_SHARE = 2, 0.05
 _MOST_GROWN = {1: 2, 2: 1}
-_MOST_DEAR = 4  # sets whose refit takes long
 _LOOSE = 0.1  # relative error of a fingerprint before its refit
-_HARDLY = 0.1  # of a deviation, what effects may move the statistic by that cannot account for it
-# nats behind, and share of what there is to explain, from which on a fingerprint is no rival of a right set
-_FAR, _FAR_SHARE = 40.0, 0.25
-_FAR_SHARE_OF_PART = 0.5  # the same of a set that leaves something
-_LEFT = 0.02  # chance of what a complete set may leave, anywhere among the statistics
 _SEEN = 4.0  # deviations that the others leave of a statistic for it to ask for an effect
 _MOVED = 3.0  # by which that effect must move it
 _UNTOUCHED = 0.5  # of that, the most by which the others may move it
@@ -91,7 +90,7 @@ class Comparison:
                 # neither need be the very law of the samples
                 probability = float(special.ndtr(behind / max(error, 1e-9)))
             else:
-                behind, error = _worth(one) - _worth(self.chosen), _apart(one, self.chosen)
+                behind, error = worth(one) - worth(self.chosen), _apart(one, self.chosen)
                 probability = float(np.exp(min(behind, 0.0)))
             found[name] = Contender(hypothesis, behind, error, probability)
         total = sum(c.probability for c in found.values())
@@ -127,7 +126,7 @@ def compare(
     Raises:
         EffortSpentError: the work is at its limit.
     """
-    trials = _Trials(refitter, tuple(held), witness)
+    trials = Trials(refitter, tuple(held), witness)
     tried = trials.tried
     singles = _singles(hypotheses, choice)
     # what the likeliest set is made of, then that set: it may leave no others worth a refit
@@ -182,129 +181,6 @@ def _within(asked: Callable[[], bool]) -> bool:
         return False
 
 
-@dataclass
-class _Trials:
-    """Sets that are refitted, as far as they are worth it.
-
-    Attributes:
-        refitter: fits sets.
-        held: effects that are fitted with each.
-        witness: brings a set near its best.
-        tried: sets at their best fit, in the order in which they were tried.
-        failed: effects of which the refit failed, and why.
-        settled: tags of the sets whose numbers were tuned.
-        asked: sets as they were begun.
-    """
-
-    refitter: Refitter
-    held: tuple[Hypothesis, ...]
-    witness: Witness
-    tried: list[Refitted] = field(default_factory=list)
-    failed: dict[str, str] = field(default_factory=dict)
-    settled: set[frozenset[str]] = field(default_factory=set)
-    asked: list[tuple[Hypothesis, ...]] = field(default_factory=list)
-
-    @property
-    def best(self) -> Refitted:
-        """The best so far."""
-        return max(self.tried, key=_worth)
-
-    @property
-    def complete(self) -> bool:
-        """Whether that leaves nothing."""
-        return bool(self.tried) and leaves_nothing(self.refitter, self.best)
-
-    def refit(self, members: Sequence[Hypothesis]) -> bool:
-        """Refit a set unless it is in vain; return False at the limit of the work, where sets are known.
-
-        Raises:
-            EffortSpentError: at that limit, no set of several has been refitted.
-        """
-        if not self._worth_it(members):
-            return True
-        self.asked.append(tuple(members))
-        best = max((one.score for one in self.tried), default=-np.inf)
-        try:
-            begun = self.witness.begun((*self.held, *members))
-            self.tried.append(self.refitter.refined(begun, best, whole=len(members) == 1))
-        except EffortSpentError:
-            if all(len(one.hypotheses) <= len(self.held) + 1 for one in self.tried):
-                raise
-            return False
-        except NotFittedError:
-            pass
-        # whatever a stranger's effect raises must not stop the others
-        except Exception as error:
-            self.failed[members[-1].tag] = error_words(error)
-        return True
-
-    def tune(self) -> None:
-        """Tune the numbers of the best set where it leaves something, then of those as good until then."""
-        gained = 0.0
-        while self.tried and not self.complete:
-            near = _worth(self.best) - gained
-            open_ = [one for one in self.tried if _worth(one) >= near and self._may_be_tuned(one)]
-            if not open_:
-                return
-            one = max(open_, key=_worth)
-            gained = max(gained, self._tuned(one).score - one.score)
-
-    def _may_be_tuned(self, one: Refitted) -> bool:
-        return one.tags not in self.settled and may_be_tuned(self.refitter, one)
-
-    def _tuned(self, one: Refitted) -> Refitted:
-        """Tune the numbers of a set, once; at the limit of the work they stay as they are."""
-        self.settled.add(one.tags)
-        try:
-            better = tuned(self.refitter, one)
-        except EffortSpentError:
-            return one
-        if better is not one:
-            self.tried.append(better)
-        return better
-
-    def thin(self) -> bool:
-        """Refit the best set without each of its effects; return False at the limit.
-
-        The weakest first. Where the set leaves nothing, fewer may leave nothing, too; and what they leave
-        tells in the end whether each is seen. Where it leaves something, others at their own numbers may
-        account for what an effect was brought in for.
-        """
-        best = self.best
-        new = best.hypotheses[len(self.held) :]
-        scale = self.refitter.null.std
-        for weakest in sorted(new, key=lambda h: float(np.sum((h.fingerprint / scale) ** 2))):
-            fewer = [h for h in new if h is not weakest]
-            if not fewer or not (has_numbers(fewer) or (len(new) > 2 and self.complete)):
-                continue
-            if len(new) > 2 and not self.refit(fewer):
-                return False
-            tags = best.tags - {weakest.tag}
-            same = [one for one in self.tried if one.tags == tags]
-            if same and not self.complete and self._may_be_tuned(max(same, key=_worth)):
-                self._tuned(max(same, key=_worth))
-            if self.best is not best:
-                return self.thin()
-        return True
-
-    def _worth_it(self, members: Sequence[Hypothesis]) -> bool:
-        """Tell whether a set may come near the best one, and was not refitted before."""
-        tags = frozenset(h.tag for h in (*self.held, *members))
-        if share_place(h.effect for h in (*self.held, *members)):
-            return False
-        dear = [one for one in self.tried if is_dear(one.effects)]
-        if is_dear(h.effect for h in members) and len(dear) >= _MOST_DEAR:
-            return False
-        if len(members) > 1 and any(_same_kinds(members, others) for others in self.asked):
-            return False
-        if self.complete and len(tags) > len(self.best.tags):
-            return False
-        alone = len(members) == 1 and bool(self.tried)
-        if not (alone or self.complete):
-            return True
-        return not _beaten(self.refitter, (*self.held, *members), self.best)
-
-
 def _dear_last(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return hypotheses, those last whose refit takes long."""
     return sorted(hypotheses, key=lambda h: is_dear([h.effect]))
@@ -319,7 +195,7 @@ def _chosen(refitter: Refitter, tried: list[Refitted], before: Sequence[Refitted
         before: sets that are known besides.
     """
     while True:
-        tried.sort(key=_worth, reverse=True)
+        tried.sort(key=worth, reverse=True)
         known = [*tried, *before]
         chosen = next((one for one in tried if _all_seen(refitter, one, known)), None)
         if chosen is None:
@@ -343,7 +219,7 @@ def _witnessed(
     found: dict[frozenset[str], tuple[float, float]] = {}
     for one in tried:
         swapped = len(one.tags - chosen.tags) == len(chosen.tags - one.tags) == 1
-        near = abs(_worth(one) - _worth(chosen)) < _NEARLY_AS_GOOD
+        near = abs(worth(one) - worth(chosen)) < _NEARLY_AS_GOOD
         if swapped and near and one.tags not in found:
             answer = witness.behind(one.effects, chosen.effects)
             if answer is not None:
@@ -394,32 +270,6 @@ def _placebo(
         return []
 
 
-def leaves_nothing(refitter: Refitter, one: Refitted) -> bool:
-    """Tell whether a set leaves no statistic beyond chance."""
-    p = float(refitter.null.p_of(one.rest, 2).min())
-    return look_elsewhere(p, refitter.null.effective_tests) > _LEFT
-
-
-def _beaten(refitter: Refitter, members: Sequence[Hypothesis], best: Refitted) -> bool:
-    """Tell whether a refit of hypotheses is in vain: far behind the best set, or blind where that is not.
-
-    By their fingerprints at the best strengths; how far these are trusted goes with what there is to explain,
-    and is less where the best set leaves something, or has more effects. Where that leaves nothing, a
-    statistic that stands out and that they hardly move says enough: a refit does not change them so much.
-    """
-    complete = leaves_nothing(refitter, best)
-    trust = _FAR_SHARE if complete and len(members) >= len(best.hypotheses) else _FAR_SHARE_OF_PART
-    shift = refitter.target - refitter.null.mean
-    noise = replace(refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=_LOOSE)
-    fit = fit_set(members, shift, noise)
-    parts = fit.parts
-    left = np.abs(shift - parts.sum(axis=0)) / np.sqrt(np.diag(noise.of(parts)))
-    if complete and np.any((left > _SEEN) & (np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift))):
-        return True
-    score = fit.log_score(shift, noise)
-    return score < best.score - _FAR - trust * (best.score - refitter.nothing)
-
-
 def own_signature(own: FloatArray, others: FloatArray, left: FloatArray, noise: FloatArray) -> bool:
     """Tell whether an effect has statistics of its own: left by the others, untouched by them, and explained.
 
@@ -432,10 +282,6 @@ def own_signature(own: FloatArray, others: FloatArray, left: FloatArray, noise: 
     touched = np.abs(others).max(axis=0, initial=0.0)
     mine = (np.abs(own) > _MOVED * noise) & (touched < _UNTOUCHED * np.abs(own))
     return bool(np.any(mine & (np.abs(left) > _SEEN) & (left * own > 0.0)))
-
-
-def _worth(one: Refitted) -> float:
-    return one.score - PRICE_OF_MORE * (len(one.hypotheses) - 1)
 
 
 def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesis]:
@@ -466,7 +312,7 @@ def _grown(
         beside: compares new hypotheses by what they do beside a refitted set.
     """
     kinds: dict[frozenset[str], Refitted] = {}
-    for one in sorted(singles, key=_worth, reverse=True):
+    for one in sorted(singles, key=worth, reverse=True):
         kinds.setdefault(one.tags, one)
     best = next(iter(kinds.values()))
     near = best.score - _REACH_SHARE * (best.score - refitter.nothing)
@@ -510,13 +356,7 @@ def _of_different_effects(sets: Sequence[tuple[Hypothesis, ...]]) -> list[tuple[
 
 def _kind(member: Hypothesis, best: Hypothesis) -> Hypothesis:
     """Return a member of a set, of the kind of another hypothesis where they are of different kinds."""
-    return member if _alike(member, best) else best
-
-
-def _alike(one: Hypothesis, other: Hypothesis) -> bool:
-    """Tell whether two hypotheses differ in nothing but the strength of their effect."""
-    without = {one.effect.strength}
-    return one.effect.model_dump(exclude=without) == other.effect.model_dump(exclude=without)
+    return member if alike(member, best) else best
 
 
 def _begun(
@@ -531,10 +371,10 @@ def _begun(
     near = [one for one in tried if one.tags < tags or sum(h.tag in one.tags for h in members) >= common]
     if not near:
         return tuple(members)
-    best = max(near, key=_worth)
+    best = max(near, key=worth)
     own = {h.tag: h for h in best.hypotheses}
     better = best.tuned and best.tags != tags
-    return tuple(own[h.tag] if h.tag in own and (better or _alike(h, own[h.tag])) else h for h in members)
+    return tuple(own[h.tag] if h.tag in own and (better or alike(h, own[h.tag])) else h for h in members)
 
 
 def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
@@ -562,7 +402,7 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
         if fixed and _beyond_others(refitter, one, place):
             continue
         # the same kinds: another kind of one that mimics both is another set
-        others = next((other for other in known if _of_kinds(other, members)), None)
+        others = next((other for other in known if of_kinds(other, members)), None)
         tags = {h.tag for h in members}
         # but for what these make of it at numbers of their own
         others = next((other for other in known if other.tuned and other.tags == tags), others)
@@ -608,17 +448,6 @@ def _seen_beside(refitter: Refitter, part: FloatArray, others: Refitted) -> bool
     noise = replace(refitter.noise(others.covariance, len(others.vectors)), model_error=_LOOSE)
     shift = refitter.target - others.mean + others.parts.sum(axis=0)
     return seen_among(part, others.parts, shift, noise)
-
-
-def _of_kinds(one: Refitted, members: Sequence[Hypothesis]) -> bool:
-    """Tell whether a set is of these effects, differing in their strengths only."""
-    return _same_kinds(one.hypotheses, members)
-
-
-def _same_kinds(one: Sequence[Hypothesis], other: Sequence[Hypothesis]) -> bool:
-    """Tell whether two sets differ in the strengths of their effects only."""
-    own = {h.tag: h for h in one}
-    return own.keys() == {h.tag for h in other} and all(_alike(own[h.tag], h) for h in other)
 
 
 def _untouched(one: Refitted, place: int, noise: FloatArray) -> bool:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import error_words
-from pchem_pipeline.discrepancy.by_simulation.comparison import leaves_nothing
 from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement, measured_moves
 from pchem_pipeline.discrepancy.by_simulation.empirical_electrons import (
     Electrons,
@@ -35,6 +34,7 @@ from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.maps import Refit, Sensor
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.replicate import simulate_frames
+from pchem_pipeline.discrepancy.by_simulation.trials import leaves_nothing
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
 from pchem_pipeline.discrepancy.observe.places import Part

@@ -20,8 +20,6 @@ from pchem_pipeline.discrepancy.by_simulation.comparison import (
     Comparison,
     _all_seen,
     _begun,
-    _of_kinds,
-    _Trials,
     compare,
     own_signature,
 )
@@ -30,6 +28,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import Choice, Hypoth
 from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import Witness
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitter
+from pchem_pipeline.discrepancy.by_simulation.trials import Trials, of_kinds
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.gap import StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
@@ -243,7 +242,7 @@ def test_the_likeliest_set_is_fitted_before_other_effects_and_kept_at_the_limit(
     plain = world.refitter()
     monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
     for name, value in (("_FAR", 1e9), ("_HARDLY", 0.0)):  # nothing is in vain
-        monkeypatch.setattr(f"pchem_pipeline.discrepancy.by_simulation.comparison.{name}", value)
+        monkeypatch.setattr(f"pchem_pipeline.discrepancy.by_simulation.trials.{name}", value)
     found = world.compare(*(hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift")))
     assert found is not None
     assert found.chosen.tags == {"row_noise", "frame_noise"}
@@ -262,7 +261,7 @@ def test_fewer_effects_are_tried_before_rivals_of_a_set_of_more(monkeypatch: pyt
     world = World([effect("row_noise", 0.1), effect("frame_noise", 0.1)])
     asked = asked_by_refits(world, monkeypatch)
     # nothing is in vain
-    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.comparison._beaten", lambda *_: False)
+    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.trials._beaten", lambda *_: False)
     row, frame, drift, coupling = (hypothesis(tag) for tag in TRUTH)
     drift, coupling = (replace(h, fingerprint=0.02 * h.fingerprint) for h in (drift, coupling))
     noise = world.refitter().noise(world.null.covariance, 40)
@@ -419,9 +418,9 @@ def test_a_signature_is_asked_of_the_same_kind_of_the_others() -> None:
     guess = hypothesis("row_noise", 0.2)
     elsewhere = replace(guess, effect=guess.effect.at_place(Region.model_validate({"columns": "0:8"})))
     one = world.refitter().refined([guess])
-    assert _of_kinds(one, [hypothesis("row_noise", 0.9)])
-    assert not _of_kinds(one, [elsewhere])
-    assert not _of_kinds(one, [hypothesis("row_noise", 0.2), hypothesis("frame_noise")])
+    assert of_kinds(one, [hypothesis("row_noise", 0.9)])
+    assert not of_kinds(one, [elsewhere])
+    assert not of_kinds(one, [hypothesis("row_noise", 0.2), hypothesis("frame_noise")])
 
 
 @pytest.mark.parametrize("second", ["columns=0:8", "columns=16:24"])
@@ -526,7 +525,7 @@ def test_a_set_is_fitted_again_with_the_kind_of_an_effect_that_does_better() -> 
     row, frame, other = (
         hypothesis("row_noise"), hypothesis("frame_noise"), hypothesis("frame_noise").effect
     )  # fmt: skip
-    trials = _Trials(world.refitter(), (), Witness())
+    trials = Trials(world.refitter(), (), Witness())
     for members in ((row,), (frame,), (row, frame), (row, frame)):
         trials.refit(members)
     assert len(trials.tried) == 3

@@ -1,0 +1,202 @@
+"""Sets of effects that are refitted, as far as each is worth it: in vain, thinned, and with numbers tuned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pchem_pipeline.base.errors import error_words
+from pchem_pipeline.discrepancy.by_simulation.details import has_numbers, may_be_tuned, tuned
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
+    PRICE_OF_MORE,
+    Hypothesis,
+    fit_set,
+    share_place,
+)
+from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
+from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import Witness
+from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
+from pchem_pipeline.discrepancy.effort import EffortSpentError
+from pchem_pipeline.discrepancy.null import look_elsewhere
+
+_MOST_DEAR = 4  # sets whose refit takes long
+_LOOSE = 0.1  # relative error of a fingerprint before its refit
+_HARDLY = 0.1  # of a deviation, what effects may move the statistic by that cannot account for it
+# nats behind, and share of what there is to explain, from which on a fingerprint is no rival of a right set
+_FAR, _FAR_SHARE = 40.0, 0.25
+_FAR_SHARE_OF_PART = 0.5  # the same of a set that leaves something
+_LEFT = 0.02  # chance of what a complete set may leave, anywhere among the statistics
+_SEEN = 4.0  # deviations that a set leaves of a statistic for it to stand out
+
+
+@dataclass
+class Trials:
+    """Sets that are refitted, as far as they are worth it.
+
+    Attributes:
+        refitter: fits sets.
+        held: effects that are fitted with each.
+        witness: brings a set near its best.
+        tried: sets at their best fit, in the order in which they were tried.
+        failed: effects of which the refit failed, and why.
+        settled: tags of the sets whose numbers were tuned.
+        asked: sets as they were begun.
+    """
+
+    refitter: Refitter
+    held: tuple[Hypothesis, ...]
+    witness: Witness
+    tried: list[Refitted] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
+    settled: set[frozenset[str]] = field(default_factory=set)
+    asked: list[tuple[Hypothesis, ...]] = field(default_factory=list)
+
+    @property
+    def best(self) -> Refitted:
+        """The best so far."""
+        return max(self.tried, key=worth)
+
+    @property
+    def complete(self) -> bool:
+        """Whether that leaves nothing."""
+        return bool(self.tried) and leaves_nothing(self.refitter, self.best)
+
+    def refit(self, members: Sequence[Hypothesis]) -> bool:
+        """Refit a set unless it is in vain; return False at the limit of the work, where sets are known.
+
+        Raises:
+            EffortSpentError: at that limit, no set of several has been refitted.
+        """
+        if not self._worth_it(members):
+            return True
+        self.asked.append(tuple(members))
+        best = max((one.score for one in self.tried), default=-np.inf)
+        try:
+            begun = self.witness.begun((*self.held, *members))
+            self.tried.append(self.refitter.refined(begun, best, whole=len(members) == 1))
+        except EffortSpentError:
+            if all(len(one.hypotheses) <= len(self.held) + 1 for one in self.tried):
+                raise
+            return False
+        except NotFittedError:
+            pass
+        # whatever a stranger's effect raises must not stop the others
+        except Exception as error:
+            self.failed[members[-1].tag] = error_words(error)
+        return True
+
+    def tune(self) -> None:
+        """Tune the numbers of the best set where it leaves something, then of those as good until then."""
+        gained = 0.0
+        while self.tried and not self.complete:
+            near = worth(self.best) - gained
+            open_ = [one for one in self.tried if worth(one) >= near and self._may_be_tuned(one)]
+            if not open_:
+                return
+            one = max(open_, key=worth)
+            gained = max(gained, self._tuned(one).score - one.score)
+
+    def _may_be_tuned(self, one: Refitted) -> bool:
+        return one.tags not in self.settled and may_be_tuned(self.refitter, one)
+
+    def _tuned(self, one: Refitted) -> Refitted:
+        """Tune the numbers of a set, once; at the limit of the work they stay as they are."""
+        self.settled.add(one.tags)
+        try:
+            better = tuned(self.refitter, one)
+        except EffortSpentError:
+            return one
+        if better is not one:
+            self.tried.append(better)
+        return better
+
+    def thin(self) -> bool:
+        """Refit the best set without each of its effects; return False at the limit.
+
+        The weakest first. Where the set leaves nothing, fewer may leave nothing, too; and what they leave
+        tells in the end whether each is seen. Where it leaves something, others at their own numbers may
+        account for what an effect was brought in for.
+        """
+        best = self.best
+        new = best.hypotheses[len(self.held) :]
+        scale = self.refitter.null.std
+        for weakest in sorted(new, key=lambda h: float(np.sum((h.fingerprint / scale) ** 2))):
+            fewer = [h for h in new if h is not weakest]
+            if not fewer or not (has_numbers(fewer) or (len(new) > 2 and self.complete)):
+                continue
+            if len(new) > 2 and not self.refit(fewer):
+                return False
+            tags = best.tags - {weakest.tag}
+            same = [one for one in self.tried if one.tags == tags]
+            if same and not self.complete and self._may_be_tuned(max(same, key=worth)):
+                self._tuned(max(same, key=worth))
+            if self.best is not best:
+                return self.thin()
+        return True
+
+    def _worth_it(self, members: Sequence[Hypothesis]) -> bool:
+        """Tell whether a set may come near the best one, and was not refitted before."""
+        tags = frozenset(h.tag for h in (*self.held, *members))
+        if share_place(h.effect for h in (*self.held, *members)):
+            return False
+        dear = [one for one in self.tried if is_dear(one.effects)]
+        if is_dear(h.effect for h in members) and len(dear) >= _MOST_DEAR:
+            return False
+        if len(members) > 1 and any(same_kinds(members, others) for others in self.asked):
+            return False
+        if self.complete and len(tags) > len(self.best.tags):
+            return False
+        alone = len(members) == 1 and bool(self.tried)
+        if not (alone or self.complete):
+            return True
+        return not _beaten(self.refitter, (*self.held, *members), self.best)
+
+
+def leaves_nothing(refitter: Refitter, one: Refitted) -> bool:
+    """Tell whether a set leaves no statistic beyond chance."""
+    p = float(refitter.null.p_of(one.rest, 2).min())
+    return look_elsewhere(p, refitter.null.effective_tests) > _LEFT
+
+
+def _beaten(refitter: Refitter, members: Sequence[Hypothesis], best: Refitted) -> bool:
+    """Tell whether a refit of hypotheses is in vain: far behind the best set, or blind where that is not.
+
+    By their fingerprints at the best strengths; how far these are trusted goes with what there is to explain,
+    and is less where the best set leaves something, or has more effects. Where that leaves nothing, a
+    statistic that stands out and that they hardly move says enough: a refit does not change them so much.
+    """
+    complete = leaves_nothing(refitter, best)
+    trust = _FAR_SHARE if complete and len(members) >= len(best.hypotheses) else _FAR_SHARE_OF_PART
+    shift = refitter.target - refitter.null.mean
+    noise = replace(refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=_LOOSE)
+    fit = fit_set(members, shift, noise)
+    parts = fit.parts
+    left = np.abs(shift - parts.sum(axis=0)) / np.sqrt(np.diag(noise.of(parts)))
+    if complete and np.any((left > _SEEN) & (np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift))):
+        return True
+    score = fit.log_score(shift, noise)
+    return score < best.score - _FAR - trust * (best.score - refitter.nothing)
+
+
+def worth(one: Refitted) -> float:
+    """Return the score of a set less the price of its effects, nats."""
+    return one.score - PRICE_OF_MORE * (len(one.hypotheses) - 1)
+
+
+def alike(one: Hypothesis, other: Hypothesis) -> bool:
+    """Tell whether two hypotheses differ in nothing but the strength of their effect."""
+    without = {one.effect.strength}
+    return one.effect.model_dump(exclude=without) == other.effect.model_dump(exclude=without)
+
+
+def of_kinds(one: Refitted, members: Sequence[Hypothesis]) -> bool:
+    """Tell whether a set is of these effects, differing in their strengths only."""
+    return same_kinds(one.hypotheses, members)
+
+
+def same_kinds(one: Sequence[Hypothesis], other: Sequence[Hypothesis]) -> bool:
+    """Tell whether two sets differ in the strengths of their effects only."""
+    own = {h.tag: h for h in one}
+    return own.keys() == {h.tag for h in other} and all(alike(own[h.tag], h) for h in other)
