@@ -316,7 +316,12 @@ def _grown(
         kinds.setdefault(one.tags, one)
     best = next(iter(kinds.values()))
     near = best.score - _REACH_SHARE * (best.score - refitter.nothing)
-    begun = [one for one in kinds.values() if one.score >= near][:_MOST_BEGINNINGS]
+    begun: list[Refitted] = []
+    for one in kinds.values():
+        # a part of a better set has grown already
+        if one.score >= near and not any(one.tags < better.tags for better in begun):
+            begun.append(one)
+    begun = begun[:_MOST_BEGINNINGS]
     choices = [(one.hypotheses[held:], choice) for one in begun if (choice := beside(one)) is not None]
     grown: list[tuple[Hypothesis, ...]] = []
     for size, most in _MOST_GROWN.items():

@@ -20,6 +20,7 @@ from pchem_pipeline.discrepancy.by_simulation.comparison import (
     Comparison,
     _all_seen,
     _begun,
+    _grown,
     compare,
     own_signature,
 )
@@ -398,6 +399,18 @@ def test_what_a_strong_effect_hides_is_asked_for_beside_it() -> None:
     grown = world.compare(hypothesis("row_noise"), beside=[hypothesis("frame_noise", 0.04)])
     assert grown is not None
     assert grown.chosen.tags == {"row_noise", "frame_noise"}
+
+
+def test_a_part_of_a_better_set_is_not_grown_again() -> None:
+    world = World([effect(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift")])
+    refitter = world.refitter()
+    row, frame, coupling = (hypothesis(tag) for tag in ("row_noise", "frame_noise", "interpixel_capacitance"))
+    tried = [refitter.refined(members) for members in ([row], [row, frame], [row, coupling])]
+    # of all that there is to explain each explains nearly as much
+    far = replace(refitter.null, mean=refitter.null.mean - 1e4 * np.eye(M)[0])
+    asked: list[frozenset[str]] = []
+    _grown(replace(refitter, null=far), tried, 0, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
+    assert asked == [{"row_noise", "frame_noise"}, {"row_noise", "interpixel_capacitance"}]
 
 
 def test_where_what_no_effect_makes_leaves_nothing_no_set_is_grown() -> None:
