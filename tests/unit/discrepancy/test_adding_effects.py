@@ -404,13 +404,17 @@ def test_what_a_strong_effect_hides_is_asked_for_beside_it() -> None:
 def test_a_part_of_a_better_set_is_not_grown_again() -> None:
     world = World([effect(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift")])
     refitter = world.refitter()
-    row, frame, coupling = (hypothesis(tag) for tag in ("row_noise", "frame_noise", "interpixel_capacitance"))
-    tried = [refitter.refined(members) for members in ([row], [row, frame], [row, coupling])]
+    row, frame, drift = (hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift"))
     # of all that there is to explain each explains nearly as much
-    far = replace(refitter.null, mean=refitter.null.mean - 1e4 * np.eye(M)[0])
-    asked: list[frozenset[str]] = []
-    _grown(replace(refitter, null=far), tried, 0, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
-    assert asked == [{"row_noise", "frame_noise"}, {"row_noise", "interpixel_capacitance"}]
+    far = replace(refitter, null=replace(refitter.null, mean=refitter.null.mean - 1e4 * np.eye(M)[0]))
+
+    def begun(*sets: list[Hypothesis]) -> list[frozenset[str]]:
+        asked: list[frozenset[str]] = []
+        _grown(far, [refitter.refined(one) for one in sets], 0, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
+        return asked
+
+    assert begun([row], [row, frame]) == [{"row_noise", "frame_noise"}]
+    assert len(begun([row, drift], [row, frame])) == 2
 
 
 def test_where_what_no_effect_makes_leaves_nothing_no_set_is_grown() -> None:
