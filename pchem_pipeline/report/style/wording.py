@@ -30,7 +30,8 @@ _SYMBOLS = {
     "charge_per_level": (r"$\mathrm{d}H/\mathrm{d}\ell$", "charge per light level", "e-/level"),
 }
 
-_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+#: Digits and signs to their superscripts.
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def unit_text(unit: str) -> str:
@@ -63,7 +64,7 @@ def short(value: float, digits: int = 3) -> str:
     if -4 < exponent < max(digits, 5):
         return f"{value:.{max(digits - 1 - exponent, 0)}f}".replace("-", "−")
     mantissa = value / 10.0**exponent
-    return f"{mantissa:.{digits - 1}f}×10{str(exponent).translate(_SUPERSCRIPT)}".replace("-", "−")
+    return f"{mantissa:.{digits - 1}f}×10{str(exponent).translate(SUPERSCRIPT)}".replace("-", "−")
 
 
 def signed(value: float) -> str:
@@ -81,12 +82,12 @@ def scientific(value: float, digits: int = 2) -> str:
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
     if int(exponent) == 0:
         return mantissa.replace("-", "−")
-    return f"{mantissa}×10{str(int(exponent)).translate(_SUPERSCRIPT)}".replace("-", "−")
+    return f"{mantissa}×10{str(int(exponent)).translate(SUPERSCRIPT)}".replace("-", "−")
 
 
 def power_of_ten(exponent: int) -> str:
     """Return ``10⁻⁴``, or nothing for the power 0."""
-    return f"10{str(exponent).translate(_SUPERSCRIPT)}" if exponent else ""
+    return f"10{str(exponent).translate(SUPERSCRIPT)}" if exponent else ""
 
 
 def measured(value: float, error: float, unit: str = "") -> str:
