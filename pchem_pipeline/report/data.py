@@ -23,7 +23,7 @@ from pchem_pipeline.report.inspector.inspector_data import InspectorData
 from pchem_pipeline.report.settings import Criteria
 
 if TYPE_CHECKING:
-    from pchem_pipeline.discrepancy.quick.sums import StackSums
+    from pchem_pipeline.report.figures.figure import Figure
 
 FloatArray = NDArray[np.float64]
 
@@ -184,7 +184,7 @@ class ReportData:
         missing: part (see ``PARTS``) to the reason why it is absent.
         discrepancy: what the model is missing, or None where nobody looked.
         quick_look: checks of rows, columns, frames, neighbours, lags and codes; None without a fit.
-        sums: of frames, rows, columns and blocks of frames; None where the run keeps none.
+        stability: figures of frames, rows and columns, made of sums as large as several maps; may be empty.
         inspector: maps and pixels to look at in the browser, or None.
         methods: content of ``methods.json``, or None where nobody compared.
         plan: frames that precisions need, or None where no pixel has a value.
@@ -223,7 +223,7 @@ class ReportData:
     missing: Mapping[str, str] = field(default_factory=dict)
     discrepancy: DiscrepancyData | None = None
     quick_look: QuickLook | None = None
-    sums: StackSums | None = None
+    stability: Sequence[Figure] = ()
     inspector: InspectorData | None = None
     methods: Mapping[str, Any] | None = None
     plan: Mapping[str, Any] | None = None

@@ -19,7 +19,6 @@ from pchem_pipeline.report.figures import (
     plan,
     rounding,
     samples,
-    stability,
     trust,
 )
 from pchem_pipeline.report.figures.figure import Figure
@@ -35,7 +34,7 @@ REPORT_FIGURES: tuple[tuple[Callable[[ReportData, ReportSettings], list[Figure]]
     (trust.left_out_figures, ("left_out",)),
     (maps.read_noise_figures, ("read_noise_histogram",)),
     (maps.map_figures, tuple(f"map_{name}" for name in maps.DRAWN_MAPS)),
-    (stability.stability_figures, ("frame_means", "profiles", "spatial_spectra")),
+    (lambda data, _: list(data.stability), ("frame_means", "profiles", "spatial_spectra")),
     (ensemble.ensemble_figures, ("ensemble",)),
     (ensemble.electron_figures, ("electron_numbers",)),
     (ensemble.component_figures, ("component_widths",)),

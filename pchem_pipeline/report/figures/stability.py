@@ -14,9 +14,7 @@ from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
-from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.style import Drawing, Look, colours_of, styled
 from pchem_pipeline.report.style.wording import count, short
 
@@ -47,9 +45,8 @@ _SPECTRA = (
 )
 
 
-def stability_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def stability_figures(sums: StackSums | None) -> list[Figure]:
     """Return means against frame, row and column, and their spectra, where the run has the sums."""
-    sums = data.sums
     if sums is None:
         return []
     makers = (_frame_figure, _profile_figure, _spectrum_figure)

@@ -19,6 +19,7 @@ from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.report.data import ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
 from pchem_pipeline.report.figures.ensemble import case_name
+from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.inspector.inspector_data import PixelSample
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
 from pchem_pipeline.report.pages.quick_look import check_sentence
@@ -170,7 +171,7 @@ def gather(
         pixels=fits,
         inspector=inspector_data(run.name, shape, maps, sample),
         quick_look=run_quick_look(store, run, sums),
-        sums=sums,
+        stability=stability_figures(sums),
     )
 
 

@@ -377,3 +377,21 @@ def test_joined_minor_ticks_look_as_those_of_matplotlib(
     assert differ.mean() < 1e-4
     monkeypatch.setitem(style._STYLE, "xtick.minor.size", 0.0)  # the test can fail
     assert (np.abs(joined - pixels()) > 40).mean() > 3e-4
+
+
+def test_powers_of_ten_are_written_without_formulas() -> None:
+    @style.styled
+    def draw(look: style.Look) -> style.Drawing:
+        figure = look.empty(60.0)
+        left, middle, right = figure.subplots(1, 3)
+        left.loglog([1.0, 3e3], [1e-4, 20.0])
+        middle.set_xscale("symlog", linthresh=4.0)
+        middle.plot([-1e3, 1e4], [1.0, 2.0])
+        right.semilogy([1.0, 2.0], [2.2, 7.7])  # less than a decade: minor ticks have the labels
+        return figure
+
+    left, middle, right = draw(style.Look(PAGE_MM)).axes
+    assert {"10⁰", "10³"} <= {label.get_text() for label in left.get_xticklabels()}
+    assert "10⁻³" in {label.get_text() for label in left.get_yticklabels()}
+    assert {"−10³", "10⁴"} <= {label.get_text() for label in middle.get_xticklabels()}
+    assert "3×10⁰" in {label.get_text() for label in right.get_yticklabels(minor=True)}

@@ -19,6 +19,7 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.data import MAP_NAMES, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import REPORT_FIGURES, report_figures
 from pchem_pipeline.report.figures.figure import DataTable, Figure, csv_text
+from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.inspector.inspector import script
 from pchem_pipeline.report.pages import report as report_module
 from pchem_pipeline.report.pages.cite import citation
@@ -82,7 +83,7 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def data() -> ReportData:
     frames = stack(np.random.default_rng(2), (300, 24, 32))
-    return replace(report_data((24, 32)), sums=sums_of(frames))
+    return replace(report_data((24, 32)), stability=stability_figures(sums_of(frames)))
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.quick_stacks import stack, sums_of
-from helpers.report_material import report_data
 
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.report.figures.figure import csv_text
@@ -17,7 +16,6 @@ from pchem_pipeline.report.figures.stability import (
     profile_table,
     stability_figures,
 )
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.style import Look, drawing_bytes
 
 N, NY, NX = 400, 40, 48
@@ -95,18 +93,17 @@ def test_long_runs_are_averaged_and_figures_come_with_their_tables(clean: StackS
     long = replace(clean, n_frames=10 * N, frame_mean=np.tile(clean.frame_mean, 10))
     assert frame_table(long)["mean"].size == 1000
     assert frame_table(long)["mean"].mean() == pytest.approx(clean.frame_mean.mean())
-    data = replace(report_data((8, 8)), sums=clean)
-    figures = stability_figures(data, ReportSettings())
+    figures = stability_figures(clean)
     assert [figure.name for figure in figures] == ["frame_means", "profiles", "spatial_spectra"]
     for figure in figures:
         assert drawing_bytes(figure.draw(Look(figure.width_mm)), "png", dpi=50)
         assert all(csv_text(table).count("\n") > 5 for table in figure.tables)
         assert any(sign.isdigit() for sign in figure.alt)
-    assert stability_figures(report_data((8, 8)), ReportSettings()) == []
+    assert stability_figures(None) == []
 
 
 def test_a_line_of_channels_has_what_it_can(clean: StackSums) -> None:
     line = sums_of(stack(np.random.default_rng(3), (200, 1, 30)))
 
-    for figure in stability_figures(replace(report_data((8, 8)), sums=line), ReportSettings()):
+    for figure in stability_figures(line):
         assert drawing_bytes(figure.draw(Look()), "png", dpi=50)
