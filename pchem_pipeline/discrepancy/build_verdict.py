@@ -16,6 +16,7 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS, VERSION
 from pchem_pipeline.discrepancy.size import size_of
 from pchem_pipeline.discrepancy.verdict import (
     CONVINCING_PLACEBO,
+    MOST_PULLS,
     Candidate,
     Change,
     Discrepancy,
@@ -42,7 +43,6 @@ FloatArray = NDArray[np.float64]
 
 #: Share of the gap that effects may leave, where it is above its floor, and still explain it.
 LARGEST_REST = 0.2
-_MOST_PULLS = 12
 _MOST_UNEXPLAINED = 8
 _MOST_RESIDUALS = 3
 _DECIDED = 3.0  # standard errors of a difference of scores that tells two effects apart
@@ -307,7 +307,7 @@ def largest_pulls(
             before=float(before[i]),
             after=float(after[i]),
         )
-        for i in np.argsort(-np.abs(weight))[:_MOST_PULLS]
+        for i in np.argsort(-np.abs(weight))[:MOST_PULLS]
     )
 
 

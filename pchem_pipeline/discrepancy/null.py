@@ -39,6 +39,8 @@ _COUNTS = ("cnt", "count", "pixels", "clusters")
 _MOVED = 4.0
 _WIDER = 0.01
 _REPLICATION = 0.02  # in each split by itself, and in the same direction
+#: Nats on held-out frames that an explanation must be worth where no statistic deviates by itself.
+CONVINCING = 6.0
 _SUSPICION = 0.1  # chance of a deviation for which it is worth to ask the candidates
 _SIGNATURE = 3.0  # standard deviations by which an effect moves the statistics of its signature
 

@@ -32,6 +32,8 @@ SCHEMA_VERSION = 3
 RARE = 0.5
 #: Share of what an effect closes, from which on an unrelated one that closes as much weakens its name.
 CONVINCING_PLACEBO = 0.25
+#: Statistics whose pulls before and after are told and drawn.
+MOST_PULLS = 12
 #: File of the verdict in the folder of a run.
 VERDICT_FILE = "discrepancy.json"
 

@@ -113,7 +113,7 @@ def apply_to_frames(
         context.fingerprint = fingerprint_of(made.content)
         for remark in made.remarks:
             reporter.warning(remark)
-        _do(context, replace(made.job, output=store.path), made, wanted)
+        _do(context, replace(made.job, output=store.path), made)
         if wanted.format == "zarr":
             how = f'xarray.open_zarr("{output}", group="applied", consolidated=False)'
             reporter.info(f"apply: open it with {how}")
@@ -329,7 +329,7 @@ def _create_counted(context: StageContext, job: Job) -> None:
 # -- the work --------------------------------------------------------------------------------------
 
 
-def _do(context: StageContext, job: Job, made: _Made, wanted: ApplySettings) -> None:
+def _do(context: StageContext, job: Job, made: _Made) -> None:
     """Bring the output up to date.
 
     Raises:

@@ -23,7 +23,7 @@ from pchem_pipeline.discrepancy.by_likelihood.sets import SetComparison, split_s
 from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap
-from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix
+from pchem_pipeline.discrepancy.null import CONVINCING, Measured, NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY, observe_histograms
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
@@ -45,7 +45,6 @@ _FEWEST_REPLICATES = 40
 _LARGEST_TOTAL = 10**9 - 1  # samples of a pixel that can be split at random
 _SIGMAS, _PRICE = 3.0, 3.0  # standard errors, and nats, by which a set must improve the score
 _REACH = 7.0  # standard deviations: the law reaches no further
-_CONVINCING = 6.0  # nats, where no statistic deviates by itself
 
 
 @dataclass(frozen=True)
@@ -223,7 +222,7 @@ class HistogramExplainer:
         self.defects |= self.sets.failed | found.sets.failed
         if not disagrees:
             rise, error = found.sets.difference(found.judged, found.sets.fit(()))
-            if not found.named or rise < max(_CONVINCING, _SIGMAS * error):
+            if not found.named or rise < max(CONVINCING, _SIGMAS * error):
                 return None
         self.found = found
         return found if found.named else None

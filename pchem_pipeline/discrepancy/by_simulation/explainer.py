@@ -66,7 +66,14 @@ from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
 from pchem_pipeline.discrepancy.by_simulation.unexplained import Unexplained
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
-from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, free_of_parameters, suspicious
+from pchem_pipeline.discrepancy.null import (
+    CONVINCING,
+    Measured,
+    NullModel,
+    as_matrix,
+    free_of_parameters,
+    suspicious,
+)
 from pchem_pipeline.discrepancy.observe.digital.misplaced import own_lines
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
@@ -84,7 +91,6 @@ IntArray = NDArray[np.int64]
 _FEWEST_PIXELS = 32
 _NOT_IDENTIFIED = 0.5  # share of ambiguous pixels from which their parameters are no ground for a verdict
 _NEAR = 0.1  # relative: so little is not worth another simulation, but can be corrected without one
-_CONVINCING = 6.0  # nats that a set must be worth on held-out frames where no statistic deviates by itself
 # standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
 # than a single one would by chance
 _ESTABLISHED = 4.5
@@ -252,7 +258,7 @@ class FrameExplainer:
         self.effort.check("the candidates were compared" if not self.rounds else "another round of effects")
         self.effort.tried.clear()
         hypotheses, choice = self._asked(self.model, _Drawn(self.fit, self.sensor), null, z)
-        if choice is None or not (disagrees or choice.advantage > _CONVINCING):
+        if choice is None or not (disagrees or choice.advantage > CONVINCING):
             return None
         return _Explanation(hypotheses, choice)
 

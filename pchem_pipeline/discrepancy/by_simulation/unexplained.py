@@ -36,6 +36,7 @@ from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.replicate import simulate_frames
 from pchem_pipeline.discrepancy.by_simulation.trials import leaves_nothing
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
+from pchem_pipeline.discrepancy.null import CONVINCING
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.analog.empirical_noise import Changed, Shared
@@ -46,7 +47,6 @@ from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 Model = tuple[Effect, ...]
 Measure = Callable[[Part, Model, Model], Measurement | None]
 
-_CONVINCING = 6.0  # nats that a form must add
 _LITTLE = 0.03  # of what there is to explain, nats
 _WORTHWHILE = 0.25  # of the nats of what is clearest: less cannot be all there is
 _MOST_TRIED = 3  # of all forms and parts
@@ -173,7 +173,7 @@ class Unexplained:
         while forms and not (found is not None and self._leaves_little(found)):
             beside, better, score = kept, "", -np.inf
             if found is not None:
-                beside, score = found.hypotheses, found.score + _CONVINCING
+                beside, score = found.hypotheses, found.score + CONVINCING
             effects = tuple(h.effect for h in beside)
             for likely in self._likeliest(effects, forms) if effects else self._of_all:
                 if likely.form not in forms:

@@ -55,7 +55,7 @@ def series_checks(mean: FloatArray, error: float, skewness: float) -> list[Check
         return []
     smooth, drift = _drift(series, noise)
     rest = series - smooth
-    return [drift, _period(rest), _memory(rest, noise), _single(mean - smooth, spread, error, skewness)]
+    return [drift, _period(rest), _memory(rest), _single(mean - smooth, spread, error, skewness)]
 
 
 def _drift(series: FloatArray, noise: float) -> tuple[FloatArray, Check]:
@@ -141,7 +141,7 @@ def _around(power: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.maximum(sums, 0.0) / np.maximum(count, 1), np.maximum(count, 1).astype(np.float64)
 
 
-def _memory(series: FloatArray, noise: float) -> Check:
+def _memory(series: FloatArray) -> Check:
     """Return whether the mean of a frame resembles that of the frame before."""
     n = series.size
     total = float(series @ series)

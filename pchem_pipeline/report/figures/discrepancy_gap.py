@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from pchem_pipeline.discrepancy.verdict import Pull, Verdict, micronats
+from pchem_pipeline.discrepancy.verdict import MOST_PULLS, Pull, Verdict, micronats
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.style.palette import Palette
@@ -34,8 +34,6 @@ _FAMILY_WORDS = {
     "frame": "means of the frames",
     "space": "rows, columns, neighbours",
 }
-#: Statistics in the figure of pulls.
-_MOST_PULLS = 12
 
 _GAP_CAPTION = (
     "Gap before and after on a logarithmic axis, with intervals where they are known, the floor (gray: "
@@ -138,7 +136,7 @@ def largest_pulls(data: DiscrepancyData) -> list[Pull]:
     def far(pull: Pull) -> float:
         return max((abs(v) for v in (pull.before, pull.after) if math.isfinite(v)), default=0.0)
 
-    return sorted(rows.values(), key=far, reverse=True)[:_MOST_PULLS]
+    return sorted(rows.values(), key=far, reverse=True)[:MOST_PULLS]
 
 
 def _pull_text(rows: Sequence[Pull]) -> str:

@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.report.style.ranges import DECADES
+
 FloatArray = NDArray[np.float64]
 
 #: Codes with a meaning of their own, and the last one of the regular range.
 _NONE, _BELOW, _FIRST, _LAST, _ABOVE = 0, 1, 2, 65534, 65535
 #: Quantiles between which a value is surely inside the range; the range is three times wider on each side.
 _TAIL = 1e-3
-#: Positive values that spread over more than this factor are stored as logarithms.
-_DECADES = 30.0
 #: Values from which quantiles are taken, at least.
 _ENOUGH = 500_009
 #: Values whose codes are made at a time.
@@ -95,7 +95,7 @@ def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0
     log = False
     if known.min() >= 0 and (known > 0).any():
         bulk = np.quantile(known[known > 0], [0.01, 0.99])
-        log = bool(bulk[1] > _DECADES * bulk[0]) or bool((known == 0).any() and bulk[1] > bulk[0])
+        log = bool(bulk[1] > DECADES * bulk[0]) or bool((known == 0).any() and bulk[1] > bulk[0])
         known = np.log10(known[known > 0]) if log else known
     low, q25, middle, q75, high = np.quantile(known, [_TAIL, 0.25, 0.5, 0.75, 1.0 - _TAIL])
     margin = 3.0 * (high - low)

@@ -13,7 +13,7 @@ from pchem_pipeline.model.maps.ordered import Ordered
 FloatArray = NDArray[np.float64]
 
 #: A positive range that spans more than this factor is drawn on a logarithmic axis.
-_DECADES = 30.0
+DECADES = 30.0
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def robust_range(
         return DisplayRange(0.0, 1.0, 0, 0, known.n_missing, False)
     smallest, largest = float(known.values[0]), float(known.values[-1])
     bulk_low, bulk_high = known.quantiles([tail, 1.0 - tail]).tolist()
-    logarithmic = allow_log and bulk_low > 0 and bulk_high / bulk_low > _DECADES
+    logarithmic = allow_log and bulk_low > 0 and bulk_high / bulk_low > DECADES
     if logarithmic:
         low, high = np.exp(_widened(np.log(bulk_low), np.log(bulk_high)))
         smallest = max(smallest, float(np.finfo(np.float64).tiny))
