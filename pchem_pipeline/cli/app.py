@@ -23,7 +23,7 @@ from pchem_pipeline.cli.twin import twin
 from pchem_pipeline.stages.table import STAGES, pipeline, pipeline_of
 
 if TYPE_CHECKING:
-    from pchem_pipeline.run.session import Command
+    from pchem_pipeline.runner.session import Command
 
 app = typer.Typer(
     name="pchem",
@@ -40,8 +40,8 @@ def _stage_command(name: str, summary: str) -> None:
 
     @takes_command()
     def stage(target: Target, *, command: Command) -> None:
-        from pchem_pipeline.run.session import run_stages
         from pchem_pipeline.run.target import find_run
+        from pchem_pipeline.runner.session import run_stages
 
         run_stages(find_run(target), [name], command)
 
@@ -83,8 +83,8 @@ def ingest(
     command: Command,
 ) -> None:
     """Check the camera files; copy or reference their frames."""
-    from pchem_pipeline.run.session import cropped, run_stages
     from pchem_pipeline.run.target import find_run
+    from pchem_pipeline.runner.session import cropped, run_stages
 
     run = find_run(target)
     if append:
@@ -138,7 +138,7 @@ def run(
     from pchem_pipeline.commands.first_screen import run_to_first_screen
     from pchem_pipeline.commands.new_run import find_or_start, first_try
     from pchem_pipeline.config.load import dump_config
-    from pchem_pipeline.run.session import cropped, up_to
+    from pchem_pipeline.runner.session import cropped, up_to
 
     given = {"integration_time": integration_time, "bit_depth": bit_depth, "kind": kind, "mode": mode}
     known = {name: value for name, value in given.items() if value is not None}

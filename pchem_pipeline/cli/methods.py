@@ -10,7 +10,7 @@ import typer
 from pchem_pipeline.cli.options import Target, takes_command
 
 if TYPE_CHECKING:
-    from pchem_pipeline.run.session import Command
+    from pchem_pipeline.runner.session import Command
 
 
 @takes_command(without=("tiles", "roi"))

@@ -14,7 +14,7 @@ import typer
 from pchem_pipeline.base.errors import ConfigError
 
 if TYPE_CHECKING:
-    from pchem_pipeline.run.session import Command
+    from pchem_pipeline.runner.session import Command
 
 Target = Annotated[Path, typer.Argument(help="a config.yaml, or the store of a run (run.zarr)")]
 Workers = Annotated[int | None, typer.Option(min=1, help="number of workers [default: compute.workers]")]
@@ -139,7 +139,7 @@ def _command(
     **rest: Any,
 ) -> Command:
     """Return what the common options ask for."""
-    from pchem_pipeline.run.session import Command
     from pchem_pipeline.run.stage import Options
+    from pchem_pipeline.runner.session import Command
 
     return Command(Options(force=force, dry_run=dry_run, tiles=tiles, roi=region_of(roi)), **rest)

@@ -20,8 +20,8 @@ from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.frames.stream import HashedFrameStream
 from pchem_pipeline.run.fingerprint import setting_values
 from pchem_pipeline.run.input_identity import ingested_identity, keep_identity, known_identity
-from pchem_pipeline.run.runner import execute
-from pchem_pipeline.run.session import Command, run_stages, run_status, working_run
+from pchem_pipeline.runner.execute import execute
+from pchem_pipeline.runner.session import Command, run_stages, run_status, working_run
 from pchem_pipeline.stages.fit.start import keep_fit
 from pchem_pipeline.stages.histogram.arrays import extend_arrays
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter

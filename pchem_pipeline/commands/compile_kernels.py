@@ -20,8 +20,8 @@ from pchem_pipeline.config.load import dump_config, make_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.compilation import mark_path
 from pchem_pipeline.run.declaration import imported
-from pchem_pipeline.run.session import Command, run_stages
 from pchem_pipeline.run.target import Target
+from pchem_pipeline.runner.session import Command, run_stages
 from pchem_pipeline.stages.table import STAGES
 
 

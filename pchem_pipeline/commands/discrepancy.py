@@ -10,8 +10,8 @@ from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, read_verdict
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.session import Command, run_stages, run_status
 from pchem_pipeline.run.target import Target
+from pchem_pipeline.runner.session import Command, run_stages, run_status
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 from pchem_pipeline.store.run_store import RunStore
 

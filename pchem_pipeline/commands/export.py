@@ -17,8 +17,8 @@ from pchem_pipeline.report.pages.emva import MAPS as EMVA_MAPS
 from pchem_pipeline.report.pages.emva import emva_rows
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.session import run_status
 from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.run_store import RunStore
 

@@ -15,8 +15,8 @@ from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.paper import FORMATS, PaperFigure, draw_paper_figure, read_style_sheet
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.session import run_status
 from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.stages.report.drawing import drawing_executor, drawing_workers
 from pchem_pipeline.stages.report.report import gather
 from pchem_pipeline.store.files import storage_error, write_atomic

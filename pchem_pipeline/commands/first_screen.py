@@ -11,8 +11,8 @@ from typing import Any
 
 from pchem_pipeline.base.errors import IncompleteRunError, NotBelievedError, quoted
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.session import Command, run_stages
 from pchem_pipeline.run.target import Target
+from pchem_pipeline.runner.session import Command, run_stages
 from pchem_pipeline.store.remote_path import RemotePath
 
 _WIDTH = 100

@@ -11,8 +11,8 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.commands.first_screen import run_to_first_screen
 from pchem_pipeline.commands.new_run import other_settings, settings_of
 from pchem_pipeline.config.load import dump_config, make_config
-from pchem_pipeline.run.session import Command
 from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.runner.session import Command
 from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath, place_of

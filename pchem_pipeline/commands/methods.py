@@ -12,8 +12,8 @@ from pchem_pipeline.stages.methods.result import METHODS_FILE, read_methods
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
-    from pchem_pipeline.run.session import Command
     from pchem_pipeline.run.target import Target
+    from pchem_pipeline.runner.session import Command
 
 
 def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) -> str:
@@ -27,7 +27,7 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
     Raises:
         PchEmError: the comparison cannot be made.
     """
-    from pchem_pipeline.run.session import run_stages, run_status
+    from pchem_pipeline.runner.session import run_stages, run_status
     from pchem_pipeline.stages.methods.other_runs import open_other_runs
 
     values = dict(given)

@@ -24,8 +24,8 @@ from pchem_pipeline.run.model_versions import (
     verdict_version,
     version_with,
 )
-from pchem_pipeline.run.session import run_status
 from pchem_pipeline.run.target import Target
+from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.remote_path import place_of
 from pchem_pipeline.store.run_store import RunStore

@@ -33,8 +33,8 @@ from pchem_pipeline.report.style.style import COLUMN_MM, Look
 from pchem_pipeline.report.style.wording import measured, symbol
 from pchem_pipeline.run.model_versions import ModelVersion, model_of, model_versions
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.session import run_status
 from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.stages.report.pixels import bin_masses, pixel_fits, pixel_index
 from pchem_pipeline.stages.report.stored import read_histograms, read_model
 from pchem_pipeline.store.run_store import RunStore
@@ -261,8 +261,8 @@ class Run:
 
         from pchem_pipeline.commands.apply.apply import apply_to_frames
         from pchem_pipeline.commands.apply.settings import ApplySettings, kinds_of
-        from pchem_pipeline.run.session import Command
         from pchem_pipeline.run.stage import Options
+        from pchem_pipeline.runner.session import Command
 
         files = [frames] if isinstance(frames, (str, os.PathLike)) else list(frames)
         command = Command(Options(force=force), quiet=True, progress="off")
@@ -293,7 +293,7 @@ class Run:
             PchEmError: the frames are gone or too few, or another command works on the run.
         """
         from pchem_pipeline.commands.discrepancy import find_and_add
-        from pchem_pipeline.run.session import Command
+        from pchem_pipeline.runner.session import Command
 
         command = Command(progress=progress, quiet=progress == "off")
         find_and_add(self._target, command, refit=refit, effort=effort)

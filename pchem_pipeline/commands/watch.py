@@ -9,8 +9,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from pchem_pipeline.run.fingerprint import StageState
-from pchem_pipeline.run.session import run_status
 from pchem_pipeline.run.target import Target
+from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.store.progress_file import read_progress
 
 _INTERVAL = 1.0

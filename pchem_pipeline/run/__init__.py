@@ -1,1 +1,1 @@
-"""What a stage is, and what runs stages: fingerprints, runner, session, progress, signals."""
+"""What a stage is and is given: its declaration, context, fingerprint, model, progress, signals."""

@@ -18,9 +18,9 @@ from pchem_pipeline.commands.joint import find_joint, run_joint
 from pchem_pipeline.commands.notebook import open_run
 from pchem_pipeline.commands.view import make_server
 from pchem_pipeline.discrepancy.verdict import read_verdict
-from pchem_pipeline.run.session import Command, run_stages, run_status, up_to
 from pchem_pipeline.run.stage import Options
 from pchem_pipeline.run.target import find_run
+from pchem_pipeline.runner.session import Command, run_stages, run_status, up_to
 from pchem_pipeline.stages.fit.fitted_model import fitted_effects
 from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.run_store import RunStore

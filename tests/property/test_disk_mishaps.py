@@ -13,13 +13,13 @@ from helpers.disk_mishaps import FailingDisk, ForgetfulDisk, materialised
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.load import parse_config
-from pchem_pipeline.run import runner
 from pchem_pipeline.run.declaration import Stage
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import WHOLE, StageContext, open_store
+from pchem_pipeline.runner import execute as runner
+from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.store import disk
 from pchem_pipeline.store.files import write_json
 from pchem_pipeline.store.run_store import RunStore

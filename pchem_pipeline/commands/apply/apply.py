@@ -41,9 +41,9 @@ from pchem_pipeline.run.compilation import announced
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.session import Command, with_overrides
 from pchem_pipeline.run.signals import stop_on_signals
 from pchem_pipeline.run.stage import StageContext
+from pchem_pipeline.runner.session import Command, with_overrides
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.remote_path import place_of
 from pchem_pipeline.store.run_store import RunStore

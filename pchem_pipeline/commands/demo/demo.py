@@ -10,8 +10,8 @@ from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.run.session import Command, run_stages
 from pchem_pipeline.run.target import find_run
+from pchem_pipeline.runner.session import Command, run_stages
 from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.run_store import RunStore

@@ -24,8 +24,8 @@ from pchem_pipeline.discrepancy.verdict import read_verdict
 from pchem_pipeline.effects.framework.region import GRAMMAR, Region, When, parse_place
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 from pchem_pipeline.frames.writing import write_frames
-from pchem_pipeline.run.session import Command, run_stages
 from pchem_pipeline.run.target import find_run
+from pchem_pipeline.runner.session import Command, run_stages
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings

@@ -31,7 +31,6 @@ from pchem_pipeline.discrepancy.by_simulation.candidates import (
     serial,
 )
 from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare
-from pchem_pipeline.discrepancy.by_simulation.empirical import without_squares
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Choice,
     Hypothesis,
@@ -52,6 +51,7 @@ from pchem_pipeline.discrepancy.by_simulation.maps import (
     learn_sensor,
     refit_maps,
 )
+from pchem_pipeline.discrepancy.by_simulation.measured.moves import without_squares
 from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import (
     PixelLikelihood,
     Witness,

@@ -12,26 +12,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import error_words
-from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement, measured_moves
-from pchem_pipeline.discrepancy.by_simulation.empirical_electrons import (
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis
+from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.maps import Refit, Sensor
+from pchem_pipeline.discrepancy.by_simulation.measured.electrons import (
     Electrons,
     electron_chances,
     measured_electrons,
 )
-from pchem_pipeline.discrepancy.by_simulation.empirical_modes import Sums, common_scores, measured_mode
-from pchem_pipeline.discrepancy.by_simulation.empirical_noise import (
+from pchem_pipeline.discrepancy.by_simulation.measured.modes import Sums, common_scores, measured_mode
+from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement, measured_moves
+from pchem_pipeline.discrepancy.by_simulation.measured.noise import (
     Covariances,
     measured_noise,
     residual_covariances,
 )
-from pchem_pipeline.discrepancy.by_simulation.empirical_response import (
+from pchem_pipeline.discrepancy.by_simulation.measured.response import (
     Responses,
     measured_response,
     residual_responses,
 )
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis
-from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
-from pchem_pipeline.discrepancy.by_simulation.maps import Refit, Sensor
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.replicate import simulate_frames
 from pchem_pipeline.discrepancy.by_simulation.trials import leaves_nothing

@@ -15,11 +15,11 @@ from pchem_pipeline.commands import first_screen, new_run
 from pchem_pipeline.commands.new_run import find_or_start
 from pchem_pipeline.config.load import load_config, parse_config
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.run import session
 from pchem_pipeline.run import target as run_target
-from pchem_pipeline.run.session import Command
 from pchem_pipeline.run.stage import Options
 from pchem_pipeline.run.target import Target
+from pchem_pipeline.runner import session
+from pchem_pipeline.runner.session import Command
 
 CONFIG = "input: {files: [a.tif]}\n"
 

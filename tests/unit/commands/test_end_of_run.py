@@ -8,9 +8,9 @@ import pytest
 from pchem_pipeline.base.errors import ExitCode, IncompleteRunError, NotBelievedError
 from pchem_pipeline.commands import first_screen
 from pchem_pipeline.config.load import parse_config
-from pchem_pipeline.run.session import Command
 from pchem_pipeline.run.stage import Options
 from pchem_pipeline.run.target import Target
+from pchem_pipeline.runner.session import Command
 
 STAGES = ("maps", "report")
 

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings
 from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
-from pchem_pipeline.discrepancy.by_simulation.empirical import _Mixture, measured_moves, without_squares
+from pchem_pipeline.discrepancy.by_simulation.measured.moves import _Mixture, measured_moves, without_squares
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.evidence import PixelMaps

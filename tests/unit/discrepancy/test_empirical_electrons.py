@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
-from pchem_pipeline.discrepancy.by_simulation.empirical_electrons import electron_chances, measured_electrons
+from pchem_pipeline.discrepancy.by_simulation.measured.electrons import electron_chances, measured_electrons
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons

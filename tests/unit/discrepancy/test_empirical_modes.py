@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pchem_pipeline.discrepancy.by_simulation.empirical_modes import (
+from pchem_pipeline.discrepancy.by_simulation.measured.modes import (
     Sums,
     codes_within_reach,
     common_scores,

@@ -10,8 +10,8 @@ import pytest
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
-from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement
-from pchem_pipeline.discrepancy.by_simulation.empirical_response import measured_response, residual_responses
+from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
+from pchem_pipeline.discrepancy.by_simulation.measured.response import measured_response, residual_responses
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames

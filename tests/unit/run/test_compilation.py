@@ -22,8 +22,8 @@ from pchem_pipeline.run.compilation import (
     mark_path,
 )
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.session import Command, run_stages
 from pchem_pipeline.run.target import Target
+from pchem_pipeline.runner.session import Command, run_stages
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings

@@ -31,9 +31,9 @@ from pchem_pipeline.run.model_versions import (
     version_with,
     write_added_exposure,
 )
-from pchem_pipeline.run.session import Command, run_stages, run_status
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.run.target import find_run
+from pchem_pipeline.runner.session import Command, run_stages, run_status
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.run_store import RunStore

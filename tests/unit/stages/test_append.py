@@ -14,9 +14,9 @@ from pchem_pipeline.commands.append import append_frames
 from pchem_pipeline.compute import memory
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.run.session import Command, run_stages, run_status
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.runner.session import Command, run_stages, run_status
 from pchem_pipeline.stages.fit.start import kept_fit
 from pchem_pipeline.store.run_store import RunStore
 

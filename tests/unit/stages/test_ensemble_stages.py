@@ -26,9 +26,9 @@ from pchem_pipeline.model.law.pcd import thresholds
 from pchem_pipeline.report.pages.summary import key_numbers, sentence
 from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import Options, StageContext
+from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
 from pchem_pipeline.stages.fit.code_sums import CodeSums, on_axis
 from pchem_pipeline.stages.report.report import report_data

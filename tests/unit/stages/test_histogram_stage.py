@@ -16,10 +16,10 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.histogram.summaries import SummaryAccumulator
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import Options, StageContext, open_store
+from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.histogram import arrays, histogram
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore

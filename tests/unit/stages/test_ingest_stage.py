@@ -21,10 +21,10 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run import input_identity
 from pchem_pipeline.run.fingerprint import StageState, status
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
 from pchem_pipeline.run.stage import Options, StageContext, open_store
+from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages import ingest
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.records import StageRecord

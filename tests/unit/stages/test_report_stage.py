@@ -20,9 +20,9 @@ from pchem_pipeline.report.pages.report_json import report_numbers
 from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import StageContext
+from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.report import report
 from pchem_pipeline.stages.report.pixels import choose_pixels
 from pchem_pipeline.stages.report.report import gather

@@ -11,9 +11,9 @@ from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import Options, StageContext
+from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.fit import together
 from pchem_pipeline.store.run_store import RunStore
 

@@ -19,9 +19,9 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
 from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.bands import cut_rows
 from pchem_pipeline.stages.histogram import memory, single_pass
 from pchem_pipeline.store.run_store import RunStore

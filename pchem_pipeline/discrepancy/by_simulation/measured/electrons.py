@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement
-from pchem_pipeline.discrepancy.by_simulation.empirical_modes import codes_within_reach, score_tables
+from pchem_pipeline.discrepancy.by_simulation.measured.modes import codes_within_reach, score_tables
+from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
 from pchem_pipeline.discrepancy.observe.pairs import Samples
 from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons, Fate
 from pchem_pipeline.effects.estimators.count_scores import charlier_information

@@ -16,10 +16,10 @@ from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.run.fingerprint import StageState, status
 from pchem_pipeline.run.model_versions import keep_in_force, model_in_force
 from pchem_pipeline.run.progress import ProgressMode, Reporter
-from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.signals import StopRequest, stop_on_signals
 from pchem_pipeline.run.stage import Options, StageContext
 from pchem_pipeline.run.target import Target
+from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.samples import SAMPLES_UNTIL, check_samples, sample_targets
 from pchem_pipeline.stages.table import STAGES, pipeline_of
 from pchem_pipeline.store.files import write_json

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement
+from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
 from pchem_pipeline.discrepancy.observe.pairs import Samples
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, Lag, NoiseMode, Shared, spectrum
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps

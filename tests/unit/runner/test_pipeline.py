@@ -11,14 +11,14 @@ from helpers.commands import sigint
 from pchem_pipeline.base.errors import ConfigError, InputError, LockedError, StoreError
 from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.load import parse_config
-from pchem_pipeline.run import runner
 from pchem_pipeline.run.declaration import Stage
 from pchem_pipeline.run.fingerprint import differences, status
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.runner import execute
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest, stop_on_signals
 from pchem_pipeline.run.stage import WHOLE, Options, StageContext, open_store
+from pchem_pipeline.runner import execute as runner
+from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.store.run_store import RunStore
 
 CALLS: list[str] = []

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.empirical import Measurement, shares_of
+from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement, shares_of
 from pchem_pipeline.effects.analog.empirical_noise import Changed, EmpiricalNoise, Lag, NoiseMode, Shared
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
