@@ -38,7 +38,6 @@ class Explainer(Protocol[Explanation]):
         model: effects; those that were there before, and those added since.
         defects: candidates that failed, and why.
         untestable: effects that such data cannot show, and why.
-        n_replicates: drawn so far.
     """
 
     settings: DiscrepancySettings
@@ -47,7 +46,11 @@ class Explainer(Protocol[Explanation]):
     model: tuple[Effect, ...]
     defects: dict[str, str]
     untestable: dict[str, str]
-    n_replicates: int
+
+    @property
+    def n_replicates(self) -> int:
+        """Replicates drawn so far."""
+        ...
 
     def split(self) -> tuple[Evidence, Examined]:
         """Split the samples into train, test and final part; return the evidence of the train part."""

@@ -7,7 +7,6 @@ anything; what it does not show at all is not named.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -43,25 +42,19 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
 )
 from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.maps import (
-    MANY_MISTAKEN,
     NotFittedError,
     Refit,
     Sensor,
     expected_codes,
-    learn_sensor,
     refit_maps,
 )
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import without_squares
 from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import (
     PixelLikelihood,
     Witness,
     with_details,
 )
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.replicate import (
-    Replicate,
-    by_part,
-)
+from pchem_pipeline.discrepancy.by_simulation.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
 from pchem_pipeline.discrepancy.by_simulation.unexplained import Unexplained
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
@@ -74,7 +67,6 @@ from pchem_pipeline.discrepancy.null import (
     free_of_parameters,
     suspicious,
 )
-from pchem_pipeline.discrepancy.observe.digital.misplaced import own_lines
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import search, silent
@@ -172,7 +164,6 @@ class FrameExplainer:
     model: tuple[Effect, ...]
     mapper: Mapper
     samples: str = "frames"
-    n_replicates: int = 0
     defects: dict[str, str] = field(default_factory=dict)
     rounds: list[Round] = field(default_factory=list)
 
@@ -182,11 +173,15 @@ class FrameExplainer:
         self.untestable = {tag: c.untestable for tag, c in effect_classes().items() if c.untestable}
         self.most_rounds = self.settings.max_rounds
         self.effort = Effort(self.settings.effort)
-        self.lost: float | None = None
         self.held: Refitted | None = None
         self.unexplained: Unexplained | None = None
         self.given = self.model
         self.drawn: dict[tuple[Effect, ...], _Drawn] = {}
+
+    @property
+    def n_replicates(self) -> int:
+        """Parts of simulated stacks so far."""
+        return self.work.done
 
     def split(self) -> tuple[Evidence, Examined]:
         """Observe train and test frames together, then each part near their fit."""
@@ -209,12 +204,13 @@ class FrameExplainer:
         splits = self.frames.splits
         parts = splits.train, splits.test, splits.final
         self.evidence = tuple(self.frames.observe(part, self.plain.maps) for part in parts)
-        self.fit, self.sensor = self._mapped(self.model)
+        self.work = Simulations(self.frames, self.plain, self.mapper, self.settings.seed, self.effort)
+        self.fit, self.sensor = self.work.mapped(self.model)
         return self.evidence[0], splits.examined(self.frames.stack.shape)
 
     def null(self) -> tuple[NullModel, Measured]:
         """Simulate and observe the fitted model, refit included."""
-        vectors = self._replicates(self.model, self.sensor, "r0", self.settings.replicates)
+        vectors = self.work.replicates(self.model, self.sensor, "r0", self.settings.replicates)
         splits = self.frames.splits
         parts = splits.train, splits.test, splits.final
         own = [self.frames.statistics(part, e) for part, e in zip(parts, self.evidence, strict=True)]
@@ -281,13 +277,13 @@ class FrameExplainer:
         """
         purpose = "/".join([str(len(self.rounds)), *(e.tag for e in model if slopes is not None)])
         simulator = ReplicateSimulator(
-            drawn.sensor.usual(self._seed(f"sensor/{purpose}")),
+            drawn.sensor.usual(self.work.seed_of(f"sensor/{purpose}")),
             model,
             self.frames.acquisition(),
             null.names,
-            self._counted,
+            self.work.counted,
             f"r{len(self.rounds)}",
-            self._seed(f"fingerprint/{purpose}"),
+            self.work.seed_of(f"fingerprint/{purpose}"),
             dict(self.defects),
         )
         shifts = (z.train - null.mean, z.test - null.mean)
@@ -307,7 +303,7 @@ class FrameExplainer:
         ]
         if slopes is None:
             guesses = with_details(
-                guesses, self._own_samples(model), drawn.fit.maps, self.frames.effects(model), self.effort
+                guesses, self.work.own_samples(model), drawn.fit.maps, self.frames.effects(model), self.effort
             )
         hypotheses = simulator.fingerprints([*guesses, *placebo_for(guesses, self.classes)])
         if slopes is None:
@@ -372,7 +368,7 @@ class FrameExplainer:
         present = self.frames.effects([e for e in self.model if e in self.given])
         if not all(effect.everywhere for effect in (*present, *effects)):
             return None
-        frames = self._own_samples((*present, *effects))
+        frames = self.work.own_samples((*present, *effects))
         return PixelLikelihood(frames, self.plain.maps, present, self.effort, pixels)
 
     def _widens(self, added: Refitted, null: NullModel, z: Measured) -> bool:
@@ -462,10 +458,10 @@ class FrameExplainer:
                 self.frames,
                 self.plain,
                 self._refitter(z, tuple(h for this in self.rounds for h in this.added.hypotheses)),
-                self._refit,
-                lambda model: self._mapped(model)[1],
+                self.work.refit,
+                lambda model: self.work.mapped(model)[1],
                 lambda found: self._established(found, z),
-                self._seed("covariances"),
+                self.work.seed_of("covariances"),
                 self.settings.extended_replicates,
                 self.effort,
                 self.defects,
@@ -546,84 +542,6 @@ class FrameExplainer:
             self.plain, code=code if expected is None else replace(code, expected=expected), z=left
         )
 
-    def _refit(self, model: tuple[Effect, ...]) -> Refit:
-        """Return the fit of the seen frames under a model."""
-        return self._refit_of(self._own_samples(model), model)
-
-    def _refit_of(self, frames: NDArray[np.unsignedinteger], model: tuple[Effect, ...]) -> Refit:
-        """Return the fit of frames, each sample that of its pixel, under a model."""
-        plain = self.plain
-        assert plain.covariance is not None
-        if not model:
-            return Refit(plain.maps, {}, plain.covariance)
-        own, numbers = self.frames.effects(model), self.frames.numbers[self.frames.seen]
-        # where the pixels are drawn anew in every replicate, what they have in the data stays part of H
-        steady = [e for e in own if not e.brightens_anew]
-        added = added_exposures(steady, frames, numbers, plain.maps)
-        fit = refit_maps(frames, plain.maps, own, plain.covariance, added, numbers)
-        tags = (effect.tag for effect in model)
-        self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags, learnt=fit.learnt)
-        return fit
-
-    def _own_samples(self, model: tuple[Effect, ...]) -> NDArray[np.unsignedinteger]:
-        """Return the seen frames without the samples that effects likely gave to other pixels."""
-        usable, effects = self.plain.maps.usable, self.frames.effects(model)
-        frames = without_squares(self.frames.stack[self.frames.seen], usable, effects)
-        return own_lines(frames, usable, effects)
-
-    def _mapped(self, model: tuple[Effect, ...]) -> tuple[Refit, Sensor]:
-        """Return the fit of the seen frames under a model, and sensors to draw replicates from."""
-        own, numbers = self.frames.effects(model), self.frames.numbers[self.frames.seen]
-        frames = self._own_samples(model)
-        fit = self._refit_of(frames, model)
-        sensor = learn_sensor(frames, numbers, fit, own, self.plain.ambiguous, self.lost)
-        self.lost = sensor.lost
-        return fit, self._corrected(sensor, model) if model else sensor
-
-    def _corrected(self, sensor: Sensor, model: tuple[Effect, ...]) -> Sensor:
-        """Return sensors that, simulated with effects and fitted without, come out as the data do."""
-        if self.plain.ambiguous > MANY_MISTAKEN:
-            return sensor
-        seed = self._seed("fitted")
-        taken = replace(self.frames.acquisition(), numbers=self.frames.numbers[self.frames.seen])
-        one = Replicate("fitted", sensor.draw(seed), model, seed, taken)
-        self.n_replicates += 1
-        self.effort.simulate(one.samples, one.maps.usable.size, one.fits)
-        return sensor.corrected(self.plain.maps, one.fitted())
-
-    def _replicates(
-        self, model: tuple[Effect, ...], sensor: Sensor, prefix: str, count: int, begin: int = 0
-    ) -> list[Mapping[str, float]]:
-        """Simulate a model, and observe ``count`` parts of it or one more, from number ``begin`` (even) on.
-
-        A simulated stack has two parts, and a sensor of its own.
-        """
-        text = "|".join(e.model_dump_json() for e in model)
-        digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-        taken, stacks = self.frames.acquisition(as_data=True), range(begin // 2, (begin + count + 1) // 2)
-        seeds = {i: self._seed(prefix, i) for i in stacks}
-        tasks = [
-            Replicate(f"{prefix}-null-{digest}-{i}", sensor.draw(seed), model, seed, taken)
-            for i, seed in seeds.items()
-        ]
-        vectors: list[Mapping[str, float]] = []
-        for result in self._counted(tasks):
-            if isinstance(result, Exception):
-                raise result
-            vectors += by_part(result)
-        self.n_replicates += len(vectors) - len(tasks)
-        return vectors
-
-    def _counted(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:
-        self.n_replicates += len(replicates)
-        for each in replicates:
-            self.effort.simulate(each.samples, each.maps.usable.size, each.fits)
-        return self.mapper(replicates)
-
-    def _seed(self, purpose: str, index: int = 0) -> int:
-        text = f"{self.settings.seed}/{purpose}/{index}"
-        return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=7).digest(), "little")
-
     def _noise(self, null: NullModel, splits: int, slopes: FloatArray | None = None) -> Noise:
         """Return the noise of a shift of the mean of so many splits; ``slopes`` are of doubtful strengths."""
         covariance = null.covariance * (1.0 / splits + 1.0 / null.n_replicates)
@@ -639,10 +557,10 @@ class FrameExplainer:
         def draw(effects: tuple[Effect, ...], count: int) -> tuple[Refit, FloatArray]:
             model = (*present, *effects)
             if model not in self.drawn:
-                self.drawn[model] = _Drawn(*self._mapped(model))
+                self.drawn[model] = _Drawn(*self.work.mapped(model))
             one = self.drawn[model]
             done = len(one.vectors)
-            one.vectors += self._replicates(model, one.sensor, "grown", count - done, done)
+            one.vectors += self.work.replicates(model, one.sensor, "grown", count - done, done)
             return one.fit, as_matrix(self.first.names, one.vectors[:count], self.first.mean)
 
         events = np.asarray(self._noise(self.first, 2).events)
@@ -701,7 +619,7 @@ class FrameExplainer:
         taken = tuple(h.times(1.0 + float(c)) for h, c in zip(added.hypotheses, change, strict=True))
         tags = {h.tag for h in taken}
         model = (*(e for e in self.model if e.tag not in tags), *(h.effect for h in taken))
-        self.fit, self.sensor = self._mapped(model)
+        self.fit, self.sensor = self.work.mapped(model)
         self.model = model
         return taken
 

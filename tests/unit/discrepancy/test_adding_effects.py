@@ -616,7 +616,7 @@ def add(
     search.first, search.gaps = world.null, StatisticsGap(world.null, 100_000)
     z = world.z if final is None else Measured(world.z.train, world.z.test, final)
     monkeypatch.setattr(search, "_refitter", lambda *_: world.refitter())
-    monkeypatch.setattr(search, "_mapped", mapped)
+    search.work = SimpleNamespace(mapped=mapped)
     monkeypatch.setattr(search, "_left_by", lambda *_: None)
     monkeypatch.setattr(search, "_likelihood", lambda *_: None)
     shifts = (z.train - world.null.mean, z.test - world.null.mean)

@@ -1,0 +1,133 @@
+"""What a search does over and over: fit the frames under a model, and draw stacks of that model.
+
+Each is counted; a search ends at a limit of that work (:mod:`pchem_pipeline.discrepancy.effort`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.by_simulation.candidates import Mapper
+from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.maps import (
+    MANY_MISTAKEN,
+    Refit,
+    Sensor,
+    learn_sensor,
+    refit_maps,
+)
+from pchem_pipeline.discrepancy.by_simulation.measured.moves import without_squares
+from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate, by_part
+from pchem_pipeline.discrepancy.effort import Effort
+from pchem_pipeline.discrepancy.observe.digital.misplaced import own_lines
+from pchem_pipeline.effects.framework.added_exposure import added_exposures
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import Evidence
+
+
+@dataclass
+class Simulations:
+    """Fits of the seen frames, and stacks simulated from them.
+
+    Attributes:
+        frames: as they were taken, with their parts.
+        plain: evidence of the seen frames.
+        mapper: runs the simulated stacks.
+        seed: root of all random numbers.
+        effort: counts the work.
+        done: parts of simulated stacks so far.
+        lost: share of the pixels that the plain fit mistakes; None: not learnt yet.
+    """
+
+    frames: FrameStack
+    plain: Evidence
+    mapper: Mapper
+    seed: int
+    effort: Effort
+    done: int = 0
+    lost: float | None = None
+
+    def refit(self, model: tuple[Effect, ...]) -> Refit:
+        """Return the fit of the seen frames under a model."""
+        return self._refit_of(self.own_samples(model), model)
+
+    def _refit_of(self, frames: NDArray[np.unsignedinteger], model: tuple[Effect, ...]) -> Refit:
+        """Return the fit of frames, each sample that of its pixel, under a model."""
+        plain = self.plain
+        assert plain.covariance is not None
+        if not model:
+            return Refit(plain.maps, {}, plain.covariance)
+        own, numbers = self.frames.effects(model), self.frames.numbers[self.frames.seen]
+        # where the pixels are drawn anew in every replicate, what they have in the data stays part of H
+        steady = [e for e in own if not e.brightens_anew]
+        added = added_exposures(steady, frames, numbers, plain.maps)
+        fit = refit_maps(frames, plain.maps, own, plain.covariance, added, numbers)
+        tags = (effect.tag for effect in model)
+        self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags, learnt=fit.learnt)
+        return fit
+
+    def own_samples(self, model: tuple[Effect, ...]) -> NDArray[np.unsignedinteger]:
+        """Return the seen frames without the samples that effects likely gave to other pixels."""
+        usable, effects = self.plain.maps.usable, self.frames.effects(model)
+        frames = without_squares(self.frames.stack[self.frames.seen], usable, effects)
+        return own_lines(frames, usable, effects)
+
+    def mapped(self, model: tuple[Effect, ...]) -> tuple[Refit, Sensor]:
+        """Return the fit of the seen frames under a model, and sensors to draw replicates from."""
+        own, numbers = self.frames.effects(model), self.frames.numbers[self.frames.seen]
+        frames = self.own_samples(model)
+        fit = self._refit_of(frames, model)
+        sensor = learn_sensor(frames, numbers, fit, own, self.plain.ambiguous, self.lost)
+        self.lost = sensor.lost
+        return fit, self._corrected(sensor, model) if model else sensor
+
+    def _corrected(self, sensor: Sensor, model: tuple[Effect, ...]) -> Sensor:
+        """Return sensors that, simulated with effects and fitted without, come out as the data do."""
+        if self.plain.ambiguous > MANY_MISTAKEN:
+            return sensor
+        seed = self.seed_of("fitted")
+        taken = replace(self.frames.acquisition(), numbers=self.frames.numbers[self.frames.seen])
+        one = Replicate("fitted", sensor.draw(seed), model, seed, taken)
+        self.done += 1
+        self.effort.simulate(one.samples, one.maps.usable.size, one.fits)
+        return sensor.corrected(self.plain.maps, one.fitted())
+
+    def replicates(
+        self, model: tuple[Effect, ...], sensor: Sensor, prefix: str, count: int, begin: int = 0
+    ) -> list[Mapping[str, float]]:
+        """Simulate a model, and observe ``count`` parts of it or one more, from number ``begin`` (even) on.
+
+        A simulated stack has two parts, and a sensor of its own.
+        """
+        text = "|".join(e.model_dump_json() for e in model)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+        taken, stacks = self.frames.acquisition(as_data=True), range(begin // 2, (begin + count + 1) // 2)
+        seeds = {i: self.seed_of(prefix, i) for i in stacks}
+        tasks = [
+            Replicate(f"{prefix}-null-{digest}-{i}", sensor.draw(seed), model, seed, taken)
+            for i, seed in seeds.items()
+        ]
+        vectors: list[Mapping[str, float]] = []
+        for result in self.counted(tasks):
+            if isinstance(result, Exception):
+                raise result
+            vectors += by_part(result)
+        self.done += len(vectors) - len(tasks)
+        return vectors
+
+    def counted(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:
+        """Return the statistics of replicates, or what they raised; count the work."""
+        self.done += len(replicates)
+        for each in replicates:
+            self.effort.simulate(each.samples, each.maps.usable.size, each.fits)
+        return self.mapper(replicates)
+
+    def seed_of(self, purpose: str, index: int = 0) -> int:
+        """Return the root of the random numbers for a purpose."""
+        text = f"{self.seed}/{purpose}/{index}"
+        return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=7).digest(), "little")
