@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.effects.framework.compose import effect_words
 from pchem_pipeline.effects.framework.registry import effect_class
-from pchem_pipeline.report.pages.discrepancy import parameter_texts
+from pchem_pipeline.report.pages.discrepancy_tables import parameter_texts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

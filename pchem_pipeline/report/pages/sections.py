@@ -18,8 +18,9 @@ from pchem_pipeline.report.pages.cite import citation
 from pchem_pipeline.report.pages.discrepancy import DiscrepancyView
 from pchem_pipeline.report.pages.next_steps import next_steps
 from pchem_pipeline.report.pages.pictures import Picture
+from pchem_pipeline.report.pages.provenance import provenance_tables
 from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, pixel_counts, sentence
-from pchem_pipeline.report.pages.tables import Table, provenance_tables
+from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import symbol
 

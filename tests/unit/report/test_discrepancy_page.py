@@ -27,7 +27,8 @@ from pchem_pipeline.report.figures.discrepancy_gap import largest_pulls
 from pchem_pipeline.report.figures.discrepancy_sensor import largest_maps, regions_of
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages import report as report_module
-from pchem_pipeline.report.pages.discrepancy import discrepancy_tables, place_text, remarks
+from pchem_pipeline.report.pages.discrepancy import remarks
+from pchem_pipeline.report.pages.discrepancy_tables import discrepancy_tables, place_text
 from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.report.pages.summary import flags

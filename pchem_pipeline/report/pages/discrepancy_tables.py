@@ -1,0 +1,313 @@
+"""The tables of a verdict's page: where data and model disagree, candidates, gaps, parameters, limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from pchem_pipeline.discrepancy.verdict import (
+    Candidate,
+    Place,
+    Step,
+    Verdict,
+)
+from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.report.data import DiscrepancyData
+from pchem_pipeline.report.figures.discrepancy_gap import gap_text
+from pchem_pipeline.report.pages.tables import Table
+from pchem_pipeline.report.style.wording import count, measured, percent, short, signed, symbol, unit_text
+
+#: Longer lists are in ``discrepancy.json`` only.
+_MOST_PLACES, _MOST_CANDIDATES = 12, 8
+#: What the maps of the survey show.
+_SURVEYED = {
+    "next_x": "neighbours in a row alike",
+    "next_y": "neighbours in a column alike",
+    "lag": "successive frames alike",
+    "spread": "levels change along the run",
+}
+
+
+def probability_text(p: float) -> str:
+    """Return a probability as people write it."""
+    if not math.isfinite(p):
+        return ""
+    return "< 0.001" if p < 0.001 else "> 0.999" if p > 0.999 else f"{p:.3f}"
+
+
+def parameter_texts(candidate: Candidate) -> list[tuple[str, str]]:
+    """Return the fields of a candidate as text, numbers to four digits."""
+    return [
+        (name, f"{value:.4g}" if isinstance(value, int | float) else str(value or ""))
+        for name, value in candidate.parameters.items()
+        if not isinstance(value, list | dict)
+    ]
+
+
+def parameter_name(name: str) -> str:
+    """Return what a map is called, for people."""
+    try:
+        return symbol(name)[1]
+    except KeyError:
+        return name.replace("_", " ")
+
+
+def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
+    """Return the tables of each part of the page that have rows."""
+    found = data.found
+    parts = {
+        "where": [_where(data, found.where)],
+        "evidence": [
+            *[_candidates(data, step, i) for i, step in enumerate(found.steps)],
+            _separate(found.steps),
+        ],
+        "shown": [_gaps(found)],
+        "parameters": [_parameters(data), _moved(found.steps)],
+        "limits": [_untestable(data), _unexplained(found.unexplained), _defects(found), _examined(data)],
+    }
+    return {part: [table for table in tables if table.rows] for part, tables in parts.items()}
+
+
+def place_text(place: Place) -> str:
+    """Return where a statistic points to: pixels, DN, frames; empty for the whole sensor and run."""
+    words = [place.spot()] if place.spot() else []
+    if place.pixels:
+        shown = ", ".join(f"({y}, {x})" for y, x in place.pixels[:4])
+        more = f" … {count(len(place.pixels), 'pixel')}" if len(place.pixels) > 4 else ""
+        words.append(f"pixels (y, x) {shown}{more}")
+    if place.dn is not None:
+        low, high = place.dn
+        words.append(f"{low:g} DN" if low == high else f"{low:g} to {high:g} DN")
+    if place.frames:
+        words.append(_frame_text(place.frames))
+    return "; ".join(words)
+
+
+def _frame_text(frames: Sequence[int]) -> str:
+    if len(frames) <= 4:
+        return "frames " + ", ".join(str(frame) for frame in frames)
+    return f"{count(len(frames), 'frame')} from {min(frames)} to {max(frames)}"
+
+
+def _where(data: DiscrepancyData, places: Sequence[Place]) -> Table:
+    rows = tuple(
+        (
+            place.sentence or _sentence(data, place.statistic),
+            place.channel or data.statistics.get(place.statistic, ("", ""))[0],
+            signed(place.z),
+            probability_text(place.p),
+            place_text(place) or "everywhere",
+            place.statistic,
+        )
+        for place in places[:_MOST_PLACES]
+    )
+    more = f" The first {_MOST_PLACES} of {len(places)}." if len(places) > _MOST_PLACES else ""
+    return Table(
+        "discrepancy-where",
+        "Statistics that disagree",
+        "How far each lies from what the plain model gives, in standard deviations of chance, with its "
+        f"probability, the farthest first.{more}",
+        ("what it says", "channel", "standard deviations", "p", "where", "statistic"),
+        rows,
+    )
+
+
+def _sentence(data: DiscrepancyData, statistic: str) -> str:
+    return data.statistics.get(statistic, ("", ""))[1] or statistic
+
+
+def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
+    rows = []
+    best = max((c.score for c in step.candidates if math.isfinite(c.score)), default=math.nan)
+    for candidate in step.candidates[:_MOST_CANDIDATES]:
+        behind = candidate.score - best
+        rows.append(
+            (
+                candidate.effect,
+                data.titles.get(candidate.effect, ""),
+                measured(candidate.score, candidate.stderr),
+                short(behind) if math.isfinite(behind) and behind < 0 else "best" if behind == 0 else "",
+                probability_text(candidate.probability),
+                ", ".join(f"{name} {value}" for name, value in parameter_texts(candidate)),
+            )
+        )
+    if step.effect:
+        outcome = f"{step.effect} was named"
+    elif data.found.verdict == "ambiguous":
+        several = len(step.candidates) > 1
+        outcome = "these data cannot tell them apart" if several else "the final samples do not confirm it"
+    else:
+        outcome = "none of them explains it"
+    title = f"Candidates, step {index + 1}" if len(data.found.steps) > 1 else "Candidates"
+    return Table(
+        f"discrepancy-candidates-{index + 1}",
+        f"{title}: {outcome}",
+        "Held-out score with its standard error (nats, larger is better), how far behind the best one, and "
+        "the share of the probability among the candidates.",
+        ("effect", "in the literature", "score", "behind", "probability", "parameters"),
+        tuple(rows),
+    )
+
+
+def _separate(steps: Sequence[Step]) -> Table:
+    rows = tuple(dict.fromkeys((rival, text) for step in steps for rival, text in step.separate.items()))
+    return Table(
+        "discrepancy-separate",
+        "What would tell them apart",
+        "Measurements that separate the effects named here from those that they are confused with.",
+        ("effect", "measurement"),
+        rows,
+    )
+
+
+def _gaps(found: Verdict) -> Table:
+    rows = []
+    for i, step in enumerate(found.steps):
+        low, high = step.gap_interval_after
+        interval = f" ({gap_text(low)} to {gap_text(high)})" if math.isfinite(low) else ""
+        rivals = [
+            f"{gap_text(rival.gap_after)} ({rival.effect})" if rival is not None else ""
+            for rival in (step.runner_up, step.placebo)
+        ]
+        rows.append(
+            (
+                f"{i + 1}: {found.added(step) or step.verdict}",
+                gap_text(step.gap_before),
+                f"{gap_text(step.gap_after)}{interval}",
+                gap_text(step.gap_floor),
+                *rivals,
+            )
+        )
+    return Table(
+        "discrepancy-gap",
+        "Gap by step",
+        "In micronats per sample on frames that no fit has seen, with its interval; runner-up and placebo "
+        "were fitted in the place of the named effect.",
+        ("step", "before", "after", "floor", "runner-up instead", "placebo instead"),
+        tuple(rows),
+    )
+
+
+def _beside(step: Step) -> str:
+    """Return what stands beside the title of an effect: where it acts, whether it is but the likeliest."""
+    place = f", in {step.place}" if step.place else ""
+    return place if step.effect else f"{place} (the likeliest)"
+
+
+def _parameters(data: DiscrepancyData) -> Table:
+    rows = tuple(
+        (
+            f"{tag}: {name}",
+            measured(p.value, p.stderr, unit_text(p.unit)),
+            data.title(tag) + _beside(step),
+            data.sources.get(tag, ""),
+        )
+        for step in data.found.steps
+        for tag in [step.likeliest]
+        for name, p in step.parameters.items()
+        if tag and (step.effect or data.found.verdict == "ambiguous")
+    )
+    return Table(
+        "discrepancy-parameters",
+        "Parameters of the effects",
+        "Estimates with their standard errors; these are the keys of model.effects in the run's YAML.",
+        ("parameter", "value", "effect", "source"),
+        rows,
+    )
+
+
+def _moved(steps: Sequence[Step]) -> Table:
+    rows = []
+    for step in steps:
+        for name, each in step.moved.items():
+            unit = unit_text(each.unit)
+            rows.append(
+                (
+                    f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
+                    step.effect or f"{step.likeliest} (the likeliest)",
+                    short(each.median) if math.isfinite(each.median) else "not known",
+                    signed(each.in_stderr),
+                )
+            )
+    return Table(
+        "discrepancy-moved",
+        "How the delivered parameters moved",
+        "Median over the pixels of (with the effect − without it), also in standard errors of a pixel.",
+        ("parameter", "effect added", "moved by", "in standard errors"),
+        tuple(rows),
+    )
+
+
+def _untestable(data: DiscrepancyData) -> Table:
+    rows = tuple((tag, data.title(tag), why or "") for tag, why in data.found.untestable.items())
+    return Table(
+        "discrepancy-untestable",
+        "Not tested by these data",
+        "They may be there or not: nothing in these frames depends on it.",
+        ("effect", "in the literature", "why, and what would show it"),
+        rows,
+    )
+
+
+def _unexplained(places: Sequence[Place]) -> Table:
+    rows = tuple(
+        (place.sentence or place.statistic, signed(place.z), place_text(place), place.statistic)
+        for place in places[:_MOST_PLACES]
+    )
+    return Table(
+        "discrepancy-unexplained",
+        "Left unexplained",
+        "What remains of the disagreement after all that was named.",
+        ("what it says", "standard deviations", "where", "statistic"),
+        rows,
+    )
+
+
+def _defects(found: Verdict) -> Table:
+    return Table(
+        "discrepancy-defects",
+        "Defects",
+        "Candidates that failed and were not compared: the verdict says nothing of them.",
+        ("effect", "error"),
+        tuple(found.defects.items()),
+    )
+
+
+def _surveyed(name: str, data: DiscrepancyData) -> str:
+    """Return in words what stands out of a map of the whole sensor."""
+    kind, _, rest = name.partition(".")
+    if kind == "pairs":
+        mode, _, channel = rest.partition(".")
+        return f"pixels of a {mode} move together ({'charge' if channel == 'charge' else 'readout'})"
+    if kind in ("score", "goodness"):
+        _, sentence = data.statistics.get(f"shape.{rest or kind}.mean", ("", name))
+        return sentence.removesuffix(", in the mean of the pixels")
+    return _SURVEYED.get(name, name)
+
+
+def _examined(data: DiscrepancyData) -> Table:
+    found, rows = data.found, []
+    for key, words in (
+        ("frames", "frames"),
+        ("train", "frames to find and fit with"),
+        ("test", "frames to confirm and score with"),
+        ("final", "frames kept for the last gap"),
+        ("rows", "rows, first and after the last"),
+        ("columns", "columns, first and after the last"),
+    ):
+        value = getattr(found.examined, key)
+        rows.append((words, " to ".join(map(str, value)) if isinstance(value, tuple) else f"{value:,}"))
+    examined = found.examined
+    if math.isfinite(examined.share):
+        rows.append(("share of the run's samples", percent(examined.share, 1.0)))
+        rows.append(("share that was looked at for places", percent(examined.surveyed, 1.0)))
+        rows += [(f"share: {kind}", percent(share, 1.0)) for kind, share in examined.surveyed_by.items()]
+    for place in examined.places:
+        words = Region.model_validate(place.region).words()
+        rows.append(
+            (f"whole sensor: {_surveyed(place.map, data)}", f"{words} (p {probability_text(place.p)})")
+        )
+    if found.replicates:
+        rows.append(("simulated replicates", f"{found.replicates:,}"))
+    rows += [(f"version: {name}", str(version)) for name, version in found.versions.items()]
+    return Table("discrepancy-examined", "What was examined", "", ("item", "value"), tuple(rows))

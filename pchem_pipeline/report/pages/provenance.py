@@ -1,0 +1,89 @@
+"""The tables of what was run on what: settings, stages, input files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.pages.tables import Table
+
+
+def provenance_tables(data: ReportData) -> list[Table]:
+    """Return the tables of what was run on what."""
+    return [table for make in (_run, _stages, _inputs) if (table := make(data)).rows]
+
+
+def size_text(size: float) -> str:
+    """Return a number of bytes in MB or GB."""
+    return (
+        f"{size / 1e9:.2f} GB"
+        if size >= 1e9
+        else f"{size / 1e6:.1f} MB"
+        if size >= 1e5
+        else f"{size / 1e3:.1f} kB"
+    )
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            rows += _flat(value, f"{prefix}{key}: ")
+        elif isinstance(value, Sequence) and not isinstance(value, str):
+            rows.append((f"{prefix}{key}", ", ".join(str(item) for item in value)))
+        else:
+            rows.append((f"{prefix}{key}", "not known" if value is None else str(value)))
+    return rows
+
+
+def _run(data: ReportData) -> Table:
+    rows = _flat(data.run)
+    return Table("run", "Run", "What made this report.", ("item", "value"), tuple(rows))
+
+
+def _stages(data: ReportData) -> Table:
+    rows = []
+    for stage in data.stages:
+        memory = stage.get("peak_memory_bytes")
+        rows.append(
+            (
+                str(stage.get("stage", "")),
+                str(stage.get("state", "")),
+                f"{float(stage['seconds']):.1f} s" if stage.get("seconds") is not None else "",
+                f"{float(stage['cpu_seconds']):.1f} s" if stage.get("cpu_seconds") is not None else "",
+                size_text(float(memory)) if memory else "",
+                str(stage.get("started", "")),
+            )
+        )
+    return Table(
+        "stages",
+        "Stages",
+        "Wall time, CPU time and largest resident memory of a process.",
+        ("stage", "state", "wall", "CPU", "peak memory", "started (UTC)"),
+        tuple(rows),
+    )
+
+
+#: Files beyond this number are counted, not listed.
+_MOST_FILES = 200
+
+
+def _inputs(data: ReportData) -> Table:
+    rows = [
+        (
+            str(entry.get("name", "")),
+            size_text(float(entry["size"])) if entry.get("size") is not None else "",
+            str(entry.get("hash", "")),
+        )
+        for entry in data.inputs[:_MOST_FILES]
+    ]
+    more = len(data.inputs) - _MOST_FILES
+    words = f" The first {_MOST_FILES} of {len(data.inputs):,} files." if more > 0 else ""
+    return Table(
+        "inputs",
+        "Input files",
+        f"Names, sizes and content hashes of the files that were read.{words}",
+        ("file", "size", "hash"),
+        tuple(rows),
+    )
