@@ -143,7 +143,7 @@ def _target(place: Path, given: Mapping[str, Any], settings: Mapping[str, Mappin
     path = settings_of(place)
     content: dict[str, Any] = {name: dict(section) for name, section in settings.items()}
     content["run"] = {**content.get("run", {}), "store": place.name}
-    known = {"files": [f"{place.stem}-frames.npy"], "mode": "reference", **given}
+    known = {"files": [f"{path.stem}-frames.npy"], "mode": "reference", **given}
     content["input"] = {**known, **content.get("input", {})}
     config = make_config(content, "characterise")
     text = dump_config(config)

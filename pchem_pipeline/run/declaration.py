@@ -57,8 +57,6 @@ class Stage:
         on_demand: done only where it is asked for by name.
         follows: stages that write the files which this one reads as input.
         reads_input: it looks at the camera files, or at the runs of the samples, as they are now.
-        looks_first: what it left before is given up only when ``run`` says so (``context.begin()``): it looks
-            at what may be refused before anything is lost.
         single_pass: what does its work, and that of the stages after it, in one pass over the input.
         plan: ``"module:function"`` that takes (configuration, folder, stages to be done) and returns lines
             which say what the stage will take.
@@ -82,7 +80,6 @@ class Stage:
     on_demand: bool = False
     follows: tuple[str, ...] = ()
     reads_input: bool = False
-    looks_first: bool = False
     single_pass: SinglePass | None = None
     plan: str | None = None
     status_words: str | None = None

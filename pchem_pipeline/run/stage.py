@@ -159,7 +159,9 @@ class StageContext:
         config_path: the YAML file of the run, where it has one.
         notes: remarks for the report, filled by the stage.
         prepared: the stages whose arrays a single pass over the input has made.
-        begin: gives up what the running stage left before; called for it unless it looks at its input first.
+        begin: gives up what the running stage left before, at the first call: :meth:`create` and
+            :meth:`run_units` call it, a stage that writes before those does so itself. What is refused until
+            then costs nothing.
     """
 
     config: RunConfig
@@ -255,6 +257,7 @@ class StageContext:
         **attributes: Any,
     ) -> None:
         """Make an array of this stage, unless the stage resumes and has it."""
+        self.begin()
         if self.fresh or not self.store.has(name):
             self.store.create_array(
                 name, shape, chunks=chunks, shards=shards, dtype=dtype, attributes=attributes
@@ -316,6 +319,7 @@ class StageContext:
             InputError: the camera files are gone.
             StoreError: the store cannot be written.
         """
+        self.begin()
         self._know_total(sum(len(unit.keys) for unit in units) if total is None else total)
         todo = self._ready(self._pending_of(units, by_tiles, total), needs)
         self.store.records.unmark(self.stage, self.fingerprint, (key for unit in todo for key in unit.keys))

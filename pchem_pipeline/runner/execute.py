@@ -83,28 +83,24 @@ def _perform(
         versions=_versions(),
     )
     record = replace(record, model=rests_on(record, context.store))
+    records.write(record)
     begun = False
 
     def begin() -> None:
-        """Give up what the stage left before.
-
-        Markers go first and arrays last: a stage that is killed in between is still known to have begun.
-        """
+        """Give up what the stage left before: markers first, a stage that is killed then has begun anew."""
         nonlocal begun
-        begun = True
-        if context.fresh:
+        if context.fresh and not begun:
             records.unmark_all(stage.name)
-        records.write(record)
-        for path in stage.writes if context.fresh else ():
-            context.store.delete(path)
+            for path in stage.writes:
+                context.store.delete(path)
+        begun = True
 
     context.begin = begin
-    if not stage.looks_first:
-        begin()
     context.reporter.event("start", stage=stage.name, why=before.words())
     wall, cpu = clock
     try:
         imported(stage.run)(context)
+        begin()
         record = replace(record, finished=True)
     finally:
         record = replace(
@@ -116,10 +112,12 @@ def _perform(
             failed=context.failed,
             notes=tuple(context.notes),
         )
-        if begun and old is None and not record.finished and not record.keys:
-            records.forget(stage.name)  # it was refused before it did anything, and leaves no trace
-        elif begun:
+        if begun and (old is not None or record.finished or record.keys):
             records.write(record)
+        elif begun or old is None:
+            records.forget(stage.name)  # it was refused before it did anything, and leaves no trace
+        else:
+            records.write(old)  # nor does it take anything away
     return _finish(stage, context, record, time.perf_counter() - wall, cpu_seconds() - cpu)
 
 

@@ -86,6 +86,7 @@ def run(context: StageContext) -> None:
     files = _files(settings)
     if context.fresh:
         _prepare(folder, settings)
+        context.begin()
         for name, values in truth.arrays().items():
             context.store.write_array(f"truth/{name}", values)
     _write_truth(folder / TRUTH_FILE, truth, settings, [name for name, _, _ in files])

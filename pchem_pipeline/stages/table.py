@@ -67,7 +67,6 @@ _ALL = (
         identity=f"{_HERE}.identities:input_content",
         follows=("simulate",),
         reads_input=True,
-        looks_first=True,
         single_pass=_SINGLE_PASS,
     ),
     Stage(

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.use.calibration import Calibration
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
+    from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 
 _AXES = ("frame", "row", "column")
 _LEAST_SCENE = 0.02  # e-
@@ -45,6 +47,8 @@ class CommonModes:
     def of_model(cls, effects: Sequence[Effect], shape: tuple[int, int]) -> CommonModes:
         """Return those of the effects of a model of a sensor of (rows, columns)."""
         found = [(effect, shared) for effect in effects if (shared := effect.shared_offset()) is not None]
+        for effect, shared in found:
+            _check(effect, shared)
         # other frames are taken at other times; of a tag that is there several times, all or none
         left = {
             effect.tag: None for effect, shared in found if shared.variance is None or effect.when is not None
@@ -78,6 +82,17 @@ class CommonModes:
         turn = 2j * np.pi
         rows, columns = (turn * self.waves[:, axis, None] * np.arange(shape[axis]) for axis in (0, 1))
         return np.exp(rows), np.exp(columns)
+
+
+def _check(effect: Effect, shared: SharedOffset) -> None:
+    """Refuse what an effect of another package may say.
+
+    Raises:
+        PchEmError: its offset is of nothing that is known, or its variance is none.
+    """
+    known = shared.of in (*_AXES, "wave")
+    if not known or (shared.variance is not None and not 0.0 <= shared.variance < np.inf):
+        raise PchEmError(f"effect {effect.tag!r}: shared_offset() returned {shared}, which is no offset")
 
 
 @dataclass(frozen=True)

@@ -195,6 +195,28 @@ def test_input_that_is_refused_costs_a_finished_run_nothing(shell, bad):
     assert len(RunStore.open(store).read("frames/dn")) == 200
 
 
+def test_a_stage_that_cannot_read_its_input_keeps_what_it_made(shell, frames):
+    """The camera files of a run that refers to them are away for a while."""
+    (shell.folder / "run.yaml").write_text(RUN + "histogram: {max_bins: 1024}\n")
+    text = (shell.folder / "run.yaml").read_text().replace("input: {", "input: {mode: reference, ")
+    (shell.folder / "run.yaml").write_text(text)
+    shell.ok("run", "run.yaml", "--until", "fit", "--workers", "1", "--max-memory", "3000")
+    store = RunStore.open(shell.folder / "run.zarr")
+    # what one command was given is no setting of the run
+    assert "max_memory: null" in store.config_text()
+    assert "workers: 1\n" not in store.config_text()
+    before = store.read("histogram/counts")
+    frames.rename(shell.folder / "away")
+    (shell.folder / "run.yaml").write_text(text.replace("1024", "512"))
+    for options in (("run", "run.yaml", "--until", "fit"), ("histogram", "run.yaml", "--force")):
+        assert shell(*options).code == 4
+        assert np.array_equal(RunStore.open(shell.folder / "run.zarr").read("histogram/counts"), before)
+    (shell.folder / "away").rename(frames)
+    (shell.folder / "run.yaml").write_text(text)
+    again = shell.ok("run", "run.yaml", "--until", "fit")
+    assert "histogram: up to date" in again.stderr
+
+
 def test_changed_camera_files_make_the_run_stale(shell, frames):
     (shell.folder / "run.yaml").write_text(RUN)
     shell.ok("ingest", "run.yaml")

@@ -109,9 +109,18 @@ def _numbers(hypotheses: Sequence[Hypothesis]) -> list[tuple[int, str]]:
         (place, name)
         for place, h in enumerate(hypotheses)
         if h.effect.strength and not is_told(h.effect)
-        for name in h.effect.details()
+        for name in _details(h.effect)
     ]
     return found[:_MOST]
+
+
+def _details(effect: Effect) -> list[str]:
+    """Return the numbers that an effect names; of a stranger's only those that have a logarithm."""
+    try:
+        named = [(name, getattr(effect, name)) for name in effect.details()]
+    except Exception:
+        return []  # it is worth no more than one that names none
+    return [name for name, value in named if isinstance(value, float) and 0.0 < value < np.inf]
 
 
 def _measured(refitter: Refitter, one: Refitted, place: int, name: str) -> _Detail | None:

@@ -106,7 +106,10 @@ class Trials:
         self.settled.add(one.tags)
         try:
             better = tuned(self.refitter, one)
-        except EffortSpentError:
+        except (EffortSpentError, NotFittedError):
+            return one
+        except Exception as error:  # of a stranger's effect, as above
+            self.failed[one.hypotheses[-1].tag] = error_words(error)
             return one
         if better is not one:
             self.tried.append(better)

@@ -173,7 +173,8 @@ def styled(draw: Callable[Concatenate[Look, P], Drawing]) -> Callable[Concatenat
     def wrapper(look: Look, /, *args: P.args, **kwargs: P.kwargs) -> Drawing:
         with _in(look):
             drawing = draw(look, *args, **kwargs)
-            _write_powers_plainly(drawing)
+            if not _own_fonts(look):
+                _write_powers_plainly(drawing)
             _join_minor_ticks(drawing)
             _lay_out(drawing)
             return drawing
@@ -207,6 +208,11 @@ def _without_formula(label: str) -> str:
     sign, factor, exponent = found.groups(default="")
     times = f"{factor}×" if factor else ""
     return f"{sign.replace('-', '−')}{times}10{exponent.translate(SUPERSCRIPT)}"
+
+
+def _own_fonts(look: Look) -> bool:
+    """Tell whether a style sheet has fonts of its own, which may lack the characters."""
+    return any(key.startswith(("font.", "mathtext.", "text.usetex")) for key in look.sheet)
 
 
 def _write_powers_plainly(drawing: Drawing) -> None:

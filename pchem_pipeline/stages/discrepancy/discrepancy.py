@@ -26,7 +26,7 @@ from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
 from pchem_pipeline.simulate.chain import dn_dtype
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
-from pchem_pipeline.stages.discrepancy.clear import is_clear
+from pchem_pipeline.stages.discrepancy.clear import fewer_samples
 from pchem_pipeline.stages.discrepancy.survey import Survey, mean_codes, survey
 from pchem_pipeline.stages.discrepancy.window import choose_window, read_window, within_memory
 from pchem_pipeline.stages.samples import open_samples
@@ -138,34 +138,23 @@ def _surveyed(
                 )
             settings = less
         tell("looking at every pixel and every frame")
-        few = settings.model_copy(update={"max_samples": min(settings.clear_samples, settings.max_samples)})
-        closely = settings if before else few
-        seen = survey(context, source, min(closely.max_samples, settings.max_pixels * source.shape[0]))
-        if not before and _is_clear(source, few, settings, roi, seen):
-            settings = few
+        seen = _survey(context, source, settings)
+        few = fewer_samples(source, settings, roi, seen.places) if not before else settings
+        if few != settings:
+            context.note(
+                f"the disagreement is clear in {few.max_samples:,} samples; raise discrepancy.clear_samples "
+                "to compare more: smaller errors, and weaker effects beside it"
+            )
+            settings, seen = few, _survey(context, source, few)
         taken = {name: getattr(settings, name) for name in _TAKEN}
         known = {"window": taken, **seen.numbers()}
         context.run_units([WHOLE], lambda _: known, by_tiles=False, total=1)
     return settings.model_copy(update=known["window"]), Survey.of_numbers(known)
 
 
-def _is_clear(
-    source: FrameSource,
-    few: DiscrepancySettings,
-    settings: DiscrepancySettings,
-    roi: tuple[int, ...] | None,
-    seen: Survey,
-) -> bool:
-    """Tell whether a smaller window than the settings allow shows all that there is."""
-    small, large = (choose_window(source.shape, each, roi, seen.places) for each in (few, settings))
-    if small.share(source.shape) >= large.share(source.shape):
-        return False
-    return is_clear(
-        read_window(source, small),
-        small.numbers,
-        n_run=source.shape[0],
-        block_frames=block_length(small.numbers.size, settings.block_frames),
-    )
+def _survey(context: StageContext, source: FrameSource, settings: DiscrepancySettings) -> Survey:
+    """Look at the whole sensor, except where all of it is compared closely."""
+    return survey(context, source, min(settings.max_samples, settings.max_pixels * source.shape[0]))
 
 
 def _start(context: StageContext) -> tuple[tuple[Effect, ...], tuple[int, ...] | None]:

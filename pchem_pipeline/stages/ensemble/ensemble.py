@@ -269,6 +269,7 @@ def _place_in_truth(
 
 def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:
     """Make the rows of sums; start anew where more pixels have moved the axes."""
+    context.begin()
     store = context.store
     content = asdict(axes)
     if store.attributes("ensemble_tiles").get("axes") != content:

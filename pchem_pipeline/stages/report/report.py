@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
+from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
@@ -172,6 +173,8 @@ def gather(
         inspector=inspector_data(run.name, shape, maps, sample),
         quick_look=run_quick_look(store, run, sums),
         stability=stability_figures(sums),
+        # what a single command was given is no setting of the run
+        config_yaml=store.config_text() or dump_config(config),
     )
 
 

@@ -126,3 +126,39 @@ def test_numbers_that_are_tuned_are_positive_and_none_is_the_strength(tag: str) 
             assert getattr(effect, name) > 0.0
             assert name != effect.strength
             assert getattr(effect.times(name, 0.9), name) == pytest.approx(0.9 * getattr(effect, name))
+
+
+class Limited(DarkCurrentRts):
+    """Of another package: some of its numbers are not free."""
+
+    def times(self, name: str, factor: float) -> "Limited":
+        if name == self.strength:
+            return super().times(name, factor)
+        raise ValueError("not so long")
+
+
+class Wrong(DarkCurrentRts):
+    """Names what is no number of it."""
+
+    def details(self) -> tuple[str, ...]:
+        return ("n_levels", "step")
+
+
+class Broken(DarkCurrentRts):
+    """Cannot say what its numbers are."""
+
+    def details(self) -> tuple[str, ...]:
+        raise RuntimeError("broken")
+
+
+@pytest.mark.parametrize("strange", [Limited, Wrong, Broken])
+def test_what_an_effect_of_another_package_raises_ends_no_search(strange: type[DarkCurrentRts]) -> None:
+    world = World([TRUE])
+    guessed = strange.model_validate(BLINKING.model_dump())
+    hypotheses = [Hypothesis(e, statistics([e])) for e in (guessed, RowNoise(row_noise_dn=0.6))]
+    shifts = (world.parts[0] - world.null.mean, world.parts[1] - world.null.mean)
+    choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
+    assert choice is not None
+    found = compare(world.refitter(), [], hypotheses, choice)
+    assert found is not None
+    assert "dark_current_rts" in found.chosen.tags

@@ -272,6 +272,17 @@ def test_a_stage_stopped_before_its_first_unit_starts_anew(make, monkeypatch):
     monkeypatch.setattr(context, "create_maps", lambda names: context.stop.check())
     with pytest.raises(InterruptedRunError):
         execute("fit", context)
+    # it had not made any, and what was there is not lost
+    assert context.store.has("fit/bias")
+    assert execute("fit", make()).state == "complete"
+
+    def create_some(names):
+        context.begin()
+        context.stop.check()
+
+    monkeypatch.setattr(context, "create_maps", create_some)
+    with pytest.raises(InterruptedRunError):
+        execute("fit", context)
     assert not context.store.has("fit/bias")
     again = make("fit: {gap_threshold: 9}")
     assert execute("fit", again).state == "complete"

@@ -1,15 +1,19 @@
 """Offsets of frames, rows and columns: found as well as the pixels allow, with their noise."""
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 from helpers.known_camera import KnownCamera
 
+from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.effects.analog.bias_drift import BiasDrift
 from pchem_pipeline.effects.analog.column_noise import ColumnNoise
 from pchem_pipeline.effects.analog.frame_noise import FrameNoise
 from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
 from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
 from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 from pchem_pipeline.use.common_modes import CommonModes, estimate_offsets, scene_of
 from pchem_pipeline.use.electrons import electrons
 
@@ -170,3 +174,22 @@ def test_a_wave_and_noise_of_rows_are_told_apart():
     error = ((found.of_samples(modes) - offset) ** 2).mean()
     assert 0.6 < error / found.left.mean() < 1.6
     assert error < 0.1 * (offset**2).mean()
+
+
+class Stranger(RowNoise):
+    """Of another package: noise of odd columns, say; what it says of it is given."""
+
+    says: ClassVar[SharedOffset] = SharedOffset("column", 4.0)
+
+    def shared_offset(self) -> SharedOffset:
+        return self.says
+
+
+def test_an_effect_of_another_package_is_taken_as_it_says(monkeypatch):
+    modes = CommonModes.of_model((Stranger(row_noise_dn=1.0),), SHAPE)
+    assert modes.removed == ("row_noise",)
+    np.testing.assert_array_equal(modes.variances, [[0.0, 0.0, 4.0]])
+    for wrong in (SharedOffset("tap", 1.0), SharedOffset("row", np.nan), SharedOffset("row", -1.0)):
+        monkeypatch.setattr(Stranger, "says", wrong)
+        with pytest.raises(PchEmError, match="'row_noise': shared_offset"):
+            CommonModes.of_model((Stranger(row_noise_dn=1.0),), SHAPE)
