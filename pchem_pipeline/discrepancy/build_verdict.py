@@ -465,7 +465,8 @@ def _shown(found: Findings) -> str:
     pulls = found.last.pulls(found.z.both, splits=2)
     worst = int(np.argmax(np.abs(pulls)))
     name = found.last.names[worst]
-    return f"; beside it {STATISTICS[name].says(float(pulls[worst]))} ({pulls[worst]:+.1f} sd)"
+    beside = "it" if len(found.named) == 1 else "them"
+    return f"; beside {beside} {STATISTICS[name].says(float(pulls[worst]))} ({pulls[worst]:+.1f} sd)"
 
 
 def _doubts(added: Added) -> str:
