@@ -251,6 +251,7 @@ def _simulate(unit: _Unit) -> dict[str, float]:
 
 
 def _write(context: StageContext, found: Discrepancy) -> None:
+    context.begin()
     names, z_before, z_after = found.statistics
     arrays = evidence_arrays(
         found.evidence,
