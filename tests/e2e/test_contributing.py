@@ -66,7 +66,8 @@ def done(tmp_path_factory, kernels):
     install(folder / "lab_effects", folder / "site")
     (folder / "bin").mkdir()
     pchem = folder / "bin" / "pchem"
-    pchem.write_text(f"#!{sys.executable}\nfrom pchem_pipeline.cli.app import main\nmain()\n")
+    # not the line of a Python script: the path of the interpreter may hold a space
+    pchem.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m pchem_pipeline "$@"\n')
     pchem.chmod(0o755)
     environment = {
         **os.environ,
