@@ -35,7 +35,7 @@ class DiscrepancySettings(Section):
         default=1 << 22,
         ge=1 << 14,
         description="the same where so few already disagree by 30 standard deviations with a model without "
-        "effects: more would take longer, with smaller errors and weaker effects beside it; max_samples: all",
+        "effects: more would take longer, and tell weaker effects beside it; the value of max_samples: all",
     )
     max_pixels: int = Field(
         default=1 << 13,

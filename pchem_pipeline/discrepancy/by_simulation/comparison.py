@@ -30,6 +30,7 @@ from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import Witness
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.by_simulation.trials import (
+    LOOSE,
     Trials,
     alike,
     leaves_nothing,
@@ -48,7 +49,6 @@ _MOST_SETS = 5
 # as good a beginning; how many of these sets are refitted, by how many effects they have besides
 _MOST_BEGINNINGS, _REACH_SHARE = 2, 0.05
 _MOST_GROWN = {1: 2, 2: 1}
-_LOOSE = 0.1  # relative error of a fingerprint before its refit
 _SEEN = 4.0  # deviations that the others leave of a statistic for it to ask for an effect
 _MOVED = 3.0  # by which that effect must move it
 _UNTOUCHED = 0.5  # of that, the most by which the others may move it
@@ -144,7 +144,7 @@ def compare(
         return None
     if before is not None and max(one.score for one in tried) < before.score - _NO_WORSE:
         return None  # nothing beside the effects held explains more than they do by themselves
-    if tried and first > 1 and not trials.complete:
+    if first > 1 and not trials.complete:
         # the same of the kinds that have done best
         trials.refit(_begun(_sets(choice, tried)[0], tried, held))
         trials.thin()
@@ -450,7 +450,7 @@ def _seen_beside(refitter: Refitter, part: FloatArray, others: Refitted) -> bool
     Where a set leaves nothing at all, its effects may move the same statistics: those that merely mimic
     something else mend each other, and do not do so everywhere.
     """
-    noise = replace(refitter.noise(others.covariance, len(others.vectors)), model_error=_LOOSE)
+    noise = replace(refitter.noise(others.covariance, len(others.vectors)), model_error=LOOSE)
     shift = refitter.target - others.mean + others.parts.sum(axis=0)
     return seen_among(part, others.parts, shift, noise)
 

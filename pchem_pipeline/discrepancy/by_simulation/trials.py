@@ -22,7 +22,8 @@ from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import look_elsewhere
 
 _MOST_DEAR = 4  # sets whose refit takes long
-_LOOSE = 0.1  # relative error of a fingerprint before its refit
+#: Relative error of a fingerprint before its refit.
+LOOSE = 0.1
 _HARDLY = 0.1  # of a deviation, what effects may move the statistic by that cannot account for it
 # nats behind, and share of what there is to explain, from which on a fingerprint is no rival of a right set
 _FAR, _FAR_SHARE = 40.0, 0.25
@@ -173,7 +174,7 @@ def _beaten(refitter: Refitter, members: Sequence[Hypothesis], best: Refitted) -
     complete = leaves_nothing(refitter, best)
     trust = _FAR_SHARE if complete and len(members) >= len(best.hypotheses) else _FAR_SHARE_OF_PART
     shift = refitter.target - refitter.null.mean
-    noise = replace(refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=_LOOSE)
+    noise = replace(refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=LOOSE)
     fit = fit_set(members, shift, noise)
     parts = fit.parts
     left = np.abs(shift - parts.sum(axis=0)) / np.sqrt(np.diag(noise.of(parts)))
