@@ -16,7 +16,6 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.common_modes import (
     WORTH_A_GUESS,
-    add_offset,
     quantile_means,
     responsivity,
     run_position,
@@ -25,7 +24,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
 )
 from pchem_pipeline.effects.estimators.time_profiles import SETTLING, along_path, check_path, settling
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

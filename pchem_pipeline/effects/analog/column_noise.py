@@ -8,30 +8,20 @@ do not change from frame to frame are part of the bias map and not this effect.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.common_modes import (
-    WORTH_A_GUESS,
-    add_offset,
-    line_excess,
-    mean_variance,
-    responsivity,
-)
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.estimators.common_modes import line_noise
+from pchem_pipeline.effects.framework.effect import register_effect
+from pchem_pipeline.effects.framework.shared_offset import SharedNoise
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+    from pchem_pipeline.effects.framework.evidence import Evidence
 
 
 @register_effect
-class ColumnNoise(Effect):
+class ColumnNoise(SharedNoise):
     """Random offset per column and frame, in DN since the disturbance sits behind the pixels' gains.
 
     Signature: the variance of the column means of the readout residual exceeds that of ``n_y`` independent
@@ -40,22 +30,17 @@ class ColumnNoise(Effect):
     """
 
     tag: Literal["column_noise"] = Field(default="column_noise", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "column noise (column temporal noise)"
     source: ClassVar[str] = "Gow et al. 2007, IEEE Trans. Electron Devices 54, 1321"
     signature: ClassVar[tuple[str, ...]] = ("space.column.readout.variance", "space.y.rr")
     strength: ClassVar[str] = "column_noise_dn"
-    power: ClassVar[float] = 2.0
+    shared_by: ClassVar[Literal["frame", "row", "column"]] = "column"
     separate: ClassVar[Mapping[str, str]] = {
         "interpixel_capacitance": "pixels far apart in a column: they are as correlated as neighbours",
         "frame_noise": "means of columns within a frame: frame noise shifts them all alike",
         "row_noise": "means of rows and of columns within a frame, one beside the other",
     }
     column_noise_dn: float = Field(ge=0, le=1e6, description="standard deviation of the columns' offsets, DN")
-
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
-        """Return the signal (frame, y, x), e-, with the offsets referred to the input."""
-        return add_offset(values, self.column_noise_dn * context.random.normal(("frame", "x")), context)
 
     @classmethod
     def typical(cls) -> Sequence[Self]:
@@ -65,17 +50,5 @@ class ColumnNoise(Effect):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return the excess variance of column means within their frames (moment estimate)."""
-        if evidence.time is None:
-            return ()
-        excess, error = line_excess(evidence.time.column_readout, mean_variance(evidence, axis=0))
-        if excess < WORTH_A_GUESS * error:
-            return ()
-        return (cls(column_noise_dn=excess**0.5 / responsivity(evidence)),)
-
-    def shared_offset(self) -> SharedOffset:
-        """Return the offset of a column."""
-        return SharedOffset("column", self.column_noise_dn**2)
-
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law with the variance of the offsets: exact, a Gaussian on a Gaussian."""
-        return model.with_variance(dn2=self.column_noise_dn**2)
+        found = line_noise(evidence, "column")
+        return () if found is None else (cls(column_noise_dn=found),)

@@ -16,9 +16,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
-from pchem_pipeline.effects.estimators.common_modes import add_offset
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.shared_offset import add_offset
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -9,32 +9,29 @@ Charge-Coupled Devices; Rauscher 2015, PASP 127, 1144 draws such pedestals).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.common_modes import (
     WORTH_A_GUESS,
-    add_offset,
     line_excess,
     mean_variance,
     responsivity,
     successive,
 )
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.framework.effect import register_effect
+from pchem_pipeline.effects.framework.shared_offset import SharedNoise
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+    from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 
 
 @register_effect
-class FrameNoise(Effect):
+class FrameNoise(SharedNoise):
     """Random offset per frame, in DN since the disturbance sits behind the pixels' gains.
 
     Signature: frame means of the readout residual scatter more than ``n`` independent pixels do, by
@@ -43,7 +40,6 @@ class FrameNoise(Effect):
     """
 
     tag: Literal["frame_noise"] = Field(default="frame_noise", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "frame noise (frame-to-frame offset noise)"
     source: ClassVar[str] = "Janesick 2001, Scientific Charge-Coupled Devices; Rauscher 2015, PASP 127, 1144"
     signature: ClassVar[tuple[str, ...]] = (
@@ -53,7 +49,7 @@ class FrameNoise(Effect):
         "space.y.rr",
     )
     strength: ClassVar[str] = "frame_noise_dn"
-    power: ClassVar[float] = 2.0
+    shared_by: ClassVar[Literal["frame", "row", "column"]] = "frame"
     separate: ClassVar[Mapping[str, str]] = {
         "black_clamp": "the camera's clamp switched off: its offsets follow the charge of some pixels",
         "exposure_flicker": "frames without light and at short exposure: flicker of the exposure vanishes",
@@ -61,10 +57,6 @@ class FrameNoise(Effect):
         "bias_drift": "a longer run: a drift grows with the time between two frames, noise does not",
     }
     frame_noise_dn: float = Field(ge=0, le=1e6, description="standard deviation of the frames' offsets, DN")
-
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
-        """Return the signal (frame, y, x), e-, with the offsets referred to the input."""
-        return add_offset(values, self.frame_noise_dn * context.random.normal(("frame",)), context)
 
     @classmethod
     def typical(cls) -> Sequence[Self]:
@@ -90,14 +82,6 @@ class FrameNoise(Effect):
         if excess < WORTH_A_GUESS * error:
             return ()
         return (cls(frame_noise_dn=float(np.sqrt(excess)) / responsivity(evidence)),)
-
-    def shared_offset(self) -> SharedOffset:
-        """Return the offset of a frame."""
-        return SharedOffset("frame", self.frame_noise_dn**2)
-
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law with the variance of the offsets: exact, a Gaussian on a Gaussian."""
-        return model.with_variance(dn2=self.frame_noise_dn**2)
 
 
 def _expected(evidence: Evidence, time: TimeSeries) -> float:

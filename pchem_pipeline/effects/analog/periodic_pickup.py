@@ -15,14 +15,13 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.common_modes import (
-    add_offset,
     chebyshev_nodes,
     responsivity,
     with_offsets,
 )
 from pchem_pipeline.effects.estimators.lines import coherent_line, incoherent_line
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.common_modes import add_offset
 from pchem_pipeline.effects.estimators.read_order import RECORD, pink_amplitudes, pink_noise_of
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.region import Span
+from pchem_pipeline.effects.framework.shared_offset import add_offset
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -15,13 +15,12 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.common_modes import (
     WORTH_A_GUESS,
-    add_offset,
     mean_variance,
     responsivity,
     with_offsets,
 )
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

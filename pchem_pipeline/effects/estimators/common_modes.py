@@ -8,14 +8,13 @@ charge: on average by ``alpha = Var(r) / sigma^2`` (Stein's identity for the Gau
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -28,12 +27,6 @@ WORTH_A_GUESS = 2.0
 # below this ratio of the spread of an offset to the read noise its shape is lost: the fourth cumulant that
 # a Gaussian of the same variance misses is 2e-4 of the squared variance, for the worst (two-valued) law
 _NARROW = 0.1
-
-
-def add_offset(values: NDArray[Any], offset_dn: ArrayLike, context: EffectContext) -> NDArray[Any]:
-    """Return the analog signal (frame, y, x), e-, with offsets in DN referred to the input."""
-    result: NDArray[Any] = values + np.asarray(offset_dn) * context.truth["conversion_gain"]
-    return result
 
 
 def run_position(frames: NDArray[np.int64], n_run: int) -> FloatArray:
@@ -85,6 +78,19 @@ def line_excess(means: NDArray[Any], variance: NDArray[np.float64]) -> tuple[flo
     degrees = (n_frames - 1) * (n_lines - 1)
     excess = float((kept**2).sum() / degrees - expected.mean())
     return excess, float(np.sqrt(2.0 / degrees) * np.sqrt((expected**2).mean()))
+
+
+def line_noise(evidence: Evidence, of: Literal["row", "column"]) -> float | None:
+    """Return the standard deviation of the rows' or columns' offsets, DN; None where none is worth a guess.
+
+    From the excess variance of their means within their frames (moment estimate).
+    """
+    if evidence.time is None:
+        return None
+    rows = of == "row"
+    means = evidence.time.row_readout if rows else evidence.time.column_readout
+    excess, error = line_excess(means, mean_variance(evidence, axis=1 if rows else 0))
+    return None if excess < WORTH_A_GUESS * error else excess**0.5 / responsivity(evidence)
 
 
 def is_narrow(spread_dn: float, maps: PixelMaps) -> bool:
