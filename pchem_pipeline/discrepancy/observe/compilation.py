@@ -13,8 +13,8 @@ from pchem_pipeline.base.kernel_cache import in_any_order
 from pchem_pipeline.discrepancy.observe.digital.misplaced import misplaced_lines
 from pchem_pipeline.discrepancy.observe.law_numba import N_TESTS
 from pchem_pipeline.discrepancy.observe.sums import pixel_statistics, sum_frames
-from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
-from pchem_pipeline.discrepancy.observe.tables_numba import N_MOMENTS
+from pchem_pipeline.discrepancy.observe.tables import pixel_laws
+from pchem_pipeline.discrepancy.observe.tables_numba import N_MOMENTS, CodeSums, PixelLaws
 from pchem_pipeline.model.fit.engine import compilations
 from pchem_pipeline.model.fit.tile_numba import Histograms
 from pchem_pipeline.model.histogram.count import histogram_frames
@@ -61,7 +61,7 @@ def _sum(frames: NDArray[Any]) -> None:
     zeros = np.zeros((n, 2))
     laws = PixelLaws(
         np.ones(n, np.bool_), np.zeros((n, N_MOMENTS)), np.zeros((n, 3, N_TESTS)), np.tile([0, 1, 0], (n, 1)),
-        np.zeros((1, 2), np.float32), 0, zeros, zeros, zeros, zeros, zeros,
+        np.zeros((1, 2), np.float32), CodeSums(0, 1, zeros, zeros[0], zeros, zeros, zeros),
     )  # fmt: skip
     pixels = pixel_statistics(laws, np.ones(n), np.ones(n), (_SIDE, _SIDE))
     n = len(frames)

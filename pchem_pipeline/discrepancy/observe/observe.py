@@ -24,7 +24,8 @@ from pchem_pipeline.discrepancy.observe.digital.repeated_lines import line_stati
 from pchem_pipeline.discrepancy.observe.follows import follow_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
 from pchem_pipeline.discrepancy.observe.sums import blocks_of, pixel_statistics, sum_frames
-from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
+from pchem_pipeline.discrepancy.observe.tables import pixel_laws
+from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of, in_order, sample_statistics
 from pchem_pipeline.discrepancy.observe.vector_frames import (
     FrameView,
@@ -206,9 +207,9 @@ def _compared(
     masked = np.where(good[:, None], parameters, np.nan)
     moments = np.where(good[:, None], laws.moments, np.nan)
     residuals = CodeResiduals(
-        laws.first_code,
-        laws.codes[0],
-        laws.codes[1],
+        laws.codes.first,
+        laws.codes.single[0],
+        laws.codes.single[1],
         int(seen.minimum[good].min()),
         int(seen.maximum[good].max()),
     )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import sums_numba as kernel
 from pchem_pipeline.discrepancy.observe import tables_numba as columns_of
-from pchem_pipeline.discrepancy.observe.tables import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -141,22 +141,25 @@ def sum_frames(
 ) -> FrameSums:
     """Sum over the frames (n, y, x) of a split whose blocks begin at ``edges``."""
     n, ny, nx = frames.shape
-    support = _packed_support(laws, pixels.usable)
     size = max(1, min(n, _CHUNK_SAMPLES // (ny * nx)))
     charge, readout = np.zeros((2, kernel.LAGS + size, ny, nx), np.float32)
     rows, columns, gain = np.zeros((4, n, ny)), np.zeros((n, 2, nx), np.float32), np.zeros(n)
     blocks = np.zeros((edges.size - 1, 2, ny, nx))
     lags, next_column, next_row = np.zeros((8, ny, nx)), np.zeros((3, ny, nx)), np.zeros((3, ny, nx))
-    modes = np.stack([pixels.exposure, pixels.usable]).astype(np.float32)
-    weights = np.stack([pixels.factor, pixels.shift, pixels.square]).astype(np.float32)
     row_noise, column_noise = np.zeros((n, ny)), np.zeros((n, nx), np.float32)
-    norms = np.array([pixels.exposure.sum(), pixels.usable.sum()], np.float64)
+    channels = kernel.Channels(
+        support=_packed_support(laws, pixels.usable),
+        tables=laws.tables,
+        modes=np.stack([pixels.exposure, pixels.usable]).astype(np.float32),
+        weights=np.stack([pixels.factor, pixels.shift, pixels.square]).astype(np.float32),
+        norms=np.array([pixels.exposure.sum(), pixels.usable.sum()], np.float64),
+    )
     for b, (first, last) in enumerate(pairwise(edges)):
-        kernel.sum_block(
-            frames[first:last], support, laws.tables, modes, weights, norms, charge, readout,
+        block = kernel.BlockSums(
             rows[:, first:last], columns[first:last], gain[first:last], blocks[b], lags,
             next_column, next_row, row_noise[first:last], column_noise[first:last],
         )  # fmt: skip
+        kernel.sum_block(frames[first:last], channels, charge, readout, block)
     lengths = np.diff(edges)
     pairs = [int(np.maximum(lengths - lag, 0).sum()) for lag in (1, 2, 3)]
     lags /= np.maximum([*pairs, *pairs, pairs[0], pairs[0]], 1)[:, None, None]

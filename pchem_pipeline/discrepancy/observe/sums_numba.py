@@ -8,7 +8,7 @@ instructions; views of the rows would cost more than the work on a short row.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,50 @@ IntArray = NDArray[np.int64]
 Float32Array = NDArray[np.float32]
 
 LAGS = 3
+
+
+class Channels(NamedTuple):
+    """How samples become k and r, and how these are weighted.
+
+    Attributes:
+        support: first code, last code, row of the first one in ``tables``, (y, 3, x).
+        tables: k and r, (rows, 2).
+        modes: H, and 1, in usable pixels, else 0, (2, y, x).
+        weights: of r k and of r in the gain, and of r^2 in the noise, (3, y, x).
+        norms: sum of H, number of usable pixels.
+    """
+
+    support: NDArray[np.int32]
+    tables: Float32Array
+    modes: Float32Array
+    weights: Float32Array
+    norms: FloatArray
+
+
+class BlockSums(NamedTuple):
+    """Sums of a block of consecutive frames.
+
+    Attributes:
+        rows: k left, k right, r left, r right of each row, (4, frame, y); to fill.
+        columns: k and r of each column, (frame, 2, x); to add to, as the following.
+        gain: weighted sums of r k and r, (frame,).
+        pixels: k and r of each pixel, (2, y, x).
+        lags: products kk and rr at lags 1 to 3, then r k(-1), k r(-1), (8, y, x).
+        next_column: products kk, rr, rk + kr with the next column, (3, y, x).
+        next_row: the same with the next row.
+        row_noise: r^2 of each row, (frame, y); to fill.
+        column_noise: of each column, (frame, x).
+    """
+
+    rows: FloatArray
+    columns: Float32Array
+    gain: FloatArray
+    pixels: FloatArray
+    lags: FloatArray
+    next_column: FloatArray
+    next_row: FloatArray
+    row_noise: FloatArray
+    column_noise: Float32Array
 
 
 @kernel
@@ -176,44 +220,16 @@ def _keep_last(values: Float32Array, size: int) -> None:
 
 @kernel
 def sum_block(
-    frames: NDArray[Any],
-    support: NDArray[np.int32],
-    tables: Float32Array,
-    modes: Float32Array,
-    weights: Float32Array,
-    norms: FloatArray,
-    charge: Float32Array,
-    readout: Float32Array,
-    rows: FloatArray,
-    columns: Float32Array,
-    gain: FloatArray,
-    block: FloatArray,
-    lags: FloatArray,
-    next_column: FloatArray,
-    next_row: FloatArray,
-    row_noise: FloatArray,
-    column_noise: Float32Array,
+    frames: NDArray[Any], channels: Channels, charge: Float32Array, readout: Float32Array, sums: BlockSums
 ) -> None:
     """Add one block of consecutive frames to the sums.
 
     Args:
         frames: codes (frame, y, x).
-        support: first code, last code, row of the first one in ``tables``, (y, 3, x).
-        tables: k and r, (rows, 2).
-        modes: H, and 1, in usable pixels, else 0, (2, y, x).
-        weights: of r k and of r in the gain, and of r^2 in the noise, (3, y, x).
-        norms: sum of H, number of usable pixels.
+        channels: of the pixels.
         charge: workspace (LAGS + frames in a chunk, y, x).
         readout: the same.
-        rows: k left, k right, r left, r right of each row, (4, frame, y); to fill.
-        columns: sums of k and r of each column, (frame, 2, x); to add to.
-        gain: weighted sums of r k and r, (frame,); to add to.
-        block: sums of k and r of each pixel, (2, y, x); to add to.
-        lags: products kk and rr at lags 1 to 3, then r k(-1), k r(-1), (8, y, x); to add to.
-        next_column: products kk, rr, rk + kr with the next column, (3, y, x); to add to.
-        next_row: the same with the next row.
-        row_noise: sums of r^2 of each row, (frame, y); to fill.
-        column_noise: of each column, (frame, x); to add to.
+        sums: to fill or to add to.
     """
     n, ny, _ = frames.shape
     chunk = charge.shape[0] - LAGS
@@ -221,27 +237,27 @@ def sum_block(
     while done < n:
         size = min(chunk, n - done)
         for y in range(ny):
-            _look_up(frames, support, tables, y, done, size, charge, readout)
-            _sum_rows(charge, readout, weights, y, done, size, rows, gain)
-            _add(charge, 0, y, done, size, columns, block)
-            _add(readout, 1, y, done, size, columns, block)
-            _add_squares(readout, weights[2], y, done, size, row_noise, column_noise)
+            _look_up(frames, channels.support, channels.tables, y, done, size, charge, readout)
+            _sum_rows(charge, readout, channels.weights, y, done, size, sums.rows, sums.gain)
+            _add(charge, 0, y, done, size, sums.columns, sums.pixels)
+            _add(readout, 1, y, done, size, sums.columns, sums.pixels)
+            _add_squares(readout, channels.weights[2], y, done, size, sums.row_noise, sums.column_noise)
         for j in range(size):
             common_k = common_r = 0.0
             for y in range(ny):
-                common_k += rows[0, done + j, y] + rows[1, done + j, y]
-                common_r += rows[2, done + j, y] + rows[3, done + j, y]
-            _subtract(charge, modes[0], np.float32(common_k / norms[0]), LAGS + j)
-            _subtract(readout, modes[1], np.float32(common_r / norms[1]), LAGS + j)
+                common_k += sums.rows[0, done + j, y] + sums.rows[1, done + j, y]
+                common_r += sums.rows[2, done + j, y] + sums.rows[3, done + j, y]
+            _subtract(charge, channels.modes[0], np.float32(common_k / channels.norms[0]), LAGS + j)
+            _subtract(readout, channels.modes[1], np.float32(common_r / channels.norms[1]), LAGS + j)
         for y in range(ny):
             for lag in range(1, LAGS + 1):
-                _add_lagged(charge, charge, lag, y, done, size, lag - 1, lags)
-                _add_lagged(readout, readout, lag, y, done, size, LAGS + lag - 1, lags)
-            _add_lagged(readout, charge, 1, y, done, size, 2 * LAGS, lags)
-            _add_lagged(charge, readout, 1, y, done, size, 2 * LAGS + 1, lags)
-            _add_neighbours(charge, readout, y, 0, 1, size, next_column)
+                _add_lagged(charge, charge, lag, y, done, size, lag - 1, sums.lags)
+                _add_lagged(readout, readout, lag, y, done, size, LAGS + lag - 1, sums.lags)
+            _add_lagged(readout, charge, 1, y, done, size, 2 * LAGS, sums.lags)
+            _add_lagged(charge, readout, 1, y, done, size, 2 * LAGS + 1, sums.lags)
+            _add_neighbours(charge, readout, y, 0, 1, size, sums.next_column)
             if y < ny - 1:
-                _add_neighbours(charge, readout, y, 1, 0, size, next_row)
+                _add_neighbours(charge, readout, y, 1, 0, size, sums.next_row)
         done += size
         _keep_last(charge, size)
         _keep_last(readout, size)

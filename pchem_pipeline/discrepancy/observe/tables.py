@@ -8,14 +8,13 @@ directions in which the parameters move it; to first order the fit does not matt
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.observe import tables_numba as kernel
 from pchem_pipeline.discrepancy.observe.law_numba import N_TESTS, supports
+from pchem_pipeline.discrepancy.observe.tables_numba import CodeSums, Fitted, PixelLaws
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -30,36 +29,6 @@ _NEGLIGIBLE = 1e-5  # samples expected beyond the electron numbers considered, i
 _LONGEST_AXIS = 1 << 17
 _COARSE, _MOST_BINS = 16, 256
 _SMALLEST_WIDTH = 0.1  # DN: below it peaks are single codes
-
-
-@dataclass(frozen=True)
-class PixelLaws:
-    """What the fitted law of n pixels and their histograms give.
-
-    Attributes:
-        good: pixels with a law, (n,); all else is meaningless elsewhere.
-        moments: columns of ``tables_numba`` (``MODEL_STD_K`` and so on), (n, N_MOMENTS).
-        scores: standardised score, its skewness and its kurtosis excess, (n, 3, 8).
-        support: first DN, number of codes, first row in ``tables``, (n, 3); (0, 1, 0) where not good.
-        tables: k (e-) and r (DN) of every code of the support, minus their mean over the samples, (rows, 2).
-        first_code: DN of the first element of ``codes``.
-        codes: observed, expected, residual, its variance, (4, n_codes).
-        fold, fold_covariance: residuals by DN modulo 16.
-        bins, bin_covariance: score of a shift of the scale, its variance for given expectations, and
-            expectation by bins of 16 (or more) codes.
-    """
-
-    good: NDArray[np.bool_]
-    moments: FloatArray
-    scores: FloatArray
-    support: IntArray
-    tables: NDArray[np.float32]
-    first_code: int
-    codes: FloatArray
-    fold: FloatArray
-    fold_covariance: FloatArray
-    bins: FloatArray
-    bin_covariance: FloatArray
 
 
 def pixel_laws(
@@ -90,26 +59,26 @@ def pixel_laws(
     while n_codes > coarse * _MOST_BINS:
         coarse *= 2
     n_bins = n_codes // coarse + 1
+    codes = CodeSums(
+        first=axis,
+        coarse=coarse,
+        single=np.zeros((4, n_codes)),
+        fold=np.zeros(16),
+        fold_covariance=np.zeros((16, 16)),
+        bins=np.zeros((3, n_bins)),
+        bin_covariance=np.zeros((n_bins, n_bins)),
+    )
     laws = PixelLaws(
         good=good,
         moments=np.zeros((n, kernel.N_MOMENTS)),
         scores=np.full((n, 3, N_TESTS), np.nan),
         support=np.tile(np.array([0, 1, 0]), (n, 1)),
         tables=np.zeros((1 + int(length[good].sum()), 2), np.float32),
-        first_code=axis,
-        codes=np.zeros((4, n_codes)),
-        fold=np.zeros(16),
-        fold_covariance=np.zeros((16, 16)),
-        bins=np.zeros((3, n_bins)),
-        bin_covariance=np.zeros((n_bins, n_bins)),
+        codes=codes,
     )
-    kernel.summarise_pixels(
-        counts, origin, outside, natural, electrons, window, axis, coarse, ALLOWED_BEYOND,
-        ALLOWED_FAR_BEYOND / max(int(good.sum()), 1),
-        laws.moments, laws.scores, laws.good, laws.support, laws.tables, laws.codes,
-        laws.fold, laws.fold_covariance, laws.bins, laws.bin_covariance,
-    )  # fmt: skip
-    for covariance in (laws.fold_covariance, laws.bin_covariance):
+    fitted = Fitted(counts, origin, outside, natural, electrons, window)
+    kernel.summarise_pixels(fitted, ALLOWED_BEYOND, ALLOWED_FAR_BEYOND / max(int(good.sum()), 1), laws)
+    for covariance in (codes.fold_covariance, codes.bin_covariance):
         covariance += np.tril(covariance, -1).T
     return laws
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,68 @@ CHI2, CHI2_MEAN, CHI2_VARIANCE, EXPECTED_LOW, EXPECTED_HIGH, SEEN_LOW, SEEN_HIGH
 EXPECTED_FAR_LOW, EXPECTED_FAR_HIGH, SEEN_FAR_LOW, SEEN_FAR_HIGH = range(15, 19)
 PEAKS_CHI2, PEAKS_MEAN, PEAKS_VARIANCE, MEAN_RRRR = range(19, 23)
 _FOLD = 16
+
+
+class Fitted(NamedTuple):
+    """Histograms of n pixels, and the law that was fitted to each.
+
+    Attributes:
+        counts: (n, B).
+        origin: DN of bin 0, (n,).
+        outside: samples below and above the histogram, (n, 2).
+        parameters: H, 1/g, mu, analog read noise in DN, (n, 4).
+        electrons: range of electron numbers, (n, 2).
+        window: range of codes of the law, (n, 2).
+    """
+
+    counts: NDArray[Any]
+    origin: IntArray
+    outside: FloatArray
+    parameters: FloatArray
+    electrons: IntArray
+    window: IntArray
+
+
+class CodeSums(NamedTuple):
+    """Sums over pixels by code.
+
+    Attributes:
+        first: DN of the first one.
+        coarse: codes in a bin.
+        single: counts, expectation, residual and its variance, (4, n_codes).
+        fold, fold_covariance: residuals by DN modulo 16, (16,), (16, 16).
+        bins: score of a shift of the scale, its variance for given expectations, and expectation by bin,
+            (3, n_bins).
+        bin_covariance: of these scores.
+    """
+
+    first: int
+    coarse: int
+    single: FloatArray
+    fold: FloatArray
+    fold_covariance: FloatArray
+    bins: FloatArray
+    bin_covariance: FloatArray
+
+
+class PixelLaws(NamedTuple):
+    """What the fitted law of n pixels and their histograms give.
+
+    Attributes:
+        good: pixels with a law, (n,); all else is meaningless elsewhere.
+        moments: columns by the constants above, (n, N_MOMENTS).
+        scores: standardised score, its skewness and its kurtosis excess, (n, 3, N_TESTS).
+        support: first DN, number of codes, first row in ``tables``, (n, 3); (0, 1, 0) where not good.
+        tables: k (e-) and r (DN) of every code of the support, minus their mean over the samples, (rows, 2).
+        codes: sums over all pixels.
+    """
+
+    good: NDArray[np.bool_]
+    moments: FloatArray
+    scores: FloatArray
+    support: IntArray
+    tables: NDArray[np.float32]
+    codes: CodeSums
 
 
 @kernel
@@ -135,21 +197,15 @@ def _code_sums(
     shift: FloatArray,
     n: float,
     first: int,
-    origin: int,
-    coarse: int,
-    codes: FloatArray,
-    fold: FloatArray,
-    fold_covariance: FloatArray,
-    bins: FloatArray,
-    bin_covariance: FloatArray,
+    sums: CodeSums,
 ) -> None:
-    """Add a pixel's residuals and covariance: per code, per code modulo 16, per bin of ``coarse`` codes.
+    """Add a pixel's residuals and covariance: per code, per code modulo 16, per bin of codes.
 
     In the bins they are weighted with what a shift of the scale does to each code, so that they sum to the
     shift of the scale there.
     Only the lower triangles of the covariances are filled.
     """
-    size = seen.size
+    size, origin, coarse = seen.size, sums.first, sums.coarse
     folded = np.zeros((N_NUISANCE, _FOLD))
     begin = (first - origin) // coarse
     n_bins = (first + size - 1 - origin) // coarse - begin + 1
@@ -164,23 +220,23 @@ def _code_sums(
             used += u * u
             folded[i, modulo] += u
             binned[i, b - begin] += u * shift[x]
-        codes[2, at] += residual
-        codes[3, at] += max(0.0, expected[x] - n * used)
-        fold[modulo] += residual
-        fold_covariance[modulo, modulo] += expected[x]
-        bins[0, b] += residual * shift[x]
-        bins[1, b] += expected[x] * shift[x] ** 2
-        bins[2, b] += expected[x]
-        bin_covariance[b, b] += expected[x] * shift[x] ** 2
+        sums.single[2, at] += residual
+        sums.single[3, at] += max(0.0, expected[x] - n * used)
+        sums.fold[modulo] += residual
+        sums.fold_covariance[modulo, modulo] += expected[x]
+        sums.bins[0, b] += residual * shift[x]
+        sums.bins[1, b] += expected[x] * shift[x] ** 2
+        sums.bins[2, b] += expected[x]
+        sums.bin_covariance[b, b] += expected[x] * shift[x] ** 2
     for i in range(N_NUISANCE):
         for a in range(_FOLD):
             value = n * folded[i, a]
             for b in range(a + 1):
-                fold_covariance[a, b] -= value * folded[i, b]
+                sums.fold_covariance[a, b] -= value * folded[i, b]
         for a in range(n_bins):
             value = n * binned[i, a]
             for b in range(a + 1):
-                bin_covariance[begin + a, begin + b] -= value * binned[i, b]
+                sums.bin_covariance[begin + a, begin + b] -= value * binned[i, b]
 
 
 @kernel
@@ -267,95 +323,63 @@ def _add_expected(
 
 
 @kernel
-def summarise_pixels(
-    counts: NDArray[Any],
-    origin: IntArray,
-    outside: FloatArray,
-    parameters: FloatArray,
-    electrons: IntArray,
-    window: IntArray,
-    axis: int,
-    coarse: int,
-    allowed: float,
-    allowed_far: float,
-    moments: FloatArray,
-    scores: FloatArray,
-    good: NDArray[np.bool_],
-    support: IntArray,
-    tables: NDArray[np.float32],
-    codes: FloatArray,
-    fold: FloatArray,
-    fold_covariance: FloatArray,
-    bins: FloatArray,
-    bin_covariance: FloatArray,
-) -> None:
+def summarise_pixels(fitted: Fitted, allowed: float, allowed_far: float, laws: PixelLaws) -> None:
     """Fill tables and sums of all pixels.
 
+    Of covariances only the lower triangles are filled.
+
     Args:
-        counts: histograms (n, B).
-        origin: DN of bin 0, (n,).
-        outside: samples below and above the histogram, (n, 2).
-        parameters: H, 1/g, mu, analog read noise in DN, (n, 4).
-        electrons: range of electron numbers, (n, 2).
-        window: range of codes of the law, (n, 2).
-        axis: DN of the first code of ``codes``.
-        coarse: codes in a bin of ``bins``.
+        fitted: the pixels.
         allowed: samples expected beyond the support on either side, at most.
         allowed_far: the same for samples far beyond.
-        moments: see the constants, (n, N_MOMENTS).
-        scores: standardised score, its skewness and kurtosis excess, (n, 3, N_TESTS).
-        good: pixels to do; unset where no code has any mass, (n,).
-        support: first code and number of codes, and the row of the first one in ``tables``, (n, 3).
-        tables: k and r, centred on the samples, one pixel after the other; enough rows for all, (rows, 2).
-        codes: counts, expectation, residual and its variance per DN, (4, n_codes).
-        fold: residuals by DN modulo 16, (16,).
-        fold_covariance: theirs; only the lower triangle, as of all covariances.
-        bins: scores of a shift, variance for given expectations, and expectation per bin, (3, n_bins).
-        bin_covariance: of the residuals.
+        laws: to fill, with rows of tables enough for all; ``good`` says which pixels are to be done, and is
+            unset where no code has any mass.
     """
     gram = np.empty((N_NUISANCE, N_COLUMNS))
     used = 1  # row 0 is that of the pixels without a law
-    for p in range(counts.shape[0]):
-        if not good[p]:
+    codes, axis = laws.codes, laws.codes.first
+    for p in range(fitted.counts.shape[0]):
+        if not laws.good[p]:
             continue
-        exposure, step, bias, width = parameters[p]
-        full = np.empty((window[p, 1] - window[p, 0] + 1, N_COLUMNS))
-        fill_law(exposure, step, bias - window[p, 0], width, electrons[p, 0], electrons[p, 1], full)
-        n = outside[p, 0] + outside[p, 1] + _total(counts[p])
+        counts, outside, window, electrons = (
+            fitted.counts[p], fitted.outside[p], fitted.window[p], fitted.electrons[p],
+        )  # fmt: skip
+        exposure, step, bias, width = fitted.parameters[p]
+        full = np.empty((window[1] - window[0] + 1, N_COLUMNS))
+        fill_law(exposure, step, bias - window[0], width, electrons[0], electrons[1], full)
+        n = outside[0] + outside[1] + _total(counts)
         low, high, below, above = within(full, n, allowed)
-        law, first = full[low : high + 1], window[p, 0] + low
+        law, first = full[low : high + 1], window[0] + low
         size = high - low + 1
         mass, inverse, seen, expected = np.empty(size), np.empty(size), np.empty(size), np.zeros(size)
         for x in range(size):
             mass[x] = law[x, 0]
             inverse[x] = 1.0 / mass[x] if mass[x] > NOTHING else 0.0
         table = np.empty((2, size))
-        _fill_tables(law, inverse, exposure, step, bias - first, electrons[p], table)
+        _fill_tables(law, inverse, exposure, step, bias - first, electrons, table)
         if not whiten(law, inverse, gram):
-            good[p] = False
+            laws.good[p] = False
             continue
-        under, over = _count(counts[p], origin[p], first, seen, axis, codes)
+        under, over = _count(counts, fitted.origin[p], first, seen, axis, codes.single)
         _expect(law, inverse, seen, expected)
-        _add_expected(full[:, 0], n, expected, low, window[p, 0] - axis, codes[1])
-        pixel_scores(law, inverse, seen, gram, exposure, scores[p])
-        out = moments[p]
+        _add_expected(full[:, 0], n, expected, low, window[0] - axis, codes.single[1])
+        pixel_scores(law, inverse, seen, gram, exposure, laws.scores[p])
+        out = laws.moments[p]
         inside = _total(seen)
         out[CHI2], out[CHI2_MEAN], out[CHI2_VARIANCE] = _goodness(law, seen, expected, inside, 5.0, 1)
         out[PEAKS_CHI2], out[PEAKS_MEAN], out[PEAKS_VARIANCE] = _goodness(
             law, seen, expected, inside, 5.0, max(1, round(width))
         )
         out[EXPECTED_LOW], out[EXPECTED_HIGH] = below, above
-        out[SEEN_LOW], out[SEEN_HIGH] = under + outside[p, 0], over + outside[p, 1]
+        out[SEEN_LOW], out[SEEN_HIGH] = under + outside[0], over + outside[1]
         _channels(mass, table[0], table[1], seen, out[SEEN_LOW], out[SEEN_HIGH], out)
         far_low, far_high, out[EXPECTED_FAR_LOW], out[EXPECTED_FAR_HIGH] = within(full, n, allowed_far)
-        far = far_low + window[p, 0], far_high + window[p, 0]
-        out[SEEN_FAR_LOW], out[SEEN_FAR_HIGH] = _beyond(counts[p], origin[p], far, outside[p])
-        support[p, 0], support[p, 1], support[p, 2] = first, size, used
+        far = far_low + window[0], far_high + window[0]
+        out[SEEN_FAR_LOW], out[SEEN_FAR_HIGH] = _beyond(counts, fitted.origin[p], far, outside)
+        laws.support[p, 0], laws.support[p, 1], laws.support[p, 2] = first, size, used
         for x in range(size):
-            tables[used + x, 0], tables[used + x, 1] = table[0, x], table[1, x]
+            laws.tables[used + x, 0], laws.tables[used + x, 1] = table[0, x], table[1, x]
         used += size
-        if first >= axis and first + size <= axis + codes.shape[1]:
-            _code_sums(
-                law, seen, expected, table[1] / (width * width + QUANTISATION_VARIANCE), inside, first, axis,
-                coarse, codes, fold, fold_covariance, bins, bin_covariance,
-            )  # fmt: skip
+        if first >= axis and first + size <= axis + codes.single.shape[1]:
+            shift = table[1] / (width * width + QUANTISATION_VARIANCE)
+            _code_sums(law, seen, expected, shift, inside, first, codes)

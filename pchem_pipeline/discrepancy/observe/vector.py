@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.discrepancy.observe import tables_numba as column
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.observe.tables import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables_numba import CodeSums, PixelLaws
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals
 
 FloatArray = NDArray[np.float64]
@@ -77,7 +77,7 @@ def sample_statistics(pixels: PixelLaws, exposure: FloatArray, residuals: CodeRe
         pixels_near = [np.count_nonzero(near[:, 0]), -np.expm1(-near[:, 1]).sum()]
         pixels_far = [np.count_nonzero(far[:, 0]), -np.expm1(-far[:, 1]).sum()]
         found[f"tail.{side}.pixels"] = _beyond(np.array(pixels_near), np.array(pixels_far))
-    return found | _code_statistics(pixels, residuals)
+    return found | _code_statistics(pixels.codes, residuals)
 
 
 def _beyond(near: FloatArray, far: FloatArray) -> float:
@@ -108,13 +108,12 @@ def _score_statistics(scores: FloatArray, log_exposure: FloatArray) -> dict[str,
     return found
 
 
-def _code_statistics(pixels: PixelLaws, residuals: CodeResiduals) -> dict[str, float]:
-    found = (
-        period_statistics(pixels.fold, pixels.fold_covariance) if pixels.fold_covariance.trace() > 0 else {}
-    )
-    expected, variance = pixels.codes[1], np.maximum(pixels.codes[3], 0.05 * pixels.codes[1])
+def _code_statistics(codes: CodeSums, residuals: CodeResiduals) -> dict[str, float]:
+    found = period_statistics(codes.fold, codes.fold_covariance) if codes.fold_covariance.trace() > 0 else {}
+    _, expected, residual, variance = codes.single
+    variance = np.maximum(variance, 0.05 * expected)
     judged = expected >= _ENOUGH
-    z = np.where(judged, pixels.codes[2] / np.sqrt(np.where(judged, variance, 1.0)), 0.0)
+    z = np.where(judged, residual / np.sqrt(np.where(judged, variance, 1.0)), 0.0)
     middle = judged[:-2] & judged[1:-1] & judged[2:]
     if middle.sum() >= 4:
         # deviation from the mean of both neighbours; the variance of its square sum is that of white noise
@@ -127,7 +126,7 @@ def _code_statistics(pixels: PixelLaws, residuals: CodeResiduals) -> dict[str, f
     if judged.any():
         found["code.largest"] = laws.largest_normal(z[judged])
     smooth = _absorbed_chi_square(
-        pixels.bins[0], pixels.bin_covariance, np.where(pixels.bins[2] >= _ENOUGH, pixels.bins[1], 0.0)
+        codes.bins[0], codes.bin_covariance, np.where(codes.bins[2] >= _ENOUGH, codes.bins[1], 0.0)
     )
     if np.isfinite(smooth):
         found["code.smooth"] = smooth

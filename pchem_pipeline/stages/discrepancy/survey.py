@@ -22,7 +22,8 @@ from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.compute.memory import resident_bytes
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
 from pchem_pipeline.discrepancy.observe.pairs import CHANNELS, Samples, pairs_bytes
-from pchem_pipeline.discrepancy.observe.tables import PixelLaws, pixel_laws
+from pchem_pipeline.discrepancy.observe.tables import pixel_laws
+from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
 from pchem_pipeline.discrepancy.quick.places import CellMap, SensorPlace, sensor_maps, sensor_place
 from pchem_pipeline.discrepancy.scan_pairs import scan_pairs

@@ -268,20 +268,21 @@ def test_loops_are_the_same_uncompiled() -> None:
     n_bins, n_codes, first = 20, 320, 60
     results = []
     for summarise in (tables_numba.summarise_pixels, tables_numba.summarise_pixels.py_func):
+        sums = [np.zeros((4, n_codes)), np.zeros(16), np.zeros((16, 16)), np.zeros((3, n_bins))]
         arrays = [
-            np.zeros((6, tables_numba.N_MOMENTS)), np.zeros((6, 3, 8)), np.array([True] * 5 + [False]),
-            np.zeros((6, 3), np.int64), np.zeros((1500, 2), np.float32), np.zeros((4, n_codes)), np.zeros(16),
-            np.zeros((16, 16)), np.zeros((3, n_bins)), np.zeros((n_bins, n_bins)),
+            np.array([True] * 5 + [False]), np.zeros((6, tables_numba.N_MOMENTS)), np.zeros((6, 3, 8)),
+            np.zeros((6, 3), np.int64), np.zeros((1500, 2), np.float32),
         ]  # fmt: skip
-        summarise(
+        codes = tables_numba.CodeSums(first, 16, *sums, np.zeros((n_bins, n_bins)))
+        fitted = tables_numba.Fitted(
             counts, histograms.origin.ravel().astype(np.int64), np.zeros((6, 2)), parameters,
-            np.tile([0, 9], (6, 1)), np.tile([75, 230], (6, 1)), first, 16,
-            1e-2, 1e-3, *arrays,
+            np.tile([0, 9], (6, 1)), np.tile([75, 230], (6, 1)),
         )  # fmt: skip
-        results.append(arrays)
+        summarise(fitted, 1e-2, 1e-3, tables_numba.PixelLaws(*arrays, codes))
+        results.append([*arrays, *codes[2:]])
     for one, other in zip(*results, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-8)
-    assert results[0][0][:5, tables_numba.CHI2_MEAN].min() > 0
+    assert results[0][1][:5, tables_numba.CHI2_MEAN].min() > 0
 
     support = np.array([[[90, 90, 90], [130, 130, 130], [0, 41, 82]]] * 2, np.int32)
     tables = np.random.default_rng(1).normal(size=(123, 2)).astype(np.float32)
@@ -290,13 +291,15 @@ def test_loops_are_the_same_uncompiled() -> None:
     )
     results = []
     for sum_block in (sums_numba.sum_block, sums_numba.sum_block.py_func):
-        arrays = [
-            np.zeros((7, 2, 3), np.float32), np.zeros((7, 2, 3), np.float32), np.zeros((4, 10, 2)),
-            np.zeros((10, 2, 3), np.float32), np.zeros(10), np.zeros((2, 2, 3)), np.zeros((8, 2, 3)),
-            np.zeros((3, 2, 3)), np.zeros((3, 2, 3)), np.zeros((10, 2)), np.zeros((10, 3), np.float32),
-        ]  # fmt: skip
-        sum_block(frames[:10], support, tables, modes, weights, np.array([9.0, 6.0]), *arrays)
-        results.append(arrays)
+        charge, readout = np.zeros((2, 7, 2, 3), np.float32)
+        sums = sums_numba.BlockSums(
+            np.zeros((4, 10, 2)), np.zeros((10, 2, 3), np.float32), np.zeros(10), np.zeros((2, 2, 3)),
+            np.zeros((8, 2, 3)), np.zeros((3, 2, 3)), np.zeros((3, 2, 3)), np.zeros((10, 2)),
+            np.zeros((10, 3), np.float32),
+        )  # fmt: skip
+        channels = sums_numba.Channels(support, tables, modes, weights, np.array([9.0, 6.0]))
+        sum_block(frames[:10], channels, charge, readout, sums)
+        results.append([charge, readout, *sums])
     for one, other in zip(*results, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
 
