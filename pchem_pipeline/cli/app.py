@@ -267,7 +267,7 @@ def export(
     """Write maps as FITS, TIFF or npz, and a CSV summary."""
     from pchem_pipeline.commands.export import export_run
 
-    for path in export_run(target, output, tuple(part.strip() for part in formats.split(","))):
+    for path in export_run(target, output, _listed(formats.lower())):
         typer.echo(path)
 
 

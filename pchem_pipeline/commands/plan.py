@@ -169,7 +169,8 @@ def _plan_lines(plan: Plan, request: PlanRequest, exposure_given: bool) -> list[
     lines += ["", f"with {plan.frames:,.0f} frames, one standard deviation of a pixel (Cramer-Rao bound):"]
     for name, value in plan.precision.items():
         unit, size = ("e-", value) if name == "bias" else ("%", 100 * value)
-        lines.append(f"  {name:<20}{size:>10.3g} {unit}")
+        if name != "dark_current":  # what the charge rate is called in the dark
+            lines.append(f"  {name:<20}{size:>10.3g} {unit}")
     if exposure_given and np.isfinite(plan.best_exposure):
         limit = " (the largest allowed)" if plan.best_exposure > 0.99 * request.max_exposure else ""
         lines += ["", f"best exposure: {plan.best_exposure:.3g} e-{limit}, {plan.best_frames:,.0f} frames"]

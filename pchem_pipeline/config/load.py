@@ -207,7 +207,7 @@ def complaints(error: ValidationError, model: type[BaseModel] = RunConfig) -> st
 
 def _complaint(item: Any, root: type[BaseModel]) -> str:
     where = ".".join(_shown(str(part)) for part in item["loc"])
-    message = item["msg"].removeprefix("Value error, ")
+    message = item["msg"].removeprefix("Value error, ").replace("valid tuple", "list")  # as YAML calls it
     if item["type"] == "extra_forbidden":
         close = difflib.get_close_matches(_shown(str(item["loc"][-1])), _keys_at(item["loc"][:-1], root), 1)
         return f"{where}: unknown key" + (f"; did you mean {close[0]}?" if close else "")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from pchem_pipeline.base.settings import Place, Section
 
@@ -24,6 +24,11 @@ class SampleSettings(Section):
     )
 
 
+def _listed(files: Any) -> Any:
+    """Take one place for a list of it."""
+    return [files] if isinstance(files, str) else files
+
+
 class InputSettings(Section):
     """Camera files (or ready-made histograms, or other runs) and what their format does not say itself.
 
@@ -31,10 +36,12 @@ class InputSettings(Section):
     take it from the file; if the file does not say, the value stays unknown and is never guessed.
     """
 
-    files: tuple[Place, ...] = Field(
+    files: Annotated[
+        tuple[Place, ...], BeforeValidator(_listed, json_schema_input_type=Place | tuple[Place, ...])
+    ] = Field(
         default=(),
-        description="camera files, globs or folders, relative to this YAML file, or URLs such as "
-        "s3://bucket/frames/*.tif; "
+        description="camera files, globs or folders, one or a list of them, relative to this YAML file, or "
+        "URLs such as s3://bucket/frames/*.tif; "
         "read in natural order of their names (frame2 before frame10)",
     )
     samples: tuple[SampleSettings, ...] = Field(

@@ -99,6 +99,8 @@ def test_plan_answers_at_once_and_checks_itself(shell):
     )
     content = json.loads((shell.folder / "plan.json").read_text())
     assert f"{content['frames']:,.0f} frames" in result.stdout
+    assert "charge_rate" in result.stdout
+    assert "dark_current" not in result.stdout  # the same number
     assert content["verified"][0]["checks"][0]["rmse"] == pytest.approx(0.01, rel=5 / np.sqrt(400))
     assert (shell.folder / "plan.png").read_bytes().startswith(b"\x89PNG")
     refused = shell("plan", "--read-noise", "2", "--exposure", "0.1", "--target", "conversion_gain=1%")

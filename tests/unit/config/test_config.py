@@ -1,4 +1,5 @@
 import itertools
+import json
 
 import pytest
 import yaml
@@ -6,7 +7,7 @@ from helpers.places import ROOT
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.config.load import dump_config, load_config, parse_config, setting_of
-from pchem_pipeline.config.template import commented_config
+from pchem_pipeline.config.template import commented_config, json_schema
 
 CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
 
@@ -42,9 +43,17 @@ def test_simulated_input_is_what_is_simulated():
     assert (config.input.format, config.input.bit_depth, config.input.integration_time) == ("fits", 12, 2.5)
 
 
+def test_files_may_be_one_place():
+    config = parse_config("input: {files: 'frames/*.tif'}")
+    assert config.input.files == ("frames/*.tif",)
+    files = json.loads(json_schema())["$defs"]["InputSettings"]["properties"]["files"]
+    assert {kind["type"] for kind in files["anyOf"]} == {"string", "array"}
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("input: {files: 3}", "input.files: Input should be a list"),
         ("input: {files: [a]}\nfit: {algoritm: em}", "fit.algoritm: unknown key; did you mean algorithm?"),
         ("input: {files: [a], integration_time: .nan}", "input.integration_time"),
         ("input: {files: [a], integration_time: 0}", "input.integration_time: .*greater than 0"),

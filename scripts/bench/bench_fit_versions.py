@@ -3,7 +3,7 @@
 Both fit the same histograms, each in a process of its own, a pass of the one and a pass of the other: what
 the machine does meanwhile meets both. The best pass of each counts.
 
-    python scripts/bench/bench_fit_old.py --old ../checkout      # one to two minutes; --only good joint
+    python scripts/bench/bench_fit_versions.py --old ../checkout      # one to two minutes; --only good joint
 """
 
 from __future__ import annotations
