@@ -39,20 +39,19 @@ def run_quick_look(store: RunStore, run: StoredRun, sums: StackSums | None) -> Q
     maps = _maps(run)
     if maps is None:
         return None
-    model = tuple(effect.tag for effect in run.model.effects)
     missing: dict[str, str] = {}
     if sums is None:
         why = store.attributes("summary").get("missing", "the stage histogram has none")
         missing["rows, columns, frames, neighbours and lags"] = str(why)
     codes = None
-    if model:
+    if run.model.effects:
         missing["codes"] = "the model has effects; pchem discrepancy compares the codes with it"
     elif maps.usable.sum() < _FEWEST:
         missing["codes"] = f"fewer than {_FEWEST} pixels with a fit that can be relied upon"
     else:
         codes = _codes(store, maps)
     command = f"pchem discrepancy {run.name}"
-    return quick_look(sums, maps, codes, model, missing, command)
+    return quick_look(sums, maps, codes, run.model.effects, missing, command)
 
 
 def _maps(run: StoredRun) -> PixelMaps | None:

@@ -8,8 +8,12 @@ nothing.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from pchem_pipeline.effects.framework.effect import Effect
 
 Level = Literal["good", "note", "caution", "serious"]
 
@@ -31,7 +35,6 @@ class Check:
         size: estimate; the root of a variance has no sign, and is 0 where the variance comes out negative.
         unit: of the size: DN, LSB, or 1 for correlations and shares.
         limit: size that is found in 19 of 20 runs like this one; NaN where that is not known.
-        effects: tags of effects that show like this: where the model has one of them, the check says so.
         where: rows, columns, frames or codes that carry it, in words; empty for all.
         region: part of the sensor that it is in, as ``model.effects`` takes a region; None: everywhere alike.
         advice: what it does to the results, in words.
@@ -48,7 +51,6 @@ class Check:
     size: float
     unit: str
     limit: float = math.nan
-    effects: tuple[str, ...] = ()
     where: str = ""
     region: dict[str, Any] | None = None
     advice: str = ""
@@ -98,15 +100,55 @@ class QuickLook:
         }
 
 
-def graded(checks: list[Check], gain: float, read_noise: float, model: tuple[str, ...]) -> tuple[Check, ...]:
+#: The statistics of a closer look (names of its catalogue) that show what a check finds: an effect of the
+#: model in whose signature one of them is explains it.
+_SIGNS: dict[str, tuple[str, ...]] = {
+    "frame_noise": (
+        "frame.readout.variance", "frame.readout.slow", "frame.readout.trend",
+        "frame.charge.variance", "frame.charge.slow", "frame.charge.trend", "frame.covariance",
+    ),
+    "row_noise": ("space.row.readout.variance",),
+    "column_noise": ("space.column.readout.variance",),
+    "drift": (
+        "frame.readout.slow", "frame.readout.trend", "frame.charge.slow", "frame.charge.trend",
+        "frame.gain.slow", "frame.gain.trend",
+    ),
+    "local_drift": (
+        "frame.readout.trend", "frame.readout.quadrants", "frame.charge.trend", "frame.charge.quadrants",
+    ),
+    "period": (
+        "frame.readout.line", "frame.readout.alternating", "frame.charge.line", "space.row.readout.line",
+    ),
+    "frame_lag": (
+        "frame.readout.lag1", "frame.charge.lag1", "time.lag1.readout.mean", "time.cross.readout_charge",
+    ),
+    "single_frames": ("frame.readout.largest", "frame.readout.quadrants", "tail.high.clusters"),
+    "lag": (
+        "time.lag1.readout.mean", "time.lag1.charge.mean", "time.cross.readout_charge", "frame.repeated",
+    ),
+    "neighbours_x": (
+        "space.x.kk", "space.x.rk", "space.x.bits", "space.row.readout.lag1", "tail.high.clusters",
+    ),
+    "neighbours_y": ("space.y.kk", "space.y.rk", "tail.high.clusters"),
+    "wandering_pixels": (
+        "time.block.charge.chi", "time.block.charge.cnt", "time.block.readout.chi", "time.block.readout.cnt",
+    ),
+    "repeated_frames": ("frame.repeated",),
+    "codes": ("code.rough", "code.smooth"),
+    "top_code": ("code.top",),
+}  # fmt: skip
+
+
+def graded(checks: list[Check], gain: float, read_noise: float, model: Sequence[Effect]) -> tuple[Check, ...]:
     """Return checks with their probability among all, their size in other units, and their level.
 
     Args:
         checks: those made.
         gain: of the median pixel, e-/DN.
         read_noise: of the median pixel, DN.
-        model: tags of the effects that the pixels were fitted with.
+        model: the effects that the pixels were fitted with.
     """
+    shown = {name for effect in model for name in effect.signature}
     found = []
     for check in checks:
         p_global = -math.expm1(len(checks) * math.log1p(-min(check.p, 1.0 - 1e-16)))
@@ -114,7 +156,7 @@ def graded(checks: list[Check], gain: float, read_noise: float, model: tuple[str
         done = replace(
             check,
             p_global=p_global,
-            in_model=any(tag in model for tag in check.effects),
+            in_model=not shown.isdisjoint(_SIGNS[check.name]),
             size_e=check.size * gain if in_dn else math.nan,
             share=check.size / read_noise if in_dn else math.nan,
         )

@@ -243,7 +243,6 @@ def _widths(sums: _Residuals, first: int) -> Check | None:
         math.sqrt(max(excess, 0.0)),
         "LSB",
         limit=math.sqrt(5.4 * error),
-        effects=("adc_dnl", "adc_inl"),
         where=_WORDS[worst].format(code=code),
         advice="the histograms of all pixels deviate from the model at the same DN",
     )
@@ -261,7 +260,6 @@ def _pile_up(sums: _Residuals, first: int) -> Check | None:
         normal_p(z),
         float(sums.observed[top] / sums.observed.sum()),
         "1",
-        effects=("clipping",),
         where=f"{first + top} DN",
         advice="larger signals are cut off there: exposures of bright pixels come out too low",
     )

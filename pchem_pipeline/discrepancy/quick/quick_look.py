@@ -14,8 +14,10 @@ statistics with simulations.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,9 @@ from pchem_pipeline.discrepancy.quick.places import (
 from pchem_pipeline.discrepancy.quick.series import normal_p, of_many, series_checks
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+
+if TYPE_CHECKING:
+    from pchem_pipeline.effects.framework.effect import Effect
 
 FloatArray = NDArray[np.float64]
 
@@ -57,7 +62,7 @@ def quick_look(
     sums: StackSums | None,
     maps: PixelMaps,
     codes: CodeSample | None = None,
-    model: tuple[str, ...] = (),
+    model: Sequence[Effect] = (),
     missing: dict[str, str] | None = None,
     command: str = "",
 ) -> QuickLook:
@@ -67,7 +72,7 @@ def quick_look(
         sums: the summaries; None where there are none.
         maps: the fitted parameters, (y, x).
         codes: histograms of some pixels; None: codes are not looked at.
-        model: tags of the effects that the pixels were fitted with.
+        model: the effects that the pixels were fitted with.
         missing: parts that are not looked at, and why.
         command: what looks closer.
     """
@@ -112,18 +117,15 @@ def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
     rows, columns = _of_lines(sums.rows), of_columns
     checks = []
     if math.isfinite(frame.error):
-        checks.append(_noise_check("frame_noise", "the pixels of a frame move together", frame,
-                                   ("frame_noise", "exposure_flicker", "bias_jumps", "bias_drift",
-                                    "exposure_drift")))  # fmt: skip
+        checks.append(_noise_check("frame_noise", "the pixels of a frame move together", frame))
     if math.isfinite(rows.error):
-        more = ("row_noise", "periodic_pickup")
         checks.append(_noise_check("row_noise", "the pixels of a row move together",
-                                   rows.less(frame) if math.isfinite(frame.error) else rows, more,
+                                   rows.less(frame) if math.isfinite(frame.error) else rows,
                                    sums.rows, "row"))  # fmt: skip
     if math.isfinite(columns.error):
         checks.append(_noise_check("column_noise", "the pixels of a column move together",
                                    columns.less(frame) if math.isfinite(frame.error) else columns,
-                                   ("column_noise",), sums.columns, "column", sums.shape[1]))  # fmt: skip
+                                   sums.columns, "column", sums.shape[1]))  # fmt: skip
     mean, error, skewness = _frame_means(sums, maps)
     checks += series_checks(mean, error, skewness)
     common = _Common(frame, rows, columns, sums)
@@ -191,10 +193,9 @@ def _placed(check: Check, place: SensorPlace, sums: StackSums) -> Check:
 def _local_drift(sums: StackSums, place: SensorPlace | None) -> Check:
     """Return whether a part of the sensor moves along the run, and the rest does not."""
     title = "a part of the sensor drifts apart from the rest"
-    effects = ("bias_drift", "exposure_drift", "bias_jumps", "persistence")
     advice = "it widens the read noise there"
     if place is None:
-        return Check("local_drift", title, 1.0, 0.0, "DN", effects=effects, advice=advice)
+        return Check("local_drift", title, 1.0, 0.0, "DN", advice=advice)
     inside = place.region.mask(sums.shape) & (sums.variance > 0)
     common = block_deviations(sums)[:, inside].mean(axis=1)
     chance = float(sums.variance[inside].mean()) / (float(sums.lengths.mean()) * inside.sum())
@@ -205,7 +206,6 @@ def _local_drift(sums: StackSums, place: SensorPlace | None) -> Check:
         place.p,
         size,
         "DN",
-        effects=effects,
         where=place.region.words(),
         region=place.region.numbers(),
         advice=advice,
@@ -273,7 +273,6 @@ def _noise_check(
     name: str,
     title: str,
     found: _Estimate,
-    effects: tuple[str, ...],
     lines: Lines | None = None,
     line: str = "",
     width: int = 0,
@@ -290,7 +289,6 @@ def _noise_check(
         math.sqrt(max(found.value, 0.0)),
         "DN",
         limit=math.sqrt(_SURE * found.error),
-        effects=effects,
         where=where,
         advice="it is part of what is called read noise, but does not average out over pixels",
     )
@@ -403,7 +401,6 @@ def _lag_check(sums: StackSums, common: _Common) -> list[Check]:
             mean,
             "1",
             limit=(_SURE + 0.2) * error,
-            effects=("analog_memory", "flicker_noise", "repeated_frames"),
             advice="charge or signal is carried over: gain and exposure are off by about as much",
         )
     ]
@@ -436,7 +433,6 @@ def _neighbour_checks(sums: StackSums, common: _Common) -> list[Check]:
                 mean,
                 "1",
                 limit=(_SURE + 0.2) * error,
-                effects=("interpixel_capacitance", "optical_crosstalk", "cosmic_rays"),
                 advice="if neighbours couple, the gain reads low by about twice the correlation",
             )
         )
@@ -472,7 +468,6 @@ def _wandering(sums: StackSums, maps: PixelMaps) -> list[Check]:
             share,
             "1",
             limit=2.0 / p.size,
-            effects=("dark_current_rts", "flicker_noise", "persistence"),
             where=f"{out.size:,} pixels, most at (y, x) {shown}" if out.size else "",
             advice="their exposure is a mean over states",
         )
@@ -499,7 +494,6 @@ def _repeats(sums: StackSums) -> list[Check]:
             len(same) / sums.n_frames,
             "1",
             limit=1.0 / sums.n_frames,
-            effects=("repeated_frames",),
             where=f"frame{'s' if len(same) > 1 else ''} {words}" if same else "",
             advice="there are fewer samples than frames, and standard errors are too small",
         )

@@ -80,7 +80,6 @@ def _drift(series: FloatArray, noise: float) -> tuple[FloatArray, Check]:
         math.sqrt(excess),
         "DN",
         limit=math.sqrt(16.0 * noise / n),
-        effects=("bias_drift", "exposure_drift", "gain_drift", "persistence", "bias_jumps"),
         where=f"{peak:.2g} DN from its lowest to its highest",
         advice="it widens the read noise, and what is taken for dark current changes along the run",
     )
@@ -123,7 +122,6 @@ def _period(series: FloatArray) -> Check:
         p,
         amplitude / math.sqrt(2.0),
         "DN",
-        effects=("periodic_pickup", "readout_alternation"),
         where=words,
         advice="it widens the read noise",
     )
@@ -153,7 +151,6 @@ def _memory(series: FloatArray) -> Check:
         correlation,
         "1",
         limit=5.7 / math.sqrt(n),
-        effects=("flicker_noise", "bias_jumps", "analog_memory", "exposure_flicker", "bias_drift"),
         advice="noise that the frames share has a memory",
     )
 
@@ -176,7 +173,6 @@ def _single(series: FloatArray, spread: float, error: float, skewness: float) ->
         of_many(float(p[largest]), p.size),
         max(out.size, 1) / series.size,
         "1",
-        effects=("cosmic_rays", "bias_jumps"),
         where=f"frame{'s' if shown.size > 1 else ''} {', '.join(str(i) for i in np.sort(shown))}{more}",
         advice="leave them out (input.frame_range), or see what happened there",
     )

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pytest
 from helpers.quick_stacks import EXPOSURE, GAIN, READ_NOISE, codes_of, maps_of, stack, sums_of
 
-from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLook
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.quick.checks import _SIGNS, SIGNIFICANCE, Check, QuickLook
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
+from pchem_pipeline.effects.analog.column_noise import ColumnNoise
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.framework.context import EffectContext
+from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
 
 SHAPE = (800, 32, 32)
@@ -18,7 +23,17 @@ SIGMA = READ_NOISE / GAIN  # DN
 VARIANCE = EXPOSURE / GAIN**2 + SIGMA**2 + 1 / 12
 
 
-def looked(frames: np.ndarray[Any, Any], model: tuple[str, ...] = ()) -> QuickLook:
+class OfAnotherPackage(Effect):
+    """An effect that nobody here knows, with the signature of row noise."""
+
+    tag: Literal["other"] = "other"
+    signature: ClassVar[tuple[str, ...]] = ("space.row.readout.variance",)
+
+    def apply(self, values: np.ndarray[Any, Any], context: EffectContext) -> np.ndarray[Any, Any]:
+        return values
+
+
+def looked(frames: np.ndarray[Any, Any], model: tuple[Effect, ...] = ()) -> QuickLook:
     return quick_look(sums_of(frames), maps_of(frames.shape[1:]), codes_of(frames), model)
 
 
@@ -244,8 +259,15 @@ def test_clipping_is_found() -> None:
 
 def test_what_the_model_has_is_a_remark() -> None:
     rng = np.random.default_rng(13)
-    look = looked(stack(rng, SHAPE, row_noise(rng, SIGMA)), ("row_noise",))
-    assert (look.found[0].name, look.found[0].level, look.found[0].in_model) == ("row_noise", "note", True)
+    frames = stack(rng, SHAPE, row_noise(rng, SIGMA))
+    for effect in (RowNoise(row_noise_dn=SIGMA), OfAnotherPackage()):
+        found = looked(frames, (effect,)).found[0]
+        assert (found.name, found.level, found.in_model) == ("row_noise", "note", True)
+    assert not looked(frames, (ColumnNoise(column_noise_dn=SIGMA),)).found[0].in_model
+
+
+def test_signs_are_statistics_of_the_catalogue() -> None:
+    assert {name for names in _SIGNS.values() for name in names} <= STATISTICS.keys()
 
 
 def test_the_level_grows_with_the_size() -> None:

@@ -9,15 +9,17 @@ import pytest
 from helpers.report_material import report_data
 
 from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook, graded
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.pages.report_json import report_numbers
 from pchem_pipeline.report.pages.summary import answers, flags
 from pchem_pipeline.report.pages.tables import result_tables
 
 
-def looked(data: ReportData, p: float, size: float, model: tuple[str, ...] = ()) -> ReportData:
+def looked(data: ReportData, p: float, size: float, model: tuple[Effect, ...] = ()) -> ReportData:
     rows = Check("row_noise", "the pixels of a row move together", p, size, "DN", limit=0.12,
-                 effects=("row_noise",), where="most in row 3", advice="it does not average out")  # fmt: skip
+                 where="most in row 3", advice="it does not average out")  # fmt: skip
     lag = Check("lag", "samples resemble those of the frame before", 0.3, 0.001, "1", limit=0.004)
     checks = graded([rows, lag], 0.1, 3.0, model)
     look = QuickLook(checks, {"codes": "too few pixels"}, 1000, "pchem discrepancy run.zarr")
@@ -59,7 +61,7 @@ def test_row_noise_of_a_third_of_the_read_noise_is_not_believed(
 
 def test_what_is_small_or_in_the_model_is_a_remark(data: ReportData) -> None:
     assert answers(looked(data, 1e-30, 0.1))[1].word == "Yes"
-    known = looked(data, 1e-30, 2.0, ("row_noise",))
+    known = looked(data, 1e-30, 2.0, (RowNoise(row_noise_dn=2.0),))
     assert answers(known)[1].word == "Yes"
     assert any("the model has an effect like it" in flag.text for flag in flags(known))
 
