@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, correction, log_density
 from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError, Refit
 from pchem_pipeline.discrepancy.null import NullModel
+from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 
 FloatArray = NDArray[np.float64]
@@ -201,7 +202,7 @@ class Refitter:
 
     def model(self, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
         """Return the model with effects."""
-        return (*self.present, *effects)
+        return along_chain(self.present, effects)
 
     @property
     def nothing(self) -> float:
