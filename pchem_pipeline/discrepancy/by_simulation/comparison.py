@@ -136,15 +136,16 @@ def compare(
     first = len(choice.best.hypotheses)
     for hypothesis in _dear_last(singles[:first]):
         trials.refit((hypothesis,))
-    if tried and first > 1 and not trials.complete:
-        trials.refit(_begun(_sets(choice, tried)[0], tried, held))
-        trials.thin()
-    # what stands out beside a set that leaves little, before others in its place: they may be beaten by then
     if trials.nearly:
+        # fingerprints on top of pixels that were fitted without it show its details, not what is beside it
         trials.tune()
         if not held and not trials.complete and _within(unlisted):
             return None
         _grow(trials, beside)
+    if first > 1 and tried and not trials.complete and all(len(one) == 1 for one in trials.asked):
+        trials.refit(_begun(_sets(choice, tried)[0], tried, held))
+        trials.thin()
+    # others in its place, dear ones last: they may be beaten by then
     for hypothesis in _dear_last(singles[first:]):
         if not trials.refit((hypothesis,)):
             break
@@ -318,21 +319,27 @@ def _asked_once(beside: Callable[[Refitted], Choice | None]) -> Callable[[Refitt
 
 
 def _grow(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> None:
-    """Refit the best set with what stands out beside it, and so on, as long as that is better."""
-    best = None
-    while not trials.complete and trials.best is not best:
+    """Refit the best set with what stands out beside it, and so on, as long as that is better.
+
+    With the fewest effects that are not far behind: a refit shows what their fingerprints cannot tell.
+    """
+    best: Refitted | None = None
+    while not (trials.best is best or trials.complete):
         best = trials.best
-        for members in _grown(trials, beside, 1):
-            if not (trials.refit(_begun(members, trials.tried, trials.held)) and trials.thin()):
-                return
-            trials.tune()
-            if trials.complete:
-                return
+        choice = beside(best)
+        if choice is None:
+            return
+        fewest = min(
+            (one for one in choice.tried if not _far_behind(one, choice)),
+            key=lambda one: (len(one.hypotheses), -one.worth),
+        )
+        members = (*best.hypotheses[len(trials.held) :], *fewest.at_fit())
+        if not (trials.refit(_begun(members, trials.tried, trials.held)) and trials.thin()):
+            return
+        trials.tune()
 
 
-def _grown(
-    trials: Trials, beside: Callable[[Refitted], Choice | None], beginnings: int = _MOST_BEGINNINGS
-) -> list[tuple[Hypothesis, ...]]:
+def _grown(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> list[tuple[Hypothesis, ...]]:
     """Return sets that hold one of the best so far and what stands out beside it.
 
     One that is strong hides or distorts what the frames show of the others.
@@ -340,7 +347,6 @@ def _grown(
     Args:
         trials: sets that were refitted.
         beside: compares new hypotheses by what they do beside a refitted set.
-        beginnings: sets to begin with, at most.
     """
     held = len(trials.held)
     kinds: dict[frozenset[str], Refitted] = {}
@@ -355,7 +361,7 @@ def _grown(
         # a part of a better set has grown already
         if one.score >= near and not in_vain and not any(one.tags < better.tags for better in begun):
             begun.append(one)
-    begun = begun[:beginnings]
+    begun = begun[:_MOST_BEGINNINGS]
     choices = [(one.hypotheses[held:], choice) for one in begun if (choice := beside(one)) is not None]
     grown: list[tuple[Hypothesis, ...]] = []
     for size, most in _MOST_GROWN.items():

@@ -151,6 +151,17 @@ def test_the_error_of_a_strong_effect_is_that_of_its_slope(
     assert np.sqrt(np.mean(np.square(off))) < 1.0 + 4.0 / np.sqrt(24.0)
 
 
+def test_a_steep_strong_effect_leaves_a_weak_one_beside_it_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is allowed to the details of an effect goes with what it does, not with its slope."""
+    monkeypatch.setitem(TRUTH, "row_noise", (np.eye(M)[0] * 2000.0, 8.0))
+    truth = [effect("row_noise", 0.1), effect("frame_noise", 0.1)]
+    refitter = World(truth).refitter()
+    found = refitter.refined([Hypothesis(one, statistics([one])) for one in truth])
+    found = refitter.sharpened(found, 24)
+    wanted = np.hypot(np.hypot(np.sqrt(1.0 / 2.0 + 1.0 / 24.0), 0.003 * 2000.0) / 40.0, 0.03)
+    assert found.stderr[1] == pytest.approx(wanted, rel=0.4)
+
+
 def test_a_part_that_stands_out_makes_no_effect_stronger_that_acts_everywhere(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
