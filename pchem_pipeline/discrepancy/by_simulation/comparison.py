@@ -32,7 +32,6 @@ from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import Witness
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.by_simulation.trials import (
     FAR,
-    FAR_SHARE,
     LOOSE,
     Trials,
     alike,
@@ -377,8 +376,8 @@ def _grown(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> list[
 
 
 def _far_behind(one: ScoredSet, choice: Choice) -> bool:
-    """Tell whether the fingerprints alone speak against a set: it explains far less than the likeliest."""
-    return one.worth < choice.best.worth - FAR - FAR_SHARE * choice.advantage
+    """Tell whether the fingerprints beside a refitted set say that another one explains far more."""
+    return one.worth < choice.best.worth - FAR - _REACH_SHARE * choice.advantage
 
 
 def _sets(choice: Choice, singles: Sequence[Refitted]) -> list[tuple[Hypothesis, ...]]:

@@ -25,8 +25,9 @@ _MOST_DEAR = 4  # sets whose refit takes long
 #: Relative error of a fingerprint before its refit.
 LOOSE = 0.1
 _HARDLY = 0.1  # of a deviation, what effects may move the statistic by that cannot account for it
-#: Nats behind, and share of what there is to explain, from which on a fingerprint is no rival of a right set.
-FAR, FAR_SHARE = 40.0, 0.25
+#: Nats behind from which on a fingerprint is no rival of a right set.
+FAR = 40.0
+_FAR_SHARE = 0.25  # of what there is to explain, the same in addition
 _FAR_SHARE_OF_PART = 0.5  # the same of a set that leaves something
 _LEFT = 0.02  # chance of what a complete set may leave, anywhere among the statistics
 _SEEN = 4.0  # deviations that a set leaves of a statistic for it to stand out
@@ -194,7 +195,7 @@ def _beaten(refitter: Refitter, members: Sequence[Hypothesis], best: Refitted) -
     statistic that stands out and that they hardly move says enough: a refit does not change them so much.
     """
     complete = leaves_nothing(refitter, best)
-    trust = FAR_SHARE if complete and len(members) >= len(best.hypotheses) else _FAR_SHARE_OF_PART
+    trust = _FAR_SHARE if complete and len(members) >= len(best.hypotheses) else _FAR_SHARE_OF_PART
     shift = refitter.target - refitter.null.mean
     noise = replace(refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=LOOSE)
     fit = fit_set(members, shift, noise)
