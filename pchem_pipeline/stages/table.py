@@ -146,7 +146,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=6,
+        version=7,
         upstream=("ingest",),
         settings=("discrepancy",),
         reads=("frames", "summary", "histogram", "fit"),

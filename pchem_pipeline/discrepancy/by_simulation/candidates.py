@@ -24,6 +24,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
 from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import broken_plugins, effect_classes
@@ -268,7 +269,7 @@ class ReplicateSimulator:
         return [state.best for state in states]
 
     def _replicate(self, effect: Effect | None, repeat: int) -> Replicate:
-        effects = self.model if effect is None else (*self.model, effect)
+        effects = self.model if effect is None else along_chain(self.model, (effect,))
         # of the model and its purpose, too: the same effects come with other strengths in one round
         text = json.dumps([self.seed, *(each.model_dump(mode="json") for each in effects)], sort_keys=True)
         digest = hashlib.sha256(text.encode()).hexdigest()[:10]

@@ -22,6 +22,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     Choice,
     Contender,
     Hypothesis,
+    ScoredSet,
     fit_set,
     seen_among,
     share_place,
@@ -30,6 +31,7 @@ from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import Witness
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.by_simulation.trials import (
+    FAR,
     LOOSE,
     Trials,
     alike,
@@ -127,16 +129,22 @@ def compare(
         EffortSpentError: the work is at its limit.
     """
     trials = Trials(refitter, tuple(held), witness)
-    tried = trials.tried
+    tried, beside = trials.tried, _asked_once(beside)
     singles = _singles(hypotheses, choice)
     # what the likeliest set is made of, then that set: it may leave no others worth a refit
     first = len(choice.best.hypotheses)
     for hypothesis in _dear_last(singles[:first]):
         trials.refit((hypothesis,))
-    if tried and first > 1 and not trials.complete:
+    if trials.nearly:
+        # fingerprints on top of pixels that were fitted without it show its details, not what is beside it
+        trials.tune()
+        if not held and not trials.complete and _within(unlisted):
+            return None
+        _grow(trials, beside)
+    if first > 1 and tried and not trials.complete and all(len(one) == 1 for one in trials.asked):
         trials.refit(_begun(_sets(choice, tried)[0], tried, held))
         trials.thin()
-    # dear ones last: they may be beaten by then
+    # others in its place, dear ones last: they may be beaten by then
     for hypothesis in _dear_last(singles[first:]):
         if not trials.refit((hypothesis,)):
             break
@@ -152,7 +160,7 @@ def compare(
     if not held and not trials.complete and _within(unlisted):
         return None
     if len(trials.best.hypotheses) > len(held) + 1 or not trials.complete:
-        grown = [] if trials.complete else _grown(refitter, tried, len(held), beside)
+        grown = [] if trials.complete else _grown(trials, beside)
         for members in _of_different_effects([*grown, *_sets(choice, tried)])[:_MOST_SETS]:
             if not (trials.refit(_begun(members, tried, held)) and trials.thin()):
                 break
@@ -295,31 +303,62 @@ def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesi
     return chosen
 
 
-def _grown(
-    refitter: Refitter,
-    singles: Sequence[Refitted],
-    held: int,
-    beside: Callable[[Refitted], Choice | None],
-) -> list[tuple[Hypothesis, ...]]:
-    """Return sets that hold one of the best single effects and what stands out beside it.
+def _asked_once(beside: Callable[[Refitted], Choice | None]) -> Callable[[Refitted], Choice | None]:
+    """Return the same, which remembers its answers."""
+    known: list[tuple[Refitted, Choice | None]] = []
+
+    def answer(one: Refitted) -> Choice | None:
+        found = [choice for asked, choice in known if asked is one]
+        if not found:
+            found = [beside(one)]
+            known.append((one, found[0]))
+        return found[0]
+
+    return answer
+
+
+def _grow(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> None:
+    """Refit the best set with what stands out beside it, and so on, as long as that is better.
+
+    With the fewest effects that are not far behind: a refit shows what their fingerprints cannot tell.
+    """
+    best: Refitted | None = None
+    while not (trials.best is best or trials.complete):
+        best = trials.best
+        choice = beside(best)
+        if choice is None:
+            return
+        fewest = min(
+            (one for one in choice.tried if not _far_behind(one, choice)),
+            key=lambda one: (len(one.hypotheses), -one.worth),
+        )
+        members = (*best.hypotheses[len(trials.held) :], *fewest.at_fit())
+        if not (trials.refit(_begun(members, trials.tried, trials.held)) and trials.thin()):
+            return
+        trials.tune()
+
+
+def _grown(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> list[tuple[Hypothesis, ...]]:
+    """Return sets that hold one of the best so far and what stands out beside it.
 
     One that is strong hides or distorts what the frames show of the others.
 
     Args:
-        refitter: fits sets.
-        singles: effects refitted alone.
-        held: how many effects of earlier rounds were fitted with each.
+        trials: sets that were refitted.
         beside: compares new hypotheses by what they do beside a refitted set.
     """
+    held = len(trials.held)
     kinds: dict[frozenset[str], Refitted] = {}
-    for one in sorted(singles, key=worth, reverse=True):
+    for one in sorted(trials.tried, key=worth, reverse=True):
         kinds.setdefault(one.tags, one)
     best = next(iter(kinds.values()))
-    near = best.score - _REACH_SHARE * (best.score - refitter.nothing)
+    near = best.score - _REACH_SHARE * (best.score - trials.refitter.nothing)
     begun: list[Refitted] = []
-    for one in kinds.values():
+    for number, one in enumerate(kinds.values()):
+        # what a set has besides is in vain where a part of it is better
+        in_vain = any(better < one.tags for better in list(kinds)[:number])
         # a part of a better set has grown already
-        if one.score >= near and not any(one.tags < better.tags for better in begun):
+        if one.score >= near and not in_vain and not any(one.tags < better.tags for better in begun):
             begun.append(one)
     begun = begun[:_MOST_BEGINNINGS]
     choices = [(one.hypotheses[held:], choice) for one in begun if (choice := beside(one)) is not None]
@@ -329,11 +368,16 @@ def _grown(
             (each.worth, (*own, *each.at_fit()))
             for own, choice in choices
             for each in choice.tried
-            if len(each.hypotheses) == size
+            if len(each.hypotheses) == size and not _far_behind(each, choice)
         ]
         found.sort(key=lambda item: item[0], reverse=True)
         grown += _of_different_effects([members for _, members in found])[:most]
     return grown
+
+
+def _far_behind(one: ScoredSet, choice: Choice) -> bool:
+    """Tell whether the fingerprints beside a refitted set say that another one explains far more."""
+    return one.worth < choice.best.worth - FAR - _REACH_SHARE * choice.advantage
 
 
 def _sets(choice: Choice, singles: Sequence[Refitted]) -> list[tuple[Hypothesis, ...]]:

@@ -73,6 +73,7 @@ from pchem_pipeline.discrepancy.skeleton import search, silent
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.discrepancy.verdict import Discrepancy, Examined
 from pchem_pipeline.effects.framework.added_exposure import added_exposures
+from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.framework.registry import effect_classes
@@ -555,7 +556,7 @@ class FrameExplainer:
         present = tuple(e for e in self.model if e.tag not in found)
 
         def draw(effects: tuple[Effect, ...], count: int) -> tuple[Refit, FloatArray]:
-            model = (*present, *effects)
+            model = along_chain(present, effects)
             if model not in self.drawn:
                 self.drawn[model] = _Drawn(*self.work.mapped(model))
             one = self.drawn[model]
@@ -618,7 +619,7 @@ class FrameExplainer:
         """Take a set into the model, its factors changed by shares; fit the pixels with it, and return it."""
         taken = tuple(h.times(1.0 + float(c)) for h, c in zip(added.hypotheses, change, strict=True))
         tags = {h.tag for h in taken}
-        model = (*(e for e in self.model if e.tag not in tags), *(h.effect for h in taken))
+        model = along_chain([e for e in self.model if e.tag not in tags], [h.effect for h in taken])
         self.fit, self.sensor = self.work.mapped(model)
         self.model = model
         return taken

@@ -138,20 +138,20 @@ class SetFit:
 
 
 def correction(
-    parts: FloatArray, residual: FloatArray, noise: Noise, scatter: FloatArray | None = None
+    slopes: FloatArray, residual: FloatArray, covariance: FloatArray, scatter: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Return relative changes of the strengths that a residual asks for, and standard errors, (e,) each.
 
     Args:
-        parts: shifts of the statistics by effect, shape (e, m).
+        slopes: how the statistics go with each strength, shape (e, m).
         residual: what the model with all effects leaves, shape (m,).
-        noise: of the residual.
+        covariance: of the residual, shape (m, m), with what is not held against the effects.
         scatter: deviations like that of the residual, of replicates, shape (b, m): the weights of so many
             statistics are tuned to a covariance that is itself estimated, and what they make of replicates
             that had no part in it is the error if it is larger; None: there are too few.
     """
-    factor = linalg.cholesky(noise.of(parts), lower=True)
-    design = linalg.solve_triangular(factor, parts.T, lower=True)
+    factor = linalg.cholesky(covariance, lower=True)
+    design = linalg.solve_triangular(factor, slopes.T, lower=True)
     weights = np.linalg.pinv(design)
 
     def asked(rows: FloatArray) -> FloatArray:

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, correction, log_density
 from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError, Refit
+from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import NullModel
+from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 
 FloatArray = NDArray[np.float64]
@@ -168,9 +170,11 @@ class Refitter:
             moved = _moved(best.hypotheses, step)
             if moved is None:
                 break
-            self.allow(words)
             try:
+                self.allow(words)
                 now = self.simulated(moved, best, replicates)
+            except EffortSpentError:
+                break  # what was simulated is not lost
             except NotFittedError:
                 now = best  # a step too far
             if now.score > best.score:
@@ -201,7 +205,7 @@ class Refitter:
 
     def model(self, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
         """Return the model with effects."""
-        return (*self.present, *effects)
+        return along_chain(self.present, effects)
 
     @property
     def nothing(self) -> float:
@@ -217,7 +221,8 @@ class Refitter:
         if slopes is not None:
             noise = self.noise(one.covariance, len(one.vectors))
             kept = self.kept(hypotheses)
-            change, _ = correction(slopes[:, kept], (self.target - one.mean)[kept], noise.among(kept))
+            allowed = noise.among(kept).of(_lesser(slopes, one.parts)[:, kept])
+            change, _ = correction(slopes[:, kept], (self.target - one.mean)[kept], allowed)
             hypotheses = _moved(hypotheses, np.log1p(np.maximum(change, -_LARGEST_SHARE))) or hypotheses
         try:
             return self.simulated(hypotheses, one, replicates, slopes)
@@ -295,7 +300,10 @@ class Refitter:
             scatter = (vectors - mean) * np.sqrt(1.0 / self.splits + 1.0 / replicates)
         slopes, kept = parts if slopes is None else slopes, self.kept(hypotheses)
         change, stderr = correction(
-            slopes[:, kept], residual[kept], noise.among(kept), None if scatter is None else scatter[:, kept]
+            slopes[:, kept],
+            residual[kept],
+            noise.among(kept).of(_lesser(slopes, parts)[:, kept]),
+            None if scatter is None else scatter[:, kept],
         )
         change = np.where(scaling, np.log1p(np.maximum(change, -_LARGEST_SHARE)), 0.0)
         found = tuple(Hypothesis(h.effect, part) for h, part in zip(hypotheses, parts, strict=True))
@@ -373,6 +381,15 @@ def _step(before: Sequence[Effect], after: Sequence[Effect]) -> FloatArray:
         a, b = (float(getattr(e, e.strength, 1.0)) if e.strength else 1.0 for e in (old, new))
         found.append(old.power * np.log(b / a) if a * b > 0.0 else 0.0)
     return np.array(found)
+
+
+def _lesser(slopes: FloatArray, parts: FloatArray) -> FloatArray:
+    """Return of what effects do, and of how that goes with their strengths, the lesser, shape (e, m).
+
+    A share of that is not held against them. An effect near a limit of its strength has slopes far above all
+    that it does: a share of those would be more than a weaker effect beside it does.
+    """
+    return np.asarray(np.where(np.abs(slopes) < np.abs(parts), slopes, parts))
 
 
 def beyond_chance(difference: FloatArray, error: FloatArray) -> FloatArray:

@@ -25,11 +25,14 @@ _MOST_DEAR = 4  # sets whose refit takes long
 #: Relative error of a fingerprint before its refit.
 LOOSE = 0.1
 _HARDLY = 0.1  # of a deviation, what effects may move the statistic by that cannot account for it
-# nats behind, and share of what there is to explain, from which on a fingerprint is no rival of a right set
-_FAR, _FAR_SHARE = 40.0, 0.25
+#: Nats behind from which on a fingerprint is no rival of a right set.
+FAR = 40.0
+_FAR_SHARE = 0.25  # of what there is to explain, the same in addition
 _FAR_SHARE_OF_PART = 0.5  # the same of a set that leaves something
 _LEFT = 0.02  # chance of what a complete set may leave, anywhere among the statistics
 _SEEN = 4.0  # deviations that a set leaves of a statistic for it to stand out
+_LITTLE = 0.03  # of what there is to explain, nats
+_VANISHED = 4.5  # standard errors of its strength below which an effect of a set is not established
 
 
 @dataclass
@@ -63,6 +66,11 @@ class Trials:
     def complete(self) -> bool:
         """Whether that leaves nothing."""
         return bool(self.tried) and leaves_nothing(self.refitter, self.best)
+
+    @property
+    def nearly(self) -> bool:
+        """Whether that leaves little, but something."""
+        return bool(self.tried) and not self.complete and leaves_little(self.refitter, self.best)
 
     def refit(self, members: Sequence[Hypothesis]) -> bool:
         """Refit a set unless it is in vain; return False at the limit of the work, where sets are known.
@@ -121,16 +129,19 @@ class Trials:
 
         The weakest first. Where the set leaves nothing, fewer may leave nothing, too; and what they leave
         tells in the end whether each is seen. Where it leaves something, others at their own numbers may
-        account for what an effect was brought in for.
+        account for what an effect was brought in for; and one that its best fit lets vanish would stand in
+        the way of the others, since each of a set must be seen.
         """
         best = self.best
+        gone = vanished(best)
         new = best.hypotheses[len(self.held) :]
         scale = self.refitter.null.std
         for weakest in sorted(new, key=lambda h: float(np.sum((h.fingerprint / scale) ** 2))):
             fewer = [h for h in new if h is not weakest]
-            if not fewer or not (has_numbers(fewer) or (len(new) > 2 and self.complete)):
+            several = len(new) > 2
+            if not fewer or not (has_numbers(fewer) or (several and (self.complete or weakest.tag in gone))):
                 continue
-            if len(new) > 2 and not self.refit(fewer):
+            if several and not self.refit(fewer):
                 return False
             tags = best.tags - {weakest.tag}
             same = [one for one in self.tried if one.tags == tags]
@@ -164,6 +175,18 @@ def leaves_nothing(refitter: Refitter, one: Refitted) -> bool:
     return look_elsewhere(p, refitter.null.effective_tests) > _LEFT
 
 
+def leaves_little(refitter: Refitter, one: Refitted) -> bool:
+    """Tell whether a set leaves nothing, or so little of what there was that it may be its details."""
+    little = one.chance - one.score < _LITTLE * (one.chance - refitter.nothing)
+    return little or leaves_nothing(refitter, one)
+
+
+def vanished(one: Refitted) -> set[str]:
+    """Return the tags of the effects of a set of which its best fit leaves no more than their error."""
+    gone = np.exp(one.change) < _VANISHED * one.stderr
+    return {h.tag for h, is_gone in zip(one.hypotheses, gone, strict=True) if is_gone and h.effect.strength}
+
+
 def _beaten(refitter: Refitter, members: Sequence[Hypothesis], best: Refitted) -> bool:
     """Tell whether a refit of hypotheses is in vain: far behind the best set, or blind where that is not.
 
@@ -181,7 +204,7 @@ def _beaten(refitter: Refitter, members: Sequence[Hypothesis], best: Refitted) -
     if complete and np.any((left > _SEEN) & (np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift))):
         return True
     score = fit.log_score(shift, noise)
-    return score < best.score - _FAR - trust * (best.score - refitter.nothing)
+    return score < best.score - FAR - trust * (best.score - refitter.nothing)
 
 
 def worth(one: Refitted) -> float:

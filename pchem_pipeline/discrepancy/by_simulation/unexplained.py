@@ -34,7 +34,7 @@ from pchem_pipeline.discrepancy.by_simulation.measured.response import (
 )
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.replicate import simulate_frames
-from pchem_pipeline.discrepancy.by_simulation.trials import leaves_nothing
+from pchem_pipeline.discrepancy.by_simulation.trials import leaves_little, leaves_nothing
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.null import CONVINCING
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
@@ -47,7 +47,6 @@ from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 Model = tuple[Effect, ...]
 Measure = Callable[[Part, Model, Model], Measurement | None]
 
-_LITTLE = 0.03  # of what there is to explain, nats
 _WORTHWHILE = 0.25  # of the nats of what is clearest: less cannot be all there is
 _MOST_TRIED = 3  # of all forms and parts
 _MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
@@ -160,9 +159,7 @@ class Unexplained:
 
     def _leaves_little(self, one: Refitted) -> bool:
         """Tell whether a set leaves nothing, or so little of what there was that it may be its details."""
-        return self.leaves_nothing(one) or one.chance - one.score < _LITTLE * (
-            one.chance - self.refitter.nothing
-        )
+        return leaves_little(self.refitter, one)
 
     def measured(self, kept: tuple[Hypothesis, ...]) -> Refitted | None:
         """Return effects with what is best measured beside them, and with other forms beside all of these."""

@@ -48,6 +48,7 @@ class AdcDnl(Effect):
 
     tag: Literal["adc_dnl"] = Field(default="adc_dnl", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ADC
+    along: ClassVar[int] = 2
     title: ClassVar[str] = "differential nonlinearity of the ADC (DNL), bit weight error, missing codes"
     source: ClassVar[str] = (
         "IEEE Std 1241; Harpsoe et al. 2012, A&A 542, A23; Boone et al. 2018, PASP 130, 064504"

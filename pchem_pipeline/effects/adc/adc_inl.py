@@ -36,6 +36,7 @@ class AdcInl(Effect):
 
     tag: Literal["adc_inl"] = Field(default="adc_inl", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ADC
+    along: ClassVar[int] = 1
     title: ClassVar[str] = "integral nonlinearity of the ADC (INL)"
     source: ClassVar[str] = "IEEE Std 1241 (terminology and test methods for analog-to-digital converters)"
     signature: ClassVar[tuple[str, ...]] = (

@@ -37,6 +37,7 @@ class BinaryOffset(Effect):
 
     tag: Literal["binary_offset"] = Field(default="binary_offset", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ADC
+    along: ClassVar[int] = 2
     title: ClassVar[str] = "binary offset (memory of the converter for bits)"
     source: ClassVar[str] = "Boone et al. 2018, PASP 130, 064504"
     signature: ClassVar[tuple[str, ...]] = ("space.x.bits", "space.x.rk", "space.x.rr")

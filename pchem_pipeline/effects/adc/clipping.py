@@ -39,6 +39,7 @@ class Clipping(Effect):
 
     tag: Literal["clipping"] = Field(default="clipping", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ADC
+    along: ClassVar[int] = 3
     title: ClassVar[str] = "clipping (black-level clamping, saturation)"
     source: ClassVar[str] = "Tobin 1958, Econometrica 26, 24 (censored observations); EMVA 1288 (saturation)"
     signature: ClassVar[tuple[str, ...]] = (

@@ -40,6 +40,7 @@ class GainStitch(Effect):
 
     tag: Literal["gain_stitch"] = Field(default="gain_stitch", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ADC
+    along: ClassVar[int] = 1
     title: ClassVar[str] = "stitch point of two gains"
     source: ClassVar[str] = "arXiv:2412.10109 (pCam6060); arXiv:2510.14484 (Marana 4.2)"
     signature: ClassVar[tuple[str, ...]] = (

@@ -13,6 +13,7 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.plane import Plane
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 if TYPE_CHECKING:
@@ -73,6 +74,28 @@ class PixelPlaces:
         if not self.frames.size:
             raise ValueError("these samples have no order in time; leave out `when`")
         return effect.when.share(self.frames)
+
+
+def along_chain(model: Sequence[Effect], new: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Return a model with new effects, each where the signal comes to it; what it has keeps its order.
+
+    In a plane effects act in the order of their list: a limit of the ADC before an offset that is added there
+    is no limit of what comes out. Where any order will do it is that of the tags.
+
+    Args:
+        model: effects in their order, which may be a user's.
+        new: effects in any order.
+    """
+    planes = list(Plane)
+
+    def place(effect: Effect) -> tuple[int, int]:
+        return planes.index(effect.plane), effect.along
+
+    found = list(model)
+    for effect in sorted(new, key=lambda effect: effect.tag):
+        behind = [i for i, known in enumerate(found) if place(known) <= place(effect)]
+        found.insert(behind[-1] + 1 if behind else 0, effect)
+    return tuple(found)
 
 
 def sample_law(

@@ -65,6 +65,8 @@ class Effect(Section):
     Attributes:
         tag: name in the YAML and in verdicts; a ``Literal`` with one value, which is the default.
         plane: where in the signal chain it acts, and so what :meth:`apply` gets (see :class:`Plane`).
+        along: the later the signal comes to it than to others of its plane, the larger: what adds to a
+            voltage, then what bends it, then the steps of the converter, then its limits.
         title: its name in the literature.
         source: where it is described.
         signature: the statistics (names in :mod:`pchem_pipeline.discrepancy.observe.catalogue`) that it moves
@@ -87,6 +89,7 @@ class Effect(Section):
 
     tag: str
     plane: ClassVar[Plane]
+    along: ClassVar[int] = 0
     title: ClassVar[str] = ""
     source: ClassVar[str] = ""
     signature: ClassVar[tuple[str, ...]] = ()

@@ -45,6 +45,7 @@ class MisplacedLines(Effect):
 
     tag: Literal["misplaced_lines"] = Field(default="misplaced_lines", description="name of the effect")
     plane: ClassVar[Plane] = Plane.READOUT
+    along: ClassVar[int] = 2
     title: ClassVar[str] = "misplaced rows or columns"
     source: ClassVar[str] = "GenICam / GigE Vision (packet resend); likelihood ratio of lines at other places"
     signature: ClassVar[tuple[str, ...]] = ("space.misplaced.rows", "space.misplaced.columns")

@@ -41,6 +41,7 @@ class PixelCorrection(Effect):
 
     tag: Literal["pixel_correction"] = Field(default="pixel_correction", description="name of the effect")
     plane: ClassVar[Plane] = Plane.READOUT
+    along: ClassVar[int] = 1
     title: ClassVar[str] = "in-camera pixel correction (hot pixels, spurious noise)"
     source: ClassVar[str] = "Hamamatsu DCAM-API (HOTPIXELCORRECT_LEVEL); Andor SDK3 (SpuriousNoiseFilter)"
     signature: ClassVar[tuple[str, ...]] = ("space.predicted.equal", "space.predicted.above", "shape.C3.mean")

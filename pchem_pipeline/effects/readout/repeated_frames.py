@@ -43,6 +43,7 @@ class RepeatedFrames(Effect):
 
     tag: Literal["repeated_frames"] = Field(default="repeated_frames", description="name of the effect")
     plane: ClassVar[Plane] = Plane.READOUT
+    along: ClassVar[int] = 2
     title: ClassVar[str] = "repeated (duplicated) frames"
     source: ClassVar[str] = (
         "GenICam / GigE Vision frame identifiers; exact-equality test of successive frames"

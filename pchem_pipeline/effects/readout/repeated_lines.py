@@ -34,6 +34,7 @@ class RepeatedLines(Effect):
 
     tag: Literal["repeated_lines"] = Field(default="repeated_lines", description="name of the effect")
     plane: ClassVar[Plane] = Plane.READOUT
+    along: ClassVar[int] = 2
     title: ClassVar[str] = "repeated rows or columns"
     source: ClassVar[str] = "exact-equality test of neighbouring lines; GenICam / GigE Vision (packet resend)"
     signature: ClassVar[tuple[str, ...]] = ("space.repeated.rows", "space.repeated.columns")

@@ -151,6 +151,17 @@ def test_the_error_of_a_strong_effect_is_that_of_its_slope(
     assert np.sqrt(np.mean(np.square(off))) < 1.0 + 4.0 / np.sqrt(24.0)
 
 
+def test_a_steep_strong_effect_leaves_a_weak_one_beside_it_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is allowed to the details of an effect goes with what it does, not with its slope."""
+    monkeypatch.setitem(TRUTH, "row_noise", (np.eye(M)[0] * 2000.0, 8.0))
+    truth = [effect("row_noise", 0.1), effect("frame_noise", 0.1)]
+    refitter = World(truth).refitter()
+    found = refitter.refined([Hypothesis(one, statistics([one])) for one in truth])
+    found = refitter.sharpened(found, 24)
+    wanted = np.hypot(np.hypot(np.sqrt(1.0 / 2.0 + 1.0 / 24.0), 0.003 * 2000.0) / 40.0, 0.03)
+    assert found.stderr[1] == pytest.approx(wanted, rel=0.4)
+
+
 def test_a_part_that_stands_out_makes_no_effect_stronger_that_acts_everywhere(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -242,7 +253,7 @@ def test_the_likeliest_set_is_fitted_before_other_effects_and_kept_at_the_limit(
 
     plain = world.refitter()
     monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
-    for name, value in (("_FAR", 1e9), ("_HARDLY", 0.0)):  # nothing is in vain
+    for name, value in (("FAR", 1e9), ("_HARDLY", 0.0)):  # nothing is in vain
         monkeypatch.setattr(f"pchem_pipeline.discrepancy.by_simulation.trials.{name}", value)
     found = world.compare(*(hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift")))
     assert found is not None
@@ -410,11 +421,50 @@ def test_a_part_of_a_better_set_is_not_grown_again() -> None:
 
     def begun(*sets: list[Hypothesis]) -> list[frozenset[str]]:
         asked: list[frozenset[str]] = []
-        _grown(far, [refitter.refined(one) for one in sets], 0, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
+        trials = Trials(far, (), Witness(), [refitter.refined(one) for one in sets])
+        _grown(trials, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
         return asked
 
     assert begun([row], [row, frame]) == [{"row_noise", "frame_noise"}]
     assert len(begun([row, drift], [row, frame])) == 2
+
+
+def test_a_set_with_more_in_vain_is_not_grown_beside_its_part() -> None:
+    refitter = World([effect("row_noise", 0.3), effect("exposure_drift", 0.3)]).refitter()
+    asked: list[frozenset[str]] = []
+    alone = refitter.refined([hypothesis("row_noise")])
+    more = refitter.refined([hypothesis("row_noise"), hypothesis("frame_noise")])
+    trials = Trials(refitter, (), Witness(), [alone, replace(more, score=alone.score)])
+    _grown(trials, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
+    assert asked == [{"row_noise"}]
+
+
+def test_what_stands_out_beside_a_set_that_leaves_little_is_fitted_before_others_in_its_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World([effect("row_noise", 0.3), effect("frame_noise", 0.04)])
+    twin = replace(hypothesis("row_noise", 0.3), effect=effect("exposure_drift", 0.3))
+    beside = [hypothesis("frame_noise", 0.04)]
+    asked = asked_by_refits(world, monkeypatch)
+    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.trials._beaten", lambda *_: False)
+    found = world.compare(hypothesis("row_noise", 0.3), twin, beside=beside)
+    assert found is not None
+    assert found.chosen.tags == {"row_noise", "frame_noise"}
+    assert asked.index("row_noise + frame_noise") < asked.index("exposure_drift")
+
+
+def test_an_effect_that_its_set_lets_vanish_does_not_take_the_others_with_it() -> None:
+    """Of three effects that the fingerprints ask for one is not there, and something is left."""
+    true = effect("row_noise", 0.3), effect("frame_noise", 0.3), effect("interpixel_capacitance", 0.1)
+    world = World(true)
+    row, frame, drift = (hypothesis(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift"))
+    noise = world.refitter().noise(world.null.covariance, 40)
+    shifts = (world.z.train - world.null.mean, world.z.test - world.null.mean)
+    tried = (score_set([row, frame, drift], shifts, noise),)
+    choice = Choice(tried[0], ((),) * 3, (1.0,) * 3, tried, 100.0)
+    found = compare(world.refitter(), [], [row, frame, drift], choice)
+    assert found is not None
+    assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
 def test_where_what_no_effect_makes_leaves_nothing_no_set_is_grown() -> None:

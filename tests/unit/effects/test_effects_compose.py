@@ -10,10 +10,14 @@ from helpers.drawn_pixels import draw
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import INTERVALS, interval_names, variables_of
+from pchem_pipeline.effects.adc.adc_inl import AdcInl
+from pchem_pipeline.effects.adc.black_clamp import BlackClamp
+from pchem_pipeline.effects.adc.clipping import Clipping
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.analog.rts_noise import RtsNoise
-from pchem_pipeline.effects.framework.compose import model_words, pixel_maps, sample_law
+from pchem_pipeline.effects.framework.compose import along_chain, model_words, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect, Plane
+from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -57,6 +61,16 @@ def test_effects_add_up_in_their_order() -> None:
     assert sample_law([], maps).neutral
     assert model_words([RowNoise(row_noise_dn=0.5), Wide()]) == "PCD + row_noise + wide"
     assert model_words([]) == "PCD"
+
+
+def test_new_effects_stand_where_the_signal_comes_to_them() -> None:
+    limit, clamp, steps = Clipping(high=260), BlackClamp(follow=0.4), AdcInl(inl_lsb=1.0, period_dn=64.0)
+    rows, repeated = RowNoise(row_noise_dn=0.5), RepeatedFrames(probability=0.1)
+    chain = rows, clamp, steps, limit, repeated
+    assert along_chain((), chain[::-1]) == along_chain((), chain) == chain
+    assert along_chain((limit,), (clamp,)) == (clamp, limit)
+    # an order that is there already may be meant
+    assert along_chain((limit, clamp), (repeated, rows)) == (rows, limit, clamp, repeated)
 
 
 def test_an_effect_that_raises_is_named() -> None:
