@@ -192,7 +192,7 @@ def _draw_mark(axes: Axes, mark: Mark, order: int) -> Handle:
                 [points] = axes.plot(mark.x, mark.y, markersize=mark.size, **style)
                 return points
             error = np.nan_to_num(mark.error)
-            lines = {"capsize": mark.cap, "elinewidth": 0.8}
+            lines: dict[str, Any] = {"capsize": mark.cap, "elinewidth": 0.8}
             return axes.errorbar(mark.x, mark.y, error, markersize=mark.size, **lines, **style)
         case Band():
             step: Any = "mid" if mark.step else None

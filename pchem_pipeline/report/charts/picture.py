@@ -34,7 +34,7 @@ from pchem_pipeline.report.style.style import COLUMN_MM
 from pchem_pipeline.report.style.wording import without_formulas
 
 #: Dots of a millimetre on paper, size of the letters and their mean width, all px; columns of a curve.
-_MM, _LETTER, _WIDE, _COLUMNS = 4.5, 11, 6.0, 300
+_MM, _LETTER, _WIDE, _COLUMNS = 4.5, 11, 6.8, 300
 #: Room beside and below panels, between them, and of a line of the legend, px.
 _LEFT, _RIGHT, _BELOW, _BETWEEN, _LINE = 68.0, 10.0, 38.0, 8.0, 15.0
 _POINT = 1.35  # px
@@ -152,7 +152,7 @@ def _panel(panel: Panel, frame: Frame, *, named: bool) -> list[str]:
     parts.append(f'<path d="{path}" fill="none" stroke="{LIGHT.edge}"/>')
     words = without_formulas(panel.y.label).split("\n")
     for i, line in enumerate(words):
-        at, middle = frame.left - 54.0 + 12.0 * (i - len(words) + 1), frame.top + frame.height / 2
+        at, middle = frame.left - 46.0 + 12.0 * (i - len(words) + 1), frame.top + frame.height / 2
         turned = f'transform="translate({at:.1f} {middle:.1f}) rotate(-90)"'
         parts.append(f'<text {turned} text-anchor="middle">{escape(line)}</text>')
     upright, side = panel.corner.split()
@@ -214,10 +214,8 @@ def _mark(mark: Mark, frame: Frame) -> str:
             x, y = thinned(mark.x, mark.y, _COLUMNS)
             if mark.step:
                 x, y = _held(x, y)
-            dots = _dots(frame, mark.x, mark.y, _POINT * mark.dots / 2) if mark.dots else ""
-            return f'<path d="{_path(frame, x, y)}" {_stroke(mark)}/>' + (
-                f'<path d="{dots}" {_fill(mark)}/>' if dots else ""
-            )
+            dots = _dots(frame, mark, mark.x, mark.y, _POINT * mark.dots / 2) if mark.dots else ""
+            return f'<path d="{_path(frame, x, y)}" {_stroke(mark)}/>{dots}'
         case Steps():
             edges, values = fewer_steps(mark.edges, mark.values, _COLUMNS)
             x, y = np.repeat(edges, 2)[1:-1], np.repeat(values, 2)
@@ -276,7 +274,7 @@ def _mark(mark: Mark, frame: Frame) -> str:
 
 
 def _points(mark: Points, frame: Frame) -> str:
-    mark, half = some_points(mark, 4 * _COLUMNS), _POINT * mark.size / 2
+    mark, half = some_points(mark, 4 * _COLUMNS), max(_POINT * mark.size / 2, 0.8)
     parts = ""
     if mark.error is not None:
         reach = np.nan_to_num(mark.error)
@@ -285,7 +283,7 @@ def _points(mark: Points, frame: Frame) -> str:
         path = "".join(f"M{a:.1f} {b:.1f}V{c:.1f}" for a, b, c in bars if b == b)
         parts = f'<path d="{path}" fill="none" stroke="{_colour(mark)}"/>'
     if mark.mark == "o":
-        return parts + f'<path d="{_dots(frame, mark.x, mark.y, half)}" {_fill(mark)}/>'
+        return parts + _dots(frame, mark, mark.x, mark.y, half)
     shape = f"m-{half:.1f} -{half:.1f}" + (
         f"h{2 * half:.1f}v{2 * half:.1f}h-{2 * half:.1f}z"
         if mark.mark == "s"
@@ -296,12 +294,12 @@ def _points(mark: Points, frame: Frame) -> str:
     return parts + f'<path d="{path}" {_fill(mark) if mark.mark == "s" else _stroke(mark, 1.2)}/>'
 
 
-def _dots(frame: Frame, x: FloatArray, y: FloatArray, half: float) -> str:
+def _dots(frame: Frame, mark: Mark, x: FloatArray, y: FloatArray, half: float) -> str:
+    """Return disks: the round ends of lines that have no length."""
     places = zip(frame.across(x).tolist(), frame.down(y).tolist(), strict=True)
-    turn = f"a{half:.1f} {half:.1f} 0 1 0"
-    return "".join(
-        f"M{a - half:.1f} {b:.1f}{turn} {2 * half:.1f} 0{turn} -{2 * half:.1f} 0" for a, b in places if b == b
-    )
+    path = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in places if b == b)
+    thick = f'stroke-width="{2 * half:.1f}" stroke-linecap="round"'
+    return f'<path d="{path}" fill="none" stroke="{_colour(mark)}" {thick}/>'
 
 
 def _held(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -306,7 +306,7 @@ def _channel(
     # no line across frames that are not there
     steps = np.diff(centre)
     apart = np.flatnonzero(steps > 2.0 * np.median(steps)) + 1 if steps.size else np.empty(0, np.int64)
-    x, y = (np.insert(v, apart, np.nan) for v in (centre, mean))
+    x, y = np.insert(centre, apart, centre[apart]), np.insert(mean, apart, np.nan)
     marks.append(Line(x, y, width=1.2, dots=1.8, label="mean of a stretch"))
     if path is not None:
         marks.append(Line(number, path, colour="vermilion", width=1.4, dash="--", label="named effects"))

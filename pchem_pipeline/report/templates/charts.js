@@ -136,7 +136,7 @@
       context.stroke();
     },
     points(mark, context, X, Y, box, ratio) {
-      const half = (mark.size * POINT * ratio) / 2;
+      const half = ratio * Math.max((mark.size * POINT) / 2, 1);
       context.lineWidth = ratio * 1.2;
       for (let i = 0; mark.error && i < mark.x.length; i++) {
         if (mark.y[i] === null) continue;
@@ -246,13 +246,13 @@
       found.filter = (u, splits) => splits;
     }
     if (axis.linear) {
-      const both = (low, high) => [0, ...[1, 10, 100, 1e3, 1e4, 1e5].flatMap((each) => [-each, each])].filter((each) => each >= low && each <= high).sort((a, b) => a - b);
+      const both = (low, high) => [0, ...[0.5 * axis.linear, 10, 100, 1e3, 1e4, 1e5].flatMap((each) => [-each, each])].filter((each) => each >= low && each <= high).sort((a, b) => a - b);
       found.splits = (u, _, low, high) => both(low, high);
       found.filter = (u, splits) => splits;
       found.values = (u, splits) => splits.map((each) => written(each));
     }
     if (axis.whole) found.incrs = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
-    if (axis.ticks && !axis.linear) {
+    if (axis.ticks) {
       const known = new Map(axis.ticks), splits = found.splits;
       const inside = (low, high) => [...known.keys()].filter((each) => each >= low && each <= high);
       found.splits = (u, i, low, high, step, space) => {

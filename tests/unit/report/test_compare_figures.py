@@ -8,8 +8,8 @@ import pytest
 from pchem_pipeline.commands.compare.settings import settings_that_differ
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.checks.run_differences import MapDifference, compare_maps
-from pchem_pipeline.report.comparison import RunFacts
 from pchem_pipeline.report.charts.on_paper import draw_chart
+from pchem_pipeline.report.comparison import RunFacts
 from pchem_pipeline.report.figures.compare import draw_difference, ensemble_tables, ensembles_chart
 from pchem_pipeline.report.style.style import Drawing, Look
 
