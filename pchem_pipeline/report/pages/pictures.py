@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from string import ascii_letters, digits
 
+from pchem_pipeline.report.charts.chart import Chart
 from pchem_pipeline.report.charts.picture import chart_picture
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.settings import ReportSettings
@@ -64,18 +65,24 @@ DrawAll = Callable[[Sequence[Figure], ReportSettings], Mapping[str, Drawn]]
 def draw_figure(figure: Figure, settings: ReportSettings) -> Drawn:
     """Draw a figure with its files; pure.
 
-    Of a chart the page needs no more than a plain picture, as its script draws the rest.
-
     Args:
         figure: the figure.
         settings: formats and resolution.
     """
-    if figure.chart is not None:
-        picture, across, down = chart_picture(figure.chart, figure.width_mm)
-        drawn_files = (
-            _files(figure.draw(Look(figure.width_mm)), figure, settings) if settings.figure_formats else {}
-        )
-        return Drawn(f"data:image/svg+xml,{escaped(picture)}", across, down, drawn_files)
+    return (
+        _draw_map(figure, settings) if figure.chart is None else _draw_chart(figure, figure.chart, settings)
+    )
+
+
+def _draw_chart(figure: Figure, chart: Chart, settings: ReportSettings) -> Drawn:
+    """Draw a plain picture, as the page's script draws the rest, and the files that are asked for."""
+    picture, width, height = chart_picture(chart, figure.width_mm)
+    files = _files(figure.draw(Look(figure.width_mm)), figure, settings) if settings.figure_formats else {}
+    return Drawn(f"data:image/svg+xml,{escaped(picture)}", width, height, files)
+
+
+def _draw_map(figure: Figure, settings: ReportSettings) -> Drawn:
+    """Draw what matplotlib alone can draw."""
     # the SVG is both a file and what the page embeds, where files are asked for
     dpi = settings.dpi if settings.figure_formats else _PAGE_DPI
     drawing = figure.draw(Look(figure.width_mm, dpi=dpi))
