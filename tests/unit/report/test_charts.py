@@ -83,7 +83,8 @@ def values_of(x: list[float] | dict[str, float]) -> np.ndarray:
 def test_curves_of_a_run_are_charts(charts: dict[str, Figure]) -> None:
     assert set(charts) >= {
         "cluster_edges_pixel", "pixel_fits", "frame_means", "profiles", "spatial_spectra", "ensemble",
-        "electron_numbers", "component_widths", "rounding", "uncertainty", "discrepancy_codes", "discrepancy_frames",
+        "electron_numbers", "component_widths", "rounding", "uncertainty", "discrepancy_codes",
+        "discrepancy_frames",
     }  # fmt: skip
 
 
