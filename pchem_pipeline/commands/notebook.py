@@ -27,8 +27,9 @@ from pchem_pipeline.commands.notebook_plots import Plots, width_of
 from pchem_pipeline.model.fit.result import html_table
 from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD
+from pchem_pipeline.report.charts.on_paper import draw_chart
 from pchem_pipeline.report.data import PixelFit, ReportData
-from pchem_pipeline.report.figures.pixels import cell_tables, draw_cells, draw_pixels, has_fit
+from pchem_pipeline.report.figures.pixels import cell_tables, cells_chart, has_fit, pixels_chart
 from pchem_pipeline.report.style.style import COLUMN_MM, Look
 from pchem_pipeline.report.style.wording import measured, symbol
 from pchem_pipeline.run.model_versions import ModelVersion, model_of, model_versions
@@ -446,9 +447,9 @@ class Pixel:
         Args:
             width: of the figure, mm, or a text such as ``"3.5in"``.
         """
-        return draw_pixels(Look(width_of(width)), pixels=[self.found])
+        return draw_chart(Look(width_of(width)), pixels_chart([self.found]))
 
     def plot_cells(self, width: float | str = COLUMN_MM) -> Drawing:
         """Draw the density with the edges between electron numbers, as the report does."""
         found = self.found
-        return draw_cells(Look(width_of(width)), tables=cell_tables(found.parameters, found))
+        return draw_chart(Look(width_of(width)), cells_chart(cell_tables(found.parameters, found)))

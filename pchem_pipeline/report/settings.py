@@ -56,9 +56,9 @@ class ReportSettings(Section):
         "read noise and low and high quanta exposure",
     )
     figure_formats: tuple[Literal["svg", "png", "pdf"], ...] = Field(
-        default=("svg",),
+        default=(),
         description="formats of files that each report writes to figures/: svg, png, pdf; empty: none (the "
-        "page is drawn as SVG anyway; `pchem figures` writes others later)",
+        "page has its own, and `pchem figures` draws them for papers later)",
     )
     dpi: int = Field(
         default=300, ge=72, le=1200, description="resolution of PNG figures and of maps, dots per inch"

@@ -124,14 +124,14 @@ _ALL = (
     ),
     Stage(
         "report",
-        version=3,
+        version=4,
         upstream=("histogram", "fit", "maps", "ensemble"),
         settings=("report", "maps", "run.title", "run.allowed_failed_pixels"),
         reads=("histogram", "summary", "fit", "maps", "ensemble", "discrepancy", "samples", "truth"),
         writes=(),
         run=f"{_HERE}.report.report:run",
         identity=f"{_HERE}.identities:verdict",
-        summary="Write report.html, report.json and the figures.",
+        summary="Write report.html, report.json and the files of figures that are asked for.",
     ),
     Stage(
         "electrons",

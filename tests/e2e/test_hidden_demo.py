@@ -20,4 +20,4 @@ def test_a_hidden_effect_is_found_and_told(shell):
     page = (run / "discrepancy.html").read_text(encoding="utf-8")
     assert "What the model is missing" in page
     for name in ("maps", "codes", "frames", "lines", "gap", "pulls"):
-        assert (run / "figures" / f"discrepancy_{name}.svg").exists()
+        assert f'id="figure-discrepancy_{name}"' in page

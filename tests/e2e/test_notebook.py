@@ -80,7 +80,7 @@ def test_a_pixel_is_that_of_the_store(run, store):
     assert abs((known**2).mean() - 1) < 5 * np.sqrt(2 / known.size)
     for figure in (pixel.plot(), pixel.plot_cells(width="60mm")):
         assert figure._repr_png_().startswith(b"\x89PNG")
-    assert pixel.plot().subfigs[0].axes[0].get_title("left").startswith(f"pixel y = {y}, x = {x}\n")
+    assert pixel.plot().axes[0].get_title("left").startswith(f"pixel y = {y}, x = {x}\n")
     assert len(run.pixels([(0, 0), (1, 2)])) == 2
 
 

@@ -178,8 +178,7 @@ def test_a_report_in_a_store_on_s3_begun_from_files(cloud, server, frames, finis
     assert (cloud.folder / "run.yaml").exists()
     store = fetched(server, tmp_path / "fetched")
     assert_same(store, finished, ("frames", "histogram"))
-    assert "<html" in (store / "report.html").read_text()
-    assert len(list((store / "figures").glob("*.png"))) > 5
+    assert 'id="figure-ensemble"' in (store / "report.html").read_text()
 
 
 def test_a_store_on_s3_is_locked_on_this_machine(cloud, frames, monkeypatch):

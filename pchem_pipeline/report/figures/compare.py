@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.checks.run_differences import FAR, MapDifference
+from pchem_pipeline.report.charts.chart import Axis, Chart, Dash, Level, Line, Panel, Span, Stack
 from pchem_pipeline.report.comparison import Pair, RunFacts
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.figures.maps import is_strip, show_map, shown_pixels
@@ -22,7 +23,7 @@ FloatArray = NDArray[np.float64]
 
 #: Hues and styles of the ensembles of runs.
 _HUES = ("ink", "blue", "vermilion", "green", "orange", "purple", "sky")
-_LINES = ("-", "--", "-.", ":")
+_LINES: tuple[Dash, ...] = ("-", "--", "-.", ":")
 #: Colours end at the 99 % quantile of the differences, at least here, standard errors.
 _LEAST = 4.0
 #: Halves of an ensemble: (part, axis, prefix of the data, unit, title).
@@ -84,7 +85,7 @@ def ensembles_figures(runs: Sequence[RunFacts]) -> list[Figure]:
             f"difference to {runs[0].label} in standard errors of counting; the gray band is ±2.",
             f"Ensemble histograms of the runs; their highest points lie at {peaks}.",
             tables,
-            partial(draw_ensembles, tables=tables),
+            ensembles_chart(tables),
             PAGE_MM,
         )
     ]
@@ -178,33 +179,20 @@ def _distribution(axes: Axes, z: FloatArray, edge: float, *, chance: bool) -> No
     axes.set(xlim=(-edge, edge), ylim=(0.5, 5.0 * highest), ylabel="pixels")
 
 
-@styled
-def draw_ensembles(look: Look, *, tables: Sequence[DataTable]) -> Drawing:
-    """Draw the ensemble histograms of runs over each other, raw and NUCed (fig:ensemble_plot).
+def ensembles_chart(tables: Sequence[DataTable]) -> Chart:
+    """Return the chart of the ensemble histograms of runs over each other, raw and NUCed (fig:ensemble_plot).
 
     The strip below each shows the difference to the first run in standard errors of counting.
 
     Args:
-        look: width and colours.
         tables: of :func:`ensemble_tables`.
     """
-    figure = look.empty(max(72.0 * len(tables), 30.0))
-    if not tables:
-        axes = figure.add_subplot()
-        axes.text(0.5, 0.5, "no ensemble histograms", ha="center", transform=axes.transAxes)
-        axes.set_axis_off()
-        return figure
-    grid = figure.subplots(2 * len(tables), 1, height_ratios=[3.0, 1.0] * len(tables), squeeze=False)[:, 0]
     words = {part: (unit, title) for part, _, _, unit, title in _HALVES}
-    for i, table in enumerate(tables):
-        unit, title = words[table.part]
-        _one_half(grid[2 * i], grid[2 * i + 1], table, unit)
-        grid[2 * i].set_title(title)
-    return figure
+    stacks = tuple(_one_half(table, *words[table.part]) for table in tables)
+    return Chart(stacks, empty="no ensemble histograms")
 
 
-def _one_half(top: Axes, strip: Axes, table: DataTable, unit: str) -> None:
-    colours = colours_of(top)
+def _one_half(table: DataTable, unit: str, title: str) -> Stack:
     low, high = np.inf, -np.inf
     names = list(dict.fromkeys(table["run"].tolist()))
     curves = {
@@ -212,25 +200,24 @@ def _one_half(top: Axes, strip: Axes, table: DataTable, unit: str) -> None:
         for name in names
     }
     first = curves[names[0]]
+    lines, differences = [], []
     for number, (name, (x, density, noise)) in enumerate(curves.items()):
-        colour, line = getattr(colours, _HUES[number % len(_HUES)]), _LINES[number % len(_LINES)]
+        colour, dash, label = _HUES[number % len(_HUES)], _LINES[number % len(_LINES)], plain(name)
         seen = x[density > density.max() / 300.0]
         low, high = min(low, float(seen[0])), max(high, float(seen[-1]))
-        top.plot(x, density, color=colour, linestyle=line, label=plain(name), drawstyle="steps-mid")
+        lines.append(Line(x, density, colour=colour, dash=dash, label=label, step=True))
         if number:
             there = [np.interp(first[0], x, values, left=0.0, right=0.0) for values in (density, noise)]
             error = np.hypot(there[1], first[2])
             z = np.divide(there[0] - first[1], error, out=np.zeros_like(error), where=error > 0)
-            strip.plot(first[0], z, color=colour, linewidth=0.8)
-    strip.axhspan(-2.0, 2.0, color=colours.band, linewidth=0, zorder=0)
-    strip.axhline(0.0, color=colours.ink, linewidth=0.5)
+            differences.append(Line(first[0], z, colour=colour, width=0.8, label=label, listed=False))
     margin = 0.04 * (high - low)
-    for axes in (top, strip):
-        axes.set_xlim(low - margin, high + margin)
-    top.tick_params(labelbottom=False)
-    top.set(ylabel=f"density (1/{unit})", ylim=(0.0, 1.3 * top.get_ylim()[1]))
-    top.legend(loc="upper right")
-    strip.set(xlabel=f"signal ({unit})", ylabel="difference\n(std. errors)")
+    marks = (Span(-2.0, 2.0, colour="band"), *differences, Level(0.0, colour="ink", width=0.5))
+    panels = (
+        Panel(Axis(f"density (1/{unit})", low=0.0), tuple(lines), 3.0, legend="upper right", room=(1.3, 1.3)),
+        Panel(Axis("difference\n(std. errors)"), marks, 1.0),
+    )
+    return Stack(panels, Axis(f"signal ({unit})", low - margin, high + margin), title, height_mm=72.0)
 
 
 def _curve(run: RunFacts, axis: str, prefix: str) -> tuple[FloatArray, FloatArray, FloatArray]:

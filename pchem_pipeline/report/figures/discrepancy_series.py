@@ -5,18 +5,28 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.verdict import Place
+from pchem_pipeline.report.charts.chart import (
+    Axis,
+    Band,
+    Chart,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Span,
+    Stack,
+    Steps,
+    Sticks,
+)
 from pchem_pipeline.report.data import CHANNELS, DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, colours_of, note, styled
+from pchem_pipeline.report.style.style import PAGE_MM
 from pchem_pipeline.report.style.wording import count, short
 
 FloatArray = NDArray[np.float64]
@@ -69,7 +79,7 @@ def code_figures(data: DiscrepancyData) -> list[Figure]:
             _CODES_CAPTION,
             alt,
             (table,),
-            partial(draw_codes, table=table, marked=data.found.where),
+            codes_chart(table, data.found.where),
             PAGE_MM,
         )
     ]
@@ -100,9 +110,7 @@ def frame_figures(data: DiscrepancyData) -> list[Figure]:
             _FRAMES_CAPTION,
             f"Means of {count(int(frames['frame'].size), 'frame')}. {'; '.join(words)}{path}.",
             (frames, stretches),
-            partial(
-                draw_frames, frames=frames, stretches=stretches, sds=sds.tolist(), marked=data.found.where
-            ),
+            frames_chart(frames, stretches, sds.tolist(), data.found.where),
             PAGE_MM,
         )
     ]
@@ -161,62 +169,61 @@ def _model(channel: str) -> str:
     return f"{channel}, named effects"
 
 
-@styled
-def draw_codes(look: Look, *, table: DataTable, marked: Sequence[Place] = ()) -> Drawing:
-    """Draw counts per DN over the sensor and their residuals; even and odd codes differ in colour.
+def codes_chart(table: DataTable, marked: Sequence[Place] = ()) -> Chart:
+    """Return the chart of counts per DN and their residuals; even and odd codes differ in colour.
 
     Args:
-        look: width and colours.
         table: of :func:`code_table`.
         marked: places whose interval of DN is shaded.
     """
-    figure, colours = look.empty(84.0 if look.wide else 92.0), look.palette
-    top, bottom = figure.subplots(2, 1, height_ratios=(1.0, 1.25), sharex=True)
     dn, observed, expected, residual = (table[name] for name in ("dn", "observed", "expected", "residual"))
     edges = np.append(dn - 0.5, dn[-1] + 0.5)
-    top.stairs(observed, edges, fill=True, color=colours.bars, label="observed")
-    top.stairs(expected, edges, color=colours.ink, linewidth=0.9, label="expected from the fitted PCDs")
+    shaded = [
+        Span(place.dn[0] - 0.5, place.dn[1] + 0.5, axis="x", colour="mark", alpha=0.5)
+        for place in marked
+        if place.dn is not None and place.dn[1] - place.dn[0] < 0.8 * dn.size
+    ]
+    above: list[Mark] = [
+        *shaded,
+        Steps(edges, observed, filled=True, colour="bars", label="observed"),
+        Steps(edges, expected, colour="ink", width=0.9, label="expected from the fitted PCDs"),
+    ]
     if _NAMED in table:
-        label = "with what was added"
-        top.stairs(table[_NAMED], edges, color=colours.vermilion, linewidth=0.9, label=label)
-    top.set_yscale("log")
-    top.set_ylim(0.5, (4.0 if look.wide else 200.0) * max(observed.max(), 1.0))
-    top.set_ylabel("samples per DN")
-    top.legend(loc="upper right")
+        above.append(Steps(edges, table[_NAMED], colour="vermilion", width=0.9, label="with what was added"))
+    highest = max(float(observed.max()), 1.0)
+    top = Panel(
+        Axis("samples per DN", 0.5, 4.0 * highest, log=True), tuple(above), 1.0, legend="upper right",
+        room=(1.0, 50.0),
+    )  # fmt: skip
     even = dn % 2 == 0
-    bottom.axhspan(-2, 2, color=colours.band, linewidth=0, zorder=0)
-    for where, colour, label in ((even, colours.blue, "even DN"), (~even, colours.vermilion, "odd DN")):
-        bottom.vlines(
-            dn[where], 0.0, residual[where], color=colour, linewidth=_bar(dn.size, look.width_mm), label=label
-        )
+    below: list[Mark] = [Span(-2.0, 2.0, colour="band"), *shaded]
+    for where, colour, label in ((even, "blue", "even DN"), (~even, "vermilion", "odd DN")):
+        below.append(Sticks(dn[where], residual[where], colour=colour, width=_bar(dn.size), label=label))
     largest = int(np.argmax(np.abs(residual)))
-    if abs(residual[largest]) > _LINEAR:
-        bottom.set_yscale("symlog", linthresh=_LINEAR, linscale=1.5)
-        ticks = [t for t in (4, 10, 100, 1000, 10_000, 100_000) if t <= 2.0 * abs(residual[largest])]
-        bottom.set_yticks([*(-t for t in reversed(ticks)), 0, *ticks])
-        bottom.set_yticklabels([f"{t:g}".replace("-", "−") for t in bottom.get_yticks()])
-        bottom.minorticks_off()
     reach = 1.25 * max(float(np.abs(residual).max()), 4.0)
-    bottom.set_ylim(-reach, reach * 1.6)
-    bottom.set(xlabel="DN", ylabel="(obs. − exp.) / √exp.", xlim=(edges[0], edges[-1]))
-    bottom.legend(loc="upper right", ncols=2)
-    note(
-        bottom,
-        f"largest: {residual[largest]:+.1f} at {dn[largest]:.0f} DN".replace("-", "−"),
-        where="lower left",
-    )
-    for place in marked:
-        if place.dn is not None and place.dn[1] - place.dn[0] < 0.8 * dn.size:
-            for axes in (top, bottom):
-                axes.axvspan(
-                    place.dn[0] - 0.5, place.dn[1] + 0.5, color=colours.mark, alpha=0.5, linewidth=0, zorder=0
-                )
-    return figure
+    y = _residual_axis(float(abs(residual[largest])), reach)
+    note = f"largest: {residual[largest]:+.1f} at {dn[largest]:.0f} DN".replace("-", "−")
+    bottom = Panel(
+        y, tuple(below), 1.25, legend="upper right", columns=2, room=(1.6, 1.6), note=note,
+        corner="lower left",
+    )  # fmt: skip
+    return Chart((Stack((top, bottom), Axis("DN", float(edges[0]), float(edges[-1])), height_mm=86.0),))
 
 
-def _bar(n: int, width_mm: float) -> float:
-    """Return the width of a bar in points, so that bars do not touch."""
-    return float(np.clip(0.62 * (width_mm - 22.0) / 25.4 * 72.0 / max(n, 1), 0.35, 4.0))
+def _residual_axis(largest: float, reach: float) -> Axis:
+    """Return the axis of the residuals: logarithmic to both sides where one is large."""
+    label = "(obs. − exp.) / √exp."
+    if largest <= _LINEAR:
+        return Axis(label, -reach, reach)
+    some = [tick for tick in (4, 10, 100, 1000, 10_000, 100_000) if tick <= 2.0 * largest]
+    ticks = [*(-tick for tick in reversed(some)), 0, *some]
+    texts = tuple((float(tick), f"{tick:g}".replace("-", "−")) for tick in ticks)
+    return Axis(label, -reach, reach, linear_to=_LINEAR, ticks=texts)
+
+
+def _bar(n: int) -> float:
+    """Return the width of a bar in points, so that bars do not touch on a page."""
+    return float(np.clip(0.62 * (PAGE_MM - 22.0) / 25.4 * 72.0 / max(n, 1), 0.35, 4.0))
 
 
 def trends(number: NDArray[Any], values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -252,89 +259,72 @@ def parity_difference(number: NDArray[Any], values: FloatArray, sd: float) -> fl
     return float((values[even].mean() - values[~even].mean()) / error)
 
 
-@styled
-def draw_frames(
-    look: Look,
-    *,
-    frames: DataTable,
-    stretches: DataTable,
-    sds: Sequence[float],
-    marked: Sequence[Place] = (),
-) -> Drawing:
-    """Draw the means of the frames in both channels over the run, with the path of the named effects.
+def frames_chart(
+    frames: DataTable, stretches: DataTable, sds: Sequence[float], marked: Sequence[Place] = ()
+) -> Chart:
+    """Return the chart of the means of the frames in both channels, with the path of the named effects.
 
     Args:
-        look: width and colours.
         frames: of :func:`frame_tables`.
         stretches: likewise.
         sds: standard deviation of a frame's mean by chance, in the stored unit, by channel.
         marked: places whose frames are shaded.
     """
-    figure = look.empty(96.0)
-    both = figure.subplots(2, 1, sharex=True)
     labels = {"charge": "charge: exposure (%)", "readout": "readout: mean residual (DN)"}
-    for axes, sd, (channel, label) in zip(both, sds, labels.items(), strict=True):
-        _strip(axes, frames, stretches, channel, _SCALES[channel][0] * sd)
-        axes.set_ylabel(label)
-        for place in marked:
-            if place.channel in (channel, "cross", ""):
-                _mark_frames(axes, place.frames, frames["frame"])
-    both[1].set_xlabel("frame")
-    handles, labels = both[0].get_legend_handles_labels()
-    columns = 5 if look.wide else 2
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, markerscale=2.0)
-    return figure
+    panels = []
+    for sd, (channel, label) in zip(sds, labels.items(), strict=True):
+        shaded = [
+            span
+            for place in marked
+            if place.channel in (channel, "cross", "")
+            for span in _marked(place.frames, frames["frame"])
+        ]
+        marks, ends, note = _channel(frames, stretches, channel, _SCALES[channel][0] * sd)
+        panel = Panel(Axis(label, *ends), (*shaded, *marks), note=note, corner="lower right")
+        panels.append(panel)
+    return Chart((Stack(tuple(panels), Axis("frame"), height_mm=96.0),), legend=(5, 2))
 
 
-def _strip(axes: Axes, frames: DataTable, stretches: DataTable, channel: str, sd: float) -> None:
-    colours = colours_of(axes)
+def _channel(
+    frames: DataTable, stretches: DataTable, channel: str, sd: float
+) -> tuple[list[Mark], tuple[float, float], str]:
+    """Return the marks of a channel, the ends of its axis, and how many frames lie beyond them."""
     number, values = frames["frame"], frames[channel]
     path = frames.get(_model(channel))
     even = number % 2 == 0
     alternates = abs(parity_difference(number, values, sd)) > 4.0
-    groups = ((even, colours.sky, "even frames"), (~even, colours.orange, "odd frames"))
-    for where, colour, label in (
-        groups if alternates else ((np.ones(even.size, bool), colours.bars, "frames"),)
-    ):
-        axes.plot(
-            number[where], values[where], ".", markersize=1.6, color=colour, rasterized=True, label=label
-        )
+    groups = ((even, "sky", "even frames"), (~even, "orange", "odd frames"))
+    all_frames = ((np.ones(even.size, bool), "bars", "frames"),)
+    marks: list[Mark] = [
+        Points(number[where], values[where], colour=colour, size=0.8, label=label)
+        for where, colour, label in (groups if alternates else all_frames)
+    ]
     centre, mean, n = (stretches[name] for name in ("frame", channel, "frames"))
     if np.isfinite(sd):
         half = 2.0 * sd / np.sqrt(n)
-        axes.fill_between(
-            centre, -half, half, color=colours.edge, alpha=0.18, linewidth=0, label="±2 sd of chance"
-        )
+        marks.append(Band(centre, -half, half, colour="edge", alpha=0.18, label="±2 sd of chance"))
     # no line across frames that are not there
     steps = np.diff(centre)
     apart = np.flatnonzero(steps > 2.0 * np.median(steps)) + 1 if steps.size else np.empty(0, np.int64)
-    line = [np.insert(v, apart, np.nan) for v in (centre, mean)]
-    axes.plot(*line, color=colours.blue, linewidth=1.2, marker="o", markersize=1.8, label="mean of a stretch")
+    x, y = np.insert(centre, apart, centre[apart]), np.insert(mean, apart, np.nan)
+    marks.append(Line(x, y, width=1.2, dots=1.8, label="mean of a stretch"))
     if path is not None:
-        axes.plot(number, path, color=colours.vermilion, linewidth=1.4, linestyle="--", label="named effects")
+        marks.append(Line(number, path, colour="vermilion", width=1.4, dash="--", label="named effects"))
     low, high = np.quantile(values, [0.001, 0.999]) if values.size else (-1.0, 1.0)
-    extremes = [
-        low,
-        high,
-        *(mean if mean.size else []),
-        *((path.min(), path.max()) if path is not None else ()),
-    ]
-    spread = max(float(max(extremes) - min(extremes)), 1e-12)
-    axes.set_ylim(min(extremes) - 0.08 * spread, max(extremes) + 0.08 * spread)
-    axes.yaxis.set_major_locator(MaxNLocator(5))
-    outside = int(((values < axes.get_ylim()[0]) | (values > axes.get_ylim()[1])).sum())
-    if outside:
-        note(axes, f"{outside} beyond the axis", where="lower right")
+    extremes = [low, high, *mean, *((path.min(), path.max()) if path is not None else ())]
+    margin = 0.08 * max(float(max(extremes) - min(extremes)), 1e-12)
+    ends = float(min(extremes)) - margin, float(max(extremes)) + margin
+    outside = int(((values < ends[0]) | (values > ends[1])).sum())
+    return marks, ends, f"{outside} beyond the axis" if outside else ""
 
 
-def _mark_frames(axes: Axes, frames: Sequence[int], number: FloatArray) -> None:
-    """Shade the frames, successive ones together, unless they are most of the run."""
-    colours = colours_of(axes)
+def _marked(frames: Sequence[int], number: FloatArray) -> list[Span]:
+    """Return what shades the frames, successive ones together, unless they are most of the run."""
     if not frames or len(frames) > 0.8 * number.size:
-        return
+        return []
     ordered = np.unique(np.asarray(frames))
     width = max(float(number[-1] - number[0]) / 400.0, 1.0)
-    for run in np.split(ordered, np.flatnonzero(np.diff(ordered) > width) + 1)[:50]:
-        axes.axvspan(
-            run[0] - width / 2, run[-1] + width / 2, color=colours.mark, alpha=0.6, linewidth=0, zorder=0
-        )
+    return [
+        Span(float(run[0]) - width / 2, float(run[-1]) + width / 2, axis="x", colour="mark", alpha=0.6)
+        for run in np.split(ordered, np.flatnonzero(np.diff(ordered) > width) + 1)[:50]
+    ]

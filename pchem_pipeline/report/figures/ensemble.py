@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from pchem_pipeline.report.charts.chart import (
+    Axis,
+    Band,
+    Bars,
+    Chart,
+    Dash,
+    Level,
+    Line,
+    Panel,
+    Points,
+    Stack,
+    Steps,
+)
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.figures.pixels import shown_bins
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, colours_of, note, styled
+from pchem_pipeline.report.style.style import PAGE_MM
 from pchem_pipeline.report.style.wording import power_of_ten, scientific, short
 
 FloatArray = NDArray[np.float64]
 
 #: Suffix of a prediction to (name in the legend, hue, line style).
-_PREDICTIONS: dict[str, tuple[str, str, str]] = {
+_PREDICTIONS: dict[str, tuple[str, str, Dash]] = {
     "independent": ("independent parameters", "vermilion", ":"),
     "dependent": ("dependent parameters", "blue", "--"),
     "exact": ("exact mean over pixels", "ink", "-"),
@@ -71,7 +81,7 @@ def ensemble_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             "Ensemble histogram before and after non-uniformity correction with predictions. "
             f"RMSE: {numbers}.",
             tables,
-            partial(draw_ensemble, tables=tables, rmse=rmse, n_frames=data.ensemble_facts.get("n_frames")),
+            ensemble_chart(tables, rmse, data.ensemble_facts.get("n_frames")),
             PAGE_MM,
         )
     ]
@@ -94,7 +104,7 @@ def electron_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             _ELECTRONS_CAPTION,
             f"Share of each electron number among the estimates against the prediction; {first}.",
             (table,),
-            partial(draw_electrons, table=table),
+            electrons_chart(table),
         )
     ]
 
@@ -117,7 +127,7 @@ def component_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             f"{short(float(width[0]))} DN at k = 0, "
             f"{short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
             (table,),
-            partial(draw_components, table=table, highlight=[c for c in _HIGHLIGHTED if c in cases]),
+            components_chart(table, [c for c in _HIGHLIGHTED if c in cases]),
             PAGE_MM,
         )
     ]
@@ -168,45 +178,26 @@ def _held(case: str) -> str:
     return f"sd, constant: {case}"
 
 
-@styled
-def draw_ensemble(
-    look: Look, *, tables: Sequence[DataTable], rmse: Mapping[str, float], n_frames: int | None = None
-) -> Drawing:
-    """Draw the ensemble histogram with the three EPCDs, raw and NUCed (fig:ensemble_plot).
+def ensemble_chart(
+    tables: Sequence[DataTable], rmse: Mapping[str, float], n_frames: int | None = None
+) -> Chart:
+    """Return the chart of the ensemble histogram with the three EPCDs, raw and NUCed (fig:ensemble_plot).
 
     The strip below each shows data minus prediction; its gray band is two standard deviations of the
     sampling noise of the data. On a page, a panel at the right shows all values on a logarithmic axis.
 
     Args:
-        look: width and colours.
         tables: of :func:`ensemble_tables`.
         rmse: RMSE of each prediction under its name, and ``noise_floor``, ``nuced_noise_floor``.
         n_frames: frames in the histogram, for the legend.
     """
     halves = [_Half(table) for table in tables if table["counts"].sum() > 0]
-    figure = look.empty(max(78.0 * len(halves), 40.0))
-    if not halves:
-        axes = figure.add_subplot()
-        axes.text(0.5, 0.5, "no ensemble histogram", ha="center", transform=axes.transAxes)
-        axes.set_axis_off()
-        return figure
-    wide = look.wide
-    grid = figure.add_gridspec(
-        2 * len(halves),
-        2 if wide else 1,
-        height_ratios=[3.2, 1.0] * len(halves),
-        width_ratios=(2.4, 1.0) if wide else None,
-    )
-    for i, half in enumerate(halves):
-        top = figure.add_subplot(grid[2 * i, 0])
-        strip = figure.add_subplot(grid[2 * i + 1, 0], sharex=top)
-        _ensemble_bulk(top, half, rmse, n_frames)
-        top.set_ylim(0.0, (1.3 if wide else 1.75) * top.get_ylim()[1])
-        _ensemble_strip(strip, half)
-        top.tick_params(labelbottom=False)
-        if wide:
-            _ensemble_tail(figure.add_subplot(grid[2 * i : 2 * i + 2, 1]), half)
-    return figure
+    stacks = []
+    for half in halves:
+        labels = _labels(half, rmse, n_frames)
+        floor = rmse.get("noise_floor" if half.raw else "nuced_noise_floor")
+        stacks += [_bulk_stack(half, labels, floor), _tail_stack(half, labels)]
+    return Chart(tuple(stacks), (2.4, 1.0), empty="no ensemble histogram")
 
 
 class _Half:
@@ -237,43 +228,51 @@ def _bulk(half: _Half) -> slice:
     return slice(max(int(seen[0]) - margin, 0), int(seen[-1]) + margin + 1)
 
 
-def _ensemble_bulk(top: Axes, half: _Half, rmse: Mapping[str, float], n_frames: int | None) -> None:
-    where, colours = _bulk(half), colours_of(top)
-    data_name = "raw data" if half.raw else "NUCed data"
-    if n_frames:
-        data_name += f", {n_frames:,} frames"
-    edges = half.edges(where)
-    top.stairs(half.density[where], edges, fill=True, color=colours.bars, label=data_name)
-    for suffix, model in half.models.items():
-        words, hue, line = _PREDICTIONS[suffix]
+def _labels(half: _Half, rmse: Mapping[str, float], n_frames: int | None) -> dict[str, str]:
+    """Return what the legend says of the data (``""``) and of each prediction."""
+    data = "raw data" if half.raw else "NUCed data"
+    found = {"": f"{data}, {n_frames:,} frames" if n_frames else data}
+    for suffix, (words, _, _) in _PREDICTIONS.items():
         name = ("epcd_" if half.raw else "nuced_") + suffix
-        label = f"{words}, RMSE {scientific(rmse[name])}" if name in rmse else words
-        top.plot(half.x[where], model[where], color=getattr(colours, hue), linestyle=line, label=label)
-    floor = rmse.get("noise_floor" if half.raw else "nuced_noise_floor")
+        found[suffix] = f"{words}, RMSE {scientific(rmse[name])}" if name in rmse else words
+    return found
+
+
+def _bulk_stack(half: _Half, labels: Mapping[str, str], floor: float | None) -> Stack:
+    where = _bulk(half)
+    edges, x = half.edges(where), half.x[where]
+    marks: list[Line | Steps] = [
+        Steps(edges, half.density[where], filled=True, colour="bars", label=labels[""])
+    ]
+    for suffix, model in half.models.items():
+        _, hue, dash = _PREDICTIONS[suffix]
+        marks.append(Line(x, model[where], colour=hue, dash=dash, label=labels[suffix]))
     if floor is not None:
-        top.plot([], [], color="none", label=f"sampling noise alone, RMSE {scientific(floor)}")
-    top.set(ylabel=f"density (1/{half.unit})", xlim=(edges[0], edges[-1]))
-    top.set_title("raw ensemble" if half.raw else "after non-uniformity correction")
-    top.legend(loc="upper right")
+        words = f"sampling noise alone, RMSE {scientific(floor)}"
+        marks.append(Line(np.empty(0), np.empty(0), colour="none", label=words))
+    y = Axis(f"density (1/{half.unit})", low=0.0)
+    top = Panel(y, tuple(marks), 3.2, legend="upper right", room=(1.3, 1.75))
+    title = "raw ensemble" if half.raw else "after non-uniformity correction"
+    ends = Axis(f"signal ({half.unit})", float(edges[0]), float(edges[-1]))
+    return Stack((top, _strip(half, where, labels)), ends, title, height_mm=78.0)
 
 
-def _ensemble_strip(strip: Axes, half: _Half) -> None:
-    where, colours = _bulk(half), colours_of(strip)
+def _strip(half: _Half, where: slice, labels: Mapping[str, str]) -> Panel:
     density, x = half.density[where], half.x[where]
     noise = np.sqrt(np.maximum(density, 0.0) / (max(float(half.counts.sum()), 1.0) * half.step))
     differences = {suffix: density - model[where] for suffix, model in half.models.items()}
     power = _power([2.0 * noise, *differences.values()])
     scale = 10.0**-power
-    strip.fill_between(
-        x, -2.0 * scale * noise, 2.0 * scale * noise, color=colours.band, linewidth=0, step="mid"
-    )
-    for suffix, difference in differences.items():
-        _, hue, line = _PREDICTIONS[suffix]
-        strip.plot(x, scale * difference, color=getattr(colours, hue), linestyle=line, linewidth=0.8)
-    strip.axhline(0.0, color=colours.ink, linewidth=0.5)
-    strip.set(
-        xlabel=f"signal ({half.unit})", ylabel=f"data − model\n({power_of_ten(power) or 1}/{half.unit})"
-    )
+    band = Band(x, -2.0 * scale * noise, 2.0 * scale * noise, colour="band", step=True)
+    lines = [
+        Line(
+            x, scale * difference, colour=_PREDICTIONS[suffix][1], dash=_PREDICTIONS[suffix][2],
+            width=0.8, label=labels[suffix], listed=False,
+        )
+        for suffix, difference in differences.items()
+    ]  # fmt: skip
+    zero = Level(0.0, colour="ink", width=0.5)
+    return Panel(Axis(f"data − model\n({power_of_ten(power) or 1}/{half.unit})"), (band, *lines, zero), 1.0)
 
 
 def _power(values: Sequence[FloatArray]) -> int:
@@ -282,65 +281,63 @@ def _power(values: Sequence[FloatArray]) -> int:
     return int(np.floor(np.log10(largest))) if largest > 0 else 0
 
 
-def _ensemble_tail(axes: Axes, half: _Half) -> None:
-    """Draw the whole range on a logarithmic axis, down to less than one count."""
-    where, colours = shown_bins(half.counts, tail=0.0), colours_of(axes)
+def _tail_stack(half: _Half, labels: Mapping[str, str]) -> Stack:
+    """Return the whole range on a logarithmic axis, down to less than one count."""
+    where = shown_bins(half.counts, tail=0.0)
     total = float(half.counts.sum())
-    axes.stairs(half.density[where], half.edges(where), fill=True, color=colours.bars, baseline=1e-300)
-    for suffix, model in half.models.items():
-        _, hue, line = _PREDICTIONS[suffix]
-        shown = np.maximum(model[where], 1e-300)
-        axes.plot(half.x[where], shown, color=getattr(colours, hue), linestyle=line, linewidth=0.9)
-    axes.set_yscale("log")
-    axes.set_ylim(0.3 / (total * half.step), 3.0 * float(half.density.max()))
-    axes.set(xlabel=f"signal ({half.unit})", title="all values, logarithmic")
+    low, high = 0.3 / (total * half.step), 3.0 * float(half.density.max())
+    data = Steps(
+        half.edges(where), half.density[where], filled=True, colour="bars", label=labels[""], listed=False
+    )
+    lines = [
+        Line(
+            half.x[where], np.maximum(model[where], 1e-3 * low), colour=_PREDICTIONS[suffix][1],
+            dash=_PREDICTIONS[suffix][2], width=0.9, label=labels[suffix], listed=False,
+        )
+        for suffix, model in half.models.items()
+    ]  # fmt: skip
+    panel = Panel(Axis("", low, high, log=True), (data, *lines))
+    x = Axis(f"signal ({half.unit})")
+    return Stack((panel,), x, "all values, logarithmic", height_mm=78.0, wide=True)
 
 
-@styled
-def draw_electrons(look: Look, *, table: DataTable) -> Drawing:
-    """Draw estimated electron numbers against the predicted mass (fig:poisson_demarg, eq. K_ensemble_pmf).
+def electrons_chart(table: DataTable) -> Chart:
+    """Return the chart of estimated electron numbers against the predicted mass (eq. K_ensemble_pmf).
 
     Args:
-        look: width and colours.
         table: electron numbers ``k``, their share ``electron_mass`` among the estimates, the mass
             ``electron_pmf`` predicted from the map of H; where known the mass ``electron_pmf_map`` that the
             estimator itself should show, and ``electron_counts`` for the sampling noise in the strip.
     """
-    figure, colours = look.empty(74.0), look.palette
-    top, strip = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 1.0))
     last = _last_shown(table["electron_mass"], table["electron_pmf"])
     k, mass, pmf = (table[name][: last + 1] for name in ("k", "electron_mass", "electron_pmf"))
-    top.bar(k, mass, width=0.85, color=colours.bars, label="estimated electron numbers")
-    top.plot(k, pmf, "o", color=colours.ink, markersize=3.2, label=r"predicted mass $p_{K_e}$")
     power = _power([mass - pmf])
     scale = 10.0**-power
+    estimated = Bars(k, np.zeros(k.size), mass, colour="bars", label="estimated electron numbers")
+    above: list[Bars | Points] = [
+        estimated,
+        Points(k, pmf, colour="ink", size=3.2, label=r"predicted mass $p_{K_e}$"),
+    ]
+    below: list[Bars | Points | Level] = []
     if "electron_counts" in table and table["electron_counts"].sum() > 0:
         noise = 2.0 * scale * np.sqrt(mass / float(table["electron_counts"].sum()))
-        strip.bar(k, 2.0 * noise, bottom=-noise, width=0.85, color=colours.band, linewidth=0)
-    strip.plot(k, scale * (mass - pmf), "o", color=colours.ink, markersize=3.0)
+        below.append(Bars(k, -noise, noise, colour="band"))
+    rest = scale * (mass - pmf)
+    below.append(Points(k, rest, colour="ink", size=3.0, label=above[1].label, listed=False))
     if "electron_pmf_map" in table:
-        expected = table["electron_pmf_map"][: last + 1]
-        top.plot(
-            k,
-            expected,
-            "x",
-            color=colours.vermilion,
-            markersize=4.0,
-            label="mass that the estimator should show",
-        )
-        strip.plot(k, scale * (mass - expected), "x", color=colours.vermilion, markersize=4.0)
-    strip.axhline(0.0, color=colours.ink, linewidth=0.5)
-    strip.margins(y=0.15)
-    top.set(ylabel="probability", ylim=(0.0, 1.4 * max(float(np.nanmax(mass, initial=0.0)), 1e-12)))
-    strip.set(
-        xlabel="electron number k (e⁻)",
-        ylabel=f"difference\n({power_of_ten(power) or 1})",
-        xlim=(-0.6, last + 0.6),
+        expected, words = table["electron_pmf_map"][: last + 1], "mass that the estimator should show"
+        cross = {"colour": "vermilion", "mark": "x", "size": 4.0, "label": words}
+        above.append(Points(k, expected, **cross))  # type: ignore[arg-type]
+        below.append(Points(k, scale * (mass - expected), listed=False, **cross))  # type: ignore[arg-type]
+    below.append(Level(0.0, colour="ink", width=0.5))
+    y = Axis("probability", 0.0, 1.1 * max(float(np.nanmax(mass, initial=0.0)), 1e-12))
+    panels = (
+        Panel(y, tuple(above), 3.2, legend="upper right", room=(1.3, 1.3)),
+        Panel(Axis(f"difference\n({power_of_ten(power) or 1})"), tuple(below), 1.0),
     )
-    strip.xaxis.set_major_locator(MaxNLocator(8, integer=True))
-    handles, labels = top.get_legend_handles_labels()
-    top.legend(handles[-1:] + handles[:-1], labels[-1:] + labels[:-1], loc="upper right")
-    return figure
+    return Chart(
+        (Stack(panels, Axis("electron number k (e⁻)", -0.6, last + 0.6, whole=True), height_mm=74.0),)
+    )
 
 
 def _last_shown(mass: NDArray[Any], pmf: NDArray[Any]) -> int:
@@ -350,51 +347,45 @@ def _last_shown(mass: NDArray[Any], pmf: NDArray[Any]) -> int:
 
 
 #: Hue and line style of the cases drawn in colour.
-_CASES = (
+_CASES: tuple[tuple[str, Dash], ...] = (
     ("blue", "-"),
     ("vermilion", "--"),
     ("green", "-."),
     ("orange", ":"),
-    ("purple", (0, (5, 1, 1, 1, 1, 1))),
-    ("sky", (0, (1, 1))),
+    ("purple", "-..."),
+    ("sky", ".."),
 )
 
 
-@styled
-def draw_components(look: Look, *, table: DataTable, highlight: Sequence[str] = ()) -> Drawing:
-    """Draw the width of the EPCD's components against the electron number (Appendix B).
+def components_chart(table: DataTable, highlight: Sequence[str] = ()) -> Chart:
+    """Return the chart of the width of the EPCD's components against the electron number (Appendix B).
 
     Args:
-        look: width and colours.
         table: of :func:`component_table`.
         highlight: cases drawn in colour, at most six; the others are gray.
     """
-    wide, colours = look.wide, look.palette
-    nuced = "sd after correction" in table
-    panels = 2 if nuced else 1
-    figure = look.empty(62.0 * (1 if wide else panels) + (14.0 if wide else 26.0))
-    axes = figure.subplots(1 if wide else panels, panels if wide else 1, squeeze=False).ravel()
     chosen = dict(zip(map(_held, highlight), _CASES, strict=False))
-    k, first = table["k"], axes[0]
+    k = table["k"]
+    gray, lines = [], []
     for name in table.columns:
         if name in chosen:
-            hue, line = chosen[name]
-            label = name.removeprefix("sd, ")
-            first.plot(k, table[name], color=getattr(colours, hue), linestyle=line, label=label, zorder=3)
+            hue, dash = chosen[name]
+            lines.append(Line(k, table[name], colour=hue, dash=dash, label=name.removeprefix("sd, ")))
         elif name.startswith("sd, "):
-            first.plot(k, table[name], color=colours.no_value, linewidth=0.7, zorder=1)
-    axes[0].set(xlabel="electron number k (e⁻)", ylabel="component width, sd (DN)", title="raw ensemble")
-    if nuced:
-        axes[1].plot(k, table["sd after correction"], color=colours.ink, marker="o", markersize=2.5)
-        axes[1].set(
-            xlabel="electron number k (e⁻)", ylabel="component width, sd (e⁻)", title="NUCed ensemble"
-        )
-    for panel in axes:
-        low, high = panel.get_ylim()
-        panel.set_ylim(0.0 if low < 0.5 * high else low - 0.1 * abs(low), 1.08 * max(high, 1e-12))
-        panel.xaxis.set_major_locator(MaxNLocator(8, integer=True))
-    if chosen:
-        figure.legend(loc="outside lower center", ncols=3 if wide else 2)
-    else:
-        note(axes[0], "every line: one set of parameters held constant")
-    return figure
+            gray.append(Line(k, table[name], colour="no_value", width=0.7))
+    note = "" if chosen else "every line: one set of parameters held constant"
+    stacks = [_component_stack("raw ensemble", "DN", (*gray, *lines), note)]
+    if "sd after correction" in table:
+        line = Line(k, table["sd after correction"], colour="ink", dots=2.5, label="sd", listed=False)
+        stacks.append(_component_stack("NUCed ensemble", "e⁻", (line,)))
+    return Chart(tuple(stacks), (1.0,) * len(stacks), (3, 2) if chosen else (0, 0))
+
+
+def _component_stack(title: str, unit: str, lines: tuple[Line, ...], note: str = "") -> Stack:
+    known = np.concatenate([line.y for line in lines])
+    low, high = float(np.min(known)), float(np.max(known))
+    bottom = 0.0 if low < 0.5 * high else low - 0.1 * abs(low)
+    y = Axis(f"component width, sd ({unit})", bottom, 1.1 * max(high, 1e-12))
+    return Stack(
+        (Panel(y, lines, note=note),), Axis("electron number k (e⁻)", whole=True), title, height_mm=75.0
+    )

@@ -1,7 +1,8 @@
-"""A figure: its words, its data as tables, and who draws it.
+"""A figure: its words, its data as tables, and what draws it.
 
-The tables are made from plain arrays before anything is drawn; matplotlib draws them (``draw``), CSV files
-beside figures for papers hold them (:func:`csv_text`), and so may any other that shows them.
+The tables are made from plain arrays before anything is drawn; CSV files beside figures for papers hold them
+(:func:`csv_text`). Curves, bars and points are a ``Chart``, which matplotlib draws on paper and the
+page itself; maps are drawn by functions.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.report.charts.chart import Chart
+from pchem_pipeline.report.charts.on_paper import draw_chart
 from pchem_pipeline.report.style.style import COLUMN_MM, Drawing, Look
 
 
@@ -82,7 +85,7 @@ class Figure:
         caption: what is drawn and how to read it.
         alt: what a reader who does not see it should know, with the numbers.
         tables: its data, the main part first.
-        draw: draws it in a look; another process can be sent it.
+        content: a chart, or what draws the figure in a look; another process can be sent either.
         width_mm: width at which it is saved.
     """
 
@@ -92,8 +95,17 @@ class Figure:
     caption: str
     alt: str
     tables: tuple[DataTable, ...]
-    draw: Callable[[Look], Drawing]
+    content: Chart | Callable[[Look], Drawing]
     width_mm: float = COLUMN_MM
+
+    @property
+    def chart(self) -> Chart | None:
+        """The chart; None of a figure that a function draws."""
+        return self.content if isinstance(self.content, Chart) else None
+
+    def draw(self, look: Look) -> Drawing:
+        """Draw it with matplotlib."""
+        return draw_chart(look, self.content) if isinstance(self.content, Chart) else self.content(look)
 
 
 def csv_text(table: DataTable) -> str:

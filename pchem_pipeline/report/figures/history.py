@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 
+from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Line, Panel, Points, Stack
 from pchem_pipeline.report.comparison import Against, HistoryRow
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, styled
+from pchem_pipeline.report.style.style import PAGE_MM
 from pchem_pipeline.report.style.wording import short, symbol
 
 _SHOWN = ("quanta_exposure", "charge_rate", "dark_current", "conversion_gain", "bias", "read_noise_e")
@@ -60,36 +60,33 @@ def history_figures(rows: Sequence[HistoryRow], against: Against) -> list[Figure
             "Medians of the maps with their standard errors; the band is the scatter of the pixels.",
             f"From {first.label} to {last.label}: {words}.",
             (table,),
-            partial(draw_history, table=table, names=tuple(shown), axis=axis),
+            history_chart(table, tuple(shown), axis),
             PAGE_MM,
         )
     ]
 
 
-@styled
-def draw_history(look: Look, *, table: DataTable, names: tuple[str, ...], axis: str) -> Drawing:
-    """Draw a panel for each map: median with its error, and the scatter of the pixels as a band.
+def history_chart(table: DataTable, names: tuple[str, ...], axis: str) -> Chart:
+    """Return the chart with a panel for each map: median with its error, and the scatter of the pixels.
 
     Args:
-        look: width and colours.
         table: of the figure.
         names: the maps.
         axis: column against which they are drawn.
     """
-    drawing = look.empty(26.0 * len(names) + 10.0)
-    at = table[axis].astype(np.float64)
-    order = np.argsort(at, kind="stable")
-    panels = np.atleast_1d(drawing.subplots(len(names), 1, sharex=True))
-    for panel, name in zip(panels, names, strict=True):
+    order = np.argsort(table[axis], kind="stable")
+    at = table[axis].astype(np.float64)[order]
+    panels = []
+    for name in names:
         median, error, scatter = (
             table[f"{name} {part}"].astype(np.float64)[order]
             for part in ("median", "standard error", "scatter")
         )
-        panel.fill_between(
-            at[order], median - scatter, median + scatter, color=look.palette.blue, alpha=0.15, lw=0
+        marks = (
+            Band(at, median - scatter, median + scatter, alpha=0.15, label="scatter of the pixels"),
+            Line(at, median),
+            Points(at, median, size=3.0, error=np.stack([error, error]), label="median"),
         )
-        panel.errorbar(at[order], median, error, fmt="o-", ms=3, color=look.palette.blue)
         sign, _, unit = symbol(name)
-        panel.set_ylabel(f"{sign} ({unit})")
-    panels[-1].set_xlabel(axis)
-    return drawing
+        panels.append(Panel(Axis(f"{sign} ({unit})"), marks))
+    return Chart((Stack(tuple(panels), Axis(axis), height_mm=26.0 * len(names) + 10.0),))

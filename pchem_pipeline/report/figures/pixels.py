@@ -2,33 +2,32 @@
 
 from __future__ import annotations
 
-import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import SubFigure
-from matplotlib.patches import PathPatch
-from matplotlib.path import Path
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.law.pcd import pcd, thresholds
+from pchem_pipeline.report.charts.chart import (
+    Axis,
+    Chart,
+    Level,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Span,
+    Stack,
+    Steps,
+    Sticks,
+    Words,
+)
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.style import (
-    COLUMN_MM,
-    PAGE_MM,
-    Drawing,
-    Look,
-    colours_of,
-    note,
-    plain,
-    styled,
-)
+from pchem_pipeline.report.style.style import COLUMN_MM, PAGE_MM, plain
 from pchem_pipeline.report.style.wording import measured, short, stored_unit, symbol
 
 FloatArray = NDArray[np.float64]
@@ -40,6 +39,11 @@ PAPER_EXAMPLE: Mapping[str, float] = {
     "bias": 0.0,
     "read_noise_dn": 0.33,
 }
+
+#: Letters of a line of the status.
+_STATUS_LETTERS = 52
+#: Cells whose number is written.
+_MOST_NUMBERS = 18
 
 _LETTERS = "abcdefghijklmnop"
 _TITLE_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
@@ -71,7 +75,7 @@ def cell_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             "Density of a PCD with peaks at 0, 1, 2, … electrons and the first four cell edges at "
             f"{_edges_text(PAPER_EXAMPLE)} e⁻.",
             example,
-            partial(draw_cells, tables=example),
+            cells_chart(example),
         )
     ]
     fitted = [pixel for pixel in data.pixels if has_fit(pixel.parameters)]
@@ -86,7 +90,7 @@ def cell_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
                 f"Histogram and density of {pixel.place}; first cell edges at "
                 f"{_edges_text(pixel.parameters)} DN.",
                 tables,
-                partial(draw_cells, tables=tables),
+                cells_chart(tables),
             )
         )
     return found
@@ -115,7 +119,7 @@ def pixel_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             _FITS_CAPTION,
             "Histograms with fitted densities. " + "; ".join(words) + ".",
             fit_tables(data.pixels),
-            partial(draw_pixels, pixels=data.pixels),
+            pixels_chart(data.pixels),
             PAGE_MM if len(data.pixels) > 1 else COLUMN_MM,
         )
     ]
@@ -212,48 +216,40 @@ def _theta(parameters: Mapping[str, float]) -> tuple[float, float, float, float]
     )
 
 
-@styled
-def draw_cells(look: Look, *, tables: Sequence[DataTable]) -> Drawing:
-    """Draw a PCD with the optimal edges between electron numbers (Hendrickson et al. 2023, eq. demarg_K_eqn).
+def cells_chart(tables: Sequence[DataTable]) -> Chart:
+    """Return the chart of a PCD with the optimal edges between electron numbers (eq. demarg_K_eqn).
 
     Args:
-        look: width and colours.
         tables: of :func:`cell_tables`.
     """
-    figure, colours = look.empty(0.62 * min(look.width_mm, 1.3 * COLUMN_MM)), look.palette
-    axes = figure.add_subplot()
     density, between, *histogram = tables
     x, edges = density["signal"], between["edge"]
     if x.size == 0:
-        axes.text(0.5, 0.5, "no fitted pixel to show", ha="center", va="center", transform=axes.transAxes)
-        axes.set_axis_off()
-        return figure
+        return Chart((), empty="no fitted pixel to show")
     low, high, unit = float(x[0]), float(x[-1]), density.units["signal"].replace("e-", "e⁻")
-    for table in histogram:
-        _draw_frames(axes, table, low, high)
-    label = "fitted density" if histogram else "PCD"
-    axes.plot(x, density["density"], color=colours.ink, label=label)
-    top = 1.22 * axes.get_ylim()[1]
-    axes.vlines(
-        edges, 0.0, 0.86 * top, color=colours.blue, linestyle="--", linewidth=0.9, label="edge of a cell"
-    )
+    frames = [bars for table in histogram for bars in _frames(table, low, high)]
+    curve = Line(x, density["density"], colour="ink", label="fitted density" if histogram else "PCD")
+    top = 1.28 * max(float(np.max(each)) for each in (curve.y, *(bars.values for bars in frames)))
+    ends = np.full(edges.size, 0.86 * top)
+    dashed = Sticks(edges, ends, colour="blue", dash="--", width=0.9, label="edge of a cell")
     cells = np.concatenate([[low], edges, [high]])
-    every = max(1, int(np.ceil(len(cells) / (18 if look.width_mm <= COLUMN_MM else 30))))
-    for k in range(0, len(cells) - 1, every):
-        words, place = f"k = {k}" if k == 0 else str(k), (cells[k] + cells[k + 1]) / 2
-        axes.text(place, 0.87 * top, words, ha="center", va="bottom", color=colours.blue, fontsize=7)
-    axes.set(xlim=(low, high), ylim=(0.0, top), xlabel=f"signal ({unit})", ylabel=f"density (1/{unit})")
-    figure.legend(loc="outside lower center", ncols=3)
-    return figure
+    every = max(1, int(np.ceil(len(cells) / _MOST_NUMBERS)))
+    words = [
+        Words((cells[k] + cells[k + 1]) / 2, 0.87, f"k = {k}" if k == 0 else str(k))
+        for k in range(0, len(cells) - 1, every)
+    ]
+    panel = Panel(Axis(f"density (1/{unit})", 0.0, top), (*frames, curve, dashed, *words))
+    return Chart((Stack((panel,), Axis(f"signal ({unit})", low, high), height_mm=55.0),), legend=(3, 3))
 
 
-def _draw_frames(axes: Axes, table: DataTable, low: float, high: float) -> None:
-    """Draw the bars of a histogram between two signals; others would only make the files large."""
+def _frames(table: DataTable, low: float, high: float) -> list[Steps]:
+    """Return the bars of a histogram between two signals; others would only make the files large."""
     dn, frames = table["dn"], table["frames"]
-    if frames.sum() > 0:
-        first = int(np.clip(np.floor(low) - dn[0], 0, dn.size - 1))
-        last = int(np.clip(np.ceil(high) - dn[0], first, dn.size - 1))
-        _bars(axes, frames, int(dn[0]), slice(first, last + 1))
+    if not frames.sum() > 0:
+        return []
+    first = int(np.clip(np.floor(low) - dn[0], 0, dn.size - 1))
+    last = int(np.clip(np.ceil(high) - dn[0], first, dn.size - 1))
+    return [_bars(frames, int(dn[0]), slice(first, last + 1))]
 
 
 def cell_range(exposure: float, gain: float, bias: float, sigma: float) -> tuple[float, float, int]:
@@ -269,10 +265,10 @@ def cell_range(exposure: float, gain: float, bias: float, sigma: float) -> tuple
     return bias - 4.0 * sigma, bias + last / gain + 4.0 * sigma, last
 
 
-def _bars(axes: Axes, counts: NDArray[Any], origin: int, where: slice) -> None:
-    """Draw these bins of a histogram of DN, normalised with all of them, as gray bars of 1 DN."""
+def _bars(counts: NDArray[Any], origin: int, where: slice) -> Steps:
+    """Return these bins of a histogram of DN, normalised with all of them, as gray bars of 1 DN."""
     edges = (origin + np.arange(counts.size + 1) - 0.5)[where.start : where.stop + 1]
-    axes.stairs(counts[where] / counts.sum(), edges, fill=True, color=colours_of(axes).bars, label="frames")
+    return Steps(edges, counts[where] / counts.sum(), filled=True, colour="bars", label="frames")
 
 
 def shown_bins(counts: NDArray[Any], *, tail: float = 2e-4) -> slice:
@@ -295,97 +291,75 @@ def shown_bins(counts: NDArray[Any], *, tail: float = 2e-4) -> slice:
     )
 
 
-@styled
-def draw_pixels(look: Look, *, pixels: Sequence[PixelFit]) -> Drawing:
-    """Draw histograms of pixels with the fitted density and the residuals (fig:plot_per_pixel_fits).
+def pixels_chart(pixels: Sequence[PixelFit]) -> Chart:
+    """Return the chart of histograms with the fitted density and the residuals (fig:plot_per_pixel_fits).
 
     Gray bars are the share of frames at each DN, the black line is the fitted density, or under a model with
     effects the mass of each DN. The strip below shows ``(count - expected) / sqrt(expected)`` where at least
     one frame is expected.
 
     Args:
-        look: width and colours.
         pixels: any number; two in a row on a page, one in a row on a column.
     """
-    columns = 2 if look.wide and len(pixels) > 1 else 1
-    rows = max(1, -(-len(pixels) // columns))
-    width_mm = look.width_mm / columns
-    lines = max((_title(pixel, "a", width_mm).count("\n") for pixel in pixels), default=0)
-    figure = look.empty((62.0 + 3.5 * lines) * rows)
-    parts = figure.subfigures(rows, columns, squeeze=False)
-    for i, pixel in enumerate(pixels):
-        letter = _LETTERS[i % len(_LETTERS)] if len(pixels) > 1 else ""
-        _one_pixel(parts[i // columns, i % columns], pixel, letter, width_mm)
-    return figure
+    many = len(pixels) > 1
+    stacks = [
+        _one_pixel(pixel, _LETTERS[i % len(_LETTERS)] if many else "") for i, pixel in enumerate(pixels)
+    ]
+    return Chart(tuple(stacks), (1.0, 1.0) if many else (1.0,))
 
 
-def _one_pixel(part: SubFigure, pixel: PixelFit, letter: str, width_mm: float) -> None:
-    top, strip = part.subplots(2, 1, sharex=True, height_ratios=(3.4, 1.0))
-    top.set_title(_title(pixel, letter, width_mm), fontsize=7.0, linespacing=1.35)
-    strip.set(xlabel="signal (DN)", ylabel="residual\n(σ)")
-    top.set_ylabel("density (1/DN)")
-    total = int(pixel.counts.sum())
+def _one_pixel(pixel: PixelFit, letter: str) -> Stack:
+    density, residual = "density (1/DN)", "residual\n(σ)"
+    title, total = _title(pixel, letter), int(pixel.counts.sum())
     if total == 0:
-        note(top, "no frames")
-        for axes in (top, strip):
-            axes.set(xticks=[], yticks=[])
-        return
+        panels = (Panel(Axis(density), (), 3.4, note="no frames"), Panel(Axis(residual), (), 1.0))
+        return Stack(panels, Axis("signal (DN)"), title, height_mm=62.0)
     where = shown_bins(pixel.counts)
-    dn, ink = _codes(pixel), colours_of(top).ink
+    dn = _codes(pixel)
     low, high = dn[where][0] - 0.5, dn[where][-1] + 0.5
-    _bars(top, pixel.counts, pixel.origin, where)
-    top.set_xlim(low, high)
+    marks: list[Mark] = [_bars(pixel.counts, pixel.origin, where)]
     remarks = [f"{total:,} {'samples' if pixel.channel else 'frames'}"]
     outside = total - int(pixel.counts[where].sum())
     if outside:
         remarks.append(f"{outside:,} outside the axis")
+    strip = Panel(Axis(residual, -3.5, 3.5), (), 1.0)
     if has_fit(pixel.parameters):
-        x = np.linspace(low, high, int(np.clip(8 * (high - low), 400, 3000)))
         if pixel.mass is None:
-            top.plot(x, pcd(x, *_theta(pixel.parameters)), color=ink)
+            x = np.linspace(low, high, int(np.clip(8 * (high - low), 400, 3000)))
+            y = pcd(x, *_theta(pixel.parameters))
         else:
-            top.plot(dn[where], pixel.mass[where], color=ink)
+            x, y = dn[where].astype(np.float64), pixel.mass[where]
+        marks.append(Line(x, y, colour="ink", label="fit"))
         if np.isfinite(pixel.goodness_p):
             remarks.append(f"goodness of fit p = {pixel.goodness_p:.2g}")
-        _residual_strip(strip, pixel, where)
+        strip = _residual_strip(pixel, where, residual)
     else:
         remarks.append("no fit")
-        strip.set_yticks([])
-    top.set_ylim(0.0, 1.25 * max(top.get_ylim()[1], 1e-12))
-    note(top, "\n".join(remarks))
+    tallest = max(float(np.nanmax(y)) for y in (marks[0].values, *(m.y for m in marks[1:])))  # type: ignore[attr-defined]
+    top = Panel(Axis(density, 0.0, 1.3 * max(tallest, 1e-12)), tuple(marks), 3.4, note="\n".join(remarks))
+    return Stack((top, strip), Axis("signal (DN)", float(low), float(high)), title, height_mm=62.0)
 
 
-def _residual_strip(strip: Axes, pixel: PixelFit, where: slice) -> None:
-    colours, columns = colours_of(strip), _pixel_columns(pixel)
+def _residual_strip(pixel: PixelFit, where: slice, label: str) -> Panel:
+    columns = _pixel_columns(pixel)
     enough = np.isfinite(columns["residual"][where])
     dn, residual = (columns[name][where][enough] for name in ("dn", "residual"))
     limit = float(np.clip(1.15 * np.max(np.abs(residual), initial=0.0), 3.5, 12.0))
-    strip.axhspan(-2.0, 2.0, color=colours.band, linewidth=0)
-    strip.axhline(0.0, color=colours.ink, linewidth=0.6)
-    _sticks(strip, dn, np.clip(residual, -limit, limit))
+    marks: list[Mark] = [
+        Span(-2.0, 2.0, colour="band"),
+        Level(0.0, colour="ink", width=0.6),
+        Sticks(dn, np.clip(residual, -limit, limit), width=0.7, label="residual"),
+    ]
     beyond = np.abs(residual) > limit
+    note = ""
     if beyond.any():
-        strip.plot(
-            dn[beyond],
-            np.sign(residual[beyond]) * 0.93 * limit,
-            "x",
-            color=colours.vermilion,
-            markersize=3,
-        )
-        note(strip, f"× {int(beyond.sum())} beyond {limit:.0f} σ")
-    strip.set_ylim(-limit, limit)
+        at = np.sign(residual[beyond]) * 0.93 * limit
+        marks.append(Points(dn[beyond], at, mark="x", colour="vermilion", size=3.0))
+        note = f"× {int(beyond.sum())} beyond {limit:.0f} σ"
+    return Panel(Axis(label, -limit, limit), tuple(marks), 1.0, note=note)
 
 
-def _sticks(axes: Axes, x: FloatArray, y: FloatArray) -> None:
-    """Draw lines from zero to each value, as one path: a fourth of the SVG that a path each takes."""
-    ends = np.stack([np.repeat(x, 2), np.stack([np.zeros_like(y), y], axis=1).ravel()], axis=1)
-    codes = np.tile([Path.MOVETO, Path.LINETO], x.size)
-    axes.add_patch(
-        PathPatch(Path(ends, codes), fill=False, edgecolor=colours_of(axes).blue, linewidth=0.7, zorder=2)
-    )
-
-
-def _title(pixel: PixelFit, letter: str, width_mm: float) -> str:
+def _title(pixel: PixelFit, letter: str) -> str:
     head = " ".join(part for part in (f"({letter})" if letter else "", plain(_cut(pixel.label))) if part)
     lines = [f"{head}: {pixel.place}" if head else pixel.place]
     if has_fit(pixel.parameters):
@@ -396,13 +370,11 @@ def _title(pixel: PixelFit, letter: str, width_mm: float) -> str:
                 words.append(
                     f"{sign} = {measured(pixel.parameters[name], pixel.stderr.get(name, float('nan')), unit)}"
                 )
-        pairs = ["   ".join(words[i : i + 2]) for i in range(0, len(words), 2)]
-        # a symbol in mathtext is about two letters wide
-        fits = all(len(re.sub(r"\$[^$]*\$", "MM", pair)) < 0.66 * width_mm for pair in pairs)
-        lines += pairs if fits else words
+        lines += ["   ".join(words[i : i + 2]) for i in range(0, len(words), 2)]
     if pixel.status:
-        letters = max(20, int(width_mm * 0.6))
-        lines += textwrap.wrap(f"status: {plain(pixel.status)}", letters, max_lines=5, placeholder=" …")
+        lines += textwrap.wrap(
+            f"status: {plain(pixel.status)}", _STATUS_LETTERS, max_lines=5, placeholder=" …"
+        )
     return "\n".join(lines)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,11 +9,11 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, rounding_bias
+from pchem_pipeline.report.charts.chart import Axis, Chart, Level, Line, Panel, Span, Stack
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.style import Drawing, Look, styled
 from pchem_pipeline.report.style.wording import short
 
 _STEPS = np.geomspace(1.5, 30.0, 40)  # DN per electron
@@ -49,7 +48,7 @@ def rounding_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             _CAPTION,
             f"At {short(step)} DN per electron, in standard errors of a pixel: {', '.join(words)}.",
             (table,),
-            partial(draw_rounding, table=table, gain=gain),
+            rounding_chart(table, gain),
         )
     ]
 
@@ -82,27 +81,26 @@ def rounding_curves(data: ReportData) -> dict[str, NDArray[np.float64]]:
     return {"1/g": _STEPS, **{name: largest[:, i] for i, name in enumerate(_NAMES)}}
 
 
-@styled
-def draw_rounding(look: Look, *, table: DataTable, gain: NDArray[Any]) -> Drawing:
-    """Draw the bias of the density's estimates against 1/g, with the range of this sensor.
+#: Hues of the parameters' curves.
+_HUES = ("blue", "vermilion", "green", "orange")
+
+
+def rounding_chart(table: DataTable, gain: NDArray[Any]) -> Chart:
+    """Return the chart of the bias of the density's estimates against 1/g, with the range of this sensor.
 
     Args:
-        look: width and colours.
         table: from :func:`rounding_curves`.
         gain: map of the conversion gain, e-/DN.
     """
-    figure, colours, steps = look.empty(62.0), look.palette, table["1/g"]
-    axes = figure.add_subplot()
-    for colour, name in zip(colours.cycle, _NAMES, strict=False):
-        axes.plot(steps, table[name], color=colour, label=name)
-    axes.axhline(LARGEST_BIAS, color=colours.green, linewidth=0.9, linestyle=":")
+    steps = table["1/g"]
     low, high = (1.0 / float(q) for q in np.quantile(finite(gain), [0.99, 0.01]))
-    axes.axvspan(low, high, color=colours.sky, alpha=0.3, linewidth=0, label="this sensor, 1–99 %")
-    axes.set(xscale="log", yscale="log", ylim=(1e-4, 30.0))
-    axes.set(xlabel="1/g (DN per electron)", ylabel="bias (standard errors)")
-    axes.set_xlim(min(float(steps[0]), 0.9 * low), max(float(steps[-1]), 1.1 * high))
-    ticks = [tick for tick in (1, 2, 5, 10, 20, 50) if axes.get_xlim()[0] <= tick <= axes.get_xlim()[1]]
-    axes.set_xticks(ticks, labels=[str(tick) for tick in ticks])
-    axes.minorticks_off()
-    axes.legend(loc="upper right")
-    return figure
+    lines = [
+        Line(steps, table[name], colour=hue, label=name) for hue, name in zip(_HUES, _NAMES, strict=True)
+    ]
+    limit = Level(LARGEST_BIAS, colour="green", width=0.9, dash=":")
+    here = Span(low, high, axis="x", colour="sky", alpha=0.3, label="this sensor, 1–99 %")
+    left, right = min(float(steps[0]), 0.9 * low), max(float(steps[-1]), 1.1 * high)
+    ticks = tuple((float(tick), str(tick)) for tick in (1, 2, 5, 10, 20, 50) if left <= tick <= right)
+    x = Axis("1/g (DN per electron)", left, right, log=True, ticks=ticks)
+    y = Axis("bias (standard errors)", 1e-4, 30.0, log=True)
+    return Chart((Stack((Panel(y, (here, *lines, limit), legend="upper right"),), x, height_mm=62.0),))

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import CHARGE_RATES
+from pchem_pipeline.report.charts.chart import Axis, Chart, Level, Line, Mark, Panel, Points, Stack
 from pchem_pipeline.report.data import ReportData, Samples
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.style import Drawing, Look, colours_of, note, styled
 from pchem_pipeline.report.style.wording import measured, short, symbol
 
 #: Label and unit of what the exposures are drawn against, and the maps that their slope may be.
@@ -54,7 +53,7 @@ def exposure_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             _LINE_CAPTION.format(against=words),
             f"Exposures on a line; median {noun} {measured(centre, error, symbol(slope)[2])}.",
             (table,),
-            partial(draw_exposures, table=table, line=line),
+            exposures_chart(table, line),
         )
     ]
 
@@ -83,7 +82,7 @@ def transfer_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             "Variance against mean above the bias: "
             + "; ".join(f"{name} {short(float(value))} DN²" for name, value in medians),
             (table,),
-            partial(draw_photon_transfer, table=table, fitted=fitted),
+            transfer_chart(table, fitted),
         )
     ]
 
@@ -144,39 +143,30 @@ def middle(values: NDArray[Any]) -> tuple[float, float, float, float]:
     return centre, 0.5 * float(ends[1] - ends[0]), low, high
 
 
-@styled
-def draw_exposures(look: Look, *, table: DataTable, line: tuple[float, float]) -> Drawing:
-    """Draw the quanta exposures against time or light with their line, and the residuals below.
+def exposures_chart(table: DataTable, line: tuple[float, float]) -> Chart:
+    """Return the chart of H against time or light with its line, and the residuals below.
 
     Points are medians over the pixels, bars the 16 to 84 % range between pixels; the error bars of the
     residuals are standard errors of the median.
 
     Args:
-        look: width and colours.
         table: of :func:`exposure_table`.
         line: slope and offset, e-.
     """
-    figure, colours = look.empty(92.0), look.palette
-    top, bottom = figure.subplots(2, 1, height_ratios=(2.0, 1.0), sharex=True)
     against = list(table.columns)[1]
     places, exposures, (slope, offset) = table[against].astype(np.float64), table["H"], line
     grid = np.linspace(0.0, 1.05 * places.max(), 50)
-    top.plot(grid, offset + slope * grid, color=colours.vermilion, label="median line of the pixels")
-    points: dict[str, Any] = {
-        "fmt": "o",
-        "color": colours.blue,
-        "markersize": 3.5,
-        "label": "median pixel, 16–84 %",
-    }
-    top.errorbar(places, exposures, yerr=_spread(table, "H"), **points)
-    top.axhline(offset, color=colours.bars, linewidth=0.8, linestyle=":")
-    top.set(ylabel="quanta exposure $H$ (e⁻)")
-    top.set_ylim(bottom=min(0.0, 1.1 * offset))
-    top.legend(loc="upper left")
-    note(top, f"offset {short(offset)} e⁻", where="lower right")
-    _residuals(bottom, places, table)
-    bottom.set(xlabel=table.heading(against), ylabel="residual (e⁻)", xlim=(0.0, grid[-1]))
-    return figure
+    marks = (
+        Line(grid, offset + slope * grid, colour="vermilion", label="median line of the pixels"),
+        Level(offset, colour="bars", width=0.8, dash=":"),
+        Points(places, exposures, error=_spread(table, "H"), label="median pixel, 16–84 %"),
+    )
+    top = Panel(
+        Axis("quanta exposure $H$ (e⁻)", low=min(0.0, 1.1 * offset)), marks, 2.0, legend="upper left",
+        note=f"offset {short(offset)} e⁻", corner="lower right",
+    )  # fmt: skip
+    x = Axis(table.heading(against), 0.0, float(grid[-1]))
+    return Chart((Stack((top, _residuals(places, table)), x, height_mm=92.0),))
 
 
 def _spread(table: DataTable, name: str) -> NDArray[np.float64]:
@@ -185,34 +175,27 @@ def _spread(table: DataTable, name: str) -> NDArray[np.float64]:
     return np.abs(np.stack(ends, dtype=np.float64))
 
 
-def _residuals(axes: Axes, places: NDArray[np.float64], table: DataTable) -> None:
-    """Draw median residuals with their errors; without freedom there are none to speak of."""
-    colours = colours_of(axes)
-    axes.axhline(0.0, color=colours.bars, linewidth=0.8)
+def _residuals(places: NDArray[np.float64], table: DataTable) -> Panel:
+    """Return median residuals with their errors; without freedom there are none to speak of."""
+    label, zero = "residual (e⁻)", Level(0.0, colour="bars", width=0.8)
     if "residual" not in table:
-        note(axes, "two exposures: the line goes through both")
-        axes.set_ylim(-1.0, 1.0)
-        return
+        return Panel(Axis(label, -1.0, 1.0), (zero,), note="two exposures: the line goes through both")
     found, error = table["residual"], table["residual standard error"]
-    axes.errorbar(places, found, yerr=error, fmt="o", color=colours.blue, markersize=3.5, capsize=2)
-    most = 1.3 * np.nanmax(np.abs(found) + error)
-    axes.set_ylim(-most, most)
+    most = 1.3 * float(np.nanmax(np.abs(found) + error))
+    points = Points(places, found, error=np.stack([error, error]), cap=2.0, label="median residual")
+    return Panel(Axis(label, -most, most), (zero, points))
 
 
-@styled
-def draw_photon_transfer(look: Look, *, table: DataTable, fitted: Mapping[str, float]) -> Drawing:
-    """Draw variance against mean above the bias with the curve of the joint fit.
+def transfer_chart(table: DataTable, fitted: Mapping[str, float]) -> Chart:
+    """Return the chart of variance against mean above the bias with the curve of the joint fit.
 
     Photon transfer: ``variance = sigma^2 + (mean - mu) / g`` in DN. Points are medians over the pixels; the
     curve has the median parameters.
 
     Args:
-        look: width and colours.
         table: of :func:`transfer_table`.
         fitted: medians of ``conversion_gain`` and ``read_noise_dn``.
     """
-    figure, colours = look.empty(66.0), look.palette
-    axes = figure.add_subplot()
     x, y, kinds = (table[name] for name in ("mean above the bias", "variance", "kind"))
     gain, noise = fitted["conversion_gain"], fitted["read_noise_dn"]
     known = finite(x[kinds == "exposed"])
@@ -222,24 +205,23 @@ def draw_photon_transfer(look: Look, *, table: DataTable, fitted: Mapping[str, f
     start = 0.3 * least if logarithmic else 0.0
     grid = np.geomspace(start, most, 200) if logarithmic else np.linspace(0.0, most, 200)
     curve, shot = "joint fit: $\\sigma^2 + (x - \\mu)/g$", "shot noise alone"
-    axes.plot(grid, noise**2 + grid / gain, color=colours.vermilion, label=curve)
-    axes.plot(grid, grid / gain, color=colours.sky, linewidth=0.9, linestyle="--", label=shot)
-    axes.axhline(noise**2, color=colours.bars, linewidth=0.8, linestyle=":", label="read noise $\\sigma^2$")
-    marks = (("exposed", "o", colours.blue, "median pixel, 16–84 %"), ("bias", "s", colours.ink, "bias"))
-    for kind, mark, colour, label in marks:
+    marks: list[Mark] = [
+        Line(grid, noise**2 + grid / gain, colour="vermilion", label=curve),
+        Line(grid, grid / gain, colour="sky", width=0.9, dash="--", label=shot),
+        Level(noise**2, colour="bars", width=0.8, dash=":", label="read noise $\\sigma^2$"),
+    ]
+    spread = _spread(table, "variance")
+    for kind, colour, label in (("exposed", "blue", "median pixel, 16–84 %"), ("bias", "ink", "bias")):
         chosen = kinds == kind
         if chosen.any():
-            points: dict[str, Any] = {
-                "fmt": mark,
-                "color": colour,
-                "markersize": 3.5,
-                "zorder": 3,
-                "label": label,
-            }
-            spread = _spread(table, "variance")[:, chosen]
-            axes.errorbar(np.maximum(x[chosen], grid[0]), y[chosen], yerr=spread, **points)
+            marks.append(
+                Points(
+                    np.maximum(x[chosen], grid[0]), y[chosen], mark="o" if kind == "exposed" else "s",
+                    colour=colour, error=spread[:, chosen], label=label,
+                )
+            )  # fmt: skip
+    up = Axis("variance (DN²)")
     if logarithmic:
-        axes.set(xscale="log", yscale="log", ylim=(0.4 * noise**2, 2.0 * (noise**2 + most / gain)))
-    axes.set(xlabel="mean above the bias (DN)", ylabel="variance (DN²)")
-    axes.legend(loc="upper left")
-    return figure
+        up = replace(up, low=0.4 * noise**2, high=2.0 * (noise**2 + most / gain), log=True)
+    panel = Panel(up, tuple(marks), legend="upper left")
+    return Chart((Stack((panel,), Axis("mean above the bias (DN)", log=logarithmic), height_mm=66.0),))

@@ -6,16 +6,14 @@ All are made of the sums that the stage ``histogram`` keeps; what chance alone d
 from __future__ import annotations
 
 import math
-from functools import partial
+from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
+from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Level, Line, Panel, Stack
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.style.style import Drawing, Look, colours_of, styled
 from pchem_pipeline.report.style.wording import count, short
 
 FloatArray = NDArray[np.float64]
@@ -66,7 +64,7 @@ def _frame_figure(sums: StackSums) -> Figure:
     )
     return Figure(
         "frame_means", "stability", "Mean of the frames", _FRAMES.format(averaged=averaged), alt,
-        (means, power), partial(draw_frames, means=means, power=power),
+        (means, power), frames_chart(means, power),
     )  # fmt: skip
 
 
@@ -83,7 +81,7 @@ def _profile_figure(sums: StackSums) -> Figure | None:
     return Figure(
         "profiles", "stability", "Profiles of rows and columns", _PROFILES,
         f"Profiles of the mean signal: {'; '.join(words)}.",
-        tuple(tables), partial(draw_profiles, tables=tuple(tables)),
+        tuple(tables), profiles_chart(tables),
     )  # fmt: skip
 
 
@@ -98,7 +96,7 @@ def _spectrum_figure(sums: StackSums) -> Figure | None:
     return Figure(
         "spatial_spectra", "stability", "Spectra of rows and columns", _SPECTRA,
         f"Largest power over chance: {', '.join(largest)}.",
-        (*fixed, *temporal), partial(draw_spectra, fixed=fixed, temporal=temporal),
+        (*fixed, *temporal), spectra_chart(fixed, temporal),
     )  # fmt: skip
 
 
@@ -202,77 +200,77 @@ def _spectrum(power: FloatArray, length: int, part: str, unit: str) -> DataTable
     return DataTable({"frequency": frequency, "power": power}, {"frequency": f"1/{unit}"}, part)
 
 
-@styled
-def draw_frames(look: Look, *, means: DataTable, power: DataTable) -> Drawing:
-    """Draw the mean of the frames, and its spectrum below.
+_CHANCE_LABEL = "chance"
+
+
+def frames_chart(means: DataTable, power: DataTable) -> Chart:
+    """Return the chart of the mean of the frames, and its spectrum below.
 
     Args:
-        look: width and colours.
         means: of :func:`frame_table`.
         power: of :func:`power_table`.
     """
-    drawing, colours = look.empty(88.0), look.palette
-    top, bottom = drawing.subplots(2, 1)
-    centre, error = float(means["mean"].mean()), means["error of chance"]
-    top.fill_between(means["frame"], centre - 2 * error, centre + 2 * error, color=colours.band, linewidth=0)
-    top.plot(means["frame"], means["mean"], color=colours.blue, linewidth=0.7)
-    top.set(xlabel="frame", ylabel="mean (DN)")
-    top.ticklabel_format(useOffset=False)
-    bottom.loglog(power["frequency"], power["largest"], color=colours.sky, linewidth=0.6)
-    bottom.loglog(power["frequency"], power["power"], color=colours.blue)
-    _one(bottom)
-    bottom.set(xlabel="frequency (1/frame)", ylabel="power / chance")
-    return drawing
+    x, centre, error = means["frame"], float(means["mean"].mean()), means["error of chance"]
+    band = Band(x, centre - 2 * error, centre + 2 * error, colour="band", label=_CHANCE_LABEL)
+    line = Line(x, means["mean"], width=0.7, label="mean")
+    spectrum = (
+        Line(power["frequency"], power["largest"], colour="sky", width=0.6, label="largest"),
+        Line(power["frequency"], power["power"], label="mean power"),
+        _one(),
+    )
+    return Chart(
+        (
+            Stack((Panel(Axis("mean (DN)"), (band, line)),), Axis("frame"), height_mm=44.0),
+            Stack(
+                (Panel(Axis("power / chance", log=True), spectrum),),
+                Axis("frequency (1/frame)", log=True),
+                height_mm=44.0,
+            ),
+        )
+    )
 
 
-@styled
-def draw_profiles(look: Look, *, tables: tuple[DataTable, ...]) -> Drawing:
-    """Draw the profiles of rows and columns.
+def profiles_chart(tables: Sequence[DataTable]) -> Chart:
+    """Return the chart of the profiles of rows and columns.
 
     Args:
-        look: width and colours.
         tables: of :func:`profile_table`.
     """
-    drawing, colours = look.empty(44.0 * len(tables)), look.palette
-    for axes, table in zip(drawing.subplots(len(tables), 1, squeeze=False)[:, 0], tables, strict=True):
+    stacks = []
+    for table in tables:
         name = next(iter(table.columns))
-        axes.fill_between(
-            table[name], table["chance from"], table["chance to"], color=colours.band, linewidth=0
-        )
-        axes.plot(table[name], table["mean signal"], color=colours.blue, linewidth=0.8)
-        axes.set(xlabel=f"{table.part} {name} (pixel)", ylabel="median (DN)")
-        axes.ticklabel_format(useOffset=False)
-    return drawing
+        x = table[name]
+        band = Band(x, table["chance from"], table["chance to"], colour="band", label=_CHANCE_LABEL)
+        line = Line(x, table["mean signal"], width=0.8, label="median")
+        panel = Panel(Axis("median (DN)"), (band, line))
+        stacks.append(Stack((panel,), Axis(f"{table.part} {name} (pixel)"), height_mm=44.0))
+    return Chart(tuple(stacks))
 
 
-@styled
-def draw_spectra(look: Look, *, fixed: tuple[DataTable, ...], temporal: tuple[DataTable, ...]) -> Drawing:
-    """Draw spatial spectra of the fixed pattern, and below of the noise of rows and columns.
+def spectra_chart(fixed: Sequence[DataTable], temporal: Sequence[DataTable]) -> Chart:
+    """Return the chart of spatial spectra of the fixed pattern, and below of the noise of rows and columns.
 
     Args:
-        look: width and colours.
         fixed: of :func:`pattern_spectra`.
         temporal: of :func:`line_spectra`.
     """
-    drawing = look.empty(88.0)
-    titles = ("fixed pattern", "noise")
-    for axes, tables, title in zip(drawing.subplots(2, 1), (fixed, temporal), titles, strict=True):
-        axes.set_title(title)
+    stacks = []
+    for tables, title in ((fixed, "fixed pattern"), (temporal, "noise")):
+        lines = []
         for table in tables:
             line = table.part.split("_")[1]
-            colour = look.palette.blue if line == "row" else look.palette.vermilion
             # where nothing ever changes there is no power, and no logarithm of it
             power = np.where(table["power"] > 0.0, table["power"], np.nan)
-            axes.semilogy(table["frequency"], power, color=colour, linewidth=0.8, label=f"{line}s")
-        _one(axes)
-        axes.set(xlabel="frequency (1/row, 1/column)", ylabel="power / chance", xlim=(0.0, 0.5))
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=2)
-        low, high = axes.get_ylim()
-        axes.set_ylim(min(low, 0.09), max(high, 11.0))
-        axes.yaxis.set_minor_formatter(NullFormatter())
-    return drawing
+            colour = "blue" if line == "row" else "vermilion"
+            lines.append(Line(table["frequency"], power, colour=colour, width=0.8, label=f"{line}s"))
+        known = np.concatenate([[1.0], *(line.y[np.isfinite(line.y)] for line in lines)])
+        y = Axis("power / chance", min(0.8 * known.min(), 0.09), max(1.25 * known.max(), 11.0), log=True)
+        panel = Panel(y, (*lines, _one()), legend="upper right", columns=2, room=(3.0, 3.0))
+        x = Axis("frequency (1/row, 1/column)", 0.0, 0.5)
+        stacks.append(Stack((panel,), x, title, height_mm=44.0))
+    return Chart(tuple(stacks))
 
 
-def _one(axes: Axes) -> None:
-    """Draw the line of chance."""
-    axes.axhline(1.0, color=colours_of(axes).ink, linewidth=0.6, linestyle="--", zorder=1)
+def _one() -> Level:
+    """Return the line of chance."""
+    return Level(1.0, colour="ink", width=0.6, dash="--")

@@ -10,6 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.checks.multiple_testing import misfit
+from pchem_pipeline.report.charts.chart import Axis, Bars, Chart, Level, Line, Mark, Panel, Stack, Words
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.figures.maps import is_strip, show_map, shown_pixels
@@ -117,7 +118,7 @@ def uncertainty_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             _UNCERTAINTY_CAPTION,
             f"Part of the variance of the maps that is noise of the estimates: {words}.",
             (maps, ensemble),
-            partial(draw_uncertainty, maps=maps, ensemble=ensemble),
+            uncertainty_chart(maps, ensemble),
             PAGE_MM,
         )
     ]
@@ -242,43 +243,48 @@ def draw_left_out(look: Look, *, share: FloatArray, n_frames: int | None) -> Dra
     return figure
 
 
-@styled
-def draw_uncertainty(look: Look, *, maps: DataTable, ensemble: DataTable) -> Drawing:
-    """Draw how much of each map is noise of the estimates, and how sure the predicted ensemble is.
+def uncertainty_chart(maps: DataTable, ensemble: DataTable) -> Chart:
+    """Return the chart of how much of each map is noise of the estimates, and how sure the prediction is.
 
     Args:
-        look: width and colours.
         maps: parts of the maps' variance that the errors of the estimates make, by map.
         ensemble: ``dn``, ``counts``, ``epcd_exact``, and ``epcd_stderr`` where it is known.
     """
-    (left, right, figure), colours = _two(look, (1, 1)), look.palette
-    shares = dict(zip(maps["map"].tolist(), maps["share of the variance"].tolist(), strict=True))
-    places = np.arange(len(shares))[::-1]
-    values = np.clip([100.0 * share for share in shares.values()], 0.0, 130.0)
+    return Chart((_noise_stack(maps), _error_stack(ensemble)), (1.0, 1.15))
+
+
+def _noise_stack(maps: DataTable) -> Stack:
+    names, shares = maps["map"].tolist(), maps["share of the variance"].astype(np.float64)
+    places, values = np.arange(shares.size), np.clip(100.0 * shares, 0.0, 130.0)
     end = 1.3 * max(float(values.max()), 1.0)
-    left.barh(places, values, color=colours.bars, height=0.6)
-    for place, value, share in zip(places, values, shares.values(), strict=True):
-        left.text(value + 0.015 * end, place, percent(share, 1.0), va="center", fontsize=6.5)
+    marks: list[Mark] = [
+        Bars(places, np.zeros(places.size), values, broad=0.6, colour="bars", label="noise", listed=False)
+    ]
+    for place, value, share in zip(places.tolist(), values.tolist(), shares.tolist(), strict=True):
+        marks.append(Words(place, value / end + 0.015, percent(share, 1.0), colour="ink"))
     if end > 100.0:
-        left.axvline(100.0, color=colours.vermilion, linewidth=0.9, linestyle=":")
-    left.set_yticks(places, [symbol(name)[0] for name in shares])
-    left.set(xlabel="noise in the variance of the map (%)", xlim=(0.0, end))
+        marks.append(Level(100.0, colour="vermilion", width=0.9, dash=":"))
+    ticks = tuple((float(place), symbol(name)[0]) for place, name in enumerate(names))
+    x = Axis("map", -0.7, len(names) - 0.3, ticks=ticks)
+    return Stack((Panel(Axis("noise in the variance (%)", 0.0, end), tuple(marks)),), x, height_mm=62.0)
+
+
+def _error_stack(ensemble: DataTable) -> Stack:
+    x, label = Axis("signal (DN)"), "density (1/DN)"
     if "epcd_stderr" not in ensemble:
-        right.set(xticks=[], yticks=[])
-        note(right, "no error of the prediction: the model holds effects")
-        return figure
-    dn, exact = ensemble["dn"], ensemble["epcd_exact"]
+        note = "no error of the prediction: the model holds effects"
+        return Stack((Panel(Axis(label), (), note=note),), x, height_mm=62.0)
+    exact, error = ensemble["epcd_exact"], ensemble["epcd_stderr"]
     total = max(float(ensemble["counts"].sum()), 1.0)
     seen = exact > 1e-6 * exact.max()
-    sampling = np.sqrt(exact / total)
-    right.plot(dn[seen], exact[seen], color=colours.ink, label="EPCD")
-    right.plot(dn[seen], sampling[seen], color=colours.sky, label="sampling noise of the data")
-    right.plot(
-        dn[seen], ensemble["epcd_stderr"][seen], color=colours.blue, label="standard error of the EPCD"
+    curves = (
+        ("EPCD", "ink", exact),
+        ("sampling noise of the data", "sky", np.sqrt(exact / total)),
+        ("standard error of the EPCD", "blue", error),
     )
-    right.set_yscale("log")
-    right.set(xlabel="signal (DN)", ylabel="density (1/DN)")
-    floor = float(np.min(ensemble["epcd_stderr"][seen & (ensemble["epcd_stderr"] > 0)], initial=np.inf))
-    right.set_ylim(max(0.5 * floor, 1e-5 * float(exact.max())) if np.isfinite(floor) else None, None)
-    right.legend(loc="upper right")
-    return figure
+    dn = ensemble["dn"][seen]
+    lines = tuple(Line(dn, values[seen], colour=colour, label=words) for words, colour, values in curves)
+    floor = float(np.min(error[seen & (error > 0)], initial=np.inf))
+    low = max(0.5 * floor, 1e-5 * float(exact.max())) if np.isfinite(floor) else None
+    panel = Panel(Axis(label, low, log=True), lines, legend="upper right")
+    return Stack((panel,), x, height_mm=62.0)

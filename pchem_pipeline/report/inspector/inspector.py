@@ -69,10 +69,10 @@ def script() -> str:
     return text_of("inspector.js")
 
 
-def text_of(name: str) -> str:
-    """Return a file of the pages' templates."""
-    folder = importlib.resources.files("pchem_pipeline.report") / "templates"
-    return (folder / name).read_text(encoding="utf-8")
+def text_of(name: str, folder: str = "templates") -> str:
+    """Return a file of the pages' templates, or of another folder of the report."""
+    whole = importlib.resources.files("pchem_pipeline.report") / folder / name
+    return whole.read_text(encoding="utf-8")
 
 
 def content_policy(*texts: str) -> str:

@@ -1,4 +1,4 @@
-"""What all pages share: frame and style, the script, the figures' numbers, the glossary."""
+"""What all pages share: frame and style, the scripts, the figures' numbers, the charts, the glossary."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
+from pchem_pipeline.report.charts.on_page import page_charts
 from pchem_pipeline.report.figures.figure import Figure, csv_text
 from pchem_pipeline.report.inspector.inspector import content_policy, json_for_html, text_of
 from pchem_pipeline.report.pages.glossary import GLOSSARY, explained
 
 #: Numbers of a table that the page keeps.
 _LARGEST_TABLE = 6_000
+#: Folder of the library that draws charts.
+_LIBRARY = "vendor/uplot"
 _FLAG_WORDS = {"good": "Good", "note": "Note", "caution": "Caution", "serious": "Serious"}
 _FLAG_SIGNS = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
 
@@ -30,9 +33,13 @@ def render_page(name: str, figures: Sequence[Figure], /, *scripts: str, **conten
         scripts: further ones that its template holds.
         content: what its template shows.
     """
+    charts = {figure.name: figure.chart for figure in figures if figure.chart is not None}
+    always = (page_script(), *((chart_script(),) if charts else ()))
     return _template(name).render(
-        policy=content_policy(page_script(), *scripts),
-        page_script=Markup(page_script()),
+        policy=content_policy(*always, *scripts),
+        page_scripts=[Markup(script) for script in always],
+        charts=json_for_html(page_charts(charts)) if charts else "",
+        chart_style=Markup(text_of("uPlot.min.css", _LIBRARY)) if charts else "",
         tables=json_for_html(figure_tables(figures)),
         glossary=GLOSSARY,
         flag_words=_FLAG_WORDS,
@@ -44,6 +51,12 @@ def render_page(name: str, figures: Sequence[Figure], /, *scripts: str, **conten
 def page_script() -> str:
     """Return the script of files, words and folded parts."""
     return text_of("page.js")
+
+
+def chart_script() -> str:
+    """Return the script that draws charts, behind its library with the library's licence."""
+    licence, library = (text_of(name, _LIBRARY) for name in ("LICENSE", "uPlot.iife.min.js"))
+    return f"/*!\n{licence}\n*/\n{library}\n{text_of('charts.js')}"
 
 
 def figure_tables(figures: Sequence[Figure]) -> dict[str, list[tuple[str, str]]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 _UNITS = {
     "e-": "e⁻",
@@ -32,6 +33,33 @@ _SYMBOLS = {
 
 #: Digits and signs to their superscripts.
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+#: Formulas of mathtext as characters, the longer ones first; what is left of them loses its marks.
+_CHARACTERS = (
+    (r"\mathrm{e}^-", "ₑ"),
+    (r"\sigma", "σ"),
+    (r"\mu", "μ"),
+    (r"\ell", "ℓ"),
+    (r"\mathrm", ""),
+    ("^2", "²"),
+    ("^-", "⁻"),
+    ("_0", "₀"),
+    ("_{K_e}", "(k)"),
+)
+_FORMULA = re.compile(r"(?<!\\)\$([^$]*)\$")
+
+
+def without_formulas(text: str) -> str:
+    """Return a text with its formulas (mathtext) as characters, for where no formula can be drawn."""
+
+    def characters(found: re.Match[str]) -> str:
+        formula = found[1]
+        for marks, sign in _CHARACTERS:
+            formula = formula.replace(marks, sign)
+        return re.sub(r"[\\{}_ ]", "", formula).replace("+", " + ").replace("-", " − ")
+
+    return _FORMULA.sub(characters, text).replace(r"\$", "$")
 
 
 def unit_text(unit: str) -> str:

@@ -8,8 +8,9 @@ import pytest
 from pchem_pipeline.commands.compare.settings import settings_that_differ
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.checks.run_differences import MapDifference, compare_maps
+from pchem_pipeline.report.charts.on_paper import draw_chart
 from pchem_pipeline.report.comparison import RunFacts
-from pchem_pipeline.report.figures.compare import draw_difference, draw_ensembles, ensemble_tables
+from pchem_pipeline.report.figures.compare import draw_difference, ensemble_tables, ensembles_chart
 from pchem_pipeline.report.style.style import Drawing, Look
 
 
@@ -56,8 +57,8 @@ def run_facts(label: str, mean: float) -> RunFacts:
 
 
 def test_ensembles_lie_over_each_other() -> None:
-    figure = draw_ensembles(
-        Look(180.0), tables=ensemble_tables([run_facts("A", 100.0), run_facts("B", 104.0)])
+    figure = draw_chart(
+        Look(180.0), ensembles_chart(ensemble_tables([run_facts("A", 100.0), run_facts("B", 104.0)]))
     )
     top, strip = figure.axes
     assert [line.get_label() for line in top.lines] == ["A (A\\$x\\$.zarr)", "B (B\\$x\\$.zarr)"]
@@ -65,7 +66,7 @@ def test_ensembles_lie_over_each_other() -> None:
     # f(x - 4) - f(x) of N(0, 8^2) is 0.0149 at most, its error sqrt(1050) / 20,000: 9.2, and chance
     assert 7 < np.abs(z).max() < 13
     odd = ensemble_tables([RunFacts("A", "a", (8, 8), 1, ""), run_facts("B", 99.0)])
-    assert len(draw_ensembles(Look(), tables=odd).axes) == 1
+    assert len(draw_chart(Look(), ensembles_chart(odd)).axes) == 1
 
 
 def test_settings_that_differ_name_their_readers() -> None:

@@ -12,12 +12,13 @@ from PIL import Image
 
 from pchem_pipeline.model.fit.status import MEANINGS, FitStatus
 from pchem_pipeline.model.maps.maps import display_transform
+from pchem_pipeline.report.charts.on_paper import draw_chart
 from pchem_pipeline.report.data import PixelFit
 from pchem_pipeline.report.figures.ensemble import (
     component_table,
-    draw_components,
-    draw_electrons,
-    draw_ensemble,
+    components_chart,
+    electrons_chart,
+    ensemble_chart,
     ensemble_tables,
 )
 from pchem_pipeline.report.figures.figure import DataTable
@@ -33,8 +34,8 @@ from pchem_pipeline.report.figures.maps import (
 from pchem_pipeline.report.figures.pixels import (
     PAPER_EXAMPLE,
     cell_tables,
-    draw_cells,
-    draw_pixels,
+    cells_chart,
+    pixels_chart,
     shown_bins,
 )
 from pchem_pipeline.report.style import style
@@ -70,7 +71,7 @@ EMPTY_PIXEL = replace(NAN_PIXEL, counts=np.zeros(4, dtype=np.uint16))
 
 
 def test_cluster_edges_of_the_paper_lie_at_the_optimal_thresholds() -> None:
-    figure = draw_cells(LOOK, tables=cell_tables(PAPER_EXAMPLE))
+    figure = draw_chart(LOOK, cells_chart(cell_tables(PAPER_EXAMPLE)))
     lines = figure.axes[0].collections[0].get_segments()
     edges = np.array([segment[0, 0] for segment in lines])
     k = np.arange(edges.size)
@@ -91,12 +92,12 @@ def test_cluster_edges_of_the_paper_lie_at_the_optimal_thresholds() -> None:
 )
 def test_cluster_edges_of_odd_pixels(pixel: PixelFit, change: dict[str, float]) -> None:
     odd = replace(pixel, parameters={**pixel.parameters, **change})
-    drawn(draw_cells(LOOK, tables=cell_tables(odd.parameters, odd)))
+    drawn(draw_chart(LOOK, cells_chart(cell_tables(odd.parameters, odd))))
 
 
 @pytest.mark.parametrize("width", [COLUMN_MM, PAGE_MM])
 def test_pixel_fits_show_parameters_with_errors_and_the_status(pixel: PixelFit, width: float) -> None:
-    figure = draw_pixels(Look(width), pixels=[pixel, NAN_PIXEL, EMPTY_PIXEL])
+    figure = draw_chart(Look(width), pixels_chart([pixel, NAN_PIXEL, EMPTY_PIXEL]))
     words = texts(figure)
     assert "± 0.012 e⁻" in words
     assert "fewer than 3 occupied bins" in words
@@ -108,15 +109,15 @@ def test_pixel_fits_show_parameters_with_errors_and_the_status(pixel: PixelFit, 
 
 def test_residuals_beyond_the_strip_are_marked(pixel: PixelFit) -> None:
     wrong = replace(pixel, parameters={**pixel.parameters, "bias": pixel.parameters["bias"] + 5.0})
-    assert "beyond 12 σ" in texts(draw_pixels(LOOK, pixels=[wrong]))
+    assert "beyond 12 σ" in texts(draw_chart(LOOK, pixels_chart([wrong])))
 
 
 def test_a_bin_far_out_does_not_stretch_the_axis(pixel: PixelFit) -> None:
     counts = np.zeros(5000, dtype=np.int64)
     counts[: pixel.counts.size] = pixel.counts
     counts[4999] = 1
-    figure = draw_pixels(LOOK, pixels=[replace(pixel, counts=counts)])
-    assert np.ptp(figure.subfigs[0].axes[0].get_xlim()) < 400
+    figure = draw_chart(LOOK, pixels_chart([replace(pixel, counts=counts)]))
+    assert np.ptp(figure.axes[0].get_xlim()) < 400
     assert "1 outside the axis" in texts(figure)
     drawn(figure)
 
@@ -255,7 +256,7 @@ RMSE = {"epcd_exact": 1.3e-4, "noise_floor": 1.2e-4, "nuced_exact": 2e-4}
 
 @pytest.mark.parametrize("width", [COLUMN_MM, PAGE_MM])
 def test_ensemble_shows_both_halves_with_rmse(arrays: dict[str, np.ndarray], width: float) -> None:
-    figure = draw_ensemble(Look(width), tables=ensemble_tables(arrays), rmse=RMSE, n_frames=250)
+    figure = draw_chart(Look(width), ensemble_chart(ensemble_tables(arrays), RMSE, 250))
     words = texts(figure)
     assert "exact mean over pixels, RMSE 1.3×10⁻⁴" in words
     assert "sampling noise alone, RMSE 1.2×10⁻⁴" in words
@@ -280,41 +281,42 @@ def _half(arrays: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
 def test_ensemble_with_parts_missing(
     arrays: dict[str, np.ndarray], change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]
 ) -> None:
-    drawn(draw_ensemble(LOOK, tables=ensemble_tables(change(arrays)), rmse={}))
+    drawn(draw_chart(LOOK, ensemble_chart(ensemble_tables(change(arrays)), {})))
 
 
 def test_electron_numbers(arrays: dict[str, np.ndarray]) -> None:
     names = ("k", "electron_mass", "electron_pmf", "electron_pmf_map", "electron_counts")
     k = arrays["k"]
-    drawn(draw_electrons(LOOK, table=DataTable({name: arrays[name] for name in names})))
+    drawn(draw_chart(LOOK, electrons_chart(DataTable({name: arrays[name] for name in names}))))
     one = {"k": k[:1], "electron_mass": np.ones(1), "electron_pmf": np.ones(1)}
-    drawn(draw_electrons(LOOK, table=DataTable(one)))
+    drawn(draw_chart(LOOK, electrons_chart(DataTable(one))))
     none = {name: np.zeros(k.size) for name in names if name != "electron_pmf_map"} | {"k": k}
-    drawn(draw_electrons(LOOK, table=DataTable(none)))
+    drawn(draw_chart(LOOK, electrons_chart(DataTable(none))))
 
 
 @pytest.mark.parametrize("width", [COLUMN_MM, PAGE_MM])
 def test_component_widths(arrays: dict[str, np.ndarray], width: float) -> None:
     variance = arrays["component_variance"]
     table = component_table(variance, CASES, arrays["nuced_component_variance"])
-    figure = draw_components(Look(width), table=table, highlight=("none", "H, g"))
+    figure = draw_chart(Look(width), components_chart(table, ("none", "H, g")))
     assert "constant: H, g" in texts(figure)
     drawn(figure)
-    drawn(draw_components(LOOK, table=component_table(variance[:1, :1], CASES[:1])))
-    drawn(draw_components(LOOK, table=component_table(np.zeros_like(variance), CASES)))
+    drawn(draw_chart(LOOK, components_chart(component_table(variance[:1, :1], CASES[:1]))))
+    drawn(draw_chart(LOOK, components_chart(component_table(np.zeros_like(variance), CASES))))
 
 
 @pytest.mark.parametrize("kind", ["svg", "png", "pdf"])
 def test_the_same_figure_gives_the_same_bytes(pixel: PixelFit, kind: str) -> None:
     tables = cell_tables(pixel.parameters, pixel)
     first, second = (
-        drawing_bytes(draw_cells(LOOK, tables=tables), kind, dpi=60, title="a <title>") for _ in range(2)
+        drawing_bytes(draw_chart(LOOK, cells_chart(tables)), kind, dpi=60, title="a <title>")
+        for _ in range(2)
     )
     assert first == second
 
 
 def test_fonts_are_embedded(pixel: PixelFit) -> None:
-    figure = draw_cells(LOOK, tables=cell_tables(pixel.parameters))
+    figure = draw_chart(LOOK, cells_chart(cell_tables(pixel.parameters)))
     svg = drawing_bytes(figure, "svg").decode()
     assert "<text" not in svg
     pdf = drawing_bytes(figure, "pdf")
@@ -324,7 +326,7 @@ def test_fonts_are_embedded(pixel: PixelFit) -> None:
 def test_drawing_leaves_the_users_settings_alone(pixel: PixelFit) -> None:
     with mpl.rc_context({"font.size": 31.0, "axes.facecolor": "red"}):
         before = dict(mpl.rcParams)
-        figure = draw_cells(LOOK, tables=cell_tables(pixel.parameters))
+        figure = draw_chart(LOOK, cells_chart(cell_tables(pixel.parameters)))
         drawing_bytes(figure, "svg")
         assert dict(mpl.rcParams) == before
         assert figure.axes[0].get_facecolor() != (1.0, 0.0, 0.0, 1.0)
@@ -344,7 +346,7 @@ def test_a_palette_does_not_change_a_map_visibly() -> None:
 def test_dark_paper_has_light_ink() -> None:
     """Same lines, other colours: nothing is drawn dark on dark."""
     light, dark = (
-        draw_cells(Look(palette=each), tables=cell_tables(PAPER_EXAMPLE)) for each in (LIGHT, DARK)
+        draw_chart(Look(palette=each), cells_chart(cell_tables(PAPER_EXAMPLE))) for each in (LIGHT, DARK)
     )
     assert texts(light) == texts(dark)
     np.testing.assert_array_equal(light.axes[0].lines[0].get_data(), dark.axes[0].lines[0].get_data())

@@ -1,0 +1,284 @@
+"""What a chart shows: marks in panels, panels over each other in stacks, stacks in columns.
+
+A figure of curves, bars and points is described once, in these words. ``on_paper`` draws it with matplotlib,
+``on_page`` writes it as the numbers that the page's script draws, ``picture`` as the plain picture of a page
+without scripts. A colour is the name of one in the ``Palette``, or ``#rrggbb``; texts may hold mathtext.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Values = NDArray[Any]
+Dash = Literal["-", "--", "-.", ":", "-...", ".."]
+
+#: Margin of an axis whose end is not given, of what it shows.
+_MARGIN = 0.05
+
+
+@dataclass(frozen=True)
+class Axis:
+    """An axis.
+
+    Attributes:
+        label: with the unit.
+        low, high: its ends; None: those of the marks and a margin.
+        log: logarithmic.
+        linear_to: logarithmic to both sides beyond this, linear between; 0: not so.
+        whole: ticks at whole numbers alone.
+        ticks: places and texts of the ticks; empty: as the renderer finds them.
+    """
+
+    label: str
+    low: float | None = None
+    high: float | None = None
+    log: bool = False
+    linear_to: float = 0.0
+    whole: bool = False
+    ticks: tuple[tuple[float, str], ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mark:
+    """What all marks have.
+
+    Attributes:
+        colour: of the mark.
+        label: in the legend; on the page its values are told under it.
+        listed: whether the legend on paper has it too.
+        width: of its line, points (1/72 inch).
+        dash: style of its line.
+        alpha: 1 where nothing shines through.
+    """
+
+    colour: str = "blue"
+    label: str = ""
+    listed: bool = True
+    width: float = 1.1
+    dash: Dash = "-"
+    alpha: float = 1.0
+
+
+@dataclass(frozen=True)
+class Line(Mark):
+    """A curve through points (n,), with a gap where y is NaN.
+
+    Attributes:
+        dots: diameter of a dot at each point, points.
+        step: each value holds half-way to its neighbours.
+    """
+
+    x: Values
+    y: Values
+    dots: float = 0.0
+    step: bool = False
+
+
+@dataclass(frozen=True)
+class Steps(Mark):
+    """A histogram: the outline, or the filled area, of n values between n + 1 edges."""
+
+    edges: Values
+    values: Values
+    filled: bool = False
+
+
+@dataclass(frozen=True)
+class Bars(Mark):
+    """Bars from ``low`` to ``high``, ``broad`` on the axis of x; all (n,)."""
+
+    x: Values
+    low: Values
+    high: Values
+    broad: float = 0.85
+
+
+@dataclass(frozen=True)
+class Sticks(Mark):
+    """Lines from zero to each value (n,)."""
+
+    x: Values
+    y: Values
+
+
+@dataclass(frozen=True)
+class Points(Mark):
+    """Points (n,).
+
+    Attributes:
+        mark: disk, square or cross.
+        size: diameter, points.
+        error: lengths of the error bars below and above, (2, n); None: there are none.
+        cap: length of the bars' ends, points.
+    """
+
+    x: Values
+    y: Values
+    mark: Literal["o", "s", "x"] = "o"
+    size: float = 3.5
+    error: Values | None = None
+    cap: float = 0.0
+
+
+@dataclass(frozen=True)
+class Band(Mark):
+    """The area between two curves (n,)."""
+
+    x: Values
+    low: Values
+    high: Values
+    step: bool = False
+
+
+@dataclass(frozen=True)
+class Level(Mark):
+    """A line across the panel at a value of an axis."""
+
+    at: float
+    axis: Literal["x", "y"] = "y"
+
+
+@dataclass(frozen=True)
+class Span(Mark):
+    """An area across the panel between two values of an axis."""
+
+    low: float
+    high: float
+    axis: Literal["x", "y"] = "y"
+
+
+@dataclass(frozen=True)
+class Words(Mark):
+    """A text in the panel: over ``x``, at a part ``up`` of its height."""
+
+    x: float
+    up: float
+    text: str
+    align: Literal["left", "center"] = "center"
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Marks between two axes.
+
+    Attributes:
+        y: the upright axis; that of x is the stack's.
+        marks: what is drawn, the lowest first.
+        height: share of the stack.
+        legend: place on paper of a legend of its own; empty: none.
+        columns: of that legend.
+        room: factor by which the upper end of y is raised for it on paper, on a page and in a column.
+        note: small words in a corner.
+        corner: which one.
+    """
+
+    y: Axis
+    marks: tuple[Mark, ...]
+    height: float = 1.0
+    legend: str = ""
+    columns: int = 1
+    room: tuple[float, float] = (1.0, 1.0)
+    note: str = ""
+    corner: str = "upper right"
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Panels over each other that share the axis of x.
+
+    Attributes:
+        panels: from top to bottom.
+        x: their common axis.
+        title: over the first one; lines that are too long for a width are broken at three blanks.
+        height_mm: on paper.
+        wide: shown only where panels have room side by side.
+    """
+
+    panels: tuple[Panel, ...]
+    x: Axis
+    title: str = ""
+    height_mm: float = 60.0
+    wide: bool = False
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure of curves, bars and points.
+
+    Attributes:
+        stacks: from left to right and from top to bottom.
+        widths: shares of the columns where stacks have room side by side; one below the other elsewhere.
+        legend: columns of a legend below all on paper, on a page and in a column; 0: none.
+        empty: what is said where there is no stack.
+    """
+
+    stacks: tuple[Stack, ...]
+    widths: tuple[float, ...] = (1.0,)
+    legend: tuple[int, int] = (0, 0)
+    empty: str = ""
+
+
+def points_of(mark: Mark) -> tuple[Values, Values]:
+    """Return the places and the values that a mark reaches, for the ends of axes; none for those across."""
+    match mark:
+        case Line() | Sticks():
+            return mark.x, mark.y
+        case Points():
+            reach = np.zeros((2, mark.y.size)) if mark.error is None else np.nan_to_num(mark.error)
+            return np.tile(mark.x, 2), np.concatenate([mark.y - reach[0], mark.y + reach[1]])
+        case Steps():
+            return mark.edges, mark.values
+        case Bars():
+            ends = np.concatenate([mark.x - mark.broad / 2, mark.x + mark.broad / 2])
+            return ends, np.concatenate([mark.low, mark.high])
+        case Band():
+            return np.tile(mark.x, 2), np.concatenate([mark.low, mark.high])
+    return np.empty(0), np.empty(0)
+
+
+def window(axis: Axis, values: Iterator[Values], base: float | None = None) -> tuple[float, float]:
+    """Return the ends of an axis that shows these values: those given, else the values' with a margin.
+
+    Args:
+        axis: the axis.
+        values: of its marks, any shapes.
+        base: a value that the axis ends at where nothing lies beyond it.
+    """
+    parts = [np.asarray(each, dtype=np.float64).ravel() for each in values]
+    known = np.concatenate(parts) if parts else np.empty(0)
+    known = known[np.isfinite(known) & ((known > 0) | (not axis.log))]
+    low, high = (float(known.min()), float(known.max())) if known.size else (1.0, 10.0)
+    if axis.log:
+        margin = (high / low) ** _MARGIN if high > low else 2.0
+        ends = low / margin, high * margin
+    else:
+        if base is not None:
+            low, high = min(low, base), max(high, base)
+        margin = _MARGIN * (high - low) or max(abs(low) * _MARGIN, 0.5)
+        ends = low - margin, high + margin
+        if base is not None:
+            ends = (low if low == base else ends[0]), (high if high == base < low else ends[1])
+    found = (
+        ends[0] if axis.low is None else axis.low,
+        ends[1] if axis.high is None else axis.high,
+    )
+    return found if found[0] < found[1] else (found[0], found[0] + abs(found[0]) + 1.0)
+
+
+def x_window(stack: Stack) -> tuple[float, float]:
+    """Return the ends of the common axis of a stack."""
+    return window(stack.x, (points_of(mark)[0] for panel in stack.panels for mark in panel.marks))
+
+
+def y_window(panel: Panel) -> tuple[float, float]:
+    """Return the ends of the upright axis of a panel."""
+    solid = any(
+        isinstance(mark, Bars | Sticks) or (isinstance(mark, Steps) and mark.filled) for mark in panel.marks
+    )
+    return window(panel.y, (points_of(mark)[1] for mark in panel.marks), 0.0 if solid else None)

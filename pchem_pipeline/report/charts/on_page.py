@@ -1,0 +1,165 @@
+"""Charts as the numbers that the page's script draws."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from pchem_pipeline.report.charts.chart import (
+    Axis,
+    Band,
+    Bars,
+    Chart,
+    Level,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Span,
+    Stack,
+    Steps,
+    Sticks,
+    Values,
+    Words,
+    x_window,
+    y_window,
+)
+from pchem_pipeline.report.charts.thinning import fewer_steps, some_points, thinned
+from pchem_pipeline.report.style.palette import DARK, LIGHT, Palette
+from pchem_pipeline.report.style.wording import without_formulas
+
+#: Columns of a curve that the page keeps, with two values each, and steps of a histogram.
+_COLUMNS, _STEPS = 2000, 4000
+#: Parts of an axis to which numbers are kept: some hundred to a dot of a screen.
+_PARTS = 5
+
+Ends = tuple[float, float]
+
+
+def page_charts(charts: Mapping[str, Chart]) -> dict[str, Any]:
+    """Return charts by figure, and the colours for light and dark paper, as plain data."""
+    return {
+        "colours": {"light": _colours(LIGHT), "dark": _colours(DARK)},
+        "charts": {name: page_chart(chart) for name, chart in charts.items()},
+    }
+
+
+def page_chart(chart: Chart) -> dict[str, Any]:
+    """Return a chart as plain data: numbers rounded to what a screen shows, long curves thinned."""
+    return {"widths": list(chart.widths), "stacks": [_stack(stack) for stack in chart.stacks]}
+
+
+def _colours(palette: Palette) -> dict[str, str]:
+    values = {each.name: getattr(palette, each.name) for each in fields(palette)}
+    return {name: value for name, value in values.items() if value.startswith("#")}
+
+
+def _stack(stack: Stack) -> dict[str, Any]:
+    ends = x_window(stack)
+    return {
+        "title": without_formulas(stack.title),
+        "height": stack.height_mm,
+        "x": _axis(stack.x, ends),
+        "panels": [_panel(panel, stack.x, ends) for panel in stack.panels],
+    }
+
+
+def _axis(axis: Axis, ends: Ends) -> dict[str, Any]:
+    """Return an axis; what it has as every other is left out."""
+    found: dict[str, Any] = {
+        "label": without_formulas(axis.label),
+        "ends": rounded(np.asarray(ends), ends, axis.log),
+    }
+    if axis.log:
+        found["log"] = True
+    if axis.linear_to:
+        found["linear"] = axis.linear_to
+    if axis.whole:
+        found["whole"] = True
+    if axis.ticks:
+        found["ticks"] = [[place, without_formulas(text)] for place, text in axis.ticks]
+    return found
+
+
+def _panel(panel: Panel, x: Axis, across: Ends) -> dict[str, Any]:
+    up = y_window(panel)
+    found: dict[str, Any] = {"height": panel.height, "y": _axis(panel.y, up)}
+    if panel.note:
+        found |= {"note": without_formulas(panel.note), "corner": panel.corner}
+    found["marks"] = [_mark(mark, _Rounding(x, across), _Rounding(panel.y, up)) for mark in panel.marks]
+    return found
+
+
+class _Rounding:
+    """How the numbers along an axis are written."""
+
+    def __init__(self, axis: Axis, ends: Ends) -> None:
+        self.log, self.ends = axis.log, ends
+
+    def __call__(self, values: Values | Sequence[float]) -> list[float | None]:
+        return rounded(np.asarray(values, dtype=np.float64), self.ends, self.log)
+
+    def places(self, values: Values) -> list[float | None] | dict[str, float]:
+        """Return places along the axis; evenly spaced ones as the first, the step and their number."""
+        values = np.asarray(values, dtype=np.float64)
+        if values.size > 3:
+            step = (values[-1] - values[0]) / (values.size - 1)
+            even = values[0] + step * np.arange(values.size)
+            if step and np.abs(values - even).max() < 1e-6 * abs(step):
+                return {"from": float(values[0]), "step": float(f"{step:.12g}"), "n": values.size}
+        return self(values)
+
+
+def rounded(values: Values, ends: Ends, log: bool = False) -> list[float | None]:
+    """Return numbers with the decimals that an axis between these ends can show; None where there is none."""
+    if log:
+        return [float(f"{value:.{_PARTS}g}") if math.isfinite(value) else None for value in values.tolist()]
+    decimals = _PARTS - math.floor(math.log10(ends[1] - ends[0]))
+    found = (np.round(values, decimals) + 0.0).tolist()
+    return [value if math.isfinite(value) else None for value in found]
+
+
+def _mark(mark: Mark, x: _Rounding, y: _Rounding) -> dict[str, Any]:
+    found: dict[str, Any] = {"kind": type(mark).__name__.lower(), "colour": mark.colour}
+    if mark.label:
+        found["label"] = without_formulas(mark.label)
+    if mark.dash != "-":
+        found["dash"] = mark.dash
+    if mark.width != Mark.width:
+        found["width"] = mark.width
+    if mark.alpha != 1.0:
+        found["alpha"] = mark.alpha
+    return found | _numbers(mark, x, y)
+
+
+def _numbers(mark: Mark, x: _Rounding, y: _Rounding) -> dict[str, Any]:
+    """Return what a mark has beside colour and label."""
+    match mark:
+        case Line():
+            places, values = thinned(mark.x, mark.y, _COLUMNS)
+            more = {name: value for name, value in (("dots", mark.dots), ("step", mark.step)) if value}
+            return {"x": x.places(places), "y": y(values), **more}
+        case Steps():
+            edges, values = fewer_steps(mark.edges, mark.values, _STEPS)
+            return {"x": x.places(edges), "y": y(values), "filled": mark.filled}
+        case Bars():
+            return {"x": x.places(mark.x), "low": y(mark.low), "y": y(mark.high), "broad": mark.broad}
+        case Sticks():
+            return {"x": x.places(mark.x), "y": y(mark.y)}
+        case Points():
+            mark = some_points(mark, _STEPS)
+            error = {} if mark.error is None else {"error": [y(np.nan_to_num(each)) for each in mark.error]}
+            return {"x": x.places(mark.x), "y": y(mark.y), "mark": mark.mark, "size": mark.size, **error}
+        case Band():
+            return {"x": x.places(mark.x), "low": y(mark.low), "y": y(mark.high), "step": mark.step}
+        case Level():
+            return {"at": mark.at, "axis": mark.axis}
+        case Span():
+            return {"low": mark.low, "high": mark.high, "axis": mark.axis}
+        case Words():
+            return {"x": mark.x, "up": mark.up, "text": without_formulas(mark.text), "align": mark.align}
+    raise TypeError(f"the page cannot draw a {type(mark).__name__}")

@@ -1,0 +1,317 @@
+"""Charts as plain SVG pictures: what a page shows without scripts and in print."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pchem_pipeline.report.charts.chart import (
+    Axis,
+    Band,
+    Bars,
+    Chart,
+    Dash,
+    Level,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Span,
+    Stack,
+    Steps,
+    Sticks,
+    Words,
+    x_window,
+    y_window,
+)
+from pchem_pipeline.report.charts.thinning import fewer_steps, some_points, thinned
+from pchem_pipeline.report.charts.ticks import scaled, ticks
+from pchem_pipeline.report.style.palette import LIGHT
+from pchem_pipeline.report.style.style import COLUMN_MM
+from pchem_pipeline.report.style.wording import without_formulas
+
+#: Dots of a millimetre on paper, size of the letters and their mean width, all px; columns of a curve.
+_MM, _LETTER, _WIDE, _COLUMNS = 4.5, 11, 6.8, 300
+#: Room beside and below panels, between them, and of a line of the legend, px.
+_LEFT, _RIGHT, _BELOW, _BETWEEN, _LINE = 68.0, 10.0, 38.0, 8.0, 15.0
+_POINT = 1.35  # px
+_DASHES: dict[Dash, str] = {
+    "--": "5 3",
+    ":": "1.5 2.5",
+    "-.": "6 3 1.5 3",
+    "-...": "7 2 1.5 2 1.5 2",
+    "..": "1.5 1.5",
+}
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A panel's place in the picture, px, and the ends of its axes."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+    x: tuple[Axis, float, float]
+    y: tuple[Axis, float, float]
+
+    def across(self, values: ArrayLike) -> FloatArray:
+        """Return places from the panel's left edge, px, of values of x."""
+        return np.asarray(self.width * scaled(values, *self.x))
+
+    def down(self, values: ArrayLike) -> FloatArray:
+        """Return places from the panel's upper edge, px, of values of y, none far outside."""
+        return np.asarray(self.height * (1.0 - np.clip(scaled(values, *self.y), -5.0, 6.0)))
+
+
+def chart_picture(chart: Chart, width_mm: float) -> tuple[bytes, int, int]:
+    """Return a chart as SVG with its width and height, px.
+
+    Args:
+        chart: what is drawn.
+        width_mm: width on paper; stacks stand side by side if it is more than a column.
+    """
+    wide = width_mm > 1.5 * COLUMN_MM
+    shares = chart.widths if wide else chart.widths[:1]
+    stacks = [stack for stack in chart.stacks if wide or not stack.wide]
+    whole, top = width_mm * _MM, 0.0
+    parts: list[str] = []
+    for start in range(0, len(stacks), len(shares)):
+        left, tallest = 0.0, 0.0
+        for share, stack in zip(shares, stacks[start : start + len(shares)], strict=False):
+            width = whole * share / sum(shares)
+            drawn, height = _stack(stack, left, top, width)
+            parts += drawn
+            left, tallest = left + width, max(tallest, height)
+        top += tallest
+    if not stacks:
+        parts, top = [_text(whole / 2, 60.0, chart.empty, "middle")], 120.0
+    size = f'width="{whole:.0f}" height="{top:.0f}"'
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size} viewBox="0 0 {whole:.0f} {top:.0f}" '
+        f'font-family="DejaVu Sans,Arial,sans-serif" font-size="{_LETTER}" fill="{LIGHT.ink}">'
+    )
+    svg = f'{head}<rect width="100%" height="100%" fill="{LIGHT.paper}"/>{"".join(parts)}</svg>'
+    return svg.encode(), round(whole), round(top)
+
+
+def _stack(stack: Stack, left: float, top: float, width: float) -> tuple[list[str], float]:
+    """Draw the panels of a stack with title and legend; return the elements and the height."""
+    lines = [line for line in without_formulas(stack.title).split("\n") if line]
+    parts = [_text(left + _LEFT, top + 13.0 + i * 14.0, line, bold=i == 0) for i, line in enumerate(lines)]
+    at = top + 8.0 + 14.0 * len(lines)
+    room = stack.height_mm * _MM - _BELOW - _BETWEEN * len(stack.panels)
+    shares = sum(panel.height for panel in stack.panels)
+    x = (stack.x, *x_window(stack))
+    for i, panel in enumerate(stack.panels):
+        frame = Frame(
+            left + _LEFT,
+            at,
+            width - _LEFT - _RIGHT,
+            room * panel.height / shares,
+            x,
+            (panel.y, *y_window(panel)),
+        )
+        parts += _panel(panel, frame, named=i == len(stack.panels) - 1)
+        at += frame.height + _BETWEEN
+    at += _BELOW - _BETWEEN
+    parts += [_text(left + _LEFT + (width - _LEFT - _RIGHT) / 2, at - 8.0, stack.x.label, "middle")]
+    legend, height = _legend(stack, left + _LEFT, at + 8.0, width - _LEFT)
+    return [*parts, *legend], at + height + 10.0 - top
+
+
+def _text(
+    x: float, y: float, text: str, anchor: str = "start", *, bold: bool = False, colour: str = ""
+) -> str:
+    more = (f' text-anchor="{anchor}"' if anchor != "start" else "") + (' font-weight="600"' if bold else "")
+    more += f' fill="{colour}"' if colour else ""
+    return f'<text x="{x:.1f}" y="{y:.1f}"{more}>{escape(without_formulas(text))}</text>'
+
+
+def _panel(panel: Panel, frame: Frame, *, named: bool) -> list[str]:
+    """Draw the marks of a panel, its axes with ticks, and its note."""
+    marks = "".join(_mark(mark, frame) for mark in panel.marks)
+    place = f'x="{frame.left:.1f}" y="{frame.top:.1f}" width="{frame.width:.1f}" height="{frame.height:.1f}"'
+    bottom, right = frame.top + frame.height, frame.left + frame.width
+    parts = [f'<svg {place} overflow="hidden">{marks}</svg>']
+    path = f"M{frame.left:.1f} {frame.top:.1f}V{bottom:.1f}H{right:.1f}"
+    for place_, text in ticks(*frame.x, most=max(2, int(frame.width // 55))):
+        across = frame.left + float(frame.across(place_))
+        path += f"M{across:.1f} {bottom:.1f}v4"
+        if named:
+            parts.append(_text(across, bottom + 15.0, text, "middle"))
+    for place_, text in ticks(*frame.y, most=max(3, int(frame.height // 28))):
+        down = frame.top + float(frame.down(place_))
+        path += f"M{frame.left:.1f} {down:.1f}h-4"
+        parts.append(_text(frame.left - 6.0, down + 4.0, text, "end"))
+    parts.append(f'<path d="{path}" fill="none" stroke="{LIGHT.edge}"/>')
+    words = without_formulas(panel.y.label).split("\n")
+    for i, line in enumerate(words):
+        at, middle = frame.left - 46.0 + 12.0 * (i - len(words) + 1), frame.top + frame.height / 2
+        turned = f'transform="translate({at:.1f} {middle:.1f}) rotate(-90)"'
+        parts.append(f'<text {turned} text-anchor="middle">{escape(line)}</text>')
+    upright, side = panel.corner.split()
+    lines = without_formulas(panel.note).split("\n") if panel.note else []
+    start = frame.top + 12.0 if upright == "upper" else bottom - 6.0 - 13.0 * (len(lines) - 1)
+    for i, line in enumerate(lines):
+        across, anchor = (right - 4.0, "end") if side == "right" else (frame.left + 6.0, "start")
+        parts.append(_text(across, start + 13.0 * i, line, anchor, colour=LIGHT.faint))
+    return parts
+
+
+def _legend(stack: Stack, left: float, top: float, width: float) -> tuple[list[str], float]:
+    """Draw the labels of all marks of a stack in lines, and return the height."""
+    seen: dict[str, Mark] = {}
+    for mark in (mark for panel in stack.panels for mark in panel.marks if mark.label and mark.listed):
+        seen.setdefault(without_formulas(mark.label), mark)
+    parts, across, down = [], 0.0, 0.0
+    for label, mark in seen.items():
+        length = 26.0 + _WIDE * len(label)
+        if across and across + length > width:
+            across, down = 0.0, down + _LINE
+        colour = _colour(mark)
+        solid = isinstance(mark, Bars | Band | Span) or (isinstance(mark, Steps) and mark.filled)
+        at, middle = left + across, top + down
+        if colour != "none":
+            parts.append(
+                f'<rect x="{at:.1f}" y="{middle - 4.5:.1f}" width="13" height="9" fill="{colour}" '
+                f'fill-opacity="{mark.alpha:g}"/>'
+                if solid
+                else f'<circle cx="{at + 7:.1f}" cy="{middle:.1f}" r="2.5" {_fill(mark)}/>'
+                if isinstance(mark, Points)
+                else f'<path d="M{at:.1f} {middle:.1f}h15" {_stroke(mark, 1.8)}/>'
+            )
+        parts.append(_text(at + 20.0, middle + 4.0, label))
+        across += length
+    return parts, down + _LINE if seen else 0.0
+
+
+def _colour(mark: Mark) -> str:
+    return str(getattr(LIGHT, mark.colour, mark.colour))
+
+
+def _stroke(mark: Mark, width: float | None = None) -> str:
+    dash = f' stroke-dasharray="{_DASHES[mark.dash]}"' if mark.dash in _DASHES else ""
+    alpha = f' stroke-opacity="{mark.alpha:g}"' if mark.alpha != 1.0 else ""
+    thick = _POINT * mark.width if width is None else width
+    return f'fill="none" stroke="{_colour(mark)}" stroke-width="{thick:.1f}"{dash}{alpha}'
+
+
+def _fill(mark: Mark) -> str:
+    alpha = f' fill-opacity="{mark.alpha:g}"' if mark.alpha != 1.0 else ""
+    return f'fill="{_colour(mark)}"{alpha}'
+
+
+def _mark(mark: Mark, frame: Frame) -> str:
+    """Return a mark as elements, from the corner of its panel."""
+    match mark:
+        case Line():
+            x, y = thinned(mark.x, mark.y, _COLUMNS)
+            if mark.step:
+                x, y = _held(x, y)
+            dots = _dots(frame, mark, mark.x, mark.y, _POINT * mark.dots / 2) if mark.dots else ""
+            return f'<path d="{_path(frame, x, y)}" {_stroke(mark)}/>{dots}'
+        case Steps():
+            edges, values = fewer_steps(mark.edges, mark.values, _COLUMNS)
+            x, y = np.repeat(edges, 2)[1:-1], np.repeat(values, 2)
+            if not mark.filled:
+                return f'<path d="{_path(frame, x, y)}" {_stroke(mark)}/>'
+            floor = frame.y[1] if frame.y[0].log else 0.0
+            x, y = np.concatenate([edges[:1], x, edges[-1:]]), np.concatenate([[floor], y, [floor]])
+            return f'<path d="{_path(frame, x, y)}Z" {_fill(mark)}/>'
+        case Bars():
+            left, right = frame.across(mark.x - mark.broad / 2), frame.across(mark.x + mark.broad / 2)
+            low, high = frame.down(mark.low), frame.down(mark.high)
+            boxes = zip(left.tolist(), right.tolist(), low.tolist(), high.tolist(), strict=True)
+            path = "".join(f"M{a:.1f} {c:.1f}H{b:.1f}V{d:.1f}H{a:.1f}Z" for a, b, c, d in boxes)
+            return f'<path d="{path}" {_fill(mark)}/>'
+        case Sticks():
+            known = np.isfinite(mark.y)
+            across, ends, base = (
+                frame.across(mark.x[known]),
+                frame.down(mark.y[known]),
+                float(frame.down(0.0)),
+            )
+            path = "".join(
+                f"M{a:.1f} {base:.1f}V{b:.1f}" for a, b in zip(across.tolist(), ends.tolist(), strict=True)
+            )
+            return f'<path d="{path}" {_stroke(mark)}/>'
+        case Points():
+            return _points(mark, frame)
+        case Band():
+            x, low, high = mark.x, mark.low, mark.high
+            if mark.step:
+                (x, low), (_, high) = _held(x, low), _held(x, high)
+            path = _path(frame, np.append(x, x[::-1]), np.append(low, high[::-1]))
+            return f'<path d="{path}Z" {_fill(mark)}/>'
+        case Level():
+            at = float(frame.across(mark.at) if mark.axis == "x" else frame.down(mark.at))
+            path = f"M{at:.1f} 0v{frame.height:.1f}" if mark.axis == "x" else f"M0 {at:.1f}h{frame.width:.1f}"
+            return f'<path d="{path}" {_stroke(mark)}/>'
+        case Span():
+            place = frame.across if mark.axis == "x" else frame.down
+            start, end = sorted((float(place(mark.low)), float(place(mark.high))))
+            along, whole = ("x", "width"), ("height", frame.height)
+            if mark.axis == "y":
+                along, whole = ("y", "height"), ("width", frame.width)
+            size = f'{along[0]}="{start:.1f}" {along[1]}="{end - start:.1f}" {whole[0]}="{whole[1]:.1f}"'
+            return f"<rect {size} {_fill(mark)}/>"
+        case Words():
+            anchor = "start" if mark.align == "left" else "middle"
+            return _text(
+                float(frame.across(mark.x)),
+                frame.height * (1.0 - mark.up),
+                mark.text,
+                anchor,
+                colour=_colour(mark),
+            )
+    raise TypeError(f"no picture of a {type(mark).__name__}")
+
+
+def _points(mark: Points, frame: Frame) -> str:
+    mark, half = some_points(mark, 4 * _COLUMNS), max(_POINT * mark.size / 2, 0.8)
+    parts = ""
+    if mark.error is not None:
+        reach = np.nan_to_num(mark.error)
+        low, high = frame.down(mark.y - reach[0]).tolist(), frame.down(mark.y + reach[1]).tolist()
+        bars = zip(frame.across(mark.x).tolist(), low, high, strict=True)
+        path = "".join(f"M{a:.1f} {b:.1f}V{c:.1f}" for a, b, c in bars if b == b)
+        parts = f'<path d="{path}" fill="none" stroke="{_colour(mark)}"/>'
+    if mark.mark == "o":
+        return parts + _dots(frame, mark, mark.x, mark.y, half)
+    shape = f"m-{half:.1f} -{half:.1f}" + (
+        f"h{2 * half:.1f}v{2 * half:.1f}h-{2 * half:.1f}z"
+        if mark.mark == "s"
+        else f"l{2 * half:.1f} {2 * half:.1f}m0 -{2 * half:.1f}l-{2 * half:.1f} {2 * half:.1f}"
+    )
+    places = zip(frame.across(mark.x).tolist(), frame.down(mark.y).tolist(), strict=True)
+    path = "".join(f"M{a:.1f} {b:.1f}{shape}" for a, b in places if b == b)
+    return parts + f'<path d="{path}" {_fill(mark) if mark.mark == "s" else _stroke(mark, 1.2)}/>'
+
+
+def _dots(frame: Frame, mark: Mark, x: FloatArray, y: FloatArray, half: float) -> str:
+    """Return disks: the round ends of lines that have no length."""
+    places = zip(frame.across(x).tolist(), frame.down(y).tolist(), strict=True)
+    path = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in places if b == b)
+    thick = f'stroke-width="{2 * half:.1f}" stroke-linecap="round"'
+    return f'<path d="{path}" fill="none" stroke="{_colour(mark)}" {thick}/>'
+
+
+def _held(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a curve that holds each value half-way to its neighbours."""
+    middle = (x[1:] + x[:-1]) / 2
+    return np.concatenate([x[:1], np.repeat(middle, 2), x[-1:]]), np.repeat(y, 2)
+
+
+def _path(frame: Frame, x: FloatArray, y: FloatArray) -> str:
+    """Return the outline of a curve; it begins anew after each gap."""
+    across, down = frame.across(x), frame.down(y)
+    known = np.isfinite(down)
+    new = known & np.concatenate([[True], ~known[:-1]])
+    places = zip(across[known].tolist(), down[known].tolist(), new[known].tolist(), strict=True)
+    return "".join(f"{'M' if first else 'L'}{a:.1f} {b:.1f}" for a, b, first in places)

@@ -1,0 +1,233 @@
+"""The charts of a report in a real browser: Debian's Chromium, headless, driven by Playwright."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.discrepancy_material import discrepancy_data
+from helpers.quick_stacks import stack, sums_of
+from helpers.report_material import report_data
+
+from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.catalogue import run_figures
+from pchem_pipeline.report.figures.stability import stability_figures
+from pchem_pipeline.report.pages.report import render_report
+from pchem_pipeline.report.settings import ReportSettings
+
+playwright = pytest.importorskip(
+    "playwright.sync_api", reason="no Playwright; install it with: pip install playwright"
+)
+CHROMIUM = os.environ.get("PCHEM_CHROMIUM") or next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium; install it with: apt-get install chromium, or set PCHEM_CHROMIUM"
+)
+
+#: What a canvas shows, as text; its number of different colours.
+SHOWN = "(canvas) => canvas.toDataURL()"
+COLOURS = """(canvas) => new Set(new Uint32Array(
+    canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size"""
+OPEN = "() => { for (const each of document.querySelectorAll('details.folded')) each.open = true; }"
+
+
+@pytest.fixture(scope="module")
+def data() -> ReportData:
+    frames = stack(np.random.default_rng(2), (300, 24, 32))
+    return replace(
+        report_data((24, 32)),
+        title="<img src=x onerror=alert(1)>",
+        stability=stability_figures(sums_of(frames)),
+        discrepancy=discrepancy_data("named"),
+    )
+
+
+@pytest.fixture(scope="module")
+def page_url(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("charts") / "report.html"
+    path.write_text(render_report(data, ReportSettings(dpi=72)).html)
+    return path.as_uri()
+
+
+@pytest.fixture(scope="module")
+def names(data: ReportData) -> set[str]:
+    figures = run_figures(data, ReportSettings())
+    return {each.name for each in figures if each.chart is not None and each.section}
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def open_page(browser: Any, page_url: str) -> Iterator[Callable[..., Any]]:
+    """Open the report; it must say nothing and ask nobody, which is checked at the end of each test."""
+    said: list[str] = []
+    contexts = []
+
+    def open_(width: int = 1200, **options: Any) -> Any:
+        context = browser.new_context(viewport={"width": width, "height": 900}, **options)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("console", lambda message: said.append(message.text))
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on(
+            "request", lambda request: request.url.startswith(("file:", "data:")) or said.append(request.url)
+        )
+        page.goto(page_url)
+        return page
+
+    yield open_
+    assert said == []
+    for context in contexts:
+        context.close()
+
+
+def chart(page: Any, name: str) -> Any:
+    """Return a figure whose chart is drawn."""
+    page.evaluate(OPEN)
+    for part in page.locator("details.part").all():
+        part.evaluate("(each) => { each.open = true; }")
+    figure = page.locator(f"#figure-{name}")
+    figure.scroll_into_view_if_needed()
+    page.wait_for_selector(f"#figure-{name}.drawn canvas", timeout=10_000)
+    return figure
+
+
+def drag(page: Any, over: Any, start: tuple[float, float], end: tuple[float, float]) -> None:
+    box = over.bounding_box()
+    (x0, y0), (x1, y1) = (
+        (box["x"] + u * box["width"], box["y"] + v * box["height"]) for u, v in (start, end)
+    )
+    page.mouse.move(x0, y0)
+    page.mouse.down()
+    page.mouse.move((x0 + x1) / 2, (y0 + y1) / 2)
+    page.mouse.move(x1, y1)
+    page.mouse.up()
+    page.mouse.move(5, 5)
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1200, "light"), (1200, "dark"), (400, "light")])
+def test_every_chart_is_drawn(
+    open_page: Callable[..., Any], names: set[str], width: int, scheme: str
+) -> None:
+    page = open_page(width, color_scheme=scheme)
+    for name in sorted(names):
+        figure = chart(page, name)
+        canvases = figure.locator("canvas").all()
+        assert canvases
+        assert all(canvas.evaluate(COLOURS) > 5 for canvas in canvases), name
+        assert not figure.locator("img").is_visible()
+        room = page.evaluate("() => document.documentElement.clientWidth")
+        assert all(0 < canvas.bounding_box()["width"] <= room for canvas in canvases)
+        assert figure.locator(".chart").get_attribute("aria-label") == figure.locator("img").get_attribute(
+            "alt"
+        )
+    assert page.evaluate("() => document.scrollingElement.scrollWidth") <= width
+
+
+def test_a_drag_zooms_and_a_double_click_goes_back(open_page: Callable[..., Any]) -> None:
+    page = open_page()
+    figure = chart(page, "ensemble")
+    top, strip = (figure.locator("canvas").nth(i) for i in (0, 1))
+    before = [each.evaluate(SHOWN) for each in (top, strip)]
+    over = figure.locator(".u-over").nth(0)
+    drag(page, over, (0.3, 0.2), (0.5, 0.8))
+    page.wait_for_timeout(50)
+    # both panels of a stack go along
+    assert all(each.evaluate(SHOWN) != old for each, old in zip((top, strip), before, strict=True))
+    over.dblclick()
+    page.mouse.move(5, 5)
+    page.wait_for_timeout(50)
+    assert [each.evaluate(SHOWN) for each in (top, strip)] == before
+
+
+def test_the_legend_has_values_and_hides_what_it_names(
+    open_page: Callable[..., Any], data: ReportData
+) -> None:
+    page = open_page()
+    figure = chart(page, "electron_numbers")
+    button = figure.get_by_role("button", name="estimated electron numbers")
+    box = figure.locator(".u-over").nth(0).bounding_box()
+    ends = page.evaluate(
+        "() => JSON.parse(document.getElementById('charts').textContent)"
+        ".charts.electron_numbers.stacks[0].x.ends"
+    )
+    for k in (1, 3):
+        page.mouse.move(
+            box["x"] + box["width"] * (k - ends[0]) / (ends[1] - ends[0]), box["y"] + box["height"] / 2
+        )
+        value = button.locator("xpath=..").locator(".value")
+        assert float(value.inner_text()) == pytest.approx(float(data.ensemble["electron_mass"][k]), rel=1e-3)
+    canvas = figure.locator("canvas").nth(0)
+    page.mouse.move(5, 5)
+    before = canvas.evaluate(SHOWN)
+    button.click()
+    assert button.get_attribute("aria-pressed") == "false"
+    page.wait_for_timeout(50)
+    assert canvas.evaluate(SHOWN) != before
+    button.press("Enter")
+    page.wait_for_timeout(50)
+    assert (button.get_attribute("aria-pressed"), canvas.evaluate(SHOWN)) == ("true", before)
+
+
+def test_keys_read_values_and_zoom(open_page: Callable[..., Any]) -> None:
+    page = open_page()
+    figure = chart(page, "rounding")
+    panel, canvas = figure.locator(".panel").nth(0), figure.locator("canvas").nth(0)
+    before = canvas.evaluate(SHOWN)
+    panel.focus()
+    page.keyboard.press("ArrowRight")
+    assert "1/g (DN per electron): " in figure.locator(".spoken").inner_text()
+    assert "read noise" in figure.locator(".spoken").inner_text()
+    page.keyboard.press("+")
+    page.wait_for_timeout(50)
+    assert canvas.evaluate(SHOWN) != before
+    page.keyboard.press("0")
+    page.wait_for_timeout(50)
+    assert canvas.evaluate(SHOWN) == before
+
+
+def test_paper_and_readers_without_scripts_get_the_plain_picture(open_page: Callable[..., Any]) -> None:
+    page = open_page()
+    figure = chart(page, "ensemble")
+    page.emulate_media(media="print")
+    assert figure.locator("img").is_visible()
+    assert not figure.locator(".chart").is_visible()
+    page = open_page(java_script_enabled=False)
+    image = page.locator("#figure-ensemble img")
+    assert image.is_visible()
+    assert image.bounding_box()["height"] > 200
+
+
+def test_a_chart_follows_the_width_of_the_window(open_page: Callable[..., Any]) -> None:
+    page = open_page()
+    figure = chart(page, "pixel_fits")
+    wide = figure.locator("canvas").nth(0).bounding_box()["width"]
+    page.set_viewport_size({"width": 420, "height": 900})
+    page.wait_for_timeout(200)
+    narrow = [each.bounding_box()["width"] for each in figure.locator("canvas").all()]
+    assert max(narrow) <= 420
+    assert max(narrow) != wide
+    assert page.evaluate("() => document.scrollingElement.scrollWidth") <= 420
+
+
+def test_a_picture_is_saved_from_the_page(open_page: Callable[..., Any], tmp_path: Path) -> None:
+    page = open_page()
+    figure = chart(page, "ensemble")
+    with page.expect_download() as download:
+        figure.get_by_role("button", name="Save ensemble as SVG").click()
+    path = tmp_path / "ensemble.svg"
+    download.value.save_as(path)
+    assert path.read_text().startswith("<svg")

@@ -1,0 +1,232 @@
+"""Charts: one description, and what paper, the page and the plain picture make of it."""
+
+import json
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from helpers.discrepancy_material import discrepancy_data
+from helpers.quick_stacks import stack, sums_of
+from helpers.report_material import report_data
+
+from pchem_pipeline.report.charts.chart import (
+    Axis,
+    Band,
+    Bars,
+    Chart,
+    Level,
+    Line,
+    Panel,
+    Points,
+    Span,
+    Stack,
+    Steps,
+    Sticks,
+    Words,
+    x_window,
+    y_window,
+)
+from pchem_pipeline.report.charts.on_page import page_chart, rounded
+from pchem_pipeline.report.charts.on_paper import draw_chart
+from pchem_pipeline.report.charts.picture import chart_picture
+from pchem_pipeline.report.charts.thinning import fewer_steps, some_points, thinned
+from pchem_pipeline.report.charts.ticks import ticks
+from pchem_pipeline.report.figures.catalogue import run_figures
+from pchem_pipeline.report.figures.figure import Figure
+from pchem_pipeline.report.figures.stability import stability_figures
+from pchem_pipeline.report.inspector.inspector import json_for_html
+from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.style import COLUMN_MM, PAGE_MM, Look
+from pchem_pipeline.report.style.wording import symbol, without_formulas
+
+HOSTILE = "</script><script>alert(1)</script><!-- & $\\mu$"
+
+
+@pytest.fixture(scope="module")
+def charts() -> dict[str, Figure]:
+    frames = stack(np.random.default_rng(2), (300, 12, 16))
+    data = replace(
+        report_data((12, 16)),
+        stability=stability_figures(sums_of(frames)),
+        discrepancy=discrepancy_data("named"),
+    )
+    return {each.name: each for each in run_figures(data, ReportSettings()) if each.chart is not None}
+
+
+def every_mark(label: str = "a") -> Chart:
+    x = np.arange(5.0)
+    y = np.array([1.0, 3.0, np.nan, 2.0, 4.0])
+    marks = (
+        Span(1.0, 2.0, colour="band"),
+        Band(x, y - 0.5, y + 0.5, colour="band", step=True),
+        Steps(np.arange(6.0), y, filled=True, colour="bars", label=label),
+        Steps(np.arange(6.0), y, colour="green"),
+        Bars(x, np.zeros(5), y, colour="sky"),
+        Sticks(x, y),
+        Line(x, y, dots=2.0, dash="--", label="curve"),
+        Points(x, y, mark="x", error=np.full((2, 5), 0.2), label="points"),
+        Points(x, y, mark="s"),
+        Level(2.0, axis="x"),
+        Words(2.0, 0.5, label),
+    )
+    panel = Panel(Axis(label), marks, note=label)
+    return Chart((Stack((panel,), Axis("x"), label),))
+
+
+def values_of(x: list[float] | dict[str, float]) -> np.ndarray:
+    if isinstance(x, dict):
+        return x["from"] + x["step"] * np.arange(x["n"])
+    return np.array(x, dtype=np.float64)
+
+
+def test_curves_of_a_run_are_charts(charts: dict[str, Figure]) -> None:
+    assert set(charts) >= {
+        "cluster_edges_pixel", "pixel_fits", "frame_means", "profiles", "spatial_spectra", "ensemble",
+        "electron_numbers", "component_widths", "rounding", "uncertainty", "discrepancy_codes",
+        "discrepancy_frames",
+    }  # fmt: skip
+
+
+def test_the_page_has_the_numbers_that_paper_shows(charts: dict[str, Figure]) -> None:
+    for figure in charts.values():
+        chart = figure.chart
+        assert chart is not None
+        described = page_chart(chart)
+        json.dumps(described, allow_nan=False)
+        for stack_, shown in zip(chart.stacks, described["stacks"], strict=True):
+            for panel, told in zip(stack_.panels, shown["panels"], strict=True):
+                across, up = (np.ptp(ends) for ends in (x_window(stack_), y_window(panel)))
+                for mark, numbers in zip(panel.marks, told["marks"], strict=True):
+                    if not isinstance(mark, Line) or mark.x.size > 4000:
+                        continue
+                    x, y = values_of(numbers["x"]), np.array(numbers["y"], dtype=np.float64)
+                    # logarithmic axes keep five digits
+                    x_error = 1e-4 * np.abs(mark.x) if stack_.x.log else 1e-5 * across
+                    y_error = 1e-4 * np.abs(mark.y) if panel.y.log else 1e-5 * up
+                    assert np.all(np.abs(x - mark.x) <= x_error)
+                    np.testing.assert_array_equal(np.isnan(y), ~np.isfinite(mark.y))
+                    assert np.all((np.abs(y - mark.y) <= y_error) | np.isnan(y))
+    axes = charts["rounding"].draw(Look()).axes[0]
+    lines = {line.get_label(): line.get_ydata() for line in axes.lines}
+    [read_noise] = [
+        mark
+        for mark in charts["rounding"].chart.stacks[0].panels[0].marks
+        if mark.label == "read noise"  # type: ignore[union-attr]
+    ]
+    assert isinstance(read_noise, Line)
+    np.testing.assert_array_equal(lines["read noise"], read_noise.y)
+
+
+@pytest.mark.parametrize("width", [COLUMN_MM, PAGE_MM])
+def test_pictures_are_whole_and_repeat(charts: dict[str, Figure], width: float) -> None:
+    for figure in charts.values():
+        assert figure.chart is not None
+        svg, across, down = chart_picture(figure.chart, width)
+        assert chart_picture(figure.chart, width) == (svg, across, down)
+        root = ElementTree.fromstring(svg)
+        words = " ".join(root.itertext())
+        assert "$" not in words
+        assert "nan" not in svg.decode()
+        for stack_ in figure.chart.stacks:
+            if width == PAGE_MM or not stack_.wide:
+                assert without_formulas(stack_.x.label) in words
+        assert 0 < down < 4 * across
+        assert len(svg) < 120_000
+
+
+def test_every_mark_is_drawn_everywhere() -> None:
+    chart = every_mark()
+    drawing = draw_chart(Look(), chart)
+    axes = drawing.axes[0]
+    assert len(axes.lines) + len(axes.patches) + len(axes.collections) + len(axes.texts) >= 11
+    kinds = [mark["kind"] for mark in page_chart(chart)["stacks"][0]["panels"][0]["marks"]]
+    assert set(kinds) == {"span", "band", "steps", "bars", "sticks", "line", "points", "level", "words"}
+    svg = chart_picture(chart, COLUMN_MM)[0].decode()
+    assert svg.count("<path") >= 9
+    assert "<rect" in svg
+
+
+def test_a_gap_is_a_gap() -> None:
+    y = np.array([1.0, 2.0, np.nan, 3.0, 4.0])
+    chart = Chart((Stack((Panel(Axis("y"), (Line(np.arange(5.0), y),)),), Axis("x")),))
+    assert page_chart(chart)["stacks"][0]["panels"][0]["marks"][0]["y"] == [1.0, 2.0, None, 3.0, 4.0]
+    root = ElementTree.fromstring(chart_picture(chart, COLUMN_MM)[0])
+    outlines = [each.get("d", "") for each in root.iter("{http://www.w3.org/2000/svg}path")]
+    assert any(each.count("M") == 2 and each.count("L") == 2 for each in outlines)
+
+
+def test_hostile_words_stay_words() -> None:
+    chart = every_mark(HOSTILE)
+    text = str(json_for_html(page_chart(chart)))
+    assert "<" not in text
+    assert json.loads(text)["stacks"][0]["title"].startswith("</script><script>")
+    root = ElementTree.fromstring(chart_picture(chart, COLUMN_MM)[0])
+    assert "</script><script>alert(1)" in "".join(root.itertext())
+    assert all("script" not in each.tag for each in root.iter())
+
+
+def test_no_formula_is_left() -> None:
+    for name in (
+        "quanta_exposure",
+        "bias",
+        "read_noise_dn",
+        "read_noise_e",
+        "dark_current",
+        "spurious_charge",
+    ):
+        assert not set(without_formulas(symbol(name)[0])) & set("$\\{}_^")
+    assert without_formulas(r"$\sigma^2 + (x - \mu)/g$") == "σ² + (x − μ)/g"
+    assert without_formulas(r"costs 3 \$ and 4 \$") == "costs 3 $ and 4 $"
+
+
+def test_long_curves_keep_their_extremes_and_gaps() -> None:
+    rng = np.random.default_rng(4)
+    x, y = np.arange(100_000.0), rng.standard_normal(100_000)
+    y[70_123], y[20_001] = 50.0, -40.0
+    y[30_000:40_000] = np.nan
+    few_x, few_y = thinned(x, y, 500)
+    assert few_x.size == few_y.size == 1000
+    assert (np.nanmax(few_y), np.nanmin(few_y)) == (50.0, -40.0)
+    assert np.isnan(few_y[(few_x > 30_200) & (few_x < 39_800)]).all()
+    assert np.all(np.diff(few_x) >= 0)
+    assert thinned(x[:900], y[:900], 500)[1] is not few_y
+    np.testing.assert_array_equal(thinned(x[:900], y[:900], 500)[1], y[:900])
+    points = some_points(Points(x, y, error=np.ones((2, y.size))), 4000)
+    assert 2000 <= points.y.size <= 4000
+    assert points.error is not None
+    assert points.error.shape == (2, points.y.size)
+    assert {50.0, -40.0} <= set(points.y.tolist())
+    edges, steps = fewer_steps(np.append(x, 100_000.0), np.abs(y), 3000)
+    assert edges.size == steps.size + 1 <= 3001
+    assert (edges[0], edges[-1], np.nanmax(steps)) == (0.0, 100_000.0, 50.0)
+
+
+def test_numbers_have_the_digits_of_a_screen() -> None:
+    assert rounded(np.array([123.4567891, np.nan, -0.0]), (123.0, 124.0)) == [123.45679, None, 0.0]
+    assert rounded(np.array([1.23456789e-7, np.inf]), (1e-9, 1.0), log=True) == [1.2346e-7, None]
+
+
+@pytest.mark.parametrize(
+    ("axis", "ends", "expected"),
+    [
+        (Axis(""), (0.0, 1.0), ["0.0", "0.2", "0.4", "0.6", "0.8", "1.0"]),
+        (Axis(""), (-0.013, 0.021), ["−0.01", "0.00", "0.01", "0.02"]),
+        (Axis("", whole=True), (0.0, 2.4), ["0", "1", "2"]),
+        (Axis("", log=True), (3e-5, 2e3), ["10⁻⁴", "10⁻²", "1", "10²"]),
+        (Axis("", ticks=((1.0, "one"), (9.0, "nine"))), (0.0, 5.0), ["one"]),
+    ],
+)
+def test_ticks_are_round(axis: Axis, ends: tuple[float, float], expected: list[str]) -> None:
+    assert [text for _, text in ticks(axis, *ends)] == expected
+
+
+def test_axes_end_where_they_are_told_or_beyond_the_marks() -> None:
+    bars = Bars(np.arange(3.0), np.zeros(3), np.array([1.0, 2.0, 3.0]))
+    assert y_window(Panel(Axis("y"), (bars,))) == (0.0, pytest.approx(3.15))
+    line = Line(np.arange(3.0), np.array([1.0, np.nan, 3.0]))
+    assert y_window(Panel(Axis("y"), (line,))) == (pytest.approx(0.9), pytest.approx(3.1))
+    assert y_window(Panel(Axis("y", low=-2.0), (line,)))[0] == -2.0
+    low, high = y_window(Panel(Axis("y", log=True), (Line(np.arange(2.0), np.array([0.0, 10.0])),)))
+    assert 0 < low < 10 < high
+    assert y_window(Panel(Axis("y"), ())) == (1.0 - 0.45, 10.0 + 0.45)
