@@ -152,7 +152,8 @@ def store() -> str:
         "`run.zarr` is a zarr group (format 3). Every array has dimension names, `units` and `long_name`:",
         '`xarray.open_zarr("run.zarr", group="fit", consolidated=False)`; a type of `*` is that of the',
         "data. What a run did not ask for is not there. `report.html` and `report.json` lie beside",
-        "the arrays, with `figures/` where `report.figure_formats` asks for it, the versions of the model as `model/0001.json` and so on.",
+        "the arrays, with `figures/` where `report.figure_formats` asks for it, the versions of the model as "
+        "`model/0001.json` and so on.",
     ]
     variables = sorted(VARIABLES.values(), key=lambda v: list(VARIABLES).index(v.path))
     for group, members in groupby(variables, key=lambda v: v.group):
