@@ -60,3 +60,22 @@ def finished(make_once, camera, kernels):
         Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels}).ok("run", "run.yaml")
 
     return make_once("finished", run) / "run.zarr"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Debian's Chromium, headless, driven by Playwright; tests of it are skipped where either is missing.
+
+    Not longer than a module: while Playwright is open an event loop runs in this thread.
+    """
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="no Playwright; install it with: pip install playwright"
+    )
+    named = map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))
+    path = os.environ.get("PCHEM_CHROMIUM") or next(filter(None, named), None)
+    if path is None:
+        pytest.skip("no Chromium; install it with: apt-get install chromium, or set PCHEM_CHROMIUM")
+    with playwright.sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()

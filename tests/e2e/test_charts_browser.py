@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,16 +18,6 @@ from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.report.settings import ReportSettings
-
-playwright = pytest.importorskip(
-    "playwright.sync_api", reason="no Playwright; install it with: pip install playwright"
-)
-CHROMIUM = os.environ.get("PCHEM_CHROMIUM") or next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="no Chromium; install it with: apt-get install chromium, or set PCHEM_CHROMIUM"
-)
 
 #: What a canvas shows, as text; its number of different colours.
 SHOWN = "(canvas) => canvas.toDataURL()"
@@ -60,14 +48,6 @@ def page_url(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> str:
 def names(data: ReportData) -> set[str]:
     figures = run_figures(data, ReportSettings())
     return {each.name for each in figures if each.chart is not None and each.section}
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as driver:
-        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture

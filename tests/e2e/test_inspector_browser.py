@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import shutil
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -26,27 +24,9 @@ from pchem_pipeline.report.style.wording import measured, short, symbol
 from pchem_pipeline.stages.report.inspector import StoredMaps, packed_map
 from pchem_pipeline.store.run_store import RunStore
 
-playwright = pytest.importorskip(
-    "playwright.sync_api", reason="no Playwright; install it with: pip install playwright"
-)
-CHROMIUM = os.environ.get("PCHEM_CHROMIUM") or next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="no Chromium; install it with: apt-get install chromium, or set PCHEM_CHROMIUM"
-)
-
 NY, NX = 70, 90
 PANEL = ("quanta_exposure", "charge_rate", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
 HOSTILE = '<script>window.hit = 1</script><img src=x onerror="window.hit = 2">'
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as driver:
-        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture(scope="module")
