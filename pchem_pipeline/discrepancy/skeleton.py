@@ -31,60 +31,83 @@ Explanation = TypeVar("Explanation")
 class Explainer(Protocol[Explanation]):
     """A way to tell effects apart in one kind of data; it keeps the model and the rounds of the search.
 
+    It begins with the samples split into train, test and final part, and with replicates of the model.
+
     Attributes:
         settings: the section ``discrepancy``.
         samples: what the data are, for the verdict's sentence ("frames", "histograms").
-        most_rounds: of explaining and adding.
-        model: effects; those that were there before, and those added since.
         defects: candidates that failed, and why.
-        untestable: effects that such data cannot show, and why.
     """
 
     settings: DiscrepancySettings
     samples: str
-    most_rounds: int
-    model: tuple[Effect, ...]
     defects: dict[str, str]
-    untestable: dict[str, str]
+
+    @property
+    def evidence(self) -> Evidence:
+        """Of the train part."""
+        ...
+
+    @property
+    def examined(self) -> Examined:
+        """What was looked at."""
+        ...
+
+    @property
+    def first(self) -> NullModel:
+        """Statistics of the model before anything was added, from its replicates."""
+        ...
+
+    @property
+    def z(self) -> Measured:
+        """Statistics of the data."""
+        ...
+
+    @property
+    def model(self) -> tuple[Effect, ...]:
+        """Effects: those that were there before, and those added since."""
+        ...
+
+    @property
+    def most_rounds(self) -> int:
+        """Of explaining and adding."""
+        ...
+
+    @property
+    def untestable(self) -> dict[str, str]:
+        """Effects that such data cannot show, and why."""
+        ...
 
     @property
     def n_replicates(self) -> int:
         """Replicates drawn so far."""
         ...
 
-    def split(self) -> tuple[Evidence, Examined]:
-        """Split the samples into train, test and final part; return the evidence of the train part."""
-        ...
-
-    def null(self) -> tuple[NullModel, Measured]:
-        """Draw replicates of the model; return their statistics, and those of the data."""
-        ...
-
     def doubt(self) -> str:
         """Say why the pixels are not identified and what would help; empty where they are."""
         ...
 
-    def gap(self, null: NullModel, z: Measured) -> Gap:
+    def gap(self, null: NullModel) -> Gap:
         """Measure the gap of the model on the final part."""
         ...
 
-    def suspects(self, null: NullModel, z: Measured) -> bool:
+    def suspects(self, null: NullModel) -> bool:
         """Tell whether candidates are worth asking although no statistic deviates beyond chance."""
         ...
 
-    def explain(self, null: NullModel, z: Measured, disagrees: bool) -> Explanation | None:
+    def explain(self, null: NullModel, disagrees: bool) -> Explanation | None:
         """Compare the candidates on train and test part; None where none explains anything."""
         ...
 
-    def add(self, explanation: Explanation, null: NullModel, z: Measured) -> NullModel | None:
+    def add(self, explanation: Explanation, null: NullModel) -> NullModel | None:
         """Put effects into the model and draw replicates of it; None where no effect is established."""
         ...
 
-    def replaced(self, null: NullModel, z: Measured) -> NullModel | None:
+    def replaced(self, null: NullModel) -> NullModel | None:
         """Put what no effect with a name makes in the place of all that were added, if it leaves less."""
         ...
 
-    def describe(self, before: Gap, null: NullModel, z: Measured) -> NullModel | None:
+    def describe(self, before: Gap, null: NullModel) -> NullModel | None:
         """Put what no effect explains into the model as it is measured; None where that does not help."""
         ...
 
@@ -92,7 +115,7 @@ class Explainer(Protocol[Explanation]):
         """Return the deviations that are not held against the added effects, shape (m,)."""
         ...
 
-    def close(self, before: Gap, null: NullModel, z: Measured, disagrees: bool) -> Added:
+    def close(self, before: Gap, null: NullModel, disagrees: bool) -> Added:
         """Measure the gap on the final part with each added effect, and with rivals in its place."""
         ...
 
@@ -109,26 +132,22 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
     """Find where data disagree with the fitted model, name the effects, and add them to the model.
 
     Args:
-        by: tells effects apart.
+        by: tells effects apart; it has drawn the model.
         tell: hears what is done next.
     """
-    significance = by.settings.significance
-    present = by.model
-    tell("splitting the samples and looking at each part")
-    evidence, examined = by.split()
-    tell("drawing the fitted model")
-    first, z = by.null()
+    significance, present = by.settings.significance, by.model
+    first, z = by.first, by.z
     tell("measuring the gap of the model")
-    before = by.gap(first, z)
-    places = locate(evidence, first, z.both, significance)
+    before = by.gap(first)
+    places = locate(by.evidence, first, z.both, significance)
     null, rounds = first, 0
     doubt = by.doubt()
     still = disagrees(null, z, significance)
-    wanted = still or (not doubt and by.suspects(null, z))
+    wanted = still or (not doubt and by.suspects(null))
     limit, instead = "", None
     while wanted and rounds < by.most_rounds:
         try:
-            extended = _round(by, null, z, still, tell)
+            extended = _round(by, null, still, tell)
         except EffortSpentError as spent:
             limit = spent.words()
             break
@@ -136,46 +155,46 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
             break
         null, rounds = extended, rounds + 1
         wanted = still = disagrees(null, z, significance, by.tolerance())
-        instead = _replaced(by, null, z) if still else None
+        instead = _replaced(by, null) if still else None
         if instead is not None:
             null, still = instead, disagrees(instead, z, significance, by.tolerance())
             break
     if still and instead is None:
         tell("measuring what no effect explains")
         try:
-            described = by.describe(before, null, z)
+            described = by.describe(before, null)
         except EffortSpentError as spent:
             described, limit = None, limit or spent.words()
         if described is not None:
             null, still = described, disagrees(described, z, significance, by.tolerance())
     tell("measuring the gap that is left, with effects and with rivals")
-    added = by.close(before, null, z, still)
+    added = by.close(before, null, still)
     found = Findings(by.samples, z, first, null, before, places, still, added, doubt, limit)
     model = found.model(present, by.model)
     return build_verdict(
         found,
         model,
         by.fitted(model),
-        (evidence, examined),
+        (by.evidence, by.examined),
         untestable=by.untestable,
         defects=by.defects,
         n_replicates=by.n_replicates,
     )
 
 
-def _replaced(by: Explainer[Explanation], null: NullModel, z: Measured) -> NullModel | None:
+def _replaced(by: Explainer[Explanation], null: NullModel) -> NullModel | None:
     """Return the null with what replaces the effects that were added; None where nothing does.
 
     At the limit of the work it is left to the end, for which some of that is kept.
     """
     try:
-        return by.replaced(null, z)
+        return by.replaced(null)
     except EffortSpentError:
         return None
 
 
 def _round(
-    by: Explainer[Explanation], null: NullModel, z: Measured, still: bool, tell: Callable[[str], None]
+    by: Explainer[Explanation], null: NullModel, still: bool, tell: Callable[[str], None]
 ) -> NullModel | None:
     """Compare candidates and add the best; return the null of the new model, None where none is established.
 
@@ -183,8 +202,8 @@ def _round(
         EffortSpentError: the work is at its limit; nothing was added.
     """
     tell("comparing candidates")
-    explanation = by.explain(null, z, still)
+    explanation = by.explain(null, still)
     if explanation is None:
         return None
     tell("fitting the pixels with the likeliest effects")
-    return by.add(explanation, null, z)
+    return by.add(explanation, null)

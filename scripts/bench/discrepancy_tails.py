@@ -55,9 +55,10 @@ def judged_sensor(seed: int) -> dict[str, Any]:
     from helpers.plain_camera import drawn_camera
 
     from pchem_pipeline.base.errors import PchEmError
-    from pchem_pipeline.discrepancy.by_simulation.candidates import serial
+    from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes, serial
     from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
     from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
+    from pchem_pipeline.discrepancy.by_simulation.seen import Seen
     from pchem_pipeline.discrepancy.null import Measured, NullModel, disagrees
     from pchem_pipeline.discrepancy.settings import DiscrepancySettings
     from pchem_pipeline.discrepancy.splits import block_length, split_frames
@@ -66,12 +67,12 @@ def judged_sensor(seed: int) -> dict[str, Any]:
     numbers = np.arange(len(stack))
     splits = split_frames(numbers, block_length(len(stack)))
     frames = FrameStack(stack, numbers, splits, len(stack), int(stack.max()).bit_length() + 1, 1.0)
-    explainer = FrameExplainer(frames, DiscrepancySettings(), (), serial)
+    settings = DiscrepancySettings()
     try:
-        explainer.split()
-        null, data = explainer.null()
+        explainer = FrameExplainer.begin(Seen.of(frames), settings, candidate_classes(settings), (), serial)
     except PchEmError as error:
         return {"seed": seed, "refused": str(error)}
+    null, data = explainer.first, explainer.z
     found: dict[str, list[float]] = defaultdict(list)
     alarms = {"simulated": 0, OWN: int(disagrees(null, data, SIGNIFICANCE))}
     for kind, p in _by_kind(null.names, null.p_values(data.both, 2)):

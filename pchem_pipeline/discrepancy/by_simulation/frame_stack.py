@@ -50,6 +50,16 @@ class FrameStack:
         """Positions of the train and test frames."""
         return np.sort(np.concatenate([self.splits.train, self.splits.test]))
 
+    @property
+    def seen_stack(self) -> NDArray[np.unsignedinteger]:
+        """The train and test frames, (frame, y, x), DN."""
+        return self.stack[self.seen]
+
+    @property
+    def seen_numbers(self) -> IntArray:
+        """Their numbers in the run, shape (frame,)."""
+        return self.numbers[self.seen]
+
     def observe(self, part: IntArray, maps: PixelMaps | None = None) -> Evidence:
         """Observe some frames, and as replicates are observed: near known maps, and the same pixels.
 
@@ -82,7 +92,7 @@ class FrameStack:
 
         Shorter blocks leave less between them that is not seen.
         """
-        stack, numbers = self.stack[self.seen], self.numbers[self.seen]
+        stack, numbers = self.seen_stack, self.seen_numbers
 
         def told(part: Part) -> Part:
             if part.when is None:
@@ -120,7 +130,7 @@ class FrameStack:
 
     def seen_apart(self, evidence: Evidence) -> list[tuple[Part, Evidence]]:
         """Return the evidence of each part, of train and test frames together."""
-        stack, numbers = self.stack[self.seen], self.numbers[self.seen]
+        stack, numbers = self.seen_stack, self.seen_numbers
         return [
             (
                 part,
@@ -156,7 +166,7 @@ class FrameStack:
 
     def samples(self, part: Part) -> int:
         """Return how many samples of the train and test frames are in a part."""
-        return int(part.frames(self.numbers[self.seen]).sum()) * int(self.inside(part).sum())
+        return int(part.frames(self.seen_numbers).sum()) * int(self.inside(part).sum())
 
     def inside(self, part: Part) -> NDArray[np.bool_]:
         """Return which of the pixels lie in a part, (y, x)."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from pchem_pipeline.discrepancy.by_simulation.maps import (
 )
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import without_squares
 from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate, by_part
+from pchem_pipeline.discrepancy.by_simulation.seen import Seen
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.digital.misplaced import own_lines
 from pchem_pipeline.effects.framework.added_exposure import added_exposures
@@ -31,26 +32,51 @@ from pchem_pipeline.effects.framework.evidence import Evidence
 
 
 @dataclass
+class Mapped:
+    """The seen frames under a model.
+
+    Attributes:
+        fit: of their pixels.
+        sensor: sensors to draw replicates from.
+        vectors: statistics of the replicates drawn so far.
+    """
+
+    fit: Refit
+    sensor: Sensor
+    vectors: list[Mapping[str, float]] = field(default_factory=list)
+
+
+@dataclass
 class Simulations:
     """Fits of the seen frames, and stacks simulated from them.
 
     Attributes:
-        frames: as they were taken, with their parts.
-        plain: evidence of the seen frames.
+        seen: the frames.
         mapper: runs the simulated stacks.
         seed: root of all random numbers.
         effort: counts the work.
         done: parts of simulated stacks so far.
         lost: share of the pixels that the plain fit mistakes; None: not learnt yet.
+        known: the models that were mapped of late.
     """
 
-    frames: FrameStack
-    plain: Evidence
+    seen: Seen
     mapper: Mapper
     seed: int
     effort: Effort
     done: int = 0
     lost: float | None = None
+    known: dict[tuple[Effect, ...], Mapped] = field(default_factory=dict)
+
+    @property
+    def frames(self) -> FrameStack:
+        """As they were taken, with their parts."""
+        return self.seen.frames
+
+    @property
+    def plain(self) -> Evidence:
+        """Evidence of the seen frames."""
+        return self.seen.plain
 
     def refit(self, model: tuple[Effect, ...]) -> Refit:
         """Return the fit of the seen frames under a model."""
@@ -62,7 +88,7 @@ class Simulations:
         assert plain.covariance is not None
         if not model:
             return Refit(plain.maps, {}, plain.covariance)
-        own, numbers = self.frames.effects(model), self.frames.numbers[self.frames.seen]
+        own, numbers = self.frames.effects(model), self.frames.seen_numbers
         # where the pixels are drawn anew in every replicate, what they have in the data stays part of H
         steady = [e for e in own if not e.brightens_anew]
         added = added_exposures(steady, frames, numbers, plain.maps)
@@ -74,24 +100,45 @@ class Simulations:
     def own_samples(self, model: tuple[Effect, ...]) -> NDArray[np.unsignedinteger]:
         """Return the seen frames without the samples that effects likely gave to other pixels."""
         usable, effects = self.plain.maps.usable, self.frames.effects(model)
-        frames = without_squares(self.frames.stack[self.frames.seen], usable, effects)
+        frames = without_squares(self.frames.seen_stack, usable, effects)
         return own_lines(frames, usable, effects)
 
-    def mapped(self, model: tuple[Effect, ...]) -> tuple[Refit, Sensor]:
-        """Return the fit of the seen frames under a model, and sensors to draw replicates from."""
-        own, numbers = self.frames.effects(model), self.frames.numbers[self.frames.seen]
-        frames = self.own_samples(model)
-        fit = self._refit_of(frames, model)
-        sensor = learn_sensor(frames, numbers, fit, own, self.plain.ambiguous, self.lost)
-        self.lost = sensor.lost
-        return fit, self._corrected(sensor, model) if model else sensor
+    def mapped(self, model: tuple[Effect, ...]) -> Mapped:
+        """Return the fit of the seen frames under a model, and sensors to draw replicates from.
+
+        Raises:
+            NotFittedError: hardly a pixel can be fitted with the model.
+        """
+        if model not in self.known:
+            own, numbers = self.frames.effects(model), self.frames.seen_numbers
+            frames = self.own_samples(model)
+            fit = self._refit_of(frames, model)
+            sensor = learn_sensor(frames, numbers, fit, own, self.plain.ambiguous, self.lost)
+            self.lost = sensor.lost
+            self.known[model] = Mapped(fit, self._corrected(sensor, model) if model else sensor)
+        return self.known[model]
+
+    def drawn(self, model: tuple[Effect, ...], count: int) -> tuple[Refit, list[Mapping[str, float]]]:
+        """Return the fit of a model and the statistics of so many replicates, drawn where they are new.
+
+        Raises:
+            NotFittedError: hardly a pixel can be fitted with the model.
+        """
+        one = self.mapped(model)
+        done = len(one.vectors)
+        one.vectors += self.replicates(model, one.sensor, "grown", count - done, done)
+        return one.fit, one.vectors[:count]
+
+    def forget(self, model: tuple[Effect, ...]) -> None:
+        """Forget all models but one: they are not asked for again."""
+        self.known = {one: mapped for one, mapped in self.known.items() if one == model}
 
     def _corrected(self, sensor: Sensor, model: tuple[Effect, ...]) -> Sensor:
         """Return sensors that, simulated with effects and fitted without, come out as the data do."""
         if self.plain.ambiguous > MANY_MISTAKEN:
             return sensor
         seed = self.seed_of("fitted")
-        taken = replace(self.frames.acquisition(), numbers=self.frames.numbers[self.frames.seen])
+        taken = replace(self.frames.acquisition(), numbers=self.frames.seen_numbers)
         one = Replicate("fitted", sensor.draw(seed), model, seed, taken)
         self.done += 1
         self.effort.simulate(one.samples, one.maps.usable.size, one.fits)

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis
-from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
-from pchem_pipeline.discrepancy.by_simulation.maps import Refit, Sensor
 from pchem_pipeline.discrepancy.by_simulation.measured.electrons import (
     Electrons,
     electron_chances,
@@ -34,14 +32,15 @@ from pchem_pipeline.discrepancy.by_simulation.measured.response import (
 )
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.replicate import simulate_frames
+from pchem_pipeline.discrepancy.by_simulation.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.trials import leaves_little, leaves_nothing
-from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
+from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import CONVINCING
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.analog.empirical_noise import Changed, Shared
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 #: Measures a part of the frames, the pixels fitted with some effects, beside some of these.
 Model = tuple[Effect, ...]
@@ -77,29 +76,19 @@ class Unexplained:
     """Measures frames beside effects.
 
     Attributes:
-        frames: all that there are; train and test frames are measured.
-        plain: evidence of these.
+        work: fits and simulates the frames; train and test frames are measured.
         refitter: fits effects to their statistics.
-        refit: fits the pixels with a model.
-        sensor: learns the sensors to simulate with a model.
         proven: effects of a set of which the data have certainly some.
-        seed: of the simulated frames.
         replicates: of what is measured.
-        effort: counts what is simulated.
         defects: forms that failed, and why.
         instead: what leaves little by itself, once it is known.
         alone: what explains most, at its best fit, once it is known; None: it failed or is not certain.
     """
 
-    frames: FrameStack
-    plain: Evidence
+    work: Simulations
     refitter: Refitter
-    refit: Callable[[tuple[Effect, ...]], Refit]
-    sensor: Callable[[tuple[Effect, ...]], Sensor]
     proven: Callable[[Refitted], Sequence[Hypothesis]]
-    seed: int
     replicates: int
-    effort: Effort
     defects: dict[str, str] = field(default_factory=dict)
     instead: Refitted | None = None
     alone: dict[int, Refitted | None] = field(default_factory=dict)
@@ -108,7 +97,7 @@ class Unexplained:
     def _forms(self) -> dict[str, Measure]:
         """The forms that the model does not have already."""
         known: dict[str, SharedBy] = {}
-        data = self._shared(self.frames.stack[self.frames.seen], self.plain.maps)
+        data = self._shared(self.work.frames.seen_stack, self.work.plain.maps)
         forms: dict[str, Measure] = {
             "empirical": self._moves,
             "empirical_noise": functools.partial(self._noise_of_samples, data, known),
@@ -205,8 +194,8 @@ class Unexplained:
         """Return the parts and forms that explain most beside effects, what is everywhere included."""
         model = self.refitter.model(effects)
         found: list[_Likely] = []
-        self.effort.ask(sum(self.frames.samples(part) for part in (Part(), *self.frames.parts)))
-        for part, form in itertools.product((Part(), *self.frames.parts), forms):
+        self.work.effort.ask(self.work.seen.samples)
+        for part, form in itertools.product((Part(), *self.work.frames.parts), forms):
             try:
                 one = forms[form](part, model, model)
             # a defect of what is measured must not cost the verdict
@@ -260,22 +249,22 @@ class Unexplained:
         self, part: Part, present: tuple[Effect, ...], beside: tuple[Effect, ...]
     ) -> Measurement | None:
         """Measure the moves of the samples of a part beside effects, with the pixels as they now are."""
-        maps = self.refit(present).maps
-        own = replace(maps, usable=maps.usable & self.frames.inside(part))
+        maps = self.work.refit(present).maps
+        own = replace(maps, usable=maps.usable & self.work.frames.inside(part))
         if not own.usable.any():
             return None
-        numbers = self.frames.numbers[self.frames.seen]
+        numbers = self.work.frames.seen_numbers
         some = part.frames(numbers)
-        return measured_moves(self.frames.stack[self.frames.seen[some]], numbers[some], own, beside)
+        return measured_moves(self.work.frames.stack[self.work.frames.seen[some]], numbers[some], own, beside)
 
     def _noise_of_samples(
         self, data: SharedBy, known: dict[str, SharedBy], part: Part, _: Model, beside: Model
     ) -> Measurement | None:
         """Measure what samples of a part share beyond what effects make of them: gain or light, or noise."""
         own, model = data(part), self._made(known, beside)(part)
-        inside = self.frames.inside(part)
-        return measured_mode(own.scores, model.scores, self.plain.maps, inside) or measured_noise(
-            own.covariances, model.covariances, self.plain, inside
+        inside = self.work.frames.inside(part)
+        return measured_mode(own.scores, model.scores, self.work.plain.maps, inside) or measured_noise(
+            own.covariances, model.covariances, self.work.plain, inside
         )
 
     def _electrons(
@@ -288,8 +277,8 @@ class Unexplained:
         self, data: SharedBy, known: dict[str, SharedBy], part: Part, _: Model, beside: Model
     ) -> Measurement | None:
         """Measure which samples of a part follow which beyond what effects make of them."""
-        model, inside = self._made(known, beside)(part).responses, self.frames.inside(part)
-        return measured_response(data(part).responses, model, self.plain, inside)
+        model, inside = self._made(known, beside)(part).responses, self.work.frames.inside(part)
+        return measured_response(data(part).responses, model, self.work.plain, inside)
 
     def _made(self, known: dict[str, SharedBy], model: Model) -> SharedBy:
         """Return the same of frames simulated with a model; ``known`` are those of other models."""
@@ -300,24 +289,25 @@ class Unexplained:
 
     def _simulated(self, model: tuple[Effect, ...]) -> tuple[NDArray[np.unsignedinteger], PixelMaps]:
         """Simulate the frames that are seen under a model, and fit their pixels."""
-        drawn = self.sensor(model).usual(self.seed)
-        taken = replace(self.frames.acquisition(), numbers=self.frames.numbers[self.frames.seen])
-        frames = simulate_frames(drawn, model, self.seed, taken)
-        self.effort.simulate(frames.size, drawn.usable.size, 1)
+        seed = self.work.seed_of("covariances")
+        drawn = self.work.mapped(model).sensor.usual(seed)
+        taken = replace(self.work.frames.acquisition(), numbers=self.work.frames.seen_numbers)
+        frames = simulate_frames(drawn, model, seed, taken)
+        self.work.effort.simulate(frames.size, drawn.usable.size, 1)
         return frames, fitted_maps(frames, ~drawn.usable)
 
     def _shared(self, frames: NDArray[np.unsignedinteger], maps: PixelMaps) -> Callable[[Part], _Shared]:
         """Return what measures how the samples of a part vary together in frames like those that are seen."""
-        numbers = self.frames.numbers[self.frames.seen]
+        numbers = self.work.frames.seen_numbers
 
         @functools.cache
         def of(part: Part) -> _Shared:
-            some, inside = part.frames(numbers), self.frames.inside(part)
+            some, inside = part.frames(numbers), self.work.frames.inside(part)
             found = residual_covariances(frames[some], numbers[some], maps, inside)
-            if self.frames.window is not None:
+            if self.work.frames.window is not None:
                 # the shape of a line beyond the window is not known
                 found = found._replace(lines={})
-            electrons = electron_chances(frames[some], numbers[some], maps, self.plain, inside)
+            electrons = electron_chances(frames[some], numbers[some], maps, self.work.plain, inside)
             responses = residual_responses(frames[some], numbers[some], maps, inside)
             return _Shared(found, common_scores(frames[some], maps, inside), electrons, responses)
 

@@ -24,13 +24,15 @@ from pchem_pipeline.discrepancy.by_simulation.comparison import (
     compare,
     own_signature,
 )
-from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer, _Explanation
+from pchem_pipeline.discrepancy.by_simulation.explainer import Explanation, FrameExplainer
 from pchem_pipeline.discrepancy.by_simulation.fingerprints import Choice, Hypothesis, choose, score_set
+from pchem_pipeline.discrepancy.by_simulation.grown_model import GrownModel
+from pchem_pipeline.discrepancy.by_simulation.judge import Judge
 from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import Witness
 from pchem_pipeline.discrepancy.by_simulation.refits import Refitter
 from pchem_pipeline.discrepancy.by_simulation.trials import Trials, of_kinds
-from pchem_pipeline.discrepancy.effort import EffortSpentError
+from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -654,25 +656,30 @@ def test_effects_that_move_the_same_statistics_are_seen_where_they_leave_nothing
     assert found.chosen.tags == ({"row_noise"} if rest else {"row_noise", "frame_noise"})
 
 
+UNMOVED = SimpleNamespace(fit=SimpleNamespace(moved={}))
+
+
 def add(
     world: World,
     monkeypatch: pytest.MonkeyPatch,
     *hypotheses: Hypothesis,
     final: Any = None,
-    mapped: Callable[[tuple[Effect, ...]], Any] = lambda _: (SimpleNamespace(moved={}), "maps"),
+    mapped: Callable[[tuple[Effect, ...]], Any] = lambda _: UNMOVED,
 ) -> Any:
     """Return a search to which a round was added, and the null that it came to."""
-    search = FrameExplainer(None, DiscrepancySettings(), (), list)  # type: ignore[arg-type]
-    search.first, search.gaps = world.null, StatisticsGap(world.null, 100_000)
     z = world.z if final is None else Measured(world.z.train, world.z.test, final)
-    monkeypatch.setattr(search, "_refitter", lambda *_: world.refitter())
-    search.work = SimpleNamespace(mapped=mapped)
+    work: Any = SimpleNamespace(mapped=mapped, forget=lambda _: None, effort=Effort(None))
+    unused: Any = None
+    settings = DiscrepancySettings()
+    judge = Judge(world.null, z, StatisticsGap(world.null, 100_000), settings.model_error)
+    search = FrameExplainer(settings, unused, work, unused, judge, GrownModel(work, world.null, (), ()))
+    monkeypatch.setattr(search, "_refitter", lambda: world.refitter())
     monkeypatch.setattr(search, "_left_by", lambda *_: None)
     monkeypatch.setattr(search, "_likelihood", lambda *_: None)
     shifts = (z.train - world.null.mean, z.test - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
     assert choice is not None
-    return search, search.add(_Explanation(hypotheses, choice), world.null, z)
+    return search, search.add(Explanation(hypotheses, choice), world.null)
 
 
 def test_what_was_chosen_enters_the_model_though_the_limit_is_reached(
@@ -710,10 +717,12 @@ def test_only_effects_that_account_for_what_they_move_are_kept_beside_what_is_me
 ) -> None:
     world = World([effect("row_noise", 0.5)])
     search, extended = add(world, monkeypatch, hypothesis("row_noise"))
-    assert [h.tag for h in search._sure(extended, world.z)] == ["row_noise"]
+    assert [h.tag for h in search.judge.accounted(search.grown.rounds, extended)] == ["row_noise"]
     elsewhere, own = np.eye(M)[5] * 60.0, np.eye(M)[0] * 60.0
-    assert [h.tag for h in search._sure(extended.shifted(elsewhere), world.z)] == ["row_noise"]
-    assert search._sure(extended.shifted(own), world.z) == ()
+    assert [h.tag for h in search.judge.accounted(search.grown.rounds, extended.shifted(elsewhere))] == [
+        "row_noise"
+    ]
+    assert search.judge.accounted(search.grown.rounds, extended.shifted(own)) == ()
 
 
 def test_what_the_final_frames_do_not_show_stays_outside(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -743,8 +752,8 @@ def test_an_effect_that_can_go_no_further_gets_no_name(
     world = World([effect("interpixel_capacitance", 0.1)])
     guess = hypothesis("interpixel_capacitance", anisotropy=anisotropy)
     search, extended = add(world, monkeypatch, guess)
-    before = search.gap(world.null, world.z)
-    [added] = search.close(before, extended, world.z, False).additions
+    before = search.gap(world.null)
+    [added] = search.close(before, extended, False).additions
     assert added.against == against
     assert added.named == (not against)
 
@@ -755,8 +764,8 @@ def test_a_rival_in_a_pair_is_measured_where_the_effect_in_whose_place_it_stands
     world = World([effect("interpixel_capacitance", 0.2), effect("frame_noise", 0.1)])
     tags = ("interpixel_capacitance", "frame_noise", "exposure_drift")
     search, extended = add(world, monkeypatch, *(hypothesis(tag) for tag in tags))
-    before = search.gap(world.null, world.z)
-    additions = search.close(before, extended, world.z, False).additions
+    before = search.gap(world.null)
+    additions = search.close(before, extended, False).additions
     assert {each.effect.tag for each in additions} == {"interpixel_capacitance", "frame_noise"}
     for each in additions:
         closed = each.before.value - each.after.value
@@ -799,12 +808,12 @@ def test_a_correction_that_no_pixel_can_be_fitted_with_is_not_made(monkeypatch: 
     world = World([effect("row_noise", 0.5)])
     search, _ = add(world, monkeypatch, hypothesis("row_noise"))
     [corrected] = search.model
-    added = search.held
+    added = search.grown.last
 
     def mapped(model: tuple[Effect, ...]) -> Any:
         if model == (corrected,):
             raise NotFittedError("hardly a pixel can be fitted with it")
-        return SimpleNamespace(moved={}), "maps"
+        return UNMOVED
 
     search, extended = add(
         World([effect("row_noise", 0.5)]), monkeypatch, hypothesis("row_noise"), mapped=mapped
@@ -818,9 +827,9 @@ def test_an_effect_is_held_to_what_it_moves_only_where_the_data_disagree_with_th
 ) -> None:
     world = World([effect("interpixel_capacitance", 0.2)])
     search, extended = add(world, monkeypatch, hypothesis("interpixel_capacitance"))
-    before = search.gap(world.null, world.z)
-    search.rounds = [replace(search.rounds[0], extended=extended.shifted(np.eye(M)[3] * 20.0))]
+    before = search.gap(world.null)
+    search.grown.rounds = [replace(search.grown.rounds[0], extended=extended.shifted(np.eye(M)[3] * 20.0))]
     for still in (False, True):
-        [added] = search.close(before, extended, world.z, still).additions
+        [added] = search.close(before, extended, still).additions
         assert added.named == (not still)
         assert bool(added.against) == still

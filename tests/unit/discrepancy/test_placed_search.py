@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.by_simulation.candidates import serial
-from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer, find_discrepancies
+from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, simulate_frames
+from pchem_pipeline.discrepancy.by_simulation.seen import Seen
 from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
@@ -173,9 +173,7 @@ def late_flicker(rng, shape):
 
 
 def split_of(frames):
-    explainer = FrameExplainer(stacked(frames), DiscrepancySettings(), (), serial)
-    explainer.split()
-    return explainer.frames
+    return Seen.of(stacked(frames)).frames
 
 
 def stacked(frames):

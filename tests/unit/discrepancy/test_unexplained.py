@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from pchem_pipeline.discrepancy.by_simulation.additions import leaves_too_much
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
+from pchem_pipeline.discrepancy.by_simulation.seen import Seen
 from pchem_pipeline.discrepancy.by_simulation.unexplained import Unexplained, _Likely
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.gap import Gap
@@ -36,13 +38,13 @@ def test_the_form_and_part_that_explain_most_come_first() -> None:
     def broken(*_: Any) -> Measurement:
         raise ValueError("no such line")
 
-    frames = SimpleNamespace(parts=(TAP,), samples=lambda part: 300 if part == TAP else 1000)
-    refitter = SimpleNamespace(model=lambda effects: effects)
+    frames: Any = SimpleNamespace(parts=(TAP,), samples=lambda part: 300 if part == TAP else 1000)
+    refitter: Any = SimpleNamespace(model=lambda effects: effects)
     nothing: Any = None
     effort = Effort(1.0)
-    unexplained = Unexplained(
-        frames, nothing, refitter, nothing, nothing, nothing, 0, 0, effort  # type: ignore[arg-type]
-    )  # fmt: skip
+    seen = Seen(frames, nothing, nothing)
+    work: Any = SimpleNamespace(frames=frames, seen=seen, effort=effort)
+    unexplained = Unexplained(work, refitter, nothing, 0)
     forms = {"moves": moves, "noise": noise, "broken": broken}
     found = [(one.part, one.form) for one in unexplained._likeliest((), forms)]
     assert found == [(TAP, "noise"), (Part(), "moves"), (Part(), "noise")]
@@ -67,7 +69,7 @@ def test_by_itself_only_what_no_named_effect_makes_is_tried_and_kept_where_it_le
         noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0, changes="gain", signal_dn=9.0),)
     )
     nothing: Any = None
-    unexplained = Unexplained(*[nothing] * 9)
+    unexplained = Unexplained(*[nothing] * 4)
     likely = [_Likely(Part(), name, Measurement(e, 9.0)) for name, e in (("bias", bias), ("gain", gain))]
     unexplained.__dict__["_of_all"] = likely
     tried = []
@@ -97,7 +99,7 @@ def test_by_itself_only_what_no_named_effect_makes_is_tried_and_kept_where_it_le
 
 def test_of_what_leaves_little_by_itself_the_better_one_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     nothing: Any = None
-    unexplained = Unexplained(*[nothing] * 9)
+    unexplained = Unexplained(*[nothing] * 4)
     effects = [
         EmpiricalResponse(response=0.1, terms=(ResponseTerm(of=of),)) for of in ("row", "column", "frame")
     ]
@@ -145,6 +147,14 @@ def test_rows_that_come_from_elsewhere_have_a_name() -> None:
         assert not Empirical(share=0.1, moves=(Move(towards=place),), together="row").unlisted
 
 
+def explainer(judge: Any, put: Callable[[Any], Any]) -> FrameExplainer:
+    """Return a search that is judged so, and puts what was measured into its model so."""
+    work: Any = SimpleNamespace(effort=Effort(None))
+    grown: Any = SimpleNamespace(rounds=[], put_measured=put)
+    nothing: Any = None
+    return FrameExplainer(DiscrepancySettings(), nothing, work, nothing, judge, grown)
+
+
 @pytest.mark.parametrize(
     ("alone", "beside", "chosen"),
     [
@@ -160,7 +170,6 @@ def test_rows_that_come_from_elsewhere_have_a_name() -> None:
 def test_what_closes_the_gap_in_fewest_forms_describes(
     monkeypatch: pytest.MonkeyPatch, alone: Any, beside: Any, chosen: str | None
 ) -> None:
-    search = FrameExplainer(None, DiscrepancySettings(), (), list)  # type: ignore[arg-type]
     held = (SimpleNamespace(tag="row_noise"),)
 
     def found(name: str, how: Any) -> Any:
@@ -172,13 +181,15 @@ def test_what_closes_the_gap_in_fewest_forms_describes(
     measures = SimpleNamespace(measured=lambda kept: known[len(kept)], by_itself=lambda: None)
     wide, closed = Gap(1.0, 0.01, (0.9, 1.1), {}), Gap(0.0, 0.01, (-0.01, 0.01), {})
     part = Gap(0.2, 0.01, (0.1, 0.3), {})
-    monkeypatch.setattr(search, "_unexplained", lambda _: measures)
-    monkeypatch.setattr(search, "_sure", lambda *_: held)
-    monkeypatch.setattr(search, "gap", lambda *_: wide)
-    monkeypatch.setattr(search, "_gap_of", lambda one, _: closed if one.closes else part)
-    monkeypatch.setattr(search, "_put_measured", lambda one: one.name)
+    judge = SimpleNamespace(
+        gap=lambda _: wide,
+        gap_of=lambda one: closed if one.closes else part,
+        accounted=lambda *_: held,
+    )
+    search = explainer(judge, lambda one: one.name)
+    monkeypatch.setattr(search, "_unexplained", lambda: measures)
     nothing: Any = None
-    assert search.describe(wide, nothing, nothing) == chosen
+    assert search.describe(wide, nothing) == chosen
 
 
 @pytest.mark.parametrize(
@@ -199,11 +210,9 @@ def test_what_leaves_clearly_less_replaces_effects_with_a_name(
         "part": Gap(0.2, 0.01, (0.1, 0.3), {}),
         "closed": Gap(0.0, 0.01, (-0.01, 0.01), {}),
     }
-    search = FrameExplainer(None, DiscrepancySettings(), (), list)  # type: ignore[arg-type]
+    judge = SimpleNamespace(gap=lambda _: gaps[left], gap_of=lambda _: gaps[found])
+    search = explainer(judge, lambda one: one)
     measures = SimpleNamespace(by_itself=lambda: "one", leaves_nothing=lambda _: nothing)
-    monkeypatch.setattr(search, "_unexplained", lambda _: measures)
-    monkeypatch.setattr(search, "gap", lambda *_: gaps[left])
-    monkeypatch.setattr(search, "_gap_of", lambda *_: gaps[found])
-    monkeypatch.setattr(search, "_put_measured", lambda one: one)
+    monkeypatch.setattr(search, "_unexplained", lambda: measures)
     unused: Any = None
-    assert search.replaced(unused, unused) == ("one" if replaced else None)
+    assert search.replaced(unused) == ("one" if replaced else None)

@@ -1,0 +1,203 @@
+"""What a search sees of ready-made histograms before it asks anything: the rows that it looks at, split."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.discrepancy.by_likelihood.sets import split_samples
+from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY, observe_histograms
+from pchem_pipeline.discrepancy.verdict import Examined
+from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.shared import Samples
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_FEWEST_SAMPLES = 300  # of a pixel
+_MOST_PIXELS = 256  # looked at; more add nothing about what all have in common
+_LARGEST_TOTAL = 10**9 - 1  # samples of a pixel that can be split at random
+_REACH = 7.0  # standard deviations: the law reaches no further
+
+
+@dataclass(frozen=True)
+class SampleHistograms:
+    """Histograms of n pixels in one sample (exposure).
+
+    Attributes:
+        counts: one histogram per pixel, shape (n, B).
+        origin: DN of bin 0, shape (n,).
+        bias: frames without electrons, H = 0.
+        integration_time: s; where all samples have one, and their exposures lie on a line over it, spurious
+            charge is told from dark current.
+    """
+
+    counts: NDArray[np.integer]
+    origin: NDArray[np.integer]
+    bias: bool = False
+    integration_time: float | None = None
+
+
+@dataclass(frozen=True)
+class SeenHistograms:
+    """The histograms of a search, split and observed.
+
+    Arrays have a row for each sample of each pixel, those of a pixel one after the other.
+
+    Attributes:
+        parts: train, test and final samples of the rows that are looked at, shape (r, B) each.
+        origin: DN of bin 0, shape (r,).
+        start: H, g, mu, sigma of the plain fit of the train part, shape (r, 4).
+        chosen: which rows of all they are, shape (r,).
+        layout: of the samples of a pixel.
+        n_pixels: of all.
+        evidence: of the train part of all rows with electrons.
+    """
+
+    parts: tuple[IntArray, ...]
+    origin: IntArray
+    start: FloatArray
+    chosen: NDArray[np.intp]
+    layout: Samples
+    n_pixels: int
+    evidence: Evidence
+
+    @classmethod
+    def of(cls, samples: Sequence[SampleHistograms], rng: np.random.Generator) -> SeenHistograms:
+        """Split the samples at random, fit the train part, and choose the rows to look at.
+
+        Raises:
+            InputError: the samples are too few, or not of the same pixels, or none has a usable fit.
+        """
+        _check(samples)
+        layout = Samples(tuple(sample.bias for sample in samples))
+        counts, origin = _rows(samples)
+        parts = split_samples(counts, 3, rng)
+        together = None
+        if layout.n > 1:
+            together = _fitted_together(parts[0], origin, layout)
+            parts, origin = _widened(parts, origin, together)
+        evidence = _observe(parts[0], origin, layout, together)
+        start = _parameters(evidence.maps) if together is None else together
+        chosen = _choose(start, counts.sum(axis=1), layout.n)
+        some = tuple(part[chosen] for part in parts)
+        n_pixels = samples[0].counts.shape[0]
+        return cls(some, origin[chosen], start[chosen], chosen, layout, n_pixels, evidence)
+
+    @property
+    def joint(self) -> bool:
+        """Whether there are several samples of a pixel."""
+        return self.layout.n > 1
+
+    @property
+    def both(self) -> IntArray:
+        """Train and test samples together, shape (r, B)."""
+        return np.asarray(self.parts[0] + self.parts[1])
+
+    def examined(self) -> Examined:
+        """Return what is looked at."""
+        sizes = [int(part.sum()) for part in self.parts]
+        return Examined(
+            histograms=self.chosen.size,
+            frames=int(sum(part.sum(axis=1).max() for part in self.parts)),
+            rows=(0, 1),
+            columns=(0, self.n_pixels),
+            train=sizes[0],
+            test=sizes[1],
+            final=sizes[2],
+        )
+
+    def statistics(self, counts: IntArray, parameters: FloatArray | None) -> Mapping[str, float]:
+        """Return the statistics of such rows; ``parameters`` where the samples of a pixel share them."""
+        return _observe(counts, self.origin, self.layout, parameters).z
+
+    def maps(self, parameters: FloatArray) -> PixelMaps:
+        """Return parameters of the rows, (r, 4), as maps, NaN elsewhere, shape (1, n) or (n, J)."""
+        columns = np.full((4, self.n_pixels * self.layout.n), np.nan)
+        columns[:, self.chosen] = parameters.T
+        shape = (self.n_pixels, self.layout.n) if self.joint else (1, self.n_pixels)
+        maps = columns.reshape(4, *shape)
+        return PixelMaps.known(maps, np.isfinite(maps[0]))
+
+
+def _check(samples: Sequence[SampleHistograms]) -> None:
+    if len({sample.counts.shape[0] for sample in samples}) != 1 or all(sample.bias for sample in samples):
+        raise InputError("the samples hold different numbers of pixels, or no electrons; give one exposure")
+    for sample in samples:
+        most = int(sample.counts.sum(axis=1).max()) if sample.counts.size else 0
+        if most < 3 * _FEWEST_SAMPLES:
+            raise InputError(
+                f"the fullest histogram holds {most} samples, fewer than {3 * _FEWEST_SAMPLES}: nothing can "
+                "be compared; take more frames"
+            )
+        if most > _LARGEST_TOTAL:
+            raise InputError(f"a histogram holds {most} samples; at most {_LARGEST_TOTAL} can be split")
+
+
+def _fitted_together(counts: IntArray, origin: IntArray, layout: Samples) -> FloatArray:
+    """Fit the PCD to all samples of each pixel; return (H, g, mu, sigma) of the rows, NaN if unusable."""
+    j = layout.n
+    by_sample = [counts[k::j].astype(np.uint32) for k in range(j)]
+    fit = fit_histograms(by_sample, [origin[k::j] for k in range(j)], dark=layout.dark)
+    usable = (fit.fit_status & UNTRUSTWORTHY) == 0
+    shared = np.stack([fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
+    shared = np.repeat(shared[:, None], j, axis=1)
+    rows = np.concatenate([fit.quanta_exposure[:, :, None], shared], axis=2)
+    return np.asarray(np.where(usable[:, None, None], rows, np.nan).reshape(-1, 4))
+
+
+def _observe(counts: IntArray, origin: IntArray, layout: Samples, parameters: FloatArray | None) -> Evidence:
+    """Observe the rows with electrons; the others say nothing about how electrons come and are read."""
+    lit = np.tile(~np.array(layout.dark), origin.size // layout.n)
+    known = None if parameters is None else parameters[lit]
+    return observe_histograms(counts[lit].astype(np.uint32), origin[lit], parameters=known)
+
+
+def _rows(samples: Sequence[SampleHistograms]) -> tuple[IntArray, IntArray]:
+    """Return histograms (n J, B) and DN of bin 0, (n J,): the samples of a pixel one after the other."""
+    n, j = samples[0].counts.shape[0], len(samples)
+    counts = np.zeros((n, j, max(sample.counts.shape[1] for sample in samples)), np.int64)
+    for k, sample in enumerate(samples):
+        counts[:, k, : sample.counts.shape[1]] = sample.counts
+    origin = np.stack([np.asarray(sample.origin, np.int64) for sample in samples], axis=1)
+    return counts.reshape(n * j, -1), origin.ravel()
+
+
+def _widened(
+    parts: Sequence[IntArray], origin: IntArray, parameters: FloatArray
+) -> tuple[tuple[IntArray, ...], IntArray]:
+    """Return the histograms with all codes that the law reaches.
+
+    Histograms end at their extreme samples; replicates drawn within these ends would lack the tails that the
+    data have.
+    """
+    h, g, mu, sigma = parameters.T
+    last = origin + parts[0].shape[1] - 1
+    low = np.nanmax(origin - (mu - _REACH * sigma))
+    high = np.nanmax(mu + (h + _REACH * (np.sqrt(h) + 1.0)) / g + _REACH * sigma - last)
+    left, right = (max(int(np.ceil(more)), 0) for more in (low, high))
+    return tuple(np.pad(part, ((0, 0), (left, right))) for part in parts), origin - left
+
+
+def _parameters(maps: PixelMaps) -> FloatArray:
+    """Return (H, g, mu, sigma), (n, 4), NaN where not usable."""
+    columns = maps.maps
+    return np.stack([values.ravel() for values in columns], axis=1)
+
+
+def _choose(parameters: FloatArray, total: NDArray[np.integer], n_samples: int) -> NDArray[np.intp]:
+    """Return rows to look at: of usable pixels with samples enough, spread over the exposures."""
+    good = np.isfinite(parameters).all(axis=1) & (total >= 3 * _FEWEST_SAMPLES)
+    usable = np.flatnonzero(good.reshape(-1, n_samples).all(axis=1))
+    if not usable.size:
+        raise InputError("no histogram with enough samples has a usable fit; see fit_status")
+    exposure = parameters[:, 0].reshape(-1, n_samples).sum(axis=1)
+    order = usable[np.argsort(exposure[usable], kind="stable")]
+    places = np.unique(np.linspace(0, order.size - 1, min(order.size, _MOST_PIXELS)).astype(np.intp))
+    pixels = np.sort(order[places])
+    return np.asarray((pixels[:, None] * n_samples + np.arange(n_samples)).ravel(), np.intp)

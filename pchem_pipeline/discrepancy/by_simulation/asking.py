@@ -1,0 +1,161 @@
+"""What every candidate would do beside a model, and how their sets compare by that."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.by_simulation.candidates import (
+    MOST_HYPOTHESES,
+    ReplicateSimulator,
+    placebo_for,
+)
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
+    Choice,
+    Hypothesis,
+    Noise,
+    choose,
+    share_place,
+)
+from pchem_pipeline.discrepancy.by_simulation.maps import expected_codes
+from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import with_details
+from pchem_pipeline.discrepancy.by_simulation.seen import Seen
+from pchem_pipeline.discrepancy.by_simulation.simulations import Simulations
+from pchem_pipeline.discrepancy.null import Measured, NullModel
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import Evidence
+
+FloatArray = NDArray[np.float64]
+
+_MOST_BESIDE = 2  # hypotheses of one effect beside a single other one
+_DOUBT = 0.2  # of the logarithm of a factor that was fitted without the effects beside it
+
+
+def noise_of_splits(null: NullModel, splits: int, model_error: float) -> Noise:
+    """Return the noise of the mean of so many splits less the mean of the replicates."""
+    covariance = null.covariance * (1.0 / splits + 1.0 / null.n_replicates)
+    return Noise(covariance, model_error, null.events / splits)
+
+
+@dataclass(frozen=True)
+class Asking:
+    """Asks the candidates.
+
+    Attributes:
+        seen: the frames.
+        work: simulates what they do.
+        z: statistics of the data.
+        classes: of the candidates, by tag.
+        given: effects that the model had before the search.
+        model_error: relative error of a fingerprint.
+        defects: candidates that failed, and why; more come to them.
+    """
+
+    seen: Seen
+    work: Simulations
+    z: Measured
+    classes: Mapping[str, type[Effect]]
+    given: tuple[Effect, ...]
+    model_error: float
+    defects: dict[str, str] = field(default_factory=dict)
+
+    def about(
+        self, model: tuple[Effect, ...], null: NullModel, number: int
+    ) -> tuple[tuple[Hypothesis, ...], Choice | None]:
+        """Ask what they would do beside the model of a round: everywhere and in the parts, split by split.
+
+        Args:
+            model: effects.
+            null: of that model.
+            number: of the round.
+
+        Returns:
+            All hypotheses, the likeliest first, and how their sets compare; None: there are none.
+        """
+        simulator = self._simulator(model, null, number, str(number))
+        evidence = (self.seen.plain, *self.seen.parts[:2])
+        guesses = with_details(
+            self._guesses(simulator, model, null, evidence, MOST_HYPOTHESES),
+            self.work.own_samples(model),
+            self.work.mapped(model).fit.maps,
+            self.seen.frames.effects(model),
+            self.work.effort,
+        )
+        hypotheses = simulator.fingerprints([*guesses, *placebo_for(guesses, self.classes)])
+        shift = self.z.both - null.mean
+        hypotheses = simulator.refined(hypotheses, shift, noise_of_splits(null, 2, self.model_error))
+        self.defects.update(simulator.defects)
+        return tuple(hypotheses), self._compared(hypotheses, null)
+
+    def beside(
+        self, model: tuple[Effect, ...], null: NullModel, slopes: FloatArray, number: int
+    ) -> Choice | None:
+        """Ask the same beside a set that was refitted: what is worth a refit, as the whole shows it.
+
+        Args:
+            model: effects, the set among them.
+            null: of that model.
+            slopes: how the statistics go with the strengths of the set, which are doubtful, shape (e, m).
+            number: of the round.
+        """
+        simulator = self._simulator(model, null, number, "/".join([str(number), *(e.tag for e in model)]))
+        guesses = self._guesses(simulator, model, null, (), _MOST_BESIDE)
+        hypotheses = simulator.fingerprints([*guesses, *placebo_for(guesses, self.classes)])
+        self.defects.update(simulator.defects)
+        return self._compared(hypotheses, null, _DOUBT**2 * slopes.T @ slopes)
+
+    def _compared(
+        self, hypotheses: Sequence[Hypothesis], null: NullModel, doubt: FloatArray | float = 0.0
+    ) -> Choice | None:
+        """Compare sets on the splits; ``doubt`` is covariance beside that of chance, (m, m)."""
+        noise = noise_of_splits(null, 1, self.model_error)
+        noise = replace(noise, covariance=noise.covariance + doubt)
+        shifts = (self.z.train - null.mean, self.z.test - null.mean)
+        return choose(hypotheses, shifts, noise) if hypotheses else None
+
+    def _simulator(
+        self, model: tuple[Effect, ...], null: NullModel, number: int, purpose: str
+    ) -> ReplicateSimulator:
+        return ReplicateSimulator(
+            self.work.mapped(model).sensor.usual(self.work.seed_of(f"sensor/{purpose}")),
+            model,
+            self.seen.frames.acquisition(),
+            null.names,
+            self.work.counted,
+            f"r{number}",
+            self.work.seed_of(f"fingerprint/{purpose}"),
+            dict(self.defects),
+        )
+
+    def _guesses(
+        self,
+        simulator: ReplicateSimulator,
+        model: tuple[Effect, ...],
+        null: NullModel,
+        evidence: tuple[Evidence, ...],
+        most: int,
+    ) -> list[Effect]:
+        """Return the guesses of all candidates that are not where a found effect of their kind is."""
+        apart = self.seen.frames.seen_apart(self.seen.plain)
+        beside = self._evidence_beside(model, null)
+        found = [effect for effect in model if effect not in self.given]
+        self.work.effort.ask(self.seen.samples)
+        guesses = simulator.guesses(self.classes, evidence, apart, beside, most)
+        return [guess for guess in guesses if not share_place((*found, guess))]
+
+    def _evidence_beside(self, model: tuple[Effect, ...], null: NullModel) -> Evidence | None:
+        """Return the evidence of the seen frames beside the effects of a model; None where it has none.
+
+        Counts per code beside those that the model expects, and the vector as it deviates from the model's.
+        """
+        if not model:
+            return None
+        frames, plain, fit = self.seen.frames, self.seen.plain, self.work.mapped(model).fit
+        codes = plain.code.first + np.arange(plain.code.observed.size)
+        expected = expected_codes(fit.maps, frames.effects(model), codes, frames.seen_numbers, fit.added)
+        code = plain.code if expected is None else replace(plain.code, expected=expected)
+        left = dict(zip(null.names, null.pulls(self.z.both, 2).tolist(), strict=True))
+        return replace(plain, code=code, z=left)

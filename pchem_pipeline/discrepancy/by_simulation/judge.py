@@ -1,0 +1,100 @@
+"""What the frames say of a set at its best fit: which effects are certain, and how wide a gap stays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.by_simulation.additions import Round, left_of, unexplained_of_its_own
+from pchem_pipeline.discrepancy.by_simulation.asking import noise_of_splits
+from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, fit_set, tolerance
+from pchem_pipeline.discrepancy.by_simulation.refits import Refitted
+from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
+from pchem_pipeline.discrepancy.null import Measured, NullModel
+
+FloatArray = NDArray[np.float64]
+
+# standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
+# than a single one would by chance
+_ESTABLISHED = 4.5
+_CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing was chosen by
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Judges sets of effects by the statistics of the data.
+
+    Attributes:
+        first: null of the model before anything was added.
+        z: statistics of the data.
+        gaps: measured with these, on the final frames.
+        model_error: relative error of a fingerprint.
+    """
+
+    first: NullModel
+    z: Measured
+    gaps: StatisticsGap
+    model_error: float
+
+    @property
+    def allowed(self) -> float:
+        """Relative error of what effects do at their best fit: their details are never quite the sensor's."""
+        return self.model_error / 2.0
+
+    def gap(self, null: NullModel) -> Gap:
+        """Return the gap of a model."""
+        return self.gaps.gap(self.z.final, null.mean, null.replicates, null.strengths)
+
+    def gap_of(self, found: Refitted) -> Gap:
+        """Return the gap of a set."""
+        return self.gaps.gap(self.z.final, found.mean, found.vectors)
+
+    def widens(self, added: Refitted, null: NullModel) -> bool:
+        """Tell whether a set, its strengths as the data ask for, leaves a wider gap than a model without."""
+        mean = added.mean + np.expm1(added.change) @ added.parts
+        before = self.gaps.gap(self.z.final, null.mean, null.replicates)
+        return self.gaps.gap(self.z.final, mean, added.vectors).interval[0] > before.value
+
+    def established(self, added: Refitted) -> tuple[Hypothesis, ...]:
+        """Return the effects of which the data have certainly some, the final frames too.
+
+        Those had no part in finding them: a true effect of 4.5 standard errors in two thirds of the frames
+        misses them once in seventy times; a chance passes once in six.
+        """
+        first, n = self.first, len(added.vectors)
+        certain = _certain(added, self.z.both - first.mean, noise_of_splits(first, 2, self.model_error))
+        noise = noise_of_splits(first, 1, self.model_error)
+        noise = replace(noise, covariance=added.covariance * (1.0 + 1.0 / n))
+        final = replace(fit_set(added.hypotheses, self.z.final - first.mean, noise), certain=certain)
+        proven = {h.tag for h in final.established(_CONFIRMED)}
+        clear = (1.0 + np.expm1(added.change) > _ESTABLISHED * added.stderr) | certain
+        return tuple(
+            h for h, is_clear in zip(added.hypotheses, clear, strict=True) if is_clear and h.tag in proven
+        )
+
+    def accounted(self, rounds: list[Round], null: NullModel) -> tuple[Hypothesis, ...]:
+        """Return the effects that rounds added of which the model accounts for what they move."""
+        if not rounds:
+            return ()
+        rest = left_of(rounds, null, self.z, self.allowed)
+        return tuple(
+            h
+            for this in rounds
+            for h, part in zip(this.added.hypotheses, this.added.parts, strict=True)
+            if not unexplained_of_its_own(part, rest, this.null)
+        )
+
+    def tolerance(self, rounds: list[Round]) -> FloatArray | float:
+        """Return what is not held against effects that rounds added, (m,): a fraction of what they do."""
+        if not rounds:
+            return 0.0
+        parts = np.concatenate([this.added.parts for this in rounds])
+        return tolerance(parts, self.allowed, self.first.events)
+
+
+def _certain(added: Refitted, shift: FloatArray, noise: Noise) -> NDArray[np.bool_]:
+    """Tell which effects an exact count asks for, however few events it has."""
+    counted = (added.parts * noise.events > 0.0) & (shift > 0.0)
+    return np.asarray(counted.any(axis=1))

@@ -1,0 +1,96 @@
+"""What a search sees of the frames before it asks anything: the parts that differ, and the evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
+from pchem_pipeline.discrepancy.observe.places import Part
+from pchem_pipeline.effects.framework.evidence import Evidence
+
+_FEWEST_PIXELS = 32
+_NOT_IDENTIFIED = 0.5  # share of ambiguous pixels from which their parameters are no ground for a verdict
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The frames of a search, observed.
+
+    Attributes:
+        frames: with the parts of sensor and run that differ.
+        plain: evidence of train and test frames together, fitted without effects.
+        parts: evidence of train, test and final frames, each near that fit.
+    """
+
+    frames: FrameStack
+    plain: Evidence
+    parts: tuple[Evidence, Evidence, Evidence]
+
+    @classmethod
+    def of(cls, frames: FrameStack) -> Seen:
+        """Observe train and test frames together, then each part near their fit.
+
+        Parameters of a third of the frames scatter too much to stand for the pixels.
+
+        Raises:
+            InputError: usable pixels are too few.
+        """
+        plain = frames.observe(frames.seen)
+        _check(plain)
+        found = suspected_parts(plain, frames.seen_stack)
+        frames = frames.with_parts(found).with_ends(plain.maps)
+        splits = frames.splits
+        train, test, final = (
+            frames.observe(part, plain.maps) for part in (splits.train, splits.test, splits.final)
+        )
+        return cls(frames, plain, (train, test, final))
+
+    def statistics(self) -> list[dict[str, float]]:
+        """Return the statistics of train, test and final frames, as replicates have them."""
+        splits = self.frames.splits
+        parts = splits.train, splits.test, splits.final
+        return [self.frames.statistics(part, e) for part, e in zip(parts, self.parts, strict=True)]
+
+    @property
+    def final_samples(self) -> int:
+        """Samples of usable pixels in the final frames."""
+        return self.frames.splits.final.size * int(self.parts[0].maps.usable.sum())
+
+    @property
+    def samples(self) -> int:
+        """Samples of train and test frames, those of each part that differs counted again."""
+        return sum(self.frames.samples(part) for part in (Part(), *self.frames.parts))
+
+    def doubt(self) -> str:
+        """Say which share of the pixels is not identified, and what would help; empty below a half."""
+        share, usable = self.plain.ambiguous, float(np.mean(self.plain.maps.usable))
+        if share < _NOT_IDENTIFIED and usable > 1.0 - _NOT_IDENTIFIED:
+            return ""
+        maps, frames = self.plain.maps, self.frames.numbers.size
+        noise = np.nanmedian(maps.read_noise_dn * maps.conversion_gain)
+        lost = (
+            f"the bias of {100 * share:.0f} % of the pixels may be off by an electron"
+            if share >= _NOT_IDENTIFIED
+            else f"only {100 * usable:.0f} % of the pixels have a fit that can be relied upon"
+        )
+        return (
+            f"{lost} (fitted read noise {noise:.2f} e-, {frames} frames): several exposures fitted together "
+            "(pchem joint) identify them; many more frames or a lower read noise may do so, too"
+        )
+
+
+def _check(plain: Evidence) -> None:
+    usable = plain.maps.usable
+    if usable.size < _FEWEST_PIXELS:
+        raise InputError(
+            f"a sensor of {usable.size} pixels, fewer than {_FEWEST_PIXELS}: nothing can be compared"
+        )
+    if usable.sum() < _FEWEST_PIXELS:
+        raise InputError(
+            f"{int(usable.sum())} of {usable.size} pixels have a usable fit, "
+            f"fewer than {_FEWEST_PIXELS}: nothing can be compared; see fit_status, or take more frames"
+        )
