@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import PchEmError
-from pchem_pipeline.discrepancy.by_simulation.replicate import truth_of
+from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
 from pchem_pipeline.discrepancy.verdict import RARE, Size
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect, Plane

@@ -55,10 +55,10 @@ def judged_sensor(seed: int) -> dict[str, Any]:
     from helpers.plain_camera import drawn_camera
 
     from pchem_pipeline.base.errors import PchEmError
-    from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes, serial
+    from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes, serial
     from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
-    from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
-    from pchem_pipeline.discrepancy.by_simulation.seen import Seen
+    from pchem_pipeline.discrepancy.by_simulation.seen.frame_stack import FrameStack
+    from pchem_pipeline.discrepancy.by_simulation.seen.seen import Seen
     from pchem_pipeline.discrepancy.null import Measured, NullModel, disagrees
     from pchem_pipeline.discrepancy.settings import DiscrepancySettings
     from pchem_pipeline.discrepancy.splits import block_length, split_frames

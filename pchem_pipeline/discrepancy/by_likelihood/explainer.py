@@ -21,7 +21,7 @@ from pchem_pipeline.discrepancy.by_likelihood.members import Member, find_member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, explain
 from pchem_pipeline.discrepancy.by_likelihood.seen import SampleHistograms, SeenHistograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
-from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
+from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import CONVINCING, Measured, NullModel, as_matrix

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, largest_pulls
-from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, unrelated
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Contender,
     Hypothesis,
     Noise,
@@ -19,6 +18,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     fit_set,
     tolerance,
 )
+from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, unrelated
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, misfits
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS

@@ -16,24 +16,24 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_simulation.additions import AddedRounds
-from pchem_pipeline.discrepancy.by_simulation.asking import Asking, noise_of_splits
-from pchem_pipeline.discrepancy.by_simulation.candidates import Mapper, candidate_classes, serial
-from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison, compare
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Choice, Hypothesis
-from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.candidates.asking import Asking, noise_of_splits
+from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper, candidate_classes, serial
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Choice, Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.grown_model import GrownModel
 from pchem_pipeline.discrepancy.by_simulation.judge import Judge
-from pchem_pipeline.discrepancy.by_simulation.maps import (
+from pchem_pipeline.discrepancy.by_simulation.measured.unexplained import Unexplained
+from pchem_pipeline.discrepancy.by_simulation.seen.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.seen.seen import Seen
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     NotFittedError,
     Refit,
     expected_codes,
     refit_maps,
 )
-from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import PixelLikelihood, Witness
-from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.seen import Seen
-from pchem_pipeline.discrepancy.by_simulation.simulations import Simulations
-from pchem_pipeline.discrepancy.by_simulation.unexplained import Unexplained
+from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
+from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, compare
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import PixelLikelihood, Witness
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import (

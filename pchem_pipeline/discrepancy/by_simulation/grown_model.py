@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.additions import Round
-from pchem_pipeline.discrepancy.by_simulation.comparison import Comparison
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, SetFit
-from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.refits import Refitted
-from pchem_pipeline.discrepancy.by_simulation.simulations import Simulations
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, SetFit
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
+from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
+from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect

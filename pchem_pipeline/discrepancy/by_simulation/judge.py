@@ -8,9 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.additions import Round, left_of, unexplained_of_its_own
-from pchem_pipeline.discrepancy.by_simulation.asking import noise_of_splits
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, fit_set, tolerance
-from pchem_pipeline.discrepancy.by_simulation.refits import Refitted
+from pchem_pipeline.discrepancy.by_simulation.candidates.asking import noise_of_splits
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    Hypothesis,
+    Noise,
+    fit_set,
+    tolerance,
+)
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 

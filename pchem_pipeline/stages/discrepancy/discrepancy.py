@@ -14,7 +14,7 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.by_likelihood.explainer import find_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.seen import SampleHistograms
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
-from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate
+from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Replicate
 from pchem_pipeline.discrepancy.observe.compilation import compile_observation
 from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings

@@ -15,8 +15,18 @@ from pchem_pipeline.discrepancy.by_simulation.additions import (
     unexplained_of_its_kind,
     unexplained_of_its_own,
 )
-from pchem_pipeline.discrepancy.by_simulation.candidates import ReplicateSimulator
-from pchem_pipeline.discrepancy.by_simulation.comparison import (
+from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import ReplicateSimulator
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    Choice,
+    Hypothesis,
+    choose,
+    score_set,
+)
+from pchem_pipeline.discrepancy.by_simulation.explainer import Explanation, FrameExplainer
+from pchem_pipeline.discrepancy.by_simulation.grown_model import GrownModel
+from pchem_pipeline.discrepancy.by_simulation.judge import Judge
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
+from pchem_pipeline.discrepancy.by_simulation.sets.comparison import (
     Comparison,
     _all_seen,
     _begun,
@@ -24,14 +34,9 @@ from pchem_pipeline.discrepancy.by_simulation.comparison import (
     compare,
     own_signature,
 )
-from pchem_pipeline.discrepancy.by_simulation.explainer import Explanation, FrameExplainer
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Choice, Hypothesis, choose, score_set
-from pchem_pipeline.discrepancy.by_simulation.grown_model import GrownModel
-from pchem_pipeline.discrepancy.by_simulation.judge import Judge
-from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import Witness
-from pchem_pipeline.discrepancy.by_simulation.refits import Refitter
-from pchem_pipeline.discrepancy.by_simulation.trials import Trials, of_kinds
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Witness
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitter
+from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials, of_kinds
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
@@ -185,7 +190,7 @@ def test_a_part_that_stands_out_makes_no_effect_stronger_that_acts_everywhere(
 
 
 def test_a_dear_refit_is_not_repeated_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.refits.is_dear", lambda _: True)
+    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.refits.is_dear", lambda _: True)
     world = World([effect("row_noise", 2.0)])
     found = world.refitter().refined([hypothesis("row_noise", 0.02)])
     assert world.drawn <= 3 * 6
@@ -226,7 +231,7 @@ def test_a_choice_among_sets_that_were_refitted_is_made_at_the_limit_too(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Of three effects all pairs are asked for, to see that each has a signature of its own."""
-    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.comparison._MOST_SETS", 1)
+    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.comparison._MOST_SETS", 1)
     tags = ("row_noise", "frame_noise", "exposure_drift")
     world = World([effect(tag, 0.3) for tag in tags])
 
@@ -256,7 +261,7 @@ def test_the_likeliest_set_is_fitted_before_other_effects_and_kept_at_the_limit(
     plain = world.refitter()
     monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
     for name, value in (("FAR", 1e9), ("_HARDLY", 0.0)):  # nothing is in vain
-        monkeypatch.setattr(f"pchem_pipeline.discrepancy.by_simulation.trials.{name}", value)
+        monkeypatch.setattr(f"pchem_pipeline.discrepancy.by_simulation.sets.trials.{name}", value)
     found = world.compare(*(hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift")))
     assert found is not None
     assert found.chosen.tags == {"row_noise", "frame_noise"}
@@ -275,7 +280,7 @@ def test_fewer_effects_are_tried_before_rivals_of_a_set_of_more(monkeypatch: pyt
     world = World([effect("row_noise", 0.1), effect("frame_noise", 0.1)])
     asked = asked_by_refits(world, monkeypatch)
     # nothing is in vain
-    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.trials._beaten", lambda *_: False)
+    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.trials._beaten", lambda *_: False)
     row, frame, drift, coupling = (hypothesis(tag) for tag in TRUTH)
     drift, coupling = (replace(h, fingerprint=0.02 * h.fingerprint) for h in (drift, coupling))
     noise = world.refitter().noise(world.null.covariance, 40)
@@ -448,7 +453,7 @@ def test_what_stands_out_beside_a_set_that_leaves_little_is_fitted_before_others
     twin = replace(hypothesis("row_noise", 0.3), effect=effect("exposure_drift", 0.3))
     beside = [hypothesis("frame_noise", 0.04)]
     asked = asked_by_refits(world, monkeypatch)
-    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.trials._beaten", lambda *_: False)
+    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.trials._beaten", lambda *_: False)
     found = world.compare(hypothesis("row_noise", 0.3), twin, beside=beside)
     assert found is not None
     assert found.chosen.tags == {"row_noise", "frame_noise"}
@@ -794,7 +799,7 @@ def test_a_set_of_which_a_part_cannot_be_fitted_is_not_chosen_and_the_others_are
 ) -> None:
     # only a refit of the part says what it leaves
     monkeypatch.setattr(
-        "pchem_pipeline.discrepancy.by_simulation.comparison._beyond_others", lambda *_: False
+        "pchem_pipeline.discrepancy.by_simulation.sets.comparison._beyond_others", lambda *_: False
     )
     world = World([effect("row_noise", 0.1), effect("frame_noise", 0.06)])
     pair = hypothesis("row_noise"), hypothesis("frame_noise")

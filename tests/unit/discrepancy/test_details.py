@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.by_simulation.comparison import compare
-from pchem_pipeline.discrepancy.by_simulation.details import has_numbers, may_be_tuned, tuned
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, choose
-from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
+from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers, may_be_tuned, tuned
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, choose
+from pchem_pipeline.discrepancy.by_simulation.sets.comparison import compare
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS

@@ -10,7 +10,7 @@ from scipy import stats
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings, _sentence
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,
     SetFit,
@@ -19,7 +19,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     score_set,
     tolerance,
 )
-from pchem_pipeline.discrepancy.by_simulation.maps import expected_codes
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import expected_codes
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, look_elsewhere
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS

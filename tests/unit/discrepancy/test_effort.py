@@ -7,7 +7,7 @@ import pytest
 from helpers.plain_camera import PlainCamera
 
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
-from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError, refit_maps
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError, refit_maps
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings

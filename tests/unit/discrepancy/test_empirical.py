@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings
-from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
+from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import _Mixture, measured_moves, without_squares
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings

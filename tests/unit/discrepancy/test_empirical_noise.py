@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from pchem_pipeline.config.load import parse_config
-from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
+from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.by_simulation.measured.noise import (
     Covariance,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pchem_pipeline.discrepancy.by_simulation.candidates import candidate_classes
+from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
 from pchem_pipeline.discrepancy.by_simulation.measured.response import measured_response, residual_responses
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples

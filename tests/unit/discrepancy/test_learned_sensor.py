@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers.plain_camera import PlainCamera
 
-from pchem_pipeline.discrepancy.by_simulation.maps import Refit, learn_sensor, refit_maps
-from pchem_pipeline.discrepancy.by_simulation.population import posterior_of_estimates, to_theta
-from pchem_pipeline.discrepancy.by_simulation.replicate import (
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import Refit, learn_sensor, refit_maps
+from pchem_pipeline.discrepancy.by_simulation.sensor.population import posterior_of_estimates, to_theta
+from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import (
     Acquisition,
     Replicate,
     by_part,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from pchem_pipeline.discrepancy.by_simulation.population import Population, Posterior
+from pchem_pipeline.discrepancy.by_simulation.sensor.population import Population, Posterior
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.observe import laws
 

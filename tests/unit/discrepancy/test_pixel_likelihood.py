@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis
-from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import (
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     PixelLikelihood,
     Witness,
     is_told,

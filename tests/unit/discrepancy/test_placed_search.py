@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
-from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
-from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, simulate_frames
-from pchem_pipeline.discrepancy.by_simulation.seen import Seen
-from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
+from pchem_pipeline.discrepancy.by_simulation.seen.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.seen.seen import Seen
+from pchem_pipeline.discrepancy.by_simulation.seen.suspects import suspected_parts
+from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Acquisition, simulate_frames
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics

@@ -11,8 +11,8 @@ import pytest
 from pchem_pipeline.discrepancy.by_simulation.additions import leaves_too_much
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
-from pchem_pipeline.discrepancy.by_simulation.seen import Seen
-from pchem_pipeline.discrepancy.by_simulation.unexplained import Unexplained, _Likely
+from pchem_pipeline.discrepancy.by_simulation.measured.unexplained import Unexplained, _Likely
+from pchem_pipeline.discrepancy.by_simulation.seen.seen import Seen
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.observe.places import Part

@@ -8,16 +8,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pchem_pipeline.base.errors import error_words
-from pchem_pipeline.discrepancy.by_simulation.details import has_numbers, may_be_tuned, tuned
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
+from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers, may_be_tuned, tuned
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     PRICE_OF_MORE,
     Hypothesis,
     fit_set,
     share_place,
 )
-from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import Witness
-from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Witness
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import look_elsewhere
 

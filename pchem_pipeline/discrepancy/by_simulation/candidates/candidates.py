@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, error_words
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     PRICE_OF_MORE,
     Hypothesis,
     Noise,
@@ -21,7 +21,7 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     fit_set,
     log_density,
 )
-from pchem_pipeline.discrepancy.by_simulation.replicate import Acquisition, Replicate
+from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Acquisition, Replicate
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.compose import along_chain

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.discrepancy.by_simulation.population_numba import solve_parabolas
+from pchem_pipeline.discrepancy.by_simulation.sensor.population_numba import solve_parabolas
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
 from pchem_pipeline.model.law.sample_law import SampleLaw
 

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, log_density
-from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import is_told
-from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, beyond_chance
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, log_density
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import is_told
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, beyond_chance
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
 

@@ -8,22 +8,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.candidates import (
+from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import (
     MOST_HYPOTHESES,
     ReplicateSimulator,
     placebo_for,
 )
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Choice,
     Hypothesis,
     Noise,
     choose,
     share_place,
 )
-from pchem_pipeline.discrepancy.by_simulation.maps import expected_codes
-from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import with_details
-from pchem_pipeline.discrepancy.by_simulation.seen import Seen
-from pchem_pipeline.discrepancy.by_simulation.simulations import Simulations
+from pchem_pipeline.discrepancy.by_simulation.seen.seen import Seen
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import expected_codes
+from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import with_details
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, leads_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps

@@ -1,10 +1,10 @@
 """Which set of effects is in the data, compared after the best fit of each.
 
-The fingerprints say which sets are worth a refit (:mod:`.fingerprints`). One effect that leaves nothing
-beyond chance after its best fit is all there is; only where every single one leaves something are sets of
-several compared, and each of their effects must have a signature of its own: statistics that the others, at
-their best fit, do not account for and do not touch, or at least do not account for where the set leaves
-nothing.
+The fingerprints (:mod:`pchem_pipeline.discrepancy.by_simulation.candidates`) say which sets are worth a refit.
+One effect that leaves nothing beyond chance after its best fit is all there is; only where every single one
+leaves something are sets of several compared, and each of their effects must have a signature of its own:
+statistics that the others, at their best fit, do not account for and do not touch, or at least do not account
+for where the set leaves nothing.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
-from pchem_pipeline.discrepancy.by_simulation.details import has_numbers
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
+from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     PRICE_OF_MORE,
     Choice,
     Contender,
@@ -27,10 +27,10 @@ from pchem_pipeline.discrepancy.by_simulation.fingerprints import (
     seen_among,
     share_place,
 )
-from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.pixel_likelihood import Witness
-from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter, is_dear
-from pchem_pipeline.discrepancy.by_simulation.trials import (
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Witness
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_dear
+from pchem_pipeline.discrepancy.by_simulation.sets.trials import (
     FAR,
     LOOSE,
     Trials,

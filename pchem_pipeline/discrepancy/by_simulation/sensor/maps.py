@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
-from pchem_pipeline.discrepancy.by_simulation.population import (
+from pchem_pipeline.discrepancy.by_simulation.sensor.population import (
     Posterior,
     clipped_mean,
     lost_variance,

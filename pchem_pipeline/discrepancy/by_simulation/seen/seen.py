@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
-from pchem_pipeline.discrepancy.by_simulation.suspects import suspected_parts
+from pchem_pipeline.discrepancy.by_simulation.seen.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.seen.suspects import suspected_parts
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.framework.evidence import Evidence
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import error_words
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.measured.electrons import (
     Electrons,
     electron_chances,
@@ -30,10 +30,10 @@ from pchem_pipeline.discrepancy.by_simulation.measured.response import (
     measured_response,
     residual_responses,
 )
-from pchem_pipeline.discrepancy.by_simulation.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.replicate import simulate_frames
-from pchem_pipeline.discrepancy.by_simulation.simulations import Simulations
-from pchem_pipeline.discrepancy.by_simulation.trials import leaves_little, leaves_nothing
+from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import simulate_frames
+from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
+from pchem_pipeline.discrepancy.by_simulation.sets.trials import leaves_little, leaves_nothing
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import CONVINCING
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps

@@ -12,18 +12,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.candidates import Mapper
-from pchem_pipeline.discrepancy.by_simulation.frame_stack import FrameStack
-from pchem_pipeline.discrepancy.by_simulation.maps import (
+from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper
+from pchem_pipeline.discrepancy.by_simulation.measured.moves import without_squares
+from pchem_pipeline.discrepancy.by_simulation.seen.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.seen.seen import Seen
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     MANY_MISTAKEN,
     Refit,
     Sensor,
     learn_sensor,
     refit_maps,
 )
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import without_squares
-from pchem_pipeline.discrepancy.by_simulation.replicate import Replicate, by_part
-from pchem_pipeline.discrepancy.by_simulation.seen import Seen
+from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Replicate, by_part
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.digital.misplaced import own_lines
 from pchem_pipeline.effects.framework.added_exposure import added_exposures

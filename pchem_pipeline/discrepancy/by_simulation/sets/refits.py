@@ -15,8 +15,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.fingerprints import Hypothesis, Noise, correction, log_density
-from pchem_pipeline.discrepancy.by_simulation.maps import NotFittedError, Refit
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    Hypothesis,
+    Noise,
+    correction,
+    log_density,
+)
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError, Refit
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
@@ -119,7 +124,7 @@ class Refitter:
             of so many replicates of it, which share their random numbers whatever the effects.
         null: of the model without them.
         target: mean of the statistics of ``splits`` parts of the data, shape (m,).
-        events: see :class:`~.fingerprints.Noise`.
+        events: see :class:`~pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints.Noise`.
         present: effects that the model has besides.
         splits: number of parts.
         steps: corrections of the strengths, at most.

@@ -1,0 +1,1 @@
+"""What each effect guesses about itself and would do to the statistics."""

@@ -1,0 +1,1 @@
+"""Sets of effects at their best fit, and how they compare."""
