@@ -1,6 +1,6 @@
 """Which set of effects is in the data, compared after the best fit of each.
 
-The fingerprints (:mod:`pchem_pipeline.discrepancy.by_simulation.candidates`) say which sets are worth a refit.
+The fingerprints (:mod:`pchem_pipeline.discrepancy.by_simulation.candidates`) say which sets are worth it.
 One effect that leaves nothing beyond chance after its best fit is all there is; only where every single one
 leaves something are sets of several compared, and each of their effects must have a signature of its own:
 statistics that the others, at their best fit, do not account for and do not touch, or at least do not account
