@@ -29,7 +29,9 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sets.comparison import (
     Comparison,
     _all_seen,
+    _asked_once,
     _begun,
+    _far_behind,
     _grown,
     compare,
     own_signature,
@@ -214,6 +216,22 @@ def test_an_effect_that_explains_a_part_only_is_not_tuned_to_the_end_unless_it_i
     assert found is not None
     assert not found.chosen.short
     assert found.chosen.score >= full.score - 0.5
+
+
+@pytest.mark.parametrize("paid", [1, 2, 3])
+def test_a_refit_that_meets_the_limit_keeps_the_steps_before_it(paid: int) -> None:
+    world, asked = World([effect("row_noise", 1.2)]), []
+
+    def allow(words: str) -> None:
+        asked.append(words)
+        if len(asked) > paid:
+            raise EffortSpentError(words)
+
+    found = replace(world.refitter(), allow=allow).refined([hypothesis("row_noise")])
+    assert world.drawn == 6 * paid
+    whole = world.refitter().refined([hypothesis("row_noise")])
+    assert (found.effects == (effect("row_noise", 0.1),)) == (paid == 1)
+    assert found.score < whole.score
 
 
 def test_the_search_ends_where_no_effect_explains_more_beside_those_held() -> None:
@@ -417,6 +435,27 @@ def test_what_a_strong_effect_hides_is_asked_for_beside_it() -> None:
     grown = world.compare(hypothesis("row_noise"), beside=[hypothesis("frame_noise", 0.04)])
     assert grown is not None
     assert grown.chosen.tags == {"row_noise", "frame_noise"}
+
+
+def test_what_stands_out_beside_a_set_is_asked_once() -> None:
+    asked: list[Any] = []
+    answers = {1: "one", 2: None}
+    beside: Any = _asked_once(lambda one: asked.append(one) or answers[one.number])  # type: ignore[arg-type]
+    first, second = SimpleNamespace(number=1), SimpleNamespace(number=2)
+    assert [beside(one) for one in (first, second, first, second)] == ["one", None, "one", None]
+    assert asked == [first, second]
+
+
+@pytest.mark.parametrize(
+    ("behind", "explained", "far"),
+    [(39.0, 0.0, False), (41.0, 0.0, True), (60.0, 1000.0, False), (95.0, 1000.0, True)],
+)
+def test_fewer_effects_beside_a_set_are_far_behind_by_more_than_their_fingerprints_may_err(
+    behind: float, explained: float, far: bool
+) -> None:
+    choice: Any = SimpleNamespace(best=SimpleNamespace(worth=explained), advantage=explained)
+    one: Any = SimpleNamespace(worth=explained - behind)
+    assert _far_behind(one, choice) is far
 
 
 def test_a_part_of_a_better_set_is_not_grown_again() -> None:
