@@ -26,7 +26,7 @@ OWN = "data"  # what comes of the measured stack, not of the simulated ones
 
 
 def run_null_tails(folder: Path, first: int, minutes: float) -> None:
-    """Judge clean sensors until the time is over; print shares of small p-values by kind, and draw them.
+    """Acceptance clean sensors until the time is over; print shares of small p-values by kind, and draw them.
 
     Args:
         folder: holds ``null_tails.jsonl`` (a line a sensor; seeds that it holds are not done again) and gets
@@ -57,8 +57,8 @@ def judged_sensor(seed: int) -> dict[str, Any]:
     from pchem_pipeline.base.errors import PchEmError
     from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes, serial
     from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
-    from pchem_pipeline.discrepancy.by_simulation.seen.frame_stack import FrameStack
-    from pchem_pipeline.discrepancy.by_simulation.seen.seen import Seen
+    from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
+    from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
     from pchem_pipeline.discrepancy.null import Measured, NullModel, disagrees
     from pchem_pipeline.discrepancy.settings import DiscrepancySettings
     from pchem_pipeline.discrepancy.splits import block_length, split_frames
@@ -69,7 +69,8 @@ def judged_sensor(seed: int) -> dict[str, Any]:
     frames = FrameStack(stack, numbers, splits, len(stack), int(stack.max()).bit_length() + 1, 1.0)
     settings = DiscrepancySettings()
     try:
-        explainer = FrameExplainer.begin(Seen.of(frames), settings, candidate_classes(settings), (), serial)
+        observed, classes = ObservedFrames.of(frames), candidate_classes(settings)
+        explainer = FrameExplainer.begin(observed, settings, classes, (), serial)
     except PchEmError as error:
         return {"seed": seed, "refused": str(error)}
     null, data = explainer.first, explainer.z

@@ -5,7 +5,7 @@ import pytest
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.by_likelihood.explainer import find_in_histograms
-from pchem_pipeline.discrepancy.by_likelihood.seen import SampleHistograms
+from pchem_pipeline.discrepancy.by_likelihood.observed import SampleHistograms
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.registry import effect_class
 

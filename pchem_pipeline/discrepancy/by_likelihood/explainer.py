@@ -18,8 +18,8 @@ from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_likelihood.additions import AddedSets
 from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, find_members
+from pchem_pipeline.discrepancy.by_likelihood.observed import ObservedHistograms, SampleHistograms
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, explain
-from pchem_pipeline.discrepancy.by_likelihood.seen import SampleHistograms, SeenHistograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
@@ -75,10 +75,10 @@ def find_in_histograms(
     classes = candidate_classes(settings)
     rng = np.random.default_rng(settings.seed)
     tell("splitting the samples and looking at each part")
-    seen = SeenHistograms.of(samples, rng)
+    observed = ObservedHistograms.of(samples, rng)
     times = [sample.integration_time for sample in samples]
     tell("drawing the fitted model")
-    found = search(HistogramExplainer.begin(seen, settings, classes, tuple(model), times, rng), tell)
+    found = search(HistogramExplainer.begin(observed, settings, classes, tuple(model), times, rng), tell)
     n, n_lit = samples[0].counts.shape[0], sum(not sample.bias for sample in samples)
     row = width or n
     shape = n // row, row
@@ -87,11 +87,11 @@ def find_in_histograms(
 
 
 @dataclass
-class Drawing:
+class HistogramReplicates:
     """Draws histograms from a law, and observes them.
 
     Attributes:
-        seen: the rows that are drawn.
+        observed: the rows that are drawn.
         bare: fits them without effects.
         count: of the replicates of a law.
         rng: all random numbers of the search.
@@ -99,26 +99,26 @@ class Drawing:
         done: replicates so far.
     """
 
-    seen: SeenHistograms
+    observed: ObservedHistograms
     bare: SetComparison
     count: int
     rng: np.random.Generator
     effort: Effort
     done: int = 0
 
-    def observed(self, counts: IntArray) -> Mapping[str, float]:
+    def statistics(self, counts: IntArray) -> Mapping[str, float]:
         """Return the statistics of histograms of the rows, fitted with the PCD alone."""
-        joint = self.seen.joint
-        return self.seen.statistics(counts, self.bare.fit((), None, counts).fit.parameters if joint else None)
+        parameters = self.bare.fit((), None, counts).fit.parameters if self.observed.joint else None
+        return self.observed.statistics(counts, parameters)
 
-    def replicates(self, log_masses: FloatArray) -> list[Mapping[str, float]]:
+    def drawn(self, log_masses: FloatArray) -> list[Mapping[str, float]]:
         """Return the statistics of histograms drawn from masses of the codes, (r, B), refit included."""
         mass = np.exp(log_masses)
         mass /= mass.sum(axis=1, keepdims=True)
-        total = self.seen.parts[0].sum(axis=1)
+        total = self.observed.parts[0].sum(axis=1)
         self.done += self.count
         self.effort.simulate(0, total.size, self.count)
-        return [self.observed(self.rng.multinomial(total, mass)) for _ in range(self.count)]
+        return [self.statistics(self.rng.multinomial(total, mass)) for _ in range(self.count)]
 
 
 @dataclass
@@ -126,8 +126,8 @@ class HistogramExplainer:
     """Tells effects apart in histograms; see :class:`~pchem_pipeline.discrepancy.skeleton.Explainer`.
 
     Attributes:
-        seen: the rows that are looked at.
-        drawing: draws replicates of them.
+        observed: the rows that are looked at.
+        replicates: draws replicates of them.
         sets: fits and scores sets of effects.
         plain: the fit without them to train and test part.
         first: null of the model.
@@ -142,8 +142,8 @@ class HistogramExplainer:
     """
 
     settings: DiscrepancySettings
-    seen: SeenHistograms
-    drawing: Drawing
+    observed: ObservedHistograms
+    replicates: HistogramReplicates
     sets: SetComparison
     plain: FittedSet
     first: NullModel
@@ -161,7 +161,7 @@ class HistogramExplainer:
     @classmethod
     def begin(
         cls,
-        seen: SeenHistograms,
+        observed: ObservedHistograms,
         settings: DiscrepancySettings,
         classes: Mapping[str, type[Effect]],
         model: tuple[Effect, ...],
@@ -171,7 +171,7 @@ class HistogramExplainer:
         """Fit the model to the train part, and observe histograms drawn from it, each with its own fit.
 
         Args:
-            seen: the rows.
+            observed: the rows.
             settings: the section ``discrepancy``.
             classes: of the candidates, by tag.
             model: effects that it has already.
@@ -179,26 +179,26 @@ class HistogramExplainer:
             rng: all random numbers.
         """
         effort = Effort(settings.effort)
-        sets = _sets(seen, model, effort)
+        sets = _sets(observed, model, effort)
         line = _on_a_line(sets, settings, times)
         if line is not None:
             sets, classes = line, {**classes, _SPURIOUS: SpuriousCharge}
-        members, untestable, defects = find_members(classes, seen.evidence, model)
+        members, untestable, defects = find_members(classes, observed.evidence, model)
         always = {tag: c.untestable for tag, c in effect_classes().items() if c.untestable}
         found = {tag: why for tag, why in (always | untestable).items() if tag not in classes}
         plain = sets.fit(())
         bare = replace(sets, present=(), start=plain.fit.parameters)
-        drawing = Drawing(seen, bare, settings.replicates, rng, effort)
-        own = [drawing.observed(part) for part in seen.parts]
-        vectors = drawing.replicates(plain.log_masses)
+        replicates = HistogramReplicates(observed, bare, settings.replicates, rng, effort)
+        own = [replicates.statistics(part) for part in observed.parts]
+        vectors = replicates.drawn(plain.log_masses)
         common = set(STATISTICS).intersection(*vectors, *own)
         names = tuple(name for name in STATISTICS if name in common)
-        both = sets.fit((), plain.fit.parameters, seen.both)
+        both = sets.fit((), plain.fit.parameters, observed.both)
         effort.begin()
         return cls(
             settings,
-            seen,
-            drawing,
+            observed,
+            replicates,
             sets,
             both,
             NullModel.from_replicates(names, as_matrix(names, vectors)),
@@ -213,17 +213,17 @@ class HistogramExplainer:
     @property
     def evidence(self) -> Evidence:
         """Of the train part."""
-        return self.seen.evidence
+        return self.observed.evidence
 
     @property
     def examined(self) -> Examined:
         """What is looked at."""
-        return self.seen.examined()
+        return self.observed.examined()
 
     @property
     def n_replicates(self) -> int:
         """Drawn so far."""
-        return self.drawing.done
+        return self.replicates.done
 
     def doubt(self) -> str:
         """Return nothing: each candidate is fitted with the parameters, so what they bend is no evidence."""
@@ -236,12 +236,12 @@ class HistogramExplainer:
     @cached_property
     def _without_effects(self) -> Gap:
         """The gap of the model before anything was added."""
-        whole = LikelihoodGap(self.seen.parts[2], self.sets.kept, 0.0, self._count, self.drawing.rng)
-        return whole.gap(self.sets.problem((), self.seen.both), self.plain.fit)
+        whole = LikelihoodGap(self.observed.parts[2], self.sets.kept, 0.0, self._count, self.replicates.rng)
+        return whole.gap(self.sets.problem((), self.observed.both), self.plain.fit)
 
     def suspects(self, null: NullModel) -> bool:
         """Tell whether several samples fit badly together although no statistic of one deviates."""
-        return self.seen.joint and not self._without_effects.at_floor
+        return self.observed.joint and not self._without_effects.at_floor
 
     def explain(self, null: NullModel, disagrees: bool) -> Explanation | None:
         """Find the set of effects that best predicts the test part, on the codes that are understood.
@@ -249,10 +249,10 @@ class HistogramExplainer:
         Raises:
             EffortSpentError: the work is at its limit; nothing was found.
         """
-        tried = self.drawing.effort.tried
+        tried = self.replicates.effort.tried
         tried.clear()
         try:
-            found = explain(self.sets, self.members, self._count, self.drawing.rng)
+            found = explain(self.sets, self.members, self._count, self.replicates.rng)
         except EffortSpentError as spent:
             tags = dict.fromkeys(m.tag for m in self.members)
             raise EffortSpentError(spent.doing, (t for t in tags if t not in tried)) from spent
@@ -266,7 +266,7 @@ class HistogramExplainer:
 
     def add(self, explanation: Explanation, null: NullModel) -> NullModel:
         """Put the named effects into the model, and observe histograms drawn from it."""
-        vectors = self.drawing.replicates(_with_effects(explanation))
+        vectors = self.replicates.drawn(_with_effects(explanation))
         return NullModel.from_replicates(null.names, as_matrix(null.names, vectors))
 
     def replaced(self, null: NullModel) -> NullModel | None:
@@ -285,7 +285,7 @@ class HistogramExplainer:
         """Fit train and test part together with each effect, and measure the gap on the final part."""
         if self.found is None:
             return Added((), before)
-        closing = AddedSets(self.seen.parts, self.found, self.plain, self._count, self.drawing.rng)
+        closing = AddedSets(self.observed.parts, self.found, self.plain, self._count, self.replicates.rng)
         added, self.final = closing.close(before, (self.first, null), self.z, disagrees)
         self.code = closing.codes(self.final, self.evidence)
         self.model = (*self.sets.present, *(each.effect for each in added.additions))
@@ -293,18 +293,18 @@ class HistogramExplainer:
 
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
         """Return the parameters of the rows looked at, NaN elsewhere, shape (1, n) or (n, J)."""
-        return Fitted(self.seen.maps(self.final.fit.parameters), self.code)
+        return Fitted(self.observed.maps(self.final.fit.parameters), self.code)
 
     @property
     def _count(self) -> int:
         return max(self.settings.extended_replicates, _FEWEST_REPLICATES)
 
 
-def _sets(seen: SeenHistograms, present: tuple[Effect, ...], effort: Effort) -> SetComparison:
+def _sets(observed: ObservedHistograms, present: tuple[Effect, ...], effort: Effort) -> SetComparison:
     """Return what fits the rows, begun at the fit that they were observed with."""
-    train, test, _ = seen.parts
+    train, test, _ = observed.parts
     every = np.ones(train.shape, np.bool_)
-    found = SetComparison(train, test, seen.origin, every, present, seen.start, seen.layout)
+    found = SetComparison(train, test, observed.origin, every, present, observed.start, observed.layout)
     return replace(found, effort=effort)
 
 

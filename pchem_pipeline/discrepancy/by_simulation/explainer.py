@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
+from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
 from pchem_pipeline.discrepancy.by_simulation.additions import AddedRounds
-from pchem_pipeline.discrepancy.by_simulation.candidates.asking import Asking, noise_of_splits
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper, candidate_classes, serial
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Choice, Hypothesis
-from pchem_pipeline.discrepancy.by_simulation.grown_model import GrownModel
-from pchem_pipeline.discrepancy.by_simulation.judge import Judge
+from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screening, noise_of_splits
+from pchem_pipeline.discrepancy.by_simulation.extended_model import ExtendedModel
+from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.measured.unexplained import Unexplained
-from pchem_pipeline.discrepancy.by_simulation.seen.frame_stack import FrameStack
-from pchem_pipeline.discrepancy.by_simulation.seen.seen import Seen
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     NotFittedError,
     Refit,
@@ -106,9 +106,9 @@ def find_discrepancies(
     frames = replace(frames, window=window)
     classes = candidate_classes(settings)
     tell("splitting the samples and looking at each part")
-    seen = Seen.of(frames)
+    observed = ObservedFrames.of(frames)
     tell("drawing the fitted model")
-    return search(FrameExplainer.begin(seen, settings, classes, tuple(model), mapper), tell)
+    return search(FrameExplainer.begin(observed, settings, classes, tuple(model), mapper), tell)
 
 
 @dataclass(frozen=True)
@@ -124,19 +124,19 @@ class FrameExplainer:
     """Tells effects apart in frames; see :class:`~pchem_pipeline.discrepancy.skeleton.Explainer`.
 
     Attributes:
-        seen: the frames.
+        observed: the frames.
         work: fits and simulates them.
-        asking: asks the candidates.
-        judge: judges what is found by the statistics of the data.
-        grown: the model, with the rounds of the search.
+        screening: asks the candidates what they would do.
+        accept: tells by the statistics of the data what is accepted.
+        extended: the model, with the rounds of the search.
     """
 
     settings: DiscrepancySettings
-    seen: Seen
+    observed: ObservedFrames
     work: Simulations
-    asking: Asking
-    judge: Judge
-    grown: GrownModel
+    screening: Screening
+    accept: Acceptance
+    extended: ExtendedModel
     samples: str = "frames"
     defects: dict[str, str] = field(default_factory=dict)
     unexplained: Unexplained | None = None
@@ -144,19 +144,19 @@ class FrameExplainer:
     @classmethod
     def begin(
         cls,
-        seen: Seen,
+        observed: ObservedFrames,
         settings: DiscrepancySettings,
         classes: dict[str, type[Effect]],
         model: tuple[Effect, ...],
         mapper: Mapper,
     ) -> FrameExplainer:
         """Simulate and observe the fitted model, refit included: the null distribution of the statistics."""
-        effort = Effort(settings.effort, ambiguous=seen.plain.ambiguous)
-        work = Simulations(seen, mapper, settings.seed, effort)
+        effort = Effort(settings.effort, ambiguous=observed.plain.ambiguous)
+        work = Simulations(observed, mapper, settings.seed, effort)
         vectors = work.replicates(model, work.mapped(model).sensor, "r0", settings.replicates)
-        own = seen.statistics()
+        own = observed.statistics()
         names = tuple(name for name in own[0] if all(name in each for each in (*own[1:], *vectors)))
-        if seen.doubt():
+        if observed.doubt():
             # where the pixels are not identified only what does not rest on their parameters counts
             names = tuple(np.array(names)[free_of_parameters(names)].tolist())
         first = NullModel.from_replicates(names, as_matrix(names, vectors))
@@ -164,38 +164,38 @@ class FrameExplainer:
         z, defects = Measured(*as_matrix(names, own)), dict[str, str]()
         return cls(
             settings,
-            seen,
+            observed,
             work,
-            Asking(seen, work, z, classes, model, settings.model_error, defects),
-            Judge(first, z, StatisticsGap(first, seen.final_samples), settings.model_error),
-            GrownModel(work, first, model, model),
+            Screening(observed, work, z, classes, model, settings.model_error, defects),
+            Acceptance(first, z, StatisticsGap(first, observed.final_samples), settings.model_error),
+            ExtendedModel(work, first, model, model),
             defects=defects,
         )
 
     @property
     def evidence(self) -> Evidence:
         """Of the train frames."""
-        return self.seen.parts[0]
+        return self.observed.parts[0]
 
     @property
     def examined(self) -> Examined:
         """What was looked at."""
-        return self.seen.frames.splits.examined(self.seen.frames.stack.shape)
+        return self.observed.frames.splits.examined(self.observed.frames.stack.shape)
 
     @property
     def first(self) -> NullModel:
         """The null of the model before anything was added."""
-        return self.judge.first
+        return self.accept.first
 
     @property
     def z(self) -> Measured:
         """Statistics of the data."""
-        return self.judge.z
+        return self.accept.z
 
     @property
     def model(self) -> tuple[Effect, ...]:
         """The effects that are in the model now."""
-        return self.grown.effects
+        return self.extended.effects
 
     @property
     def most_rounds(self) -> int:
@@ -214,11 +214,11 @@ class FrameExplainer:
 
     def doubt(self) -> str:
         """Say which share of the pixels is not identified, and what would help; empty below a half."""
-        return self.seen.doubt()
+        return self.observed.doubt()
 
     def gap(self, null: NullModel) -> Gap:
         """Measure the gap in the statistics of the final frames."""
-        return self.judge.gap(null)
+        return self.accept.gap(null)
 
     def suspects(self, null: NullModel) -> bool:
         """Tell whether some statistic deviates so far that a candidate may explain it with others."""
@@ -226,10 +226,10 @@ class FrameExplainer:
 
     def explain(self, null: NullModel, disagrees: bool) -> Explanation | None:
         """Simulate what candidates would do, and choose the set that best predicts held-out frames."""
-        number = len(self.grown.rounds)
+        number = len(self.extended.rounds)
         self.work.effort.check("another round of effects" if number else "the candidates were compared")
         self.work.effort.tried.clear()
-        hypotheses, choice = self.asking.about(self.model, null, number)
+        hypotheses, choice = self.screening.of(self.model, null, number)
         if choice is None or not (disagrees or choice.advantage > CONVINCING):
             return None
         return Explanation(hypotheses, choice)
@@ -251,9 +251,9 @@ class FrameExplainer:
         self.defects.update(found.failed)
         # what was chosen is not lost for the little that is left to do: no limit
         refitter = replace(refitter, allow=lambda _: None)
-        count, held = self.settings.extended_replicates, {h.tag for h in self.grown.added}
+        count, held = self.settings.extended_replicates, {h.tag for h in self.extended.added}
         added = refitter.sharpened(found.chosen, count)
-        kept = self.judge.established(added)
+        kept = self.accept.established(added)
         while len(kept) < len(added.hypotheses):
             if {h.tag for h in kept} <= held:
                 return None
@@ -261,20 +261,20 @@ class FrameExplainer:
                 added = refitter.sharpened(refitter.refined(kept), count)
             except NotFittedError:
                 return None
-            kept = self.judge.established(added)
-        if self.judge.widens(added, null):
+            kept = self.accept.established(added)
+        if self.accept.widens(added, null):
             return None
-        return self.grown.put(found, added, explanation.hypotheses, null)
+        return self.extended.put(found, added, explanation.hypotheses, null)
 
     def _compared(self, explanation: Explanation, refitter: Refitter) -> Comparison | None:
         """Compare sets of effects after the best fit of each; None where none holds."""
         try:
             return compare(
                 refitter,
-                self.grown.added,
+                self.extended.added,
                 explanation.hypotheses,
                 explanation.choice,
-                self.grown.last,
+                self.extended.last,
                 lambda best: self._left_by(best, refitter),
                 Witness(self._likelihood),
                 lambda: self._unexplained().explains_all(),
@@ -286,7 +286,7 @@ class FrameExplainer:
 
     def _refitter(self) -> Refitter:
         """Return what fits effects beside those that the model had before the search."""
-        present, first = self.grown.present, self.first
+        present, first = self.extended.present, self.first
 
         def draw(effects: tuple[Effect, ...], count: int) -> tuple[Refit, FloatArray]:
             fit, vectors = self.work.drawn(along_chain(present, effects), count)
@@ -302,16 +302,17 @@ class FrameExplainer:
         """Compare what candidates would do beside a refitted set: what that hid stands out there."""
         null = NullModel.from_replicates(self.first.names, best.vectors, self.first)
         null = null.shifted(np.expm1(best.change) @ best.slopes)
-        return self.asking.beside(refitter.model(best.effects), null, best.slopes, len(self.grown.rounds))
+        model, number = refitter.model(best.effects), len(self.extended.rounds)
+        return self.screening.beside(model, null, best.slopes, number)
 
     def _likelihood(self, effects: Sequence[Effect], pixels: int) -> PixelLikelihood | None:
         """Return the likelihood of some pixels beside what the model had at first; None: not one law."""
-        frames = self.seen.frames
-        present = frames.effects([e for e in self.model if e in self.grown.given])
+        frames = self.observed.frames
+        present = frames.effects([e for e in self.model if e in self.extended.given])
         if not all(effect.everywhere for effect in (*present, *effects)):
             return None
         samples = self.work.own_samples((*present, *effects))
-        return PixelLikelihood(samples, self.seen.plain.maps, present, self.work.effort, pixels)
+        return PixelLikelihood(samples, self.observed.plain.maps, present, self.work.effort, pixels)
 
     def replaced(self, null: NullModel) -> NullModel | None:
         """Put what no effect with a name makes in the place of all that were added, if it leaves less.
@@ -325,11 +326,11 @@ class FrameExplainer:
         found = unexplained.by_itself()
         if found is None:
             return None
-        gap = self.judge.gap_of(found)
+        gap = self.accept.gap_of(found)
         better = gap.interval[1] < _CLEARLY_LESS * left.value
         # effects that the final frames do not tell from the truth are known to leave something by the others
         as_good = gap.at_floor and (not left.at_floor or unexplained.leaves_nothing(found))
-        return self.grown.put_measured(found) if better or as_good else None
+        return self.extended.put_measured(found) if better or as_good else None
 
     def describe(self, before: Gap, null: NullModel) -> NullModel | None:
         """Measure what no effect explains in the samples, and put it into the model.
@@ -347,7 +348,7 @@ class FrameExplainer:
         instead, left = self.replaced(null), self.gap(null)
         if instead is not None or left.at_floor:
             return instead
-        unexplained, sure = self._unexplained(), self.judge.accounted(self.grown.rounds, null)
+        unexplained, sure = self._unexplained(), self.accept.accounted(self.extended.rounds, null)
         best: tuple[tuple[bool, float], Refitted] | None = None
         for kept in ((), sure) if sure else ((),):
             try:
@@ -358,7 +359,7 @@ class FrameExplainer:
                 break
             if found is None:
                 continue
-            gap = self.judge.gap_of(found)
+            gap = self.accept.gap_of(found)
             # effects none of which accounts for what it moves lose their names: then less is better
             alone = (
                 _DESCRIBED * min(left.value, before.value)
@@ -372,7 +373,7 @@ class FrameExplainer:
                 best = rank, found
             if best is not None and best[0] == (False, 1.0):
                 break
-        return None if best is None else self.grown.put_measured(best[1])
+        return None if best is None else self.extended.put_measured(best[1])
 
     def _unexplained(self) -> Unexplained:
         """Return what measures beside effects that the model had before the search; always the same."""
@@ -380,7 +381,7 @@ class FrameExplainer:
             self.unexplained = Unexplained(
                 self.work,
                 self._refitter(),
-                self.judge.established,
+                self.accept.established,
                 self.settings.extended_replicates,
                 self.defects,
             )
@@ -388,12 +389,12 @@ class FrameExplainer:
 
     def tolerance(self) -> FloatArray | float:
         """Return what is not held against effects that were added: a fraction of what they do."""
-        return self.judge.tolerance(self.grown.rounds)
+        return self.accept.tolerance(self.extended.rounds)
 
     def close(self, before: Gap, null: NullModel, disagrees: bool) -> Added:
         """Measure the gap on the final frames after each effect, and with rivals in its place."""
-        judge = self.judge
-        rounds = AddedRounds(self.grown.rounds, judge.gaps, self.z, self.settings, judge.allowed)
+        accept = self.accept
+        rounds = AddedRounds(self.extended.rounds, accept.gaps, self.z, self.settings, accept.allowed)
         return rounds.close(before, null, disagrees)
 
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
@@ -404,14 +405,14 @@ class FrameExplainer:
         drawn anew.
         """
         frames, plain, fit, expected = (
-            self.seen.frames,
-            self.seen.plain,
+            self.observed.frames,
+            self.observed.plain,
             self.work.mapped(self.model).fit,
             None,
         )
         maps = fit.maps
         assert plain.covariance is not None
-        if self.grown.rounds:
+        if self.extended.rounds:
             code = self.evidence.code
             codes = code.first + np.arange(code.observed.size)
             train = frames.numbers[frames.splits.train]

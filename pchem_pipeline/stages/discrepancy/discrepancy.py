@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.by_likelihood.explainer import find_in_histograms
-from pchem_pipeline.discrepancy.by_likelihood.seen import SampleHistograms
+from pchem_pipeline.discrepancy.by_likelihood.observed import SampleHistograms
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Replicate
 from pchem_pipeline.discrepancy.observe.compilation import compile_observation

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
 from pchem_pipeline.discrepancy.by_simulation.additions import (
     unexplained_of_its_kind,
     unexplained_of_its_own,
@@ -23,8 +24,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     score_set,
 )
 from pchem_pipeline.discrepancy.by_simulation.explainer import Explanation, FrameExplainer
-from pchem_pipeline.discrepancy.by_simulation.grown_model import GrownModel
-from pchem_pipeline.discrepancy.by_simulation.judge import Judge
+from pchem_pipeline.discrepancy.by_simulation.extended_model import ExtendedModel
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sets.comparison import (
     Comparison,
@@ -715,8 +715,8 @@ def add(
     work: Any = SimpleNamespace(mapped=mapped, forget=lambda _: None, effort=Effort(None))
     unused: Any = None
     settings = DiscrepancySettings()
-    judge = Judge(world.null, z, StatisticsGap(world.null, 100_000), settings.model_error)
-    search = FrameExplainer(settings, unused, work, unused, judge, GrownModel(work, world.null, (), ()))
+    judge = Acceptance(world.null, z, StatisticsGap(world.null, 100_000), settings.model_error)
+    search = FrameExplainer(settings, unused, work, unused, judge, ExtendedModel(work, world.null, (), ()))
     monkeypatch.setattr(search, "_refitter", lambda: world.refitter())
     monkeypatch.setattr(search, "_left_by", lambda *_: None)
     monkeypatch.setattr(search, "_likelihood", lambda *_: None)
@@ -761,12 +761,12 @@ def test_only_effects_that_account_for_what_they_move_are_kept_beside_what_is_me
 ) -> None:
     world = World([effect("row_noise", 0.5)])
     search, extended = add(world, monkeypatch, hypothesis("row_noise"))
-    assert [h.tag for h in search.judge.accounted(search.grown.rounds, extended)] == ["row_noise"]
+    assert [h.tag for h in search.accept.accounted(search.extended.rounds, extended)] == ["row_noise"]
     elsewhere, own = np.eye(M)[5] * 60.0, np.eye(M)[0] * 60.0
-    assert [h.tag for h in search.judge.accounted(search.grown.rounds, extended.shifted(elsewhere))] == [
+    assert [h.tag for h in search.accept.accounted(search.extended.rounds, extended.shifted(elsewhere))] == [
         "row_noise"
     ]
-    assert search.judge.accounted(search.grown.rounds, extended.shifted(own)) == ()
+    assert search.accept.accounted(search.extended.rounds, extended.shifted(own)) == ()
 
 
 def test_what_the_final_frames_do_not_show_stays_outside(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -852,7 +852,7 @@ def test_a_correction_that_no_pixel_can_be_fitted_with_is_not_made(monkeypatch: 
     world = World([effect("row_noise", 0.5)])
     search, _ = add(world, monkeypatch, hypothesis("row_noise"))
     [corrected] = search.model
-    added = search.grown.last
+    added = search.extended.last
 
     def mapped(model: tuple[Effect, ...]) -> Any:
         if model == (corrected,):
@@ -872,7 +872,8 @@ def test_an_effect_is_held_to_what_it_moves_only_where_the_data_disagree_with_th
     world = World([effect("interpixel_capacitance", 0.2)])
     search, extended = add(world, monkeypatch, hypothesis("interpixel_capacitance"))
     before = search.gap(world.null)
-    search.grown.rounds = [replace(search.grown.rounds[0], extended=extended.shifted(np.eye(M)[3] * 20.0))]
+    [one] = search.extended.rounds
+    search.extended.rounds = [replace(one, extended=extended.shifted(np.eye(M)[3] * 20.0))]
     for still in (False, True):
         [added] = search.close(before, extended, still).additions
         assert added.named == (not still)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
-from pchem_pipeline.discrepancy.by_simulation.seen.frame_stack import FrameStack
-from pchem_pipeline.discrepancy.by_simulation.seen.seen import Seen
-from pchem_pipeline.discrepancy.by_simulation.seen.suspects import suspected_parts
+from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
+from pchem_pipeline.discrepancy.by_simulation.frames.suspects import suspected_parts
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Acquisition, simulate_frames
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
@@ -173,7 +173,7 @@ def late_flicker(rng, shape):
 
 
 def split_of(frames):
-    return Seen.of(stacked(frames)).frames
+    return ObservedFrames.of(stacked(frames)).frames
 
 
 def stacked(frames):

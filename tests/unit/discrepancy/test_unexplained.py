@@ -10,9 +10,9 @@ import pytest
 
 from pchem_pipeline.discrepancy.by_simulation.additions import leaves_too_much
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
+from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
 from pchem_pipeline.discrepancy.by_simulation.measured.unexplained import Unexplained, _Likely
-from pchem_pipeline.discrepancy.by_simulation.seen.seen import Seen
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.observe.places import Part
@@ -42,7 +42,7 @@ def test_the_form_and_part_that_explain_most_come_first() -> None:
     refitter: Any = SimpleNamespace(model=lambda effects: effects)
     nothing: Any = None
     effort = Effort(1.0)
-    seen = Seen(frames, nothing, nothing)
+    seen = ObservedFrames(frames, nothing, nothing)
     work: Any = SimpleNamespace(frames=frames, seen=seen, effort=effort)
     unexplained = Unexplained(work, refitter, nothing, 0)
     forms = {"moves": moves, "noise": noise, "broken": broken}

@@ -194,7 +194,7 @@ class Unexplained:
         """Return the parts and forms that explain most beside effects, what is everywhere included."""
         model = self.refitter.model(effects)
         found: list[_Likely] = []
-        self.work.effort.ask(self.work.seen.samples)
+        self.work.effort.ask(self.work.observed.samples)
         for part, form in itertools.product((Part(), *self.work.frames.parts), forms):
             try:
                 one = forms[form](part, model, model)

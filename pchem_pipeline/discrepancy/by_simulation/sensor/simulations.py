@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper
+from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import without_squares
-from pchem_pipeline.discrepancy.by_simulation.seen.frame_stack import FrameStack
-from pchem_pipeline.discrepancy.by_simulation.seen.seen import Seen
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     MANY_MISTAKEN,
     Refit,
@@ -51,7 +51,7 @@ class Simulations:
     """Fits of the seen frames, and stacks simulated from them.
 
     Attributes:
-        seen: the frames.
+        observed: the frames.
         mapper: runs the simulated stacks.
         seed: root of all random numbers.
         effort: counts the work.
@@ -60,7 +60,7 @@ class Simulations:
         known: the models that were mapped of late.
     """
 
-    seen: Seen
+    observed: ObservedFrames
     mapper: Mapper
     seed: int
     effort: Effort
@@ -71,12 +71,12 @@ class Simulations:
     @property
     def frames(self) -> FrameStack:
         """As they were taken, with their parts."""
-        return self.seen.frames
+        return self.observed.frames
 
     @property
     def plain(self) -> Evidence:
         """Evidence of the seen frames."""
-        return self.seen.plain
+        return self.observed.plain
 
     def refit(self, model: tuple[Effect, ...]) -> Refit:
         """Return the fit of the seen frames under a model."""

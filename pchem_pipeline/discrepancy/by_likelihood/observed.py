@@ -44,7 +44,7 @@ class SampleHistograms:
 
 
 @dataclass(frozen=True)
-class SeenHistograms:
+class ObservedHistograms:
     """The histograms of a search, split and observed.
 
     Arrays have a row for each sample of each pixel, those of a pixel one after the other.
@@ -68,7 +68,7 @@ class SeenHistograms:
     evidence: Evidence
 
     @classmethod
-    def of(cls, samples: Sequence[SampleHistograms], rng: np.random.Generator) -> SeenHistograms:
+    def of(cls, samples: Sequence[SampleHistograms], rng: np.random.Generator) -> ObservedHistograms:
         """Split the samples at random, fit the train part, and choose the rows to look at.
 
         Raises:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.discrepancy.by_simulation.seen.frame_stack import FrameStack
-from pchem_pipeline.discrepancy.by_simulation.seen.suspects import suspected_parts
+from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.frames.suspects import suspected_parts
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.framework.evidence import Evidence
 
@@ -17,7 +17,7 @@ _NOT_IDENTIFIED = 0.5  # share of ambiguous pixels from which their parameters a
 
 
 @dataclass(frozen=True)
-class Seen:
+class ObservedFrames:
     """The frames of a search, observed.
 
     Attributes:
@@ -31,7 +31,7 @@ class Seen:
     parts: tuple[Evidence, Evidence, Evidence]
 
     @classmethod
-    def of(cls, frames: FrameStack) -> Seen:
+    def of(cls, frames: FrameStack) -> ObservedFrames:
         """Observe train and test frames together, then each part near their fit.
 
         Parameters of a third of the frames scatter too much to stand for the pixels.

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.additions import Round, left_of, unexplained_of_its_own
-from pchem_pipeline.discrepancy.by_simulation.candidates.asking import noise_of_splits
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,
     fit_set,
     tolerance,
 )
+from pchem_pipeline.discrepancy.by_simulation.candidates.screening import noise_of_splits
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
@@ -28,7 +28,7 @@ _CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing wa
 
 
 @dataclass(frozen=True)
-class Judge:
+class Acceptance:
     """Judges sets of effects by the statistics of the data.
 
     Attributes:

@@ -20,7 +20,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     choose,
     share_place,
 )
-from pchem_pipeline.discrepancy.by_simulation.seen.seen import Seen
+from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import expected_codes
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import with_details
@@ -41,11 +41,11 @@ def noise_of_splits(null: NullModel, splits: int, model_error: float) -> Noise:
 
 
 @dataclass(frozen=True)
-class Asking:
+class Screening:
     """Asks the candidates.
 
     Attributes:
-        seen: the frames.
+        observed: the frames.
         work: simulates what they do.
         z: statistics of the data.
         classes: of the candidates, by tag.
@@ -54,7 +54,7 @@ class Asking:
         defects: candidates that failed, and why; more come to them.
     """
 
-    seen: Seen
+    observed: ObservedFrames
     work: Simulations
     z: Measured
     classes: Mapping[str, type[Effect]]
@@ -62,7 +62,7 @@ class Asking:
     model_error: float
     defects: dict[str, str] = field(default_factory=dict)
 
-    def about(
+    def of(
         self, model: tuple[Effect, ...], null: NullModel, number: int
     ) -> tuple[tuple[Hypothesis, ...], Choice | None]:
         """Ask what they would do beside the model of a round: everywhere and in the parts, split by split.
@@ -76,12 +76,12 @@ class Asking:
             All hypotheses, the likeliest first, and how their sets compare; None: there are none.
         """
         simulator = self._simulator(model, null, number, str(number))
-        evidence = (self.seen.plain, *self.seen.parts[:2])
+        evidence = (self.observed.plain, *self.observed.parts[:2])
         guesses = with_details(
             self._guesses(simulator, model, null, evidence, MOST_HYPOTHESES),
             self.work.own_samples(model),
             self.work.mapped(model).fit.maps,
-            self.seen.frames.effects(model),
+            self.observed.frames.effects(model),
             self.work.effort,
         )
         hypotheses = simulator.fingerprints([*guesses, *placebo_for(guesses, self.classes)])
@@ -122,7 +122,7 @@ class Asking:
         return ReplicateSimulator(
             self.work.mapped(model).sensor.usual(self.work.seed_of(f"sensor/{purpose}")),
             model,
-            self.seen.frames.acquisition(),
+            self.observed.frames.acquisition(),
             null.names,
             self.work.counted,
             f"r{number}",
@@ -139,10 +139,10 @@ class Asking:
         most: int,
     ) -> list[Effect]:
         """Return the guesses of all candidates that are not where a found effect of their kind is."""
-        apart = self.seen.frames.seen_apart(self.seen.plain)
+        apart = self.observed.frames.seen_apart(self.observed.plain)
         beside = self._evidence_beside(model, null)
         found = [effect for effect in model if effect not in self.given]
-        self.work.effort.ask(self.seen.samples)
+        self.work.effort.ask(self.observed.samples)
         guesses = simulator.guesses(self.classes, evidence, apart, beside, most)
         return [guess for guess in guesses if not share_place((*found, guess))]
 
@@ -153,7 +153,7 @@ class Asking:
         """
         if not model:
             return None
-        frames, plain, fit = self.seen.frames, self.seen.plain, self.work.mapped(model).fit
+        frames, plain, fit = self.observed.frames, self.observed.plain, self.work.mapped(model).fit
         codes = plain.code.first + np.arange(plain.code.observed.size)
         expected = expected_codes(fit.maps, frames.effects(model), codes, frames.seen_numbers, fit.added)
         code = plain.code if expected is None else replace(plain.code, expected=expected)

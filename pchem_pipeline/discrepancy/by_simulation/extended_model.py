@@ -23,7 +23,7 @@ _NEAR = 0.1  # relative: so little is not worth another simulation, but can be c
 
 
 @dataclass
-class GrownModel:
+class ExtendedModel:
     """Effects, and how they came.
 
     Attributes:

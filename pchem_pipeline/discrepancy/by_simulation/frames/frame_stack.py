@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.seen.suspects import with_ends
+from pchem_pipeline.discrepancy.by_simulation.frames.suspects import with_ends
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Acquisition
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics
