@@ -42,8 +42,8 @@ def test_the_form_and_part_that_explain_most_come_first() -> None:
     refitter: Any = SimpleNamespace(model=lambda effects: effects)
     nothing: Any = None
     effort = Effort(1.0)
-    seen = ObservedFrames(frames, nothing, nothing)
-    work: Any = SimpleNamespace(frames=frames, seen=seen, effort=effort)
+    observed = ObservedFrames(frames, nothing, nothing)
+    work: Any = SimpleNamespace(frames=frames, observed=observed, effort=effort)
     unexplained = Unexplained(work, refitter, nothing, 0)
     forms = {"moves": moves, "noise": noise, "broken": broken}
     found = [(one.part, one.form) for one in unexplained._likeliest((), forms)]
