@@ -30,6 +30,7 @@ from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import search, silent
 from pchem_pipeline.discrepancy.verdict import Discrepancy, Examined
 from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
+from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.framework.registry import effect_classes
@@ -288,7 +289,7 @@ class HistogramExplainer:
         closing = AddedSets(self.observed.parts, self.found, self.plain, self._count, self.replicates.rng)
         added, self.final = closing.close(before, (self.first, null), self.z, disagrees)
         self.code = closing.codes(self.final, self.evidence)
-        self.model = (*self.sets.present, *(each.effect for each in added.additions))
+        self.model = along_chain(self.sets.present, [each.effect for each in added.additions])
         return added
 
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
