@@ -142,19 +142,19 @@ def ensemble_sums(pixels: UsablePixels, dn: DnAxis, nuced: NucedAxis | None = No
     Returns:
         The sums; divide by ``n_pixels`` for the means.
     """
-    raw, raw_square = np.zeros((2, dn.size))
-    bins, bins_square = np.zeros((2, nuced.size if nuced else 0))
-    ensemble_numba.sum_pcd_pixels(
-        *pixels.maps,
-        dn.start,
-        raw,
-        raw_square,
-        nuced.width if nuced else 0.0,
-        nuced.start if nuced else 0,
-        bins,
-        bins_square,
-    )
-    return EnsembleSums(len(pixels), raw, raw_square, bins, bins_square)
+    raw, bins = _raw_sums(dn), _nuced_sums(nuced)
+    ensemble_numba.sum_pcd_pixels(tuple(pixels.maps), raw, bins)
+    return EnsembleSums(len(pixels), raw.total, raw.square, bins.total, bins.square)
+
+
+def _raw_sums(dn: DnAxis) -> ensemble_numba.AxisSums:
+    return ensemble_numba.AxisSums(dn.start, 1.0, *np.zeros((2, dn.size)))
+
+
+def _nuced_sums(nuced: NucedAxis | None) -> ensemble_numba.AxisSums:
+    if nuced is None:
+        return ensemble_numba.AxisSums(0, 0.0, *np.zeros((2, 0)))
+    return ensemble_numba.AxisSums(nuced.start, nuced.width, *np.zeros((2, nuced.size)))
 
 
 def mass_sums(
@@ -175,13 +175,10 @@ def mass_sums(
     Returns:
         The sums, and those of the means of the NUCed value (e-) and of its square (e-^2), shape (2,).
     """
-    raw, raw_square = np.zeros((2, dn.size))
-    bins, bins_square = np.zeros((2, nuced.size))
-    moments = np.zeros(2)
+    raw, bins, moments = _raw_sums(dn), _nuced_sums(nuced), np.zeros(2)
     _, gain, bias, _ = pixels.maps
-    places = mass, first, start, gain, bias, dn.start
-    ensemble_numba.sort_masses(*places, raw, raw_square, nuced.width, nuced.start, bins, bins_square, moments)
-    return EnsembleSums(len(pixels), raw, raw_square, bins, bins_square), moments
+    ensemble_numba.sort_masses(mass, first, start, gain, bias, raw, bins, moments)
+    return EnsembleSums(len(pixels), raw.total, raw.square, bins.total, bins.square), moments
 
 
 def curve_errors(
@@ -238,17 +235,15 @@ def tally(
     """
     raw = np.zeros(dn.size, dtype=np.int64)
     bins = np.zeros(nuced.size if nuced else 0, dtype=np.int64)
+    start, width = (nuced.start, nuced.width) if nuced else (0, 0.0)
     sums = np.zeros((len(pixels), 2))
     outside, nuced_outside = ensemble_numba.tally_counts(
         kernel_counts(counts),
         np.asarray(origin, dtype=np.int64),
         pixels.conversion_gain,
         pixels.bias,
-        dn.start,
-        raw,
-        nuced.width if nuced else 0.0,
-        nuced.start if nuced else 0,
-        bins,
+        ensemble_numba.AxisCounts(dn.start, 1.0, raw),
+        ensemble_numba.AxisCounts(start, width, bins),
         sums,
     )
     return Tally(raw, bins, int(outside), int(nuced_outside), math.fsum(sums[:, 0]), math.fsum(sums[:, 1]))

@@ -6,7 +6,7 @@ A component is a Gaussian of weight ``P(K = k)``.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,29 +81,50 @@ def reach_of(log_weight: float) -> float:
     return math.sqrt(max(REACH * REACH + 2.0 * log_weight, 0.0))
 
 
+class AxisSums(NamedTuple):
+    """What is added up along an axis, of DN or of NUCed values.
+
+    Attributes:
+        start: index of the first bin: of the raw axis its DN.
+        width: of a bin, DN or e-; 0: nothing is added up.
+        total: in and out, sums of the pixels' masses.
+        square: in and out, sums of their squares.
+    """
+
+    start: int
+    width: float
+    total: FloatArray
+    square: FloatArray
+
+
+class AxisCounts(NamedTuple):
+    """Samples counted along an axis; see :class:`AxisSums`."""
+
+    start: int
+    width: float
+    counts: IntArray
+
+
 @kernel
 def sum_pcd_pixels(
-    exposure: FloatArray,
-    gain: FloatArray,
-    bias: FloatArray,
-    sigma: FloatArray,
-    dn_start: int,
-    total: FloatArray,
-    total_square: FloatArray,
-    width: float,
-    nuced_start: int,
-    nuced: FloatArray,
-    nuced_square: FloatArray,
+    pixels: tuple[FloatArray, FloatArray, FloatArray, FloatArray], raw: AxisSums, nuced: AxisSums
 ) -> None:
     """Add every pixel's PCD, and its square, at the integers; and the same PCD sorted into NUCed bins.
 
     The NUCed value of DN ``x`` is ``(x - mu) g``, so each DN falls into one bin as a whole, exactly as the
-    data do. ``width <= 0`` leaves the NUCed sums out.
+    data do.
+
+    Args:
+        pixels: H, g, mu, sigma, shape (n,) each.
+        raw: at the integers.
+        nuced: in the NUCed bins.
     """
+    exposure, gain, bias, sigma = pixels
+    dn_start, total, total_square = raw.start, raw.total, raw.square
     weights = np.zeros(capacity(exposure))
     log_factorial = log_factorials(weights.size)
     row = np.zeros((1, total.size + _ROOM))
-    places, held = np.zeros(total.size, np.int32), np.zeros(nuced.size + 2)
+    places, held = np.zeros(total.size, np.int32), np.zeros(nuced.total.size + 2)
     for p in range(exposure.size):
         low, high = poisson_weights(exposure[p], weights)
         step, log_exposure = 1.0 / gain[p], math.log(max(exposure[p], LEAST_EXPOSURE))
@@ -126,8 +147,8 @@ def sum_pcd_pixels(
         for i in range(part.size):
             total[first + i] += part[i]
             total_square[first + i] += part[i] * part[i]
-        if width > 0.0:
-            _add_nuced(part, base, gain[p], bias[p], width, nuced_start, nuced, nuced_square, places, held)
+        if nuced.width > 0.0:
+            _add_nuced(part, base, gain[p], bias[p], nuced, places, held)
 
 
 @kernel(borrows=True)
@@ -159,10 +180,7 @@ def _add_nuced(
     base: float,
     gain: float,
     bias: float,
-    width: float,
-    nuced_start: int,
-    nuced: FloatArray,
-    nuced_square: FloatArray,
+    nuced: AxisSums,
     places: NDArray[np.int32],
     held: FloatArray,
 ) -> None:
@@ -173,22 +191,20 @@ def _add_nuced(
         base: first of these.
         gain: g.
         bias: mu.
-        width: of a bin, e-.
-        nuced_start: index of the first bin.
-        nuced: in and out, sums of the masses.
-        nuced_square: in and out, sums of their squares.
+        nuced: the bins.
         places: working memory, as long as ``part``.
-        held: working memory, all 0 before and after; one longer than ``nuced`` at either end.
+        held: working memory, all 0 before and after; one longer than the bins at either end.
     """
-    low, high, scale = nuced_start - 1.0, nuced_start + float(nuced.size), gain / width
+    total, square = nuced.total, nuced.square
+    low, high, scale = nuced.start - 1.0, nuced.start + float(total.size), gain / nuced.width
     for i in range(part.size):
         value = np.floor((base + i - bias) * scale + 0.5)
         places[i] = np.int32(min(max(value, low), high) - low)
     for i in range(part.size):
         held[places[i]] += part[i]
-    for j in range(max(places[0], 1), min(places[part.size - 1], nuced.size) + 1):
-        nuced[j - 1] += held[j]
-        nuced_square[j - 1] += held[j] * held[j]
+    for j in range(max(places[0], 1), min(places[part.size - 1], total.size) + 1):
+        total[j - 1] += held[j]
+        square[j - 1] += held[j] * held[j]
     held[places[0] : places[part.size - 1] + 1] = 0.0
 
 
@@ -199,13 +215,8 @@ def sort_masses(
     start: IntArray,
     gain: FloatArray,
     bias: FloatArray,
-    dn_start: int,
-    total: FloatArray,
-    total_square: FloatArray,
-    width: float,
-    nuced_start: int,
-    nuced: FloatArray,
-    nuced_square: FloatArray,
+    raw: AxisSums,
+    nuced: AxisSums,
     moments: FloatArray,
 ) -> None:
     """Add every pixel's masses, and their squares, at the integers and in the NUCed bins.
@@ -216,16 +227,12 @@ def sort_masses(
         start: place of its mass, shape (n + 1,).
         gain: g, shape (n,).
         bias: mu, shape (n,).
-        dn_start: first DN of the raw axis.
-        total: out, sums of the masses at each DN.
-        total_square: out, sums of their squares.
-        width: of a NUCed bin, e-.
-        nuced_start: index of the first bin.
-        nuced: out, sums of the masses.
-        nuced_square: out, sums of their squares.
+        raw: at the integers.
+        nuced: in the NUCed bins.
         moments: out, sums over pixels of the mean of the NUCed value and of its square.
     """
-    places, held = np.zeros(total.size, np.int32), np.zeros(nuced.size + 2)
+    dn_start, total, total_square = raw.start, raw.total, raw.square
+    places, held = np.zeros(total.size, np.int32), np.zeros(nuced.total.size + 2)
     for p in range(first.size):
         begin = start[p] + max(0, dn_start - first[p])
         end = min(start[p + 1], start[p] + dn_start + total.size - first[p])
@@ -238,8 +245,7 @@ def sort_masses(
             moments[1] += part[i] * value * value
             total[base + i - dn_start] += part[i]
             total_square[base + i - dn_start] += part[i] * part[i]
-        start_dn = float(base)
-        _add_nuced(part, start_dn, gain[p], bias[p], width, nuced_start, nuced, nuced_square, places, held)
+        _add_nuced(part, float(base), gain[p], bias[p], nuced, places, held)
 
 
 @kernel
@@ -438,24 +444,22 @@ def tally_counts(
     origin: IntArray,
     gain: FloatArray,
     bias: FloatArray,
-    dn_start: int,
-    raw: IntArray,
-    width: float,
-    nuced_start: int,
-    nuced: IntArray,
+    raw: AxisCounts,
+    nuced: AxisCounts,
     nuced_sums: FloatArray,
 ) -> tuple[np.int64, np.int64]:
     """Sort per-pixel histograms onto the DN axis and onto the NUCed axis.
 
     ``nuced_sums[p]`` receives the sums of the NUCed value and of its square over the pixel's samples, exact
-    before any binning. ``width <= 0`` leaves all that is NUCed out.
+    before any binning; where the NUCed axis has no width it receives nothing.
 
     Returns:
         How many samples fell outside of the DN axis, and outside of the NUCed axis.
     """
     outside, nuced_outside = np.int64(0), np.int64(0)
-    places, held = np.zeros(counts.shape[1], np.int32), np.zeros(nuced.size + 2, np.int64)
-    low, high = nuced_start - 1.0, nuced_start + float(nuced.size)
+    n_raw, n_nuced = raw.counts.size, nuced.counts.size
+    places, held = np.zeros(counts.shape[1], np.int32), np.zeros(n_nuced + 2, np.int64)
+    low, high = nuced.start - 1.0, nuced.start + float(n_nuced)
     for p in range(counts.shape[0]):
         begin, end = occupied(counts, p)
         offset, total = origin[p] - bias[p], np.int64(0)
@@ -466,24 +470,24 @@ def tally_counts(
             first += c * b
             second += c * b * b
         mean = first + offset * total
-        shift = origin[p] - dn_start
-        inside = min(max(begin, -shift), end), max(min(end, raw.size - shift), begin)
+        shift = origin[p] - raw.start
+        inside = min(max(begin, -shift), end), max(min(end, n_raw - shift), begin)
         for b in range(inside[0], inside[1]):
             c = np.int64(counts[p, b])
-            raw[b + shift] += c
+            raw.counts[b + shift] += c
             total -= c
         outside += total
-        if width <= 0.0:
+        if nuced.width <= 0.0:
             continue
         nuced_sums[p, 0] = gain[p] * mean
         nuced_sums[p, 1] = gain[p] * gain[p] * (second + offset * (first + mean))
-        scale = gain[p] / width
+        scale = gain[p] / nuced.width
         for b in range(begin, end):
             value = np.floor((origin[p] + b - bias[p]) * scale + 0.5)
             places[b] = np.int32(min(max(value, low), high) - low)
         for b in range(begin, end):
             held[places[b]] += np.int64(counts[p, b])
-    for j in range(nuced.size):
-        nuced[j] += held[j + 1]
-    nuced_outside += held[0] + held[nuced.size + 1]
+    for j in range(n_nuced):
+        nuced.counts[j] += held[j + 1]
+    nuced_outside += held[0] + held[n_nuced + 1]
     return outside, nuced_outside

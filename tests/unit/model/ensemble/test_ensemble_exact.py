@@ -105,10 +105,10 @@ def test_compiled_and_plain_kernels_agree() -> None:
     pixels, axis = make_pixels(6), NucedAxis(0.1, -20, 150)
     results = []
     for kernel in (ensemble_numba.sum_pcd_pixels, ensemble_numba.sum_pcd_pixels.py_func):
-        raw, square = np.zeros((2, 300))
-        bins, bins_square = np.zeros((2, axis.size))
-        kernel(*pixels.maps, 50, raw, square, axis.width, axis.start, bins, bins_square)
-        results.append(np.concatenate([raw, square, bins, bins_square]))
+        raw = ensemble_numba.AxisSums(50, 1.0, *np.zeros((2, 300)))
+        bins = ensemble_numba.AxisSums(axis.start, axis.width, *np.zeros((2, axis.size)))
+        kernel(tuple(pixels.maps), raw, bins)
+        results.append(np.concatenate([raw.total, raw.square, bins.total, bins.square]))
     np.testing.assert_allclose(*results, rtol=1e-13)
     for kernel in (normal_numba.add_density, normal_numba.add_mass):
         outs = np.zeros((2, 60))

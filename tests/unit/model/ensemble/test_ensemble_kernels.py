@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -35,11 +36,8 @@ ENSEMBLE: dict[str, tuple[Any, ...]] = {
         ORIGIN,
         G,
         MU,
-        12,
-        np.zeros(30, dtype=np.int64),
-        0.1,
-        -8,
-        np.zeros(50, dtype=np.int64),
+        ensemble_numba.AxisCounts(12, 1.0, np.zeros(30, dtype=np.int64)),
+        ensemble_numba.AxisCounts(-8, 0.1, np.zeros(50, dtype=np.int64)),
         np.zeros((3, 2)),
     ),
 }
@@ -78,15 +76,24 @@ ELECTRONS: dict[str, tuple[Any, ...]] = {
 def test_compiled_and_plain_agree(kernel: Any, arguments: tuple[Any, ...]) -> None:
     results = []
     for function in (kernel, kernel.py_func):
-        copies = [a.copy() if isinstance(a, np.ndarray) else a for a in arguments]
+        copies = copy.deepcopy(arguments)
         returned = function(*copies)
-        outputs = [c for c, a in zip(copies, arguments, strict=True) if isinstance(a, np.ndarray)]
-        results.append((returned, outputs))
         # something was written, and nothing but the outputs
-        arrays = [(c, a) for c, a in zip(copies, arguments, strict=True) if isinstance(a, np.ndarray)]
-        changed = [a for c, a in arrays if not np.array_equal(c, a)]
+        changed = [
+            (now, before)
+            for now, before in zip(arrays_in(copies), arrays_in(arguments), strict=True)
+            if not np.array_equal(now, before)
+        ]
         assert changed
-        assert not any(np.any(a) for a in changed)
+        assert not any(np.any(before) for _, before in changed)
+        results.append((returned, [now for now, _ in changed]))
     assert results[0][0] == results[1][0]
     for compiled, plain in zip(results[0][1], results[1][1], strict=True):
         np.testing.assert_allclose(compiled, plain, rtol=1e-13, atol=1e-18)
+
+
+def arrays_in(value: Any) -> list[np.ndarray]:
+    """Return the arrays of arguments, those in tuples too."""
+    if isinstance(value, tuple):
+        return [array for each in value for array in arrays_in(each)]
+    return [value] if isinstance(value, np.ndarray) else []
