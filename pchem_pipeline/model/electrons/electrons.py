@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.electrons import electrons_numba
-from pchem_pipeline.model.electrons.electrons_numba import NO_PRIOR
+from pchem_pipeline.model.electrons.electrons_numba import NO_PRIOR, CodeTables, PixelLaws, SampleNumbers
 from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
 from pchem_pipeline.model.law.parameters import FloatArray, Parameters, columns_of, usable_pixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -49,13 +49,13 @@ class KnownPixels:
         columns = columns_of(self.parameters)
         return np.where(usable_pixels(*columns.T), columns[:, 0], np.nan)
 
-    def kernel_inputs(self) -> tuple[FloatArray, FloatArray, Any]:
+    def kernel_inputs(self) -> PixelLaws:
         """Return parameters, free satellites and law as the loops take them."""
         columns = columns_of(self.parameters)
         n = len(columns)
         columns[np.isnan(self.exposure)] = np.nan
         columns[:, 0] = np.where(columns[:, 0] == 0.0, 1.0, columns[:, 0])  # the prior is given apart
-        return columns, satellites_of(self.parameters, self.satellites, n), pack([self.law], n)
+        return PixelLaws(columns, satellites_of(self.parameters, self.satellites, n), pack([self.law], n))
 
     def codes(
         self, counts: NDArray[np.integer[Any]] | None = None, origin: NDArray[np.integer[Any]] | None = None
@@ -66,9 +66,9 @@ class KnownPixels:
             counts: histograms whose samples are among the codes, too, shape (n, n_bins); None: no samples.
             origin: DN of their bin 0, shape (n,).
         """
-        inputs = self.kernel_inputs()
-        reach = np.empty((len(inputs[0]), 2), np.int64)
-        electrons_numba.find_reach(np.nan_to_num(self.exposure), *inputs, reach)
+        exposure = np.nan_to_num(self.exposure)
+        reach = np.empty((exposure.size, 2), np.int64)
+        electrons_numba.find_reach(exposure, self.kernel_inputs(), reach)
         low, high = reach.T
         if counts is None or origin is None:
             return low, np.minimum(high, low + _MOST_CODES)
@@ -135,6 +135,10 @@ class NumberTables:
         """What stands for no number."""
         return int(np.iinfo(self.number.dtype).max)
 
+    @property
+    def _tables(self) -> CodeTables:
+        return CodeTables(self.first, self.start, self.number, self.mass, self.right, self.expected)
+
     def convert(
         self, frames: NDArray[np.unsignedinteger[Any]], *, expected: bool = False, lift: int = 0
     ) -> Numbers:
@@ -149,11 +153,9 @@ class NumberTables:
         number = np.empty((n_frames, n), self.number.dtype)
         probability = np.empty((n_frames, n) if self.mass.size else (0, 0), np.float32)
         mean = np.empty((n_frames, n) if expected else (0, 0), np.float32)
-        places = self.first + lift, self.start
-        tables = self.number, self.mass, self.right, self.expected, self.missing
-        electrons_numba.convert_frames(
-            frames.reshape(n_frames, n), *places, *tables, number, probability, mean
-        )
+        lifted = self._tables._replace(first=self.first + lift)
+        out = SampleNumbers(number, probability, mean)
+        electrons_numba.convert_frames(frames.reshape(n_frames, n), lifted, self.missing, out)
         shape = (n_frames, *self.shape)
         return Numbers(
             number.reshape(shape),
@@ -174,9 +176,7 @@ class NumberTables:
         beyond = electrons_numba.tally_numbers(
             kernel_counts(counts),
             np.asarray(origin, dtype=np.int64),
-            self.first,
-            self.start,
-            self.number,
+            self._tables,
             self.missing,
             out,
         )
@@ -192,8 +192,7 @@ class NumberTables:
         """
         if data is not None:
             out, errors = np.zeros(n_k), np.empty(self.first.size)
-            inputs = data.exposure, *data.kernel_inputs()
-            electrons_numba.sum_outcomes(self.first, self.start, self.number, *inputs, out, errors)
+            electrons_numba.sum_outcomes(self._tables, data.exposure, data.kernel_inputs(), out, errors)
             return Outcomes(out, errors)
         pixel = np.repeat(np.arange(self.first.size), np.diff(self.start))
         right = np.bincount(pixel, self.right, self.first.size)
@@ -260,10 +259,8 @@ def number_tables(
     expected = np.empty(mass.size, np.float32)
     missing = int(np.iinfo(dtype).max)
     weights = np.full(n, NO_PRIOR) if prior is None else np.ascontiguousarray(prior.ravel(), np.float64)
-    tables = number, mass, right, expected
-    electrons_numba.fill_tables(
-        first, start, parts, weights, *pixels.kernel_inputs(), missing - 1, missing, *tables
-    )
+    tables = CodeTables(first, start, number, mass, right, expected)
+    electrons_numba.fill_tables(tables, parts, weights, pixels.kernel_inputs(), missing - 1, missing)
     return NumberTables(minimum.shape, first, start, number.astype(dtype, copy=False), mass, right, expected)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +31,52 @@ _LEAST_MASS = 1e-300
 _LEAST_LIKELY = 1e-17  # of an electron number
 
 
+class PixelLaws(NamedTuple):
+    """What n pixels and their samples follow.
+
+    Attributes:
+        parameters: (H, g, mu, sigma), shape (n, 4).
+        satellites: amplitude (e-) and weight of free satellites, shape (n, 2).
+        law: of the samples.
+    """
+
+    parameters: FloatArray
+    satellites: FloatArray
+    law: Law
+
+
+class CodeTables(NamedTuple):
+    """What each code of n pixels says of the electron number, one pixel after the other.
+
+    Attributes:
+        first: first code of each pixel, shape (n,).
+        start: place of it in the tables; the last element is their length, shape (n + 1,).
+        number: the most probable one.
+        mass: P(code); empty: not wanted.
+        right: P(code, and the number is right); likewise.
+        expected: E[k | x], e-; likewise, and NaN where the law expects no such code.
+    """
+
+    first: IntArray
+    start: IntArray
+    number: NDArray[Any]
+    mass: FloatArray
+    right: FloatArray
+    expected: NDArray[np.float32]
+
+
+class SampleNumbers(NamedTuple):
+    """What samples say of the electron number, shape (frame, n) each; the last two may be empty."""
+
+    number: NDArray[Any]
+    probability: NDArray[np.float32]
+    expected: NDArray[np.float32]
+
+
 @kernel
-def find_reach(
-    exposure: FloatArray, parameters: FloatArray, satellites: FloatArray, law: Law, out: IntArray
-) -> None:
+def find_reach(exposure: FloatArray, pixels: PixelLaws, out: IntArray) -> None:
     """Fill the first and last code that each pixel shows, DN, shape (n, 2); (0, -1) without parameters."""
+    parameters, satellites, law = pixels
     pixel, scratch = pixel_scratch(2, law)
     theta = scratch.small[OWN]
     for p in range(exposure.size):
@@ -56,37 +97,20 @@ def _longest(start: IntArray) -> int:
 
 @kernel
 def fill_tables(
-    first: IntArray,
-    start: IntArray,
-    parts: int,
-    prior: FloatArray,
-    parameters: FloatArray,
-    satellites: FloatArray,
-    law: Law,
-    largest: int,
-    missing: int,
-    number: NDArray[Any],
-    mass: FloatArray,
-    right: FloatArray,
-    expected: NDArray[np.float32],
+    tables: CodeTables, parts: int, prior: FloatArray, pixels: PixelLaws, largest: int, missing: int
 ) -> None:
     """Fill, for each code of each pixel, the most probable electron number, how probable, and the mean.
 
     Args:
-        first: first code of each pixel, in parts of a DN, shape (n,).
-        start: place of its first code in the tables; the last element is their length, shape (n + 1,).
+        tables: in, the codes, in parts of a DN; out, the rest, NaN for pixels without parameters.
         parts: codes in a DN.
         prior: exposure to expect, e-; ``NO_PRIOR``: all numbers alike; shape (n,).
-        parameters: (H, g, mu, sigma), shape (n, 4).
-        satellites: amplitude (e-) and weight of free satellites, shape (n, 2).
-        law: of the samples.
+        pixels: what they follow.
         largest: electron numbers above are cut to this.
         missing: what codes of pixels without parameters get.
-        number: out.
-        mass: out, P(code); NaN without parameters. Empty: not wanted.
-        right: out, P(code, and the number is right); likewise.
-        expected: out, E[k | x], e-; likewise, and NaN where the law expects no such code.
     """
+    first, start, number, mass, right, expected = tables
+    parameters, satellites, law = pixels
     most = _longest(start)
     pixel, scratch = pixel_scratch(most + 2, law)
     detailed, share = mass.size > 0, share_scratch(most)
@@ -135,29 +159,19 @@ def fill_tables(
 
 @kernel
 def sum_outcomes(
-    first: IntArray,
-    start: IntArray,
-    number: NDArray[Any],
-    exposure: FloatArray,
-    parameters: FloatArray,
-    satellites: FloatArray,
-    law: Law,
-    out: FloatArray,
-    errors: FloatArray,
+    tables: CodeTables, exposure: FloatArray, pixels: PixelLaws, out: FloatArray, errors: FloatArray
 ) -> None:
     """Add, over pixels, the probability that the number in the table is k; ``errors[p]`` that it is wrong.
 
     Args:
-        first: first code of each pixel, DN, shape (n,).
-        start: place of its first code in the table, shape (n + 1,).
-        number: the table.
+        tables: by whole DN.
         exposure: of the pixels, e-, shape (n,).
-        parameters: (H, g, mu, sigma) that the data follow, shape (n, 4).
-        satellites: amplitude (e-) and weight of free satellites, shape (n, 2).
-        law: of the samples.
+        pixels: what the data follow.
         out: out, by electron number.
         errors: out, shape (n,); what lies beyond the table counts as wrong; NaN without parameters.
     """
+    first, start, number = tables.first, tables.start, tables.number
+    parameters, satellites, law = pixels
     most = _longest(start)
     pixel, scratch = pixel_scratch(most + 2, law)
     theta, share = scratch.small[OWN], share_scratch(most)
@@ -187,15 +201,10 @@ def sum_outcomes(
 
 @kernel
 def tally_numbers(
-    counts: NDArray[Any],
-    origin: IntArray,
-    first: IntArray,
-    start: IntArray,
-    number: NDArray[Any],
-    missing: int,
-    out: IntArray,
+    counts: NDArray[Any], origin: IntArray, tables: CodeTables, missing: int, out: IntArray
 ) -> np.int64:
     """Add the electron numbers of per-pixel histograms to ``out[k]``; return how many lie beyond it."""
+    first, start, number = tables.first, tables.start, tables.number
     beyond = np.int64(0)
     for p in range(counts.shape[0]):
         for b in range(counts.shape[1]):
@@ -211,45 +220,27 @@ def tally_numbers(
 
 
 @kernel
-def convert_frames(
-    frames: NDArray[Any],
-    first: IntArray,
-    start: IntArray,
-    number: NDArray[Any],
-    mass: FloatArray,
-    right: FloatArray,
-    expected: NDArray[np.float32],
-    missing: int,
-    out_number: NDArray[Any],
-    out_probability: NDArray[np.float32],
-    out_expected: NDArray[np.float32],
-) -> None:
+def convert_frames(frames: NDArray[Any], tables: CodeTables, missing: int, out: SampleNumbers) -> None:
     """Look every sample up in the table of its pixel.
 
     Args:
         frames: codes, shape (frame, n).
-        first: first code of each pixel, shape (n,).
-        start: place of its first code in the tables, shape (n + 1,).
-        number: the table of the numbers.
-        mass: that of the codes' probabilities.
-        right: that of the parts of these in which the number is right.
-        expected: that of the means.
+        tables: of the pixels.
         missing: number of a code that is not in the table.
-        out_number: out, shape of the frames.
-        out_probability: out, likewise; or empty.
-        out_expected: out, likewise; or empty.
+        out: out.
     """
-    with_probability, with_expected = out_probability.size > 0, out_expected.size > 0
+    first, start, number, mass, right, expected = tables
+    with_probability, with_expected = out.probability.size > 0, out.expected.size > 0
     for t in range(frames.shape[0]):
         for p in range(frames.shape[1]):
             i = start[p] + np.int64(frames[t, p]) - first[p]
             known = start[p] <= i < start[p + 1]
-            out_number[t, p] = number[i] if known else missing
+            out.number[t, p] = number[i] if known else missing
             if with_probability:
                 sure = known and mass[i] > _LEAST_MASS
-                out_probability[t, p] = np.float32(right[i] / mass[i] if sure else math.nan)
+                out.probability[t, p] = np.float32(right[i] / mass[i] if sure else math.nan)
             if with_expected:
-                out_expected[t, p] = expected[i] if known else np.float32(math.nan)
+                out.expected[t, p] = expected[i] if known else np.float32(math.nan)
 
 
 @kernel

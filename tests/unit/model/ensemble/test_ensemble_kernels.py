@@ -25,6 +25,15 @@ NUMBERS = np.array([[0, 3, 65535], [2, 2, 9]], dtype=np.uint16)
 TRUE = np.array([[0, 2, 1], [2, 5, 1]], dtype=np.uint32)
 TABLE = np.random.default_rng(2).integers(0, 9, 120).astype(np.uint16)
 PIXELS = KnownPixels([H, G, MU, SIGMA], SampleLaw()).kernel_inputs()
+EMPTY_TABLES = electrons_numba.CodeTables(
+    ORIGIN,
+    np.arange(4) * 40,
+    np.zeros(120, np.uint16),
+    np.zeros(120),
+    np.zeros(120),
+    np.zeros(120, np.float32),
+)
+NUMBER_TABLES = EMPTY_TABLES._replace(number=TABLE)
 
 ENSEMBLE: dict[str, tuple[Any, ...]] = {
     "sum_pcd_cells": (SHARE, H, G, MU, SIGMA, 3, np.zeros(90)),
@@ -45,22 +54,10 @@ PLAIN = np.stack([H, G, MU, SIGMA], axis=1)
 THRESHOLDS = (COUNTS, ORIGIN, PLAIN, 9, np.zeros(8, dtype=np.int64), np.zeros(8), np.zeros(3))
 ELECTRONS: dict[str, tuple[Any, ...]] = {
     "count_errors": (NUMBERS, TRUE, 65535, np.zeros(4, dtype=np.int64)),
-    "tally_numbers": (COUNTS, ORIGIN, ORIGIN, np.arange(4) * 40, TABLE, 65535, np.zeros(5, dtype=np.int64)),
-    "find_reach": (H, *PIXELS, np.zeros((3, 2), dtype=np.int64)),
-    "fill_tables": (
-        ORIGIN,
-        np.arange(4) * 40,
-        1,
-        H,
-        *PIXELS,
-        9,
-        65535,
-        np.zeros(120, np.uint16),
-        np.zeros(120),
-        np.zeros(120),
-        np.zeros(120, np.float32),
-    ),
-    "sum_outcomes": (ORIGIN, np.arange(4) * 40, TABLE, H, *PIXELS, np.zeros(6), np.zeros(3)),
+    "tally_numbers": (COUNTS, ORIGIN, NUMBER_TABLES, 65535, np.zeros(5, dtype=np.int64)),
+    "find_reach": (H, PIXELS, np.zeros((3, 2), dtype=np.int64)),
+    "fill_tables": (EMPTY_TABLES, 1, H, PIXELS, 9, 65535),
+    "sum_outcomes": (NUMBER_TABLES, H, PIXELS, np.zeros(6), np.zeros(3)),
 }
 
 
