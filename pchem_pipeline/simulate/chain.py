@@ -18,7 +18,7 @@ import numpy as np
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.plane import Plane
-from pchem_pipeline.simulate.chain_numba import draw_rows, simulate_rows
+from pchem_pipeline.simulate.chain_numba import SampleKeys, draw_rows, simulate_rows
 from pchem_pipeline.simulate.streams import (
     KeyedStreams,
     make_key,
@@ -103,10 +103,12 @@ def _simulate_plain(
         band.conversion_gain,
         band.bias,
         band.analog_read_noise_e,
-        to_words(np.arange(*frames)),
-        to_words(np.arange(*rows)),
-        to_words(np.arange(settings.shape[1])),
-        *make_key(settings.seed, _SAMPLE_PURPOSE),
+        SampleKeys(
+            to_words(np.arange(*frames)),
+            to_words(np.arange(*rows)),
+            to_words(np.arange(settings.shape[1])),
+            make_key(settings.seed, _SAMPLE_PURPOSE),
+        ),
         float(2**settings.bit_depth - 1),
         dn,
         electrons,
@@ -186,9 +188,8 @@ class _Block:
         truth, words = self.truth, self._words()
         shape = tuple(axis.size for axis in words)
         charge, noise = np.empty(shape, np.int64), np.empty(shape)
-        key = make_key(self.settings.seed, _SAMPLE_PURPOSE)
-        maps = truth.quanta_exposure, truth.analog_read_noise_e
-        draw_rows(*maps, *words, *key, charge, noise)
+        keys = SampleKeys(*words, make_key(self.settings.seed, _SAMPLE_PURPOSE))
+        draw_rows(truth.quanta_exposure, truth.analog_read_noise_e, keys, charge, noise)
         return np.broadcast_to(truth.quanta_exposure, shape), charge, noise
 
     def _streams(self, purpose: str) -> KeyedStreams:

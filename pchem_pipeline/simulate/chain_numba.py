@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.simulate.streams_numba import (
@@ -11,6 +14,34 @@ from pchem_pipeline.simulate.streams_numba import (
     poisson_table,
     uniform_row,
 )
+
+FloatArray = NDArray[np.float64]
+
+
+class SampleKeys(NamedTuple):
+    """What the random numbers of samples come from.
+
+    Attributes:
+        frames, ys, xs: counter words of frames, rows and columns, uint64.
+        key: two words.
+    """
+
+    frames: NDArray[np.uint64]
+    ys: NDArray[np.uint64]
+    xs: NDArray[np.uint64]
+    key: tuple[np.uint64, np.uint64]
+
+
+class _Row(NamedTuple):
+    """Room for a row of samples: tables of the electron numbers, uniform and normal numbers."""
+
+    tables: FloatArray
+    first: NDArray[np.int64]
+    length: NDArray[np.int64]
+    u: FloatArray
+    v: FloatArray
+    z: FloatArray
+
 
 # tables up to this length are searched from the bottom, longer ones by bisection
 _LINEAR = 48
@@ -44,40 +75,39 @@ def _widest(mean):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fill_tables(exposure, tables, first, length):  # type: ignore[no-untyped-def]
-    """Fill the tables of the electron numbers of a row of pixels."""
-    for x in range(exposure.size):
+def _prepared(exposure, n):  # type: ignore[no-untyped-def]
+    """Return the room for a row of pixels with the tables of their electron numbers."""
+    tables, first, length = np.empty((n, _widest(exposure))), np.empty(n, np.int64), np.empty(n, np.int64)
+    for x in range(n):
         first[x], length[x] = poisson_table(exposure[x], tables[x])
+    return _Row(tables, first, length, np.empty(n), np.empty(n), np.empty(n))
 
 
 @kernel
-def _draw_row(frame, y, xs, k0, k1, tables, first, length, u, v, k, z):  # type: ignore[no-untyped-def]
-    """Fill the electron numbers ``k`` of a row in a frame, and its normal numbers ``z``."""
-    uniform_row(frame, y, xs, np.uint64(0), k0, k1, u, v)
-    normal_from_uniform(v, z)
-    for x in range(xs.size):
-        k[x] = first[x] + _look_up(tables[x], length[x], u[x])
+def _draw_row(frame, y, keys, row, k):  # type: ignore[no-untyped-def]
+    """Fill the electron numbers ``k`` of a row in a frame, and its normal numbers ``row.z``."""
+    uniform_row(frame, y, keys.xs, np.uint64(0), keys.key[0], keys.key[1], row.u, row.v)
+    normal_from_uniform(row.v, row.z)
+    for x in range(keys.xs.size):
+        k[x] = row.first[x] + _look_up(row.tables[x], row.length[x], row.u[x])
 
 
 @kernel
-def simulate_rows(  # type: ignore[no-untyped-def]
-    exposure, gain, bias, noise, frames, ys, xs, k0, k1, top, dn, electrons
-):
+def simulate_rows(exposure, gain, bias, noise, keys, top, dn, electrons):  # type: ignore[no-untyped-def]
     """Fill ``dn`` (frame, y, x), and ``electrons`` as far as it has frames.
 
-    Maps are (y, x) of the band, e-, e-/DN, DN, e-; coordinates uint64; ``top`` the largest DN.
+    Maps are (y, x) of the band, e-, e-/DN, DN, e-; ``keys`` those of :class:`SampleKeys`; ``top`` the largest
+    DN.
     """
-    nx = xs.size
-    u, v, z, k = np.empty(nx), np.empty(nx), np.empty(nx), np.empty(nx)
-    first, length = np.empty(nx, np.int64), np.empty(nx, np.int64)
-    for y in range(ys.size):
-        tables = np.empty((nx, _widest(exposure[y])))
-        _fill_tables(exposure[y], tables, first, length)
-        for t in range(frames.size):
-            _draw_row(frames[t], ys[y], xs, k0, k1, tables, first, length, u, v, k, z)
+    nx = keys.xs.size
+    k = np.empty(nx)
+    for y in range(keys.ys.size):
+        row = _prepared(exposure[y], nx)
+        for t in range(keys.frames.size):
+            _draw_row(keys.frames[t], keys.ys[y], keys, row, k)
             line = dn[t, y]
             for x in range(nx):
-                value = np.rint((k[x] + noise[y, x] * z[x]) / gain[y, x] + bias[y, x])
+                value = np.rint((k[x] + noise[y, x] * row.z[x]) / gain[y, x] + bias[y, x])
                 line[x] = dn.dtype.type(min(max(value, 0.0), top))
             if t < electrons.shape[0]:
                 for x in range(nx):
@@ -85,18 +115,15 @@ def simulate_rows(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def draw_rows(exposure, noise, frames, ys, xs, k0, k1, charge, read_noise):  # type: ignore[no-untyped-def]
+def draw_rows(exposure, noise, keys, charge, read_noise):  # type: ignore[no-untyped-def]
     """Fill ``charge`` and ``read_noise`` (frame, y, x), e-, with the draws of :func:`simulate_rows`.
 
     For chains whose exposure is the same in all frames: a table for each pixel is built once.
     """
-    nx = xs.size
-    u, v, z = np.empty(nx), np.empty(nx), np.empty(nx)
-    first, length = np.empty(nx, np.int64), np.empty(nx, np.int64)
-    for y in range(ys.size):
-        tables = np.empty((nx, _widest(exposure[y])))
-        _fill_tables(exposure[y], tables, first, length)
-        for t in range(frames.size):
-            _draw_row(frames[t], ys[y], xs, k0, k1, tables, first, length, u, v, charge[t, y], z)
+    nx = keys.xs.size
+    for y in range(keys.ys.size):
+        row = _prepared(exposure[y], nx)
+        for t in range(keys.frames.size):
+            _draw_row(keys.frames[t], keys.ys[y], keys, row, charge[t, y])
             for x in range(nx):
-                read_noise[t, y, x] = noise[y, x] * z[x]
+                read_noise[t, y, x] = noise[y, x] * row.z[x]

@@ -158,26 +158,21 @@ def estimate_offsets(
 
     n, ny, nx = frames.shape
     m = len(modes.parts)
-    rows, columns, left = np.empty((n, m, ny)), np.empty((n, m, nx)), np.empty((n, m))
-    waves = np.empty((n, len(modes.waves), 2))
+    out = common_modes_numba.Offsets(
+        np.empty((n, m, ny)), np.empty((n, m, nx)), np.empty((n, len(modes.waves), 2)), np.empty((n, m))
+    )
     down, along = (np.stack([each.real, each.imag], axis=1) for each in modes.turns((ny, nx)))
-    tables = common_modes_numba.Waves(
+    waves = common_modes_numba.Waves(
         down, along, modes.waves[:, 2].copy(), modes.waves[:, 3].astype(np.int64)
     )
     sigma = np.sqrt(calibration.noise_variance_dn2)
     known = np.where(np.isfinite(sigma), scene, np.nan)
     common_modes_numba.find_offsets(
         frames,
-        np.ascontiguousarray(known),
-        calibration.conversion_gain,
-        calibration.bias,
-        sigma,
-        modes.parts,
-        modes.variances,
-        tables,
-        rows,
-        columns,
-        waves,
-        left,
+        common_modes_numba.Pixels(
+            np.ascontiguousarray(known), calibration.conversion_gain, calibration.bias, sigma
+        ),
+        common_modes_numba.Modes(modes.parts, modes.variances, waves),
+        out,
     )
-    return Offsets(rows, columns, waves, left)
+    return Offsets(*out)

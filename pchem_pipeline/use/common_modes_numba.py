@@ -34,6 +34,52 @@ class Waves(NamedTuple):
     parts: NDArray[np.int64]
 
 
+class Pixels(NamedTuple):
+    """What is known of the pixels, shape (y, x) each.
+
+    Attributes:
+        exposure: H to expect, e-; NaN: a pixel that is left out.
+        gain: g, e-/DN.
+        bias: mu, DN.
+        sigma: noise of the pixel alone, DN.
+    """
+
+    exposure: FloatArray
+    gain: FloatArray
+    bias: FloatArray
+    sigma: FloatArray
+
+
+class Modes(NamedTuple):
+    """Which offsets there are.
+
+    Attributes:
+        parts: pixels that share offsets, shape (part, y, x).
+        variances: of the offsets of frames, rows and columns of each part, DN^2, shape (part, 3).
+        waves: periodic patterns.
+    """
+
+    parts: BoolArray
+    variances: FloatArray
+    waves: Waves
+
+
+class Offsets(NamedTuple):
+    """Offsets of frames.
+
+    Attributes:
+        rows: DN, that of the whole frame with it, shape (frame, part, y).
+        columns: DN, shape (frame, part, x).
+        coefficients: of cosine and sine of the waves, DN, shape (frame, wave, 2).
+        left: variance of a sample's offset after all that is known, DN^2, shape (frame, part).
+    """
+
+    rows: FloatArray
+    columns: FloatArray
+    coefficients: FloatArray
+    left: FloatArray
+
+
 @kernel
 def _score(difference: float, exposure: float, gain: float, sigma: float, reach: int) -> tuple[float, float]:
     """Return the slope of the log-likelihood in an offset, 1/DN, and the information, 1/DN^2.
@@ -64,18 +110,12 @@ def _score(difference: float, exposure: float, gain: float, sigma: float, reach:
 
 
 @kernel
-def _from_means(
-    frame: NDArray[Any],
-    exposure: FloatArray,
-    gain: FloatArray,
-    bias: FloatArray,
-    sigma: FloatArray,
-    form: FloatArray,
-) -> None:
+def _from_means(frame: NDArray[Any], pixels: Pixels, form: FloatArray) -> None:
     """Fill the quadratic form of the offsets by the means of the samples.
 
     They tell offsets beyond half an electron apart.
     """
+    exposure, gain, bias, sigma = pixels
     for y in range(frame.shape[0]):
         for x in range(frame.shape[1]):
             form[0, y, x] = form[1, y, x] = 0.0
@@ -86,16 +126,9 @@ def _from_means(
 
 
 @kernel
-def _from_electrons(
-    frame: NDArray[Any],
-    exposure: FloatArray,
-    gain: FloatArray,
-    bias: FloatArray,
-    sigma: FloatArray,
-    offset: FloatArray,
-    form: FloatArray,
-) -> None:
+def _from_electrons(frame: NDArray[Any], pixels: Pixels, offset: FloatArray, form: FloatArray) -> None:
     """Fill the quadratic form of the offsets by the electron numbers of the samples, around some offsets."""
+    exposure, gain, bias, sigma = pixels
     for y in range(frame.shape[0]):
         for x in range(frame.shape[1]):
             form[0, y, x] = form[1, y, x] = 0.0
@@ -132,17 +165,24 @@ def _of_part(form: FloatArray, mask: BoolArray, offset: FloatArray, out: FloatAr
 @kernel
 def _climb_parts(
     form: FloatArray,
-    parts: BoolArray,
-    variances: FloatArray,
+    modes: Modes,
     whole: FloatArray,
-    rows: FloatArray,
-    columns: FloatArray,
-    waves: Waves,
-    coefficients: FloatArray,
+    lines: tuple[FloatArray, FloatArray, FloatArray],
     offset: FloatArray,
     own: FloatArray,
 ) -> None:
-    """Bring the offsets of all parts to the top of a quadratic form, part by part, wave by wave."""
+    """Bring the offsets of all parts to the top of a quadratic form, part by part, wave by wave.
+
+    Args:
+        form: of the samples, shape (2, y, x).
+        modes: which offsets there are.
+        whole: in and out, of the frame, shape (part,).
+        lines: in and out, of the rows, of the columns, and coefficients of the waves.
+        offset: in and out, of the samples, shape (y, x).
+        own: working memory, shape of the form.
+    """
+    parts, variances, waves = modes
+    rows, columns, coefficients = lines
     for _ in range(1 if len(parts) + len(coefficients) == 1 else _SWEEPS):
         for wave in range(len(coefficients)):
             _climb_wave(form, parts[waves.parts[wave]], waves, wave, coefficients[wave], offset)
@@ -248,20 +288,7 @@ def _unknown(weight: FloatArray, mask: BoolArray, variances: FloatArray) -> floa
 
 
 @kernel
-def find_offsets(
-    frames: NDArray[Any],
-    exposure: FloatArray,
-    gain: FloatArray,
-    bias: FloatArray,
-    sigma: FloatArray,
-    parts: BoolArray,
-    variances: FloatArray,
-    waves: Waves,
-    rows: FloatArray,
-    columns: FloatArray,
-    coefficients: FloatArray,
-    left: FloatArray,
-) -> None:
+def find_offsets(frames: NDArray[Any], pixels: Pixels, modes: Modes, out: Offsets) -> None:
     """Fill the most probable offsets of rows, columns and waves of each frame.
 
     That of the whole frame is with its rows. Offsets are normal with the given variances; 0 is no such
@@ -270,38 +297,29 @@ def find_offsets(
 
     Args:
         frames: DN, shape (frame, y, x).
-        exposure: H to expect, e-, shape (y, x); NaN: a pixel that is left out.
-        gain: g, e-/DN, shape (y, x).
-        bias: mu, DN, shape (y, x).
-        sigma: noise of the pixel alone, DN, shape (y, x).
-        parts: pixels that share offsets, shape (part, y, x).
-        variances: of the offsets of frames, rows and columns of each part, DN^2, shape (part, 3).
-        waves: periodic patterns.
-        rows: out, DN, shape (frame, part, y).
-        columns: out, DN, shape (frame, part, x).
-        coefficients: out, of cosine and sine of the waves, DN, shape (frame, wave, 2).
-        left: out, variance of a sample's offset after all that is known, DN^2, shape (frame, part).
+        pixels: what is known of them.
+        modes: which offsets there are.
+        out: out.
     """
+    parts, variances, waves = modes
     n_parts, ny, nx = parts.shape
     form, own, offset = np.empty((2, ny, nx)), np.empty((2, ny, nx)), np.empty((ny, nx))
     whole = np.empty(n_parts)
     for t in range(len(frames)):
         whole[:] = 0.0
-        rows[t] = 0.0
-        columns[t] = 0.0
-        coefficients[t] = 0.0
+        lines = out.rows[t], out.columns[t], out.coefficients[t]
+        for line in lines:
+            line[:] = 0.0
         offset[:] = 0.0
-        _from_means(frames[t], exposure, gain, bias, sigma, form)
-        _climb_parts(form, parts, variances, whole, rows[t], columns[t], waves, coefficients[t], offset, own)
+        _from_means(frames[t], pixels, form)
+        _climb_parts(form, modes, whole, lines, offset, own)
         for _ in range(_ROUNDS - 1):
-            _from_electrons(frames[t], exposure, gain, bias, sigma, offset, form)
-            _climb_parts(
-                form, parts, variances, whole, rows[t], columns[t], waves, coefficients[t], offset, own
-            )
+            _from_electrons(frames[t], pixels, offset, form)
+            _climb_parts(form, modes, whole, lines, offset, own)
         for part in range(n_parts):
-            rows[t, part] += whole[part]
-            left[t, part] = _unknown(form[1], parts[part], variances[part])
+            out.rows[t, part] += whole[part]
+            out.left[t, part] = _unknown(form[1], parts[part], variances[part])
         for wave, part in enumerate(waves.parts):
             # each coefficient is known by half of the samples' information, and cos^2 + sin^2 = 1
             known = 0.5 * np.sum(form[1] * parts[part])
-            left[t, part] += 1.0 / (known + 1.0 / waves.variances[wave])
+            out.left[t, part] += 1.0 / (known + 1.0 / waves.variances[wave])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,26 @@ _LEAST_WEIGHT = 1e-6  # of a rival: less moves no standard error
 _MOST_STEPS = 200
 _PRECISION = 1e-9
 _OUTSIDE = 0.05  # part of a standard error by which a parameter is moved to find its slope
+
+
+class _Samples(NamedTuple):
+    """The samples of a pixel, with room to evaluate them.
+
+    Attributes:
+        codes: at which they are.
+        pixel: its law.
+        weight: of its free satellites.
+        theta: room for its parameters.
+        counts: samples at each code.
+        sums: room, shape (3, codes).
+    """
+
+    codes: Codes
+    pixel: Pixel
+    weight: float
+    theta: FloatArray
+    counts: FloatArray
+    sums: FloatArray
 
 
 @kernel
@@ -96,17 +116,9 @@ def _climb(start: float, cells: Cells, levels: Levels, counts: FloatArray, sums:
 
 
 @kernel
-def _score_at(
-    exposure: float,
-    parameters: FloatArray,
-    weight: float,
-    codes: Codes,
-    pixel: Pixel,
-    theta: FloatArray,
-    counts: FloatArray,
-    sums: FloatArray,
-) -> float:
+def _score_at(exposure: float, parameters: FloatArray, samples: _Samples) -> float:
     """Return the slope of the log-likelihood in H under other parameters."""
+    codes, pixel, weight, theta, counts, sums = samples
     known_theta(parameters, pixel.centre, weight, theta)
     cells = cells_of(pixel, np.int64(0))
     levels = list_levels(theta, cells, codes)
@@ -173,10 +185,9 @@ def estimate_exposures(
         if not curvature > 0.0:
             continue
         out[index, 1] = 1.0 / math.sqrt(curvature)
-        out[index, 2] = _from_calibration(
-            near, score / near, curvature, parameters[index], covariance[index], satellites[index, 1],
-            codes, pixel, theta, moved, seen, sums,
-        )  # fmt: skip
+        samples = _Samples(codes, pixel, satellites[index, 1], theta, seen, sums)
+        slope = near, score / near, curvature
+        out[index, 2] = _from_calibration(slope, parameters[index], covariance[index], samples, moved)
         for rival in rivals[index]:
             if rival[0] > _LEAST_WEIGHT:
                 moved[1:] = rival[1:]
@@ -188,20 +199,22 @@ def estimate_exposures(
 
 @kernel
 def _from_calibration(
-    exposure: float,
-    score: float,
-    curvature: float,
+    slope: tuple[float, float, float],
     parameters: FloatArray,
     covariance: FloatArray,
-    weight: float,
-    codes: Codes,
-    pixel: Pixel,
-    theta: FloatArray,
+    samples: _Samples,
     moved: FloatArray,
-    counts: FloatArray,
-    sums: FloatArray,
 ) -> float:
-    """Return the standard error of H from those of g, mu and sigma, by the implicit function theorem."""
+    """Return the standard error of H from those of g, mu and sigma, by the implicit function theorem.
+
+    Args:
+        slope: H, and slope and curvature of the log-likelihood there.
+        parameters: (H, g, mu, sigma).
+        covariance: of (g, mu, sigma), shape (3, 3).
+        samples: of the pixel.
+        moved: working memory, shape (4,).
+    """
+    exposure, score, curvature = slope
     slopes = np.zeros(3)
     for j in range(3):
         step = _OUTSIDE * math.sqrt(covariance[j, j])
@@ -212,7 +225,7 @@ def _from_calibration(
         for i in range(4):
             moved[i] = parameters[i]
         moved[1 + j] += step
-        ahead = _score_at(exposure, moved, weight, codes, pixel, theta, counts, sums)
+        ahead = _score_at(exposure, moved, samples)
         slopes[j] = (ahead - score) / (step * curvature)
     variance = 0.0
     for i in range(3):
