@@ -1,10 +1,11 @@
 """Places whose pixels share noise of their rows, columns or frames: a scan over all pairs of pixels.
 
-Of every band of lines, every band across them, every rectangle and every n-th line the mean covariance of the
-pairs inside is compared with that of all other pairs, so that noise which all pixels share has no place. The
-standard error is ``1 / sqrt(N)`` of N pairs (:mod:`.observe.pairs`), or what the frames' scatter gives where
-that is more; the sum of squares behind it is skewed, which Wilson and Hilferty's root takes away. The
-probability is the union bound over the places of the family, the families, modes and channels.
+Of every band of lines, every band across them, every rectangle, every n-th line, and the lines that stand out
+each by itself the mean covariance of the pairs inside is compared with that of all other pairs, so that noise
+which all pixels share has no place. The standard error is ``1 / sqrt(N)`` of N pairs (:mod:`.observe.pairs`),
+or what the frames' scatter gives where that is more; the sum of squares behind it is skewed, which Wilson and
+Hilferty's root takes away. The probability is the union bound over the places of the family, the families,
+modes and channels.
 """
 
 from __future__ import annotations
@@ -28,9 +29,10 @@ BoolArray = NDArray[np.bool_]
 _PERIODS = (2, 4, 8, 16, 32)
 _FEWEST_LINES = 2  # of a period
 #: Guesses that are held against the scatter of the frames, the most significant first.
-_MEASURED = 6
-#: Families of places: bands of lines, bands across them, rectangles, periods.
-_FAMILIES = 4
+_MEASURED = 8
+#: Families of places: bands of lines, bands across them, rectangles, periods, scattered lines.
+_FAMILIES = 5
+_LINE_BY_CHANCE = 1e-4  # probability of a line that stands out by itself, among all
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class _Best:
-    """The best place of a family: cells of lines and across them (or a tap), z, pairs, number of places."""
+    """The best place of a family: cells of lines and across them, or a tap, or lines; z, number of places."""
 
     family: str
     z: float
@@ -73,6 +75,7 @@ class _Best:
     lines: tuple[int, int] = (0, 0)
     across: tuple[int, int] = (0, 0)
     taps: Taps | None = None
+    scattered: tuple[int, ...] = ()
 
 
 def scan_pairs(
@@ -106,7 +109,11 @@ def _most_significant(samples: Samples, log_limit: float, limits: Limits) -> Sha
             (_log_p(best.z, best.places), channel, pairs, best)
             for channel, modes in enumerate(pairs_of(samples))
             for pairs in modes.values()
-            for best in (*_boxes(pairs, samples.usable, limits), *_periods(pairs))
+            for best in (
+                *_boxes(pairs, samples.usable, limits),
+                *_periods(pairs),
+                *_scattered(pairs, samples.usable, limits),
+            )
         ),
         key=lambda guess: guess[0],
     )
@@ -133,11 +140,16 @@ def _region(best: _Best, pairs: Pairs, shape: tuple[int, int]) -> Region | None:
     if best.taps is not None:
         return Region(taps=best.taps)
     mask = np.zeros(shape, np.bool_)
-    lines, across = (
-        slice(int(edges[a]), int(edges[b]))
-        for edges, (a, b) in ((pairs.lines, best.lines), (pairs.across, best.across))
-    )
-    mask[(across, lines) if pairs.mode == "column" else (lines, across)] = True
+    turned = mask.T if pairs.mode == "column" else mask
+    if best.scattered:
+        for line in best.scattered:
+            turned[pairs.lines[line] : pairs.lines[line + 1]] = True
+    else:
+        lines, across = (
+            slice(int(edges[a]), int(edges[b]))
+            for edges, (a, b) in ((pairs.lines, best.lines), (pairs.across, best.across))
+        )
+        turned[lines, across] = True
     return None if mask.all() else Region.of_mask(mask)
 
 
@@ -243,3 +255,31 @@ def _periods(pairs: Pairs) -> list[_Best]:
                     )
                     best = _Best("period", z, 1.0, taps=taps)
     return [replace(best, places=float(tried))] if best.z > 0 else []
+
+
+def _scattered(pairs: Pairs, usable: BoolArray, limits: Limits) -> list[_Best]:
+    """Return the rows (columns) that stand out each by itself, where they are more than one band."""
+    if pairs.mode == "frame":
+        return []
+    n, every = pairs.lines.size - 1, (np.array([0]), np.array([pairs.across.size - 1]))
+    sums, counts = (
+        np.diff(np.append(0.0, pairs.from_line(pairs.boxes(table, *every), 0)[:, 0]))
+        for table in (pairs.sums, pairs.counts)
+    )
+    some = counts > 0
+    if some.sum() < 3:
+        return []
+    usual = float(np.median(sums[some] / counts[some]))
+    z = np.zeros(n)
+    z[some] = (sums[some] - usual * counts[some]) / np.sqrt(2.0 * counts[some])
+    chosen = np.flatnonzero(z > -special.ndtri(_LINE_BY_CHANCE / n))
+    area = np.add.reduceat((usable.T if pairs.mode == "column" else usable).sum(axis=1), pairs.lines[:-1])
+    size = int(area[chosen].sum())
+    if not (np.diff(chosen) > 1).any() or not limits.fewest <= size <= limits.largest * usable.sum():
+        return []
+    together = float(z[chosen] @ np.sqrt(counts[chosen]) / np.sqrt(counts[chosen].sum()))
+    # of all sets of as many lines
+    log_places = (
+        special.gammaln(n + 1) - special.gammaln(chosen.size + 1) - special.gammaln(n - chosen.size + 1)
+    )
+    return [_Best("scattered", together, float(np.exp(log_places)), scattered=tuple(chosen.tolist()))]

@@ -90,6 +90,30 @@ def test_a_place_is_found_from_twelve_standard_errors_of_its_pairs_on(
     assert 6.0 < found[0].place.z < 16.0
 
 
+@pytest.mark.parametrize("mode", ["row", "column"])
+@pytest.mark.parametrize("lines", [[(4, 5), (17, 18), (25, 27)], [(2, 3), (29, 30)]])
+def test_scattered_lines_are_one_place(mode: str, lines: list[tuple[int, int]]) -> None:
+    rng = np.random.default_rng(6)
+    region = Region.model_validate({"rows" if mode == "row" else "columns": lines})
+    mask = region.mask(SHAPE)
+    axes = (FRAMES, 32, 1) if mode == "row" else (FRAMES, 1, 32)
+    # each line 12 standard errors of its own pairs
+    shared = np.sqrt(12.0 / np.sqrt(FRAMES * 32 * 31 / 2.0)) * rng.standard_normal(axes)
+    frames = rng.standard_normal((FRAMES, *SHAPE)) + mask * shared
+    found = scan_pairs(samples_of(np.clip(frames, -6, 6)), significance=1e-3)
+    # one guess of each channel is the same, since both are
+    assert found[0].mode == mode
+    assert np.array_equal(found[0].place.region.mask(SHAPE), mask)
+    assert len(found) == 1
+
+
+def test_lines_of_noise_that_all_share_are_not_scattered() -> None:
+    rng = np.random.default_rng(7)
+    for axes in ((FRAMES, 32, 1), (FRAMES, 1, 32), (FRAMES, 1, 1)):
+        frames = rng.standard_normal((FRAMES, *SHAPE)) + 0.5 * rng.standard_normal(axes)
+        assert scan_pairs(samples_of(np.clip(frames, -6, 6)), significance=1e-3) == []
+
+
 def test_what_all_pixels_share_has_no_place_and_nothing_is_found_in_nothing() -> None:
     for seed in range(2):
         rng = np.random.default_rng(seed)
