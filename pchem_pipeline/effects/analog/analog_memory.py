@@ -45,7 +45,7 @@ class AnalogMemory(Effect):
 
     tag: Literal["analog_memory"] = Field(default="analog_memory", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "Memory of the analog chain (incomplete reset)"
+    title: ClassVar[str] = "memory of the analog chain (incomplete reset)"
     source: ClassVar[str] = "Janesick 2001 (incomplete reset); Boone et al. 2018 (memory of readout chains)"
     signature: ClassVar[tuple[str, ...]] = (
         "time.cross.readout_charge", "time.lag1.readout.mean", "time.lag1.charge.mean",

@@ -185,7 +185,7 @@ class EmpiricalNoise(Effect):
 
     tag: Literal["empirical_noise"] = Field(default="empirical_noise", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "Measured noise that samples share, without an explanation"
+    title: ClassVar[str] = "measured noise that samples share, without an explanation"
     source: ClassVar[str] = "Wold 1938, Priestley 1981 (a stationary process by its spectrum)"
     strength: ClassVar[str] = "noise_dn"
     power: ClassVar[float] = 2.0

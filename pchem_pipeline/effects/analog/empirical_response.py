@@ -88,7 +88,7 @@ class EmpiricalResponse(Effect):
 
     tag: Literal["empirical_response"] = Field(default="empirical_response", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "Measured response to the charge of other samples, without an explanation"
+    title: ClassVar[str] = "measured response to the charge of other samples, without an explanation"
     source: ClassVar[str] = "Volterra 1930, Priestley 1981 (linear responses)"
     strength: ClassVar[str] = "response"
     measured_only: ClassVar[bool] = True

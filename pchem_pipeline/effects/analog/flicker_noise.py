@@ -41,7 +41,7 @@ class FlickerNoise(Effect):
 
     tag: Literal["flicker_noise"] = Field(default="flicker_noise", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "Flicker (1/f) noise of the pixels"
+    title: ClassVar[str] = "flicker (1/f) noise of the pixels"
     source: ClassVar[str] = "van Vliet 1976; Kansy 1980 (double sampling of 1/f noise); McWhorter 1957"
     signature: ClassVar[tuple[str, ...]] = (
         "time.block.readout.chi", "time.lag1.readout.mean", "time.lag2.readout.mean",

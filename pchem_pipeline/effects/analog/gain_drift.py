@@ -42,7 +42,7 @@ class GainDrift(Effect):
 
     tag: Literal["gain_drift"] = Field(default="gain_drift", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "Drift of the conversion gain"
+    title: ClassVar[str] = "drift of the conversion gain"
     source: ClassVar[str] = "EMVA 1288 (stability of the gain); Janesick 2007"
     signature: ClassVar[tuple[str, ...]] = (
         "frame.gain.trend", "frame.gain.slow", "frame.readout.trend", "frame.readout.slow",

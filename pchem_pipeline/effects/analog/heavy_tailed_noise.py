@@ -42,7 +42,7 @@ class HeavyTailedNoise(Effect):
 
     tag: Literal["heavy_tailed_noise"] = Field(default="heavy_tailed_noise", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "Non-Gaussian (heavy-tailed) read noise"
+    title: ClassVar[str] = "non-Gaussian (heavy-tailed) read noise"
     source: ClassVar[str] = (
         "Tukey 1960 (contaminated normal); Wang, Rao, Mierop and Theuwissen 2006, Leyris et al. 2006 (tails "
         "of CMOS read noise)"

@@ -37,7 +37,7 @@ class InterpixelCapacitance(Effect):
         default="interpixel_capacitance", description="name of the effect"
     )
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "Interpixel capacitance (IPC)"
+    title: ClassVar[str] = "interpixel capacitance (IPC)"
     source: ClassVar[str] = "Moore, Ninkov and Forrest 2004; Donlon, Ninkov and Baum 2018"
     signature: ClassVar[tuple[str, ...]] = (
         "space.x.rk", "space.y.rk", "space.x.rr", "space.y.rr", "space.x.kk", "space.y.kk",

@@ -39,7 +39,7 @@ class NoiseSkew(Effect):
 
     tag: Literal["noise_skew"] = Field(default="noise_skew", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "Skewed read noise (exponentially modified Gaussian)"
+    title: ClassVar[str] = "skewed read noise (exponentially modified Gaussian)"
     source: ClassVar[str] = "Grushka 1972 (exponentially modified Gaussian)"
     signature: ClassVar[tuple[str, ...]] = (
         "shape.He3.mean", "shape.He2C1.mean", "shape.He3C1.mean", "shape.He4.mean", "code.smooth",

@@ -35,7 +35,7 @@ class Nonlinearity(Effect):
 
     tag: Literal["nonlinearity"] = Field(default="nonlinearity", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "Nonlinearity of the pixel's response"
+    title: ClassVar[str] = "nonlinearity of the pixel's response"
     source: ClassVar[str] = "Janesick 2007 (V/V and V/e- nonlinearity)"
     signature: ClassVar[tuple[str, ...]] = (
         "shape.He1C2.mean", "code.smooth", "shape.He3C1.mean", "shape.He1C2.slope", "shape.C3.mean",

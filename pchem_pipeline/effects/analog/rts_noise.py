@@ -69,7 +69,7 @@ class RtsNoise(Effect):
 
     tag: Literal["rts_noise"] = Field(default="rts_noise", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "Random telegraph noise (RTS noise, burst noise) of the source follower"
+    title: ClassVar[str] = "random telegraph noise (RTS noise, burst noise) of the source follower"
     source: ClassVar[str] = (
         "Kandiah and Whiting 1978; Wang, Rao, Mierop and Theuwissen 2006; Leyris et al. 2006 (three levels "
         "behind correlated double sampling)"

@@ -36,7 +36,7 @@ class SignalDependentNoise(Effect):
         default="signal_dependent_noise", description="name of the effect"
     )
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "Signal-dependent noise (gain or excess noise)"
+    title: ClassVar[str] = "signal-dependent noise (gain or excess noise)"
     source: ClassVar[str] = "McIntyre 1966 (multiplication noise); Eckert et al. 2010 (peaks of SiPM spectra)"
     signature: ClassVar[tuple[str, ...]] = (
         "shape.He2C1.mean", "shape.He3.mean", "shape.He2C1.slope", "shape.He4.mean", "shape.He2C2.mean",

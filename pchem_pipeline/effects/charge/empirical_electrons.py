@@ -71,7 +71,7 @@ class EmpiricalElectrons(Effect):
         default="empirical_electrons", description="name of the effect"
     )
     plane: ClassVar[Plane] = Plane.CHARGE
-    title: ClassVar[str] = "Measured law of electron numbers, without an explanation"
+    title: ClassVar[str] = "measured law of electron numbers, without an explanation"
     source: ClassVar[str] = "Cox and Isham 1980, Point processes (factorial cumulants)"
     strength: ClassVar[str] = "chance"
     measured_only: ClassVar[bool] = True

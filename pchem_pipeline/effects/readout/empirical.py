@@ -99,7 +99,7 @@ class Empirical(Effect):
     tag: Literal["empirical"] = Field(default="empirical", description="name of the effect")
     plane: ClassVar[Plane] = Plane.READOUT
     along: ClassVar[int] = 3
-    title: ClassVar[str] = "Measured moves of samples, without an explanation"
+    title: ClassVar[str] = "measured moves of samples, without an explanation"
     source: ClassVar[str] = "Laird 1978, Lindsay 1983 (mixing laws); Raftery 1985 (mixture transitions)"
     strength: ClassVar[str] = "share"
     measured_only: ClassVar[bool] = True

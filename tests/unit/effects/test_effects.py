@@ -92,6 +92,8 @@ def test_every_effect_is_documented():
     for effect in registry.effect_classes().values():
         assert effect.__doc__
         assert "Signature:" in effect.__doc__
+        # it stands in the middle of a sentence
+        assert effect.title[:1] == effect.title[:1].lower()
         assert importlib.import_module(effect.__module__).__doc__
         assert all(field.description for field in effect.model_fields.values())
 
