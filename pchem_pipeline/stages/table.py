@@ -146,7 +146,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=7,
+        version=8,
         upstream=("ingest",),
         settings=("discrepancy",),
         reads=("frames", "summary", "histogram", "fit"),

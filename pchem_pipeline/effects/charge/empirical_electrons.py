@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence
 
-#: What happens to electrons: some that have others in their sample are lost or moved, or each brings others.
-Fate = Literal["lost", "moved", "followed"]
+#: What happens to electrons: some that have others in their sample are lost or moved, or each brings others,
+#: or all of a sample are lost together.
+Fate = Literal["lost", "moved", "followed", "emptied"]
 _DEPTH = 4  # frames through which electrons that follow others are followed themselves
 
 
@@ -35,10 +36,13 @@ class ElectronMode(Section):
     """Something that happens to electrons, in proportion to their number or to that of their pairs.
 
     Lost, moved: each electron with a chance for every other one in its sample. Followed: each brings a
-    Poisson number of others, and those that come to a later frame bring others themselves.
+    Poisson number of others, and those that come to a later frame bring others themselves. Emptied: a sample
+    loses all of its electrons.
     """
 
-    fate: Fate = Field(description="lost, moved (to the place), or followed (by others, at the place)")
+    fate: Fate = Field(
+        description="lost, moved (to the place), followed (by others, at the place), or emptied (all of them)"
+    )
     weight: float = Field(default=1.0, gt=0, description="relative frequency, no unit")
     place: tuple[int, int, int] = Field(
         default=(0, 0, 0), description="where: frames later, rows and columns from the electron's pixel"
@@ -48,10 +52,14 @@ class ElectronMode(Section):
     def _of_the_future(self) -> Self:
         if self.place[0] < 0 or (self.fate == "moved") > any(self.place):
             raise ValueError("place: of this frame or a later one; electrons are moved to another sample")
+        if self.fate == "emptied" and any(self.place):
+            raise ValueError("place: a sample that is emptied has none")
         return self
 
     def words(self, chance: float) -> str:
         """Return in words what happens with a chance (or a mean number)."""
+        if self.fate == "emptied":
+            return f"a sample loses all of them with a chance of {chance:.2g}"
         where = f"to {neighbour_words(self.place)}" if any(self.place) else "to its own sample"
         if self.fate == "followed":
             return f"each brings {chance:.2g} others on average {where}"
@@ -61,7 +69,7 @@ class ElectronMode(Section):
 
 @register_effect
 class EmpiricalElectrons(Effect):
-    """Electrons that are lost, moved or followed by others, with chances that are measured.
+    """Electrons that are lost, one by one or together, moved or followed by others, as often as is measured.
 
     Signature: none of its own; it is measured where the data disagree with all that is known, and describes
     the law of the electron numbers without a name for what makes it so.
@@ -84,8 +92,10 @@ class EmpiricalElectrons(Effect):
 
     @property
     def unlisted(self) -> bool:
-        """Whether electrons go, or bring others to later frames."""
-        return all(mode.fate != "followed" or mode.place[0] for mode in self.modes)
+        """Whether electrons go one by one, or bring others to later frames."""
+        return all(
+            mode.fate != "emptied" and (mode.fate != "followed" or mode.place[0]) for mode in self.modes
+        )
 
     @property
     def measured_parts(self) -> int:
@@ -108,7 +118,8 @@ class EmpiricalElectrons(Effect):
         for number, mode in enumerate(self.modes):
             if mode.fate != "followed":
                 u = context.random.uniform(("frame", "y", "x"), number)
-                gone = _gone(own, u, chance[number])
+                emptied = mode.fate == "emptied"
+                gone = np.where(u < chance[number], own, 0) if emptied else _gone(own, u, chance[number])
                 own = own - gone + (_arrived(gone, mode.place) if mode.fate == "moved" else 0)
         followed = [n for n, mode in enumerate(self.modes) if mode.fate == "followed"]
         found = own

@@ -50,6 +50,11 @@ def moved(k: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return found
 
 
+def emptied(k: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return electrons of which a sample loses all with a chance of 0.06."""
+    return np.where(rng.random(k.shape) < 0.06, 0, k)
+
+
 def codes(electrons: np.ndarray, seed: int) -> np.ndarray:
     """Return the digital numbers of electrons."""
     noise = NOISE * np.random.default_rng(seed).standard_normal(electrons.shape)
@@ -80,6 +85,7 @@ def plain() -> Any:
         (followed, "followed", (1, 0, 0), 0.05),
         (lost, "lost", (0, 0, 0), 0.03),
         (moved, "moved", (0, 0, 1), 0.04),
+        (emptied, "emptied", (0, 0, 0), 0.06),
     ],
 )
 def test_what_happens_to_electrons_is_told_with_its_chance(
@@ -128,6 +134,13 @@ def test_simulated_electrons_that_go_are_as_many_as_told_and_come_where_it_is_to
     assert abs(moved[:, :, 0].mean() - 1.8) < 5 * error * np.sqrt(SHAPE[1])
 
 
+def test_simulated_samples_are_emptied_as_often_as_told() -> None:
+    k = simulated(ElectronMode(fate="emptied"), chance=0.1)
+    none = 0.1 + 0.9 * np.exp(-2.0)
+    assert abs((k < 0.5).mean() - none) < 5 * np.sqrt(none / k.size)
+    assert abs(k.mean() - 1.8) < 5 * np.sqrt(k.var() / k.size)
+
+
 def test_simulated_frames_do_not_depend_on_how_they_are_cut() -> None:
     values = (2.0, 1 / STEP, 100.0, 1e-6)
     truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
@@ -148,6 +161,8 @@ def test_it_competes_with_nothing_and_refuses_what_cannot_be() -> None:
         ElectronMode(fate="followed", place=(-1, 0, 0))
     with pytest.raises(ValidationError, match="another sample"):
         ElectronMode(fate="moved")
+    with pytest.raises(ValidationError, match="has none"):
+        ElectronMode(fate="emptied", place=(0, 0, 1))
 
 
 def test_its_words_say_what_happens_to_electrons() -> None:

@@ -128,6 +128,7 @@ def test_of_what_leaves_little_by_itself_the_better_one_stays(monkeypatch: pytes
         (ElectronMode(fate="followed", place=(0, 1, 0)), False),
         (ElectronMode(fate="followed", place=(1, 0, 0)), True),
         (ElectronMode(fate="lost"), True),
+        (ElectronMode(fate="emptied"), False),
         (Move(shift_dn=4), False),
         (Move(towards=(0, 0, 1)), False),
         (Move(towards=(-1, 0, 0), part=0.5), True),

@@ -7,6 +7,7 @@ successive frames. Both are divided by what one event for each electron, or for 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -153,11 +154,17 @@ def measured_electrons(data: Electrons, model: Electrons) -> Measurement | None:
     """
     more, of_pairs = _beyond(data.excess, model.excess)
     found: list[tuple[Fate, Place, float]] = []
+    # what makes electrons come in company: others that follow them, or samples without any
+    ways: list[tuple[float, tuple[Fate, Place, float]]] = []
     if more.clear > _CLEAR:
-        found.append(("followed", _OWN, more.value))
+        ways.append((more.clear, ("followed", _OWN, more.value)))
+    if of_pairs.clear > _CLEAR:
+        # of samples of which a share p is emptied Var K = H + p / (1 - p) H^2
+        emptied = 2.0 * of_pairs.value / (1.0 + 2.0 * of_pairs.value)
+        ways.append((of_pairs.clear, ("emptied", _OWN, emptied)))
     fate: Fate = "lost"
     where, lost = _OWN, -of_pairs.value if of_pairs.clear < -_CLEAR else 0.0
-    gain, chain = (0.5 * max(abs(more.clear), abs(of_pairs.clear)) ** 2 if found or lost else 0.0), 0.0
+    gain, chain = (0.5 * max(abs(more.clear), abs(of_pairs.clear)) ** 2 if ways or lost else 0.0), 0.0
     for place, chances in data.together.items():
         each, arriving = _beyond(chances, model.together.get(place, _NOTHING))
         # those that came to the next frame have brought others themselves
@@ -172,13 +179,18 @@ def measured_electrons(data: Electrons, model: Electrons) -> Measurement | None:
             chain = each.value if place == _NEXT else chain
     if lost:
         found.append((fate, where, lost))
-    if not found:
-        return None
-    chance = max(value for _, _, value in found)
+    likeliest_first = [way for _, way in sorted(ways, key=lambda way: -way[0])]
+    effects = [_effect([way, *found]) for way in likeliest_first] or ([_effect(found)] if found else [])
+    return Measurement(effects[0], gain, tuple(effects[1:])) if effects else None
+
+
+def _effect(events: Sequence[tuple[Fate, Place, float]]) -> EmpiricalElectrons:
+    """Return the effect of events: what happens, where, and the chance."""
+    chance = max(value for _, _, value in events)
     modes = tuple(
-        ElectronMode(fate=fate, place=place, weight=round(value / chance, 4)) for fate, place, value in found
+        ElectronMode(fate=fate, place=place, weight=round(value / chance, 4)) for fate, place, value in events
     )
-    return Measurement(EmpiricalElectrons(chance=min(chance, _MOST), modes=modes), gain)
+    return EmpiricalElectrons(chance=min(chance, _MOST), modes=modes)
 
 
 def _beyond(data: Chances, model: Chances) -> Chances:
