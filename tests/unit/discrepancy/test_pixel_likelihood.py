@@ -22,7 +22,7 @@ from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.effects.framework.registry import effect_class
 
 SIDE, FRAMES, EXPOSURE, STEP = 16, 3000, 1.5, 8.0  # pixels, frames, e-, DN per e-
@@ -52,12 +52,18 @@ def exgaussian(rng: np.random.Generator, share: float) -> NDArray[np.float64]:
     return 0.3 * (smooth + share * (rng.standard_exponential(shape) - 1.0))
 
 
+def acted_on(effect: Effect) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    some = np.ones(FRAMES, np.bool_) if effect.when is None else effect.when.frames(np.arange(FRAMES))
+    inside = np.ones((SIDE, SIDE), np.bool_) if effect.region is None else effect.region.mask((SIDE, SIDE))
+    return some, inside
+
+
 @pytest.mark.parametrize(("share", "factor"), [(0.1, 2.2), (0.4, 1.5)])
 def test_share_and_width_of_a_tail_are_found_from_afar(share: float, factor: float) -> None:
     frames = frames_of(mixture(np.random.default_rng(3), share, factor), 4)
     guesses = [HEAVY(share=0.02, factor=3.0), HEAVY(share=0.5, factor=1.3), SKEW(share=0.2)]
     effort = Effort(None)
-    found, skew = with_details(guesses, frames, maps_of(0.28), (), effort)
+    found, skew = with_details(guesses, frames, maps_of(0.28), (), effort, acted_on)
     assert skew == SKEW(share=0.2)  # a strength is all that it has: the statistics tell it
     assert effort.spent > 0.0
     likelihood = PixelLikelihood(frames, maps_of(0.28), (), effort, 256)
@@ -69,14 +75,29 @@ def test_share_and_width_of_a_tail_are_found_from_afar(share: float, factor: flo
     assert error[1] < 0.1 * factor  # the limit is worth something
 
 
-def test_guesses_that_act_in_a_part_and_other_effects_stay_as_they_are() -> None:
+def test_numbers_of_a_tail_in_a_part_are_told_by_the_samples_there() -> None:
+    there, when = Region(rows=((4, 8),)), When(range=((0, 2000),))
+    frames = frames_of(mixture(np.random.default_rng(3), 0.0, 1.0), 4)
+    tails = frames_of(mixture(np.random.default_rng(5), 0.3, 2.0), 6)
+    frames[:2000, 4:8] = tails[:2000, 4:8]
+    guesses = [HEAVY(share=0.02, factor=3.0, region=there, when=when), HEAVY(share=0.02, factor=3.0)]
+    placed, everywhere = with_details(guesses, frames, maps_of(0.28), (), Effort(None), acted_on)
+    assert (placed.region, placed.when) == (there, when)
+    assert placed.share == pytest.approx(0.3, abs=0.08)  # type: ignore[attr-defined]
+    assert placed.factor == pytest.approx(2.0, abs=0.15)  # type: ignore[attr-defined]
+    # of the whole the part is a sixth
+    assert everywhere.region is None
+    assert everywhere.share < 0.15  # type: ignore[attr-defined]
+
+
+def test_guesses_of_few_pixels_and_other_effects_stay_as_they_are() -> None:
     frames = frames_of(mixture(np.random.default_rng(5), 0.1, 2.2), 6)
-    placed = HEAVY(share=0.02, factor=3.0, region=Region(rows=((0, 4),)))
+    placed = HEAVY(share=0.02, factor=3.0, region=Region(rows=((0, 1),), columns=((0, 8),)))
     others: list[Effect] = [placed, effect_class("row_noise")(row_noise_dn=1.0), SKEW(share=0.3)]
-    assert with_details(others, frames, maps_of(0.28), (), Effort(None)) == others
+    assert with_details(others, frames, maps_of(0.28), (), Effort(None), acted_on) == others
     present = (effect_class("row_noise")(row_noise_dn=1.0, region=Region(rows=((0, 4),))),)
     everywhere = [HEAVY(share=0.02, factor=3.0)]
-    assert with_details(everywhere, frames, maps_of(0.28), present, Effort(None)) == everywhere
+    assert with_details(everywhere, frames, maps_of(0.28), present, Effort(None), acted_on) == everywhere
     assert [is_told(each) for each in (*others, HEAVY(share=0.1))] == [False, False, True, True]
 
 

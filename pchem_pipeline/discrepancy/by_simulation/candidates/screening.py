@@ -83,6 +83,7 @@ class Screening:
             self.work.mapped(model).fit.maps,
             self.observed.frames.effects(model),
             self.work.effort,
+            self.observed.frames.acted_on,
         )
         hypotheses = simulator.fingerprints([*guesses, *placebo_for(guesses, self.classes)])
         shift = self.z.both - null.mean

@@ -168,6 +168,11 @@ class FrameStack:
         """Return how many samples of the train and test frames are in a part."""
         return int(part.frames(self.seen_numbers).sum()) * int(self.inside(part).sum())
 
+    def acted_on(self, effect: Effect) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return on which of the train and test frames, (frame,), and pixels, (y, x), an effect acts."""
+        part = Part(effect.region, effect.when)
+        return part.frames(self.seen_numbers), self.inside(part)
+
     def inside(self, part: Part) -> NDArray[np.bool_]:
         """Return which of the pixels lie in a part, (y, x)."""
         window = self.window or SensorWindow.whole(self.stack.shape)

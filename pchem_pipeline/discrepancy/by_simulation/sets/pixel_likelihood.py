@@ -19,13 +19,18 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hyp
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.model.histogram.count import histogram_frames
+
+BoolArray = NDArray[np.bool_]
+Place = tuple[Region | None, When | None]
 
 #: Pixels that tell effects apart.
 MANY_PIXELS = 1024
 #: Pixels that tell numbers well enough to begin with.
 FEW_PIXELS = 256
 _MOST_STARTS = 3  # of one effect
+_FEWEST_PIXELS, _FEWEST_FRAMES = 16, 200  # of a place, whose histograms tell numbers
 _FARTHEST = 30.0  # factor of a fingerprint: beyond, it is another hypothesis
 _ALIKE = 0.5  # nats: fits that came to the same
 
@@ -164,11 +169,12 @@ def with_details(
     maps: PixelMaps,
     present: Sequence[Effect],
     effort: Effort,
+    acted_on: Callable[[Effect], tuple[BoolArray, BoolArray]],
 ) -> list[Effect]:
-    """Return guesses with the numbers that the histograms tell, the likeliest of an effect first.
+    """Return guesses with the numbers that the histograms tell, the likeliest of an effect in a place first.
 
-    Those that act everywhere, by a law of more numbers than a strength; others, and those that no pixel can
-    be fitted with, stay as they are. Guesses that come to the same are one.
+    Those of effects with a law of more numbers than a strength, by the samples on which they act; others, and
+    those that no pixel can be fitted with, stay as they are. Guesses that come to the same are one.
 
     Args:
         guesses: of all effects.
@@ -176,18 +182,35 @@ def with_details(
         maps: of their pixels under the model.
         present: effects of the model.
         effort: counts the work.
+        acted_on: returns the frames, (frame,), and the pixels, (y, x), on which an effect acts.
     """
-    detailed = {g.tag for g in guesses if is_told(g) and len(Member.of(g).coordinates) > 1}
-    if not detailed or not all(effect.everywhere for effect in present):
+    if not all(effect.everywhere for effect in present):
         return list(guesses)
-    likelihood = PixelLikelihood(frames, maps, present, effort, FEW_PIXELS)
+    known: dict[Place, PixelLikelihood | None] = {}
+
+    def likelihood(effect: Effect) -> PixelLikelihood | None:
+        place = effect.region, effect.when
+        if place not in known:
+            some, inside = acted_on(effect)
+            usable = maps.usable & inside
+            enough = usable.sum() >= _FEWEST_PIXELS and some.sum() >= _FEWEST_FRAMES
+            own = frames if some.all() else frames[some]
+            known[place] = (
+                PixelLikelihood(own, replace(maps, usable=usable), present, effort, FEW_PIXELS)
+                if enough
+                else None
+            )
+        return known[place]
+
     found: list[Effect] = []
     for tag in dict.fromkeys(g.tag for g in guesses):
         own = [g for g in guesses if g.tag == tag]
-        if tag in detailed:
-            everywhere = [g for g in own if g.everywhere]
-            own = [*likelihood.detailed(everywhere), *(g for g in own if not g.everywhere)]
-        found += own
+        for region, when in dict.fromkeys((g.region, g.when) for g in own):
+            there = [g for g in own if (g.region, g.when) == (region, when)]
+            anywhere = [g.at_place(None) for g in there]
+            has_numbers = any(is_told(g) and len(Member.of(g).coordinates) > 1 for g in anywhere)
+            by = likelihood(there[0]) if has_numbers else None
+            found += there if by is None else [g.at_place(region, when) for g in by.detailed(anywhere)]
     return found
 
 
