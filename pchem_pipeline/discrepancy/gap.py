@@ -19,6 +19,7 @@ from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 
 FloatArray = NDArray[np.float64]
 
+_REST_OF_NAMED = 0.1  # of the gap that an effect closes, the most that may be left where it gets a name
 _FLOOR_QUANTILE = 0.95
 _INTERVAL = 1.96
 
@@ -73,6 +74,14 @@ class Gap:
     def at_floor(self) -> bool:
         """Whether nothing more can be seen in these samples."""
         return self.value <= self.floor
+
+    def too_wide(self, closed: float) -> bool:
+        """Tell whether so much is left that an effect which closed some gets no name.
+
+        What counts is what the samples prove to be left: few of them tell the gap of a weak effect from none
+        badly.
+        """
+        return max(self.interval[0], 0.0) >= _REST_OF_NAMED * closed
 
 
 @dataclass(frozen=True)

@@ -107,6 +107,10 @@ class Explainer(Protocol[Explanation]):
         """Put what no effect with a name makes in the place of all that were added, if it leaves less."""
         ...
 
+    def unfinished(self, before: Gap, null: NullModel) -> bool:
+        """Tell whether so much of the gap is left that what was added gets no name, though the data agree."""
+        ...
+
     def describe(self, before: Gap, null: NullModel) -> NullModel | None:
         """Put what no effect explains into the model as it is measured; None where that does not help."""
         ...
@@ -159,7 +163,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
         if instead is not None:
             null, still = instead, disagrees(instead, z, significance, by.tolerance())
             break
-    if still and instead is None:
+    if instead is None and (still or (rounds > 0 and by.unfinished(before, null))):
         tell("measuring what no effect explains")
         try:
             described = by.describe(before, null)

@@ -274,6 +274,10 @@ class HistogramExplainer:
         """Leave what was added: nothing is measured of anything else here."""
         return None
 
+    def unfinished(self, before: Gap, null: NullModel) -> bool:
+        """Return False: nothing is measured here of what no effect explains."""
+        return False
+
     def describe(self, before: Gap, null: NullModel) -> NullModel | None:
         """Leave what no effect explains to the codes that are told: nothing is measured of it here."""
         return None

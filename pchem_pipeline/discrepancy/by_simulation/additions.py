@@ -30,7 +30,6 @@ from pchem_pipeline.effects.framework.effect import Effect
 FloatArray = NDArray[np.float64]
 
 _CLEAR_MARGIN = 50.0  # nats
-_REST_OF_NAMED = 0.1  # of the gap that an effect closes, the most that may be left where it gets a name
 _LEFT = 4.0  # deviations that are left of a statistic
 _MOVED = 2.0  # standard deviations by which an effect moves it
 _OF_SIGNATURE = 0.1  # of what an effect does to all statistics, in a family where its signature stands
@@ -65,15 +64,6 @@ class Round:
         return replace(self, added=replace(self.added, hypotheses=new, stderr=stderr))
 
 
-def leaves_too_much(after: Gap, closed: float) -> bool:
-    """Tell whether so much of the gap is left that an effect which closed some of it gets no name.
-
-    What counts is what the final frames prove to be left: few of them tell the gap of a weak effect from none
-    badly.
-    """
-    return max(after.interval[0], 0.0) >= _REST_OF_NAMED * closed
-
-
 @dataclass(frozen=True)
 class AddedRounds:
     """Measures what each effect of the rounds closed of the gap.
@@ -101,7 +91,7 @@ class AddedRounds:
             still: whether the data disagree with that.
         """
         after = self._gap(last)
-        unfinished = not after.at_floor and (still or leaves_too_much(after, before.value))
+        unfinished = not after.at_floor and (still or after.too_wide(before.value))
         rest = left_of(self.rounds, last, self.z, self.allowed) if unfinished and self.rounds else None
         additions: list[Addition] = []
         gap = before
@@ -120,7 +110,7 @@ class AddedRounds:
                 against = (
                     "" if rest is None else unexplained_of_its_kind(effect, parts[member], rest, this.null)
                 )
-                if rest is not None and leaves_too_much(after, gap.value - now.value):
+                if rest is not None and after.too_wide(gap.value - now.value):
                     against = "too much of the gap is left beside it"
                 against = against or self._against(this, int(member), still)
                 later = parts[order[place + 1 :]].sum(axis=0)

@@ -332,6 +332,11 @@ class FrameExplainer:
         as_good = gap.at_floor and (not left.at_floor or unexplained.leaves_nothing(found))
         return self.extended.put_measured(found) if better or as_good else None
 
+    def unfinished(self, before: Gap, null: NullModel) -> bool:
+        """Tell whether the final frames prove that too much of the gap is left."""
+        left = self.gap(null)
+        return not left.at_floor and left.too_wide(before.value)
+
     def describe(self, before: Gap, null: NullModel) -> NullModel | None:
         """Measure what no effect explains in the samples, and put it into the model.
 

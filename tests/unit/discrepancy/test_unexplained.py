@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from pchem_pipeline.discrepancy.by_simulation.additions import leaves_too_much
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
@@ -56,9 +55,9 @@ def test_the_form_and_part_that_explain_most_come_first() -> None:
 
 def test_effects_that_leave_a_tenth_of_what_they_closed_get_no_name_where_the_final_frames_prove_it() -> None:
     left = Gap(0.3, 0.01, (0.11, 0.5), {})
-    assert leaves_too_much(left, 1.0)
-    assert not leaves_too_much(left, 1.2)
-    assert not leaves_too_much(Gap(0.3, 0.01, (-0.1, 0.7), {}), 1.0)
+    assert left.too_wide(1.0)
+    assert not left.too_wide(1.2)
+    assert not Gap(0.3, 0.01, (-0.1, 0.7), {}).too_wide(1.0)
 
 
 def test_by_itself_only_what_no_named_effect_makes_is_tried_and_kept_where_it_leaves_little(
