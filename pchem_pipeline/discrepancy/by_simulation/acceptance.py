@@ -25,6 +25,9 @@ FloatArray = NDArray[np.float64]
 # than a single one would by chance
 _ESTABLISHED = 4.5
 _CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing was chosen by
+# the same of what is measured without a name, in either: few forms of it are tried, and only where the data
+# disagree with all that has one
+_MEASURED = 3.0
 
 
 @dataclass(frozen=True)
@@ -66,18 +69,19 @@ class Acceptance:
         """Return the effects of which the data have certainly some, the final frames too.
 
         Those had no part in finding them: a true effect of 4.5 standard errors in two thirds of the frames
-        misses them once in seventy times; a chance passes once in six.
+        misses them once in seventy times; a chance passes once in six. What is measured without a name needs
+        3 standard errors in either.
         """
         first, n = self.first, len(added.vectors)
         certain = _certain(added, self.z.both - first.mean, noise_of_splits(first, 2, self.model_error))
         noise = noise_of_splits(first, 1, self.model_error)
         noise = replace(noise, covariance=added.covariance * (1.0 + 1.0 / n))
         final = replace(fit_set(added.hypotheses, self.z.final - first.mean, noise), certain=certain)
-        proven = {h.tag for h in final.established(_CONFIRMED)}
-        clear = (1.0 + np.expm1(added.change) > _ESTABLISHED * added.stderr) | certain
-        return tuple(
-            h for h, is_clear in zip(added.hypotheses, clear, strict=True) if is_clear and h.tag in proven
-        )
+        measured = np.array([type(h.effect).measured_only for h in added.hypotheses])
+        clear = np.exp(added.change) > np.where(measured, _MEASURED, _ESTABLISHED) * added.stderr
+        proven = final.factors > np.where(measured, _MEASURED, _CONFIRMED) * final.stderr
+        there = (clear & proven) | certain
+        return tuple(h for h, is_there in zip(added.hypotheses, there, strict=True) if is_there)
 
     def accounted(self, rounds: list[Round], null: NullModel) -> tuple[Hypothesis, ...]:
         """Return the effects that rounds added of which the model accounts for what they move."""

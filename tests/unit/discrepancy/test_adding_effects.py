@@ -45,6 +45,7 @@ from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_class
@@ -767,6 +768,38 @@ def test_only_effects_that_account_for_what_they_move_are_kept_beside_what_is_me
         "row_noise"
     ]
     assert search.accept.accounted(search.extended.rounds, extended.shifted(own)) == ()
+
+
+@pytest.mark.parametrize(
+    ("error", "in_final", "with_name", "without"),
+    [
+        (0.15, 6.0, True, True),
+        (0.26, 6.0, False, True),  # 3.8 standard errors
+        (0.40, 6.0, False, False),
+        (0.15, 2.0, True, False),
+        (0.15, 0.5, False, False),
+    ],
+)
+def test_what_gets_no_name_needs_fewer_errors_and_more_of_them_in_the_final_frames(
+    error: float, in_final: float, with_name: bool, without: bool
+) -> None:
+    world, part = World([]), np.eye(M)[0] * 6.0
+    unused: Any = None
+    for one, there in (
+        (effect("row_noise", 0.1), with_name),
+        (EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),)), without),
+    ):
+        added: Any = SimpleNamespace(
+            hypotheses=(Hypothesis(one, part),),
+            parts=part[None],
+            change=np.zeros(1),
+            stderr=np.array([error]),
+            vectors=np.zeros((400, M)),
+            covariance=np.eye(M),
+        )
+        final = world.null.mean + np.eye(M)[0] * in_final
+        accept = Acceptance(world.null, Measured(final, final, final), unused, 0.0)
+        assert bool(accept.established(added)) is there
 
 
 def test_what_the_final_frames_do_not_show_stays_outside(monkeypatch: pytest.MonkeyPatch) -> None:

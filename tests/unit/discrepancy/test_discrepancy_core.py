@@ -13,7 +13,6 @@ from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings, 
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,
-    SetFit,
     choose,
     fit_set,
     score_set,
@@ -306,16 +305,6 @@ def test_expected_codes_are_those_of_the_mixture_of_every_usable_pixel() -> None
 
 def test_every_statistic_belongs_to_a_family() -> None:
     assert {s.family for s in STATISTICS.values()} == set(FAMILIES)
-
-
-def test_established_is_what_is_many_errors_strong_or_counted_exactly() -> None:
-    tags = ("row_noise", "frame_noise", "exposure_drift")
-    first, second, third = (_hypothesis(tag, row) for tag, row in zip(tags, np.eye(3), strict=True))
-    fit = SetFit(
-        (first, second, third), np.array([5.0, 4.0, 0.5]), np.ones(3), np.array([False, False, True])
-    )
-    assert fit.established(4.5) == (first, third)
-    assert fit.established(6.0) == (third,)
 
 
 def test_a_statistic_that_a_replicate_lacks_says_nothing() -> None:

@@ -115,11 +115,6 @@ class SetFit:
         """Predicted shift by effect, shape (e, m)."""
         return np.array([c * h.fingerprint for c, h in zip(self.factors, self.hypotheses, strict=True)])
 
-    def established(self, least: float) -> tuple[Hypothesis, ...]:
-        """Return those whose strength is at least so many standard errors, or that an exact count proves."""
-        there = (self.factors > least * self.stderr) | self.certain
-        return tuple(h for h, is_there in zip(self.hypotheses, there, strict=True) if is_there)
-
     def settled(self, close: float) -> bool:
         """Tell whether all strengths are what the data ask for, to ``close`` or half a standard error."""
         return bool(np.all(np.abs(self.factors - 1.0) < np.maximum(close, self.stderr / 2.0)))
