@@ -127,6 +127,7 @@ class HistogramExplainer:
     """Tells effects apart in histograms; see :class:`~pchem_pipeline.discrepancy.skeleton.Explainer`.
 
     Attributes:
+        settings: the section ``discrepancy``.
         observed: the rows that are looked at.
         replicates: draws replicates of them.
         sets: fits and scores sets of effects.

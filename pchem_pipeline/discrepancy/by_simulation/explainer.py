@@ -124,11 +124,15 @@ class FrameExplainer:
     """Tells effects apart in frames; see :class:`~pchem_pipeline.discrepancy.skeleton.Explainer`.
 
     Attributes:
+        settings: the section ``discrepancy``.
         observed: the frames.
         work: fits and simulates them.
         screening: asks the candidates what they would do.
         accept: tells by the statistics of the data what is accepted.
         extended: the model, with the rounds of the search.
+        samples: what the data are, in words.
+        defects: candidates that failed, and why.
+        unexplained: what measures what no effect explains, once it is asked for.
     """
 
     settings: DiscrepancySettings
