@@ -43,8 +43,8 @@ Quadrant = Literal["top left", "top right", "bottom left", "bottom right"]
 
 #: The syntax of a place and a time in one line, for messages.
 GRAMMAR = (
-    "rows=A:B, columns=A:B|C:D, taps=WIDTH/NUMBER, every=N/PHASE, quadrant=top-left, frames=A:B, frames=A|B|C, "
-    "period=N/PHASE, joined by commas (A:B ends before B; columns=40:50 are 40 to 49)"
+    "rows=A:B, columns=A:B|C:D, taps=WIDTH/NUMBER, every=N/PHASE, quadrant=top-left, frames=A:B, "
+    "frames=A|B|C, period=N/PHASE, joined by commas (A:B ends before B; columns=40:50 are 40 to 49)"
 )
 _FEW = 6  # numbers that are listed in words
 
