@@ -48,6 +48,9 @@ _MOST_RESIDUALS = 3
 _DECIDED = 3.0  # standard errors of a difference of scores that tells two effects apart
 _MOST_LONGER = 30.0  # times the samples that anyone will take
 _RARE = 0.02  # a chance that is worth telling though it is no disagreement
+# nats per sample from which on a plain fit may be far off: six of seven hidden effects that left so much had
+# moved the gain of 19 to 100 % of the pixels by a fifth or more
+_BEYOND_A_FIT = 0.1
 
 
 @dataclass(frozen=True)
@@ -365,7 +368,7 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
         first = found.places[0] if found.places else None
         lead = f": {first.sentence or first.statistic}" if first is not None else ""
         none = "no known effect explains it" if not found.limit else "none that was tried explains it"
-        words = f"{lead}; {none}{_nearest(found)}{_left(added)}"
+        words = f"{lead}; {none}{_nearest(found)}{_left(added)}{_broken(found)}"
         return f"The {data} disagree with the model{words}."
     if state == "described":
         return _described(found, titles, sizes)
@@ -375,6 +378,7 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
         return f"The model was missing {_and(titles)}, too little for the final {data} alone to show."
     if state == "named_in_part":
         words = f"{_rest(found)}{_shown(found)}{_nearest(found)}{_left(added)}{_doubts(added)}"
+        words += _broken(found)
         return f"A part of what the model was missing is {_and(titles)}{words}."
     them = "them" if len(titles) > 1 else "it"
     words = f"with {them}, no more of the gap is left than chance makes{_left(added)}{_doubts(added)}"
@@ -456,6 +460,18 @@ def _rest(found: Findings) -> str:
     if after.at_floor or found.before.value <= 0.0:
         return ""
     return f"; {_share(max(after.value, 0.0) / found.before.value)} of the gap is left unexplained"
+
+
+def _broken(found: Findings) -> str:
+    """Return a caution where what is left is so much that the pixels' own parameters are in doubt."""
+    left = found.added.after.interval[0]
+    if left < _BEYOND_A_FIT:
+        return ""
+    return (
+        f"; what is left, {left:.2g} nats per sample at least, is so much that the fit itself breaks down: "
+        "gain, bias, read noise and exposure of the pixels may be far off, and with them what is said of "
+        "electrons"
+    )
 
 
 def _shown(found: Findings) -> str:

@@ -402,3 +402,14 @@ def test_what_one_statistic_shows_still_is_a_part_that_has_no_name() -> None:
     calm = replace(found, still=False)
     assert calm.state == "named"
     assert STATISTICS[NAMES[7]].sentence not in _sentence(calm, {})
+
+
+@pytest.mark.parametrize("left", [0.05, 0.3])
+def test_the_verdict_says_where_the_fit_itself_breaks_down(left: float) -> None:
+    """A gain of the rows that scatters by a half in every frame leaves 0.8 nats per sample."""
+    null = _null(np.random.default_rng(5))
+    z = null.mean + 40.0 * null.std
+    gap = Gap(left + 0.02, 3e-5, (left, left + 0.04), {})
+    found = Findings("frames", Measured(z, z, z), null, null, gap, [], True, Added((), gap))
+    assert found.state == "unexplained"
+    assert ("the fit itself breaks down" in _sentence(found, {})) == (left > 0.1)
