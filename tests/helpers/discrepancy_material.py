@@ -183,7 +183,7 @@ def step(effect: str | None, verdict: str, before: float, after: float) -> dict[
                 "effect": "periodic_pickup",
                 "gap_after": 120 * micro,
                 "behind": -16.8,
-                "why": f"leaves {STATISTICS['space.row.readout.lag1'].sentence} (+9.1 sd)",
+                "why": f"with it in the model {STATISTICS['space.row.readout.lag1'].sentence} (+9.1 sd)",
             },
             {"effect": "interpixel_capacitance", "gap_after": 300 * micro, "behind": -262.0, "why": ""},
         ],

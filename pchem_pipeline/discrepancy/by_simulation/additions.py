@@ -211,7 +211,7 @@ class AddedRounds:
         elif abs(other.rest[worst]) > _LEFT:
             # in the unit in which the statistic is told elsewhere
             left = this.null.shifted(other.mean - this.null.mean).pulls(self.z.both, 2)[worst]
-            why = f"leaves {STATISTICS[this.null.names[worst]].says(left)} ({left:+.1f} sd)"
+            why = f"with it in the model {STATISTICS[this.null.names[worst]].says(left)} ({left:+.1f} sd)"
         elif other.error is not None:
             why = f"fits the histograms of the pixels worse, by {-other.behind:.1f} +- {other.error:.1f} nats"
         else:
@@ -282,9 +282,9 @@ def unexplained_of_its_kind(effect: Effect, part: FloatArray, rest: FloatArray, 
 def _worst_words(looked_at: NDArray[np.bool_], rest: FloatArray, null: NullModel) -> str:
     left = np.where(looked_at, np.abs(rest), 0.0)
     worst = int(np.argmax(left))
-    return (
-        f"it leaves {STATISTICS[null.names[worst]].says(float(rest[worst]))}" if left[worst] > _LEFT else ""
-    )
+    if left[worst] <= _LEFT:
+        return ""
+    return f"with it in the model {STATISTICS[null.names[worst]].says(float(rest[worst]))}"
 
 
 def _weight(part: FloatArray, null: NullModel) -> float:

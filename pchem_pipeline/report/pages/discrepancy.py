@@ -349,7 +349,7 @@ def _compared(step: Step, data: DiscrepancyData) -> list[Flag]:
     name, runner_up, placebo = _short(data, step.effect or ""), step.runner_up, step.placebo
     if runner_up is not None:
         share = percent(max(step.closed_by(runner_up), 0.0), 1.0)
-        why = f" and {runner_up.why}" if runner_up.why else ""
+        why = f": {runner_up.why}" if runner_up.why else ""
         rival = f"In the place of {name} the runner-up, {_short(data, runner_up.effect)}"
         flags.append(Flag("note", f"{rival}, would close {share} of the gap{why}."))
     if placebo is None:

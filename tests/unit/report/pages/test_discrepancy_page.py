@@ -143,7 +143,7 @@ def test_a_named_effect_has_all_its_evidence(base: ReportData) -> None:
         "0.3512 ± 0.0041 DN",
         "unrelated to it) closes 3",
         ", would close 75 % of the",
-        "leaves adjacent rows have similar means",
+        "with it in the model adjacent rows have similar means",
         "−16.8 ± 3.3",
         "0.985",
         "pixels (y, x) (3, 4), (10, 20), (30, 39)",

@@ -39,7 +39,7 @@ def test_an_ambiguous_verdict_says_what_would_decide() -> None:
 
 def test_a_verdict_says_why_the_next_rivals_lost() -> None:
     text = " ".join(verdict_text(verdict_of("named_in_part")).split())
-    assert "row_noise, not periodic_pickup (16.8 nats behind): leaves" in text
+    assert "row_noise, not periodic_pickup (16.8 nats behind): with it in the model adjacent" in text
     assert "(+9.1 sd)" in text
 
 
