@@ -119,7 +119,8 @@ class NoiseMode(Section):
         if self.changes != "offset":
             share, of = 100.0 * size / self.signal_dn, _CHANGED[self.changes]
             at = "" if self.changes == "noise" else "at a signal "
-            what = f"{share:.2g} % of the {of}, {what} {at}of {self.signal_dn:.3g} DN"
+            form = ".2g" if self.burst is None else "+.2g"
+            what = f"{share:{form}} % of the {of}, {what} {at}of {self.signal_dn:.3g} DN"
         burst = "" if self.burst is None else f"in {100 * self.burst:.2g} % of the {self.of}s only"
         return ", ".join(part for part in (what, whole, burst, shared) if part)
 
@@ -282,7 +283,8 @@ class EmpiricalNoise(Effect):
         parts = "; ".join(mode.words(self.share_of(mode)) for mode in self.modes)
         if all(mode.changes == "offset" for mode in self.modes):
             return f"noise of {self.noise_dn:.2g} DN{place} that samples share before the converter ({parts})"
-        return f"a variation{place} that samples share before the converter ({parts})"
+        changed = dict.fromkeys(_CHANGED.get(mode.changes, "offset") for mode in self.modes)
+        return f"a change of the {' and the '.join(changed)}{place} that samples share ({parts})"
 
 
 class _Average(NamedTuple):

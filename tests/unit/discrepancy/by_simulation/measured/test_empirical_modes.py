@@ -96,7 +96,8 @@ def test_frames_that_are_noisier_are_told_with_how_many_they_are() -> None:
     assert 0.5 < found.noise_dn / (0.5 * np.sqrt(some.mean()) * 0.25 * STEP) < 1.2
     assert found.unlisted
     # of bursts their size in the frames that have them
-    assert re.search(r"\([34]\d % of the read noise, 1\.\d DN of 3.51 DN, the same in", found.words())
+    size = r"\(\+[34]\d % of the read noise, 1\.\d DN of 3.51 DN, the same in"
+    assert re.search(f"a change of the read noise that samples share {size}", found.words())
 
 
 @pytest.mark.parametrize("size", [0.3, 1.0, 2.5])
