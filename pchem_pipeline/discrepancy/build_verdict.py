@@ -69,6 +69,7 @@ class Addition:
         pulls: the statistics that moved most.
         moved: change of each parameter map by its refit with the effect.
         described: whether it is measured where no known effect explains the data, and not understood.
+        certain: whether its strength is beyond doubt.
     """
 
     effect: Effect
@@ -83,6 +84,7 @@ class Addition:
     pulls: tuple[Pull, ...]
     moved: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     described: bool = False
+    certain: bool = True
 
     @property
     def fits(self) -> bool:
@@ -91,8 +93,8 @@ class Addition:
 
     @property
     def confirmed(self) -> bool:
-        """Whether the final samples show what it is for, or come nearer to the model with it."""
-        return not self.before.at_floor or self.after.value < self.before.value
+        """Whether it is certain, and the final samples show what it is for or come nearer with it."""
+        return self.certain and (not self.before.at_floor or self.after.value < self.before.value)
 
     @property
     def named(self) -> bool:
@@ -389,13 +391,17 @@ def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size 
     """Return what the model may lack: effects not told apart, and what the final samples do not confirm."""
     data, additions = found.samples, found.added.additions
     unknown = [" or ".join(_title(c.effect) for c in each.candidates) for each in additions if not each.alone]
-    weak = _and([_sized(e.effect, sizes) for e in additions if e.alone and e.fits and not e.confirmed])
+    doubtful = [each for each in additions if each.alone and each.fits and not each.confirmed]
+    weak = _and([_sized(each.effect, sizes) for each in doubtful])
+    why = f"which the final {data} do not confirm"
+    if not all(each.certain for each in doubtful):
+        why = f"too weak in these {data} to be certain"
     also = f"{_and(titles)} is missing, and " if titles else ""
     if not unknown:
         also = f"The model was missing {_and(titles)}, and it may" if titles else "The model may"
         left = f"{_rest(found)}{_left(found.added)}"
-        return f"{also} lack {weak}, which the final {data} do not confirm: more samples would tell{left}."
-    weak = f"; it may lack {weak}, which the final {data} do not confirm" if weak else ""
+        return f"{also} lack {weak}, {why}: more samples would tell{left}."
+    weak = f"; it may lack {weak}, {why}" if weak else ""
     lacks = f"{also}{_and(unknown)}{weak}{_rest(found)}{_left(found.added)}"
     return f"The model lacks something that these {data} cannot tell apart: {lacks}."
 
@@ -415,7 +421,7 @@ def _described(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size 
     none = "No known effect explains" if not found.limit else "No effect that was tried explains"
     return (
         f"{none} the {found.samples}{besides}, but what they hold is measured: {words}; "
-        f"with it {_closed(found)}; {_alike(found)}."
+        f"with it {_closed(found)}; {_alike(found)}{_broken(found)}."
     )
 
 

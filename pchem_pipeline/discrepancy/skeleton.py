@@ -107,6 +107,13 @@ class Explainer(Protocol[Explanation]):
         """Put what no effect with a name makes in the place of all that were added, if it leaves less."""
         ...
 
+    def probable(self) -> NullModel | None:
+        """Put effects into the model that explain the data but are not certain; None: there are none.
+
+        They are told, and leave the model again with the verdict.
+        """
+        ...
+
     def unfinished(self, before: Gap, null: NullModel) -> bool:
         """Tell whether so much of the gap is left that what was added gets no name, though the data agree."""
         ...
@@ -169,6 +176,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
             described = by.describe(before, null)
         except EffortSpentError as spent:
             described, limit = None, limit or spent.words()
+        described = described or by.probable()
         if described is not None:
             null, still = described, disagrees(described, z, significance, by.tolerance())
     tell("measuring the gap that is left, with effects and with rivals")

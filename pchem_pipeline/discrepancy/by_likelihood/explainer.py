@@ -275,6 +275,10 @@ class HistogramExplainer:
         """Leave what was added: nothing is measured of anything else here."""
         return None
 
+    def probable(self) -> NullModel | None:
+        """Return nothing: what the likelihood of the test part does not prefer is not compared further."""
+        return None
+
     def unfinished(self, before: Gap, null: NullModel) -> bool:
         """Return False: nothing is measured here of what no effect explains."""
         return False

@@ -47,6 +47,7 @@ class Round:
         null: of the model before it.
         extended: of the model after it.
         moved: change of the parameter maps by their refit with the effects.
+        certain: whether the effects are beyond doubt; else they only leave nothing.
     """
 
     compared: Comparison
@@ -55,6 +56,7 @@ class Round:
     null: NullModel
     extended: NullModel
     moved: Mapping[str, Mapping[str, Any]]
+    certain: bool = True
 
     def updated(self, now: Mapping[str, Hypothesis], errors: Mapping[str, float]) -> Round:
         """Return it with its effects as a later round has fitted them anew, and relative standard errors."""
@@ -168,6 +170,7 @@ class AddedRounds:
                 this.extended.pulls(self.z.both, 2),
             ),
             moved=this.moved,
+            certain=this.certain,
         )
 
     def _others(self, this: Round, member: int) -> list[_Other]:

@@ -7,6 +7,7 @@ anything; what it does not show at all is not named.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -34,6 +35,7 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulati
 from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, compare
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import PixelLikelihood, Witness
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
+from pchem_pipeline.discrepancy.by_simulation.sets.trials import leaves_nothing
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import (
@@ -133,6 +135,7 @@ class FrameExplainer:
         samples: what the data are, in words.
         defects: candidates that failed, and why.
         unexplained: what measures what no effect explains, once it is asked for.
+        doubtful: puts effects into the model that leave nothing but are not certain; None: there are none.
     """
 
     settings: DiscrepancySettings
@@ -144,6 +147,7 @@ class FrameExplainer:
     samples: str = "frames"
     defects: dict[str, str] = field(default_factory=dict)
     unexplained: Unexplained | None = None
+    doubtful: Callable[[], NullModel] | None = None
 
     @classmethod
     def begin(
@@ -260,6 +264,9 @@ class FrameExplainer:
         kept = self.accept.established(added)
         while len(kept) < len(added.hypotheses):
             if {h.tag for h in kept} <= held:
+                if not held and leaves_nothing(refitter, added):
+                    put = functools.partial(self.extended.put, found, added, explanation.hypotheses, null)
+                    self.doubtful = functools.partial(put, certain=False)
                 return None
             try:
                 added = refitter.sharpened(refitter.refined(kept), count)
@@ -335,6 +342,10 @@ class FrameExplainer:
         # effects that the final frames do not tell from the truth are known to leave something by the others
         as_good = gap.at_floor and (not left.at_floor or unexplained.leaves_nothing(found))
         return self.extended.put_measured(found) if better or as_good else None
+
+    def probable(self) -> NullModel | None:
+        """Put the likeliest effects into the model that leave nothing but are too weak to be certain."""
+        return None if self.doubtful is None or self.extended.rounds else self.doubtful()
 
     def unfinished(self, before: Gap, null: NullModel) -> bool:
         """Tell whether the final frames prove that too much of the gap is left."""

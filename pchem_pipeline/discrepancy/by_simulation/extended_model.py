@@ -54,7 +54,13 @@ class ExtendedModel:
         return tuple(e for e in self.effects if e.tag not in added)
 
     def put(
-        self, found: Comparison, added: Refitted, hypotheses: tuple[Hypothesis, ...], null: NullModel
+        self,
+        found: Comparison,
+        added: Refitted,
+        hypotheses: tuple[Hypothesis, ...],
+        null: NullModel,
+        *,
+        certain: bool = True,
     ) -> NullModel:
         """Put a set into the model, at the strengths to which its replicates correct it; return the null.
 
@@ -63,6 +69,7 @@ class ExtendedModel:
             added: the set with many replicates.
             hypotheses: all candidates of the round.
             null: of the model before it.
+            certain: whether its effects are beyond doubt.
         """
         # within a standard error the steps end, too
         near = np.abs(added.change) < np.maximum(_NEAR, added.stderr)
@@ -86,7 +93,7 @@ class ExtendedModel:
             new, np.ones(len(new)), np.array([errors[h.tag] for h in new]), np.zeros(len(new), np.bool_)
         )
         moved = self.work.mapped(self.effects).fit.moved
-        self.rounds.append(Round(found, fit, hypotheses, null, extended, moved))
+        self.rounds.append(Round(found, fit, hypotheses, null, extended, moved, certain))
         return extended
 
     def put_measured(self, found: Refitted) -> NullModel:

@@ -119,7 +119,8 @@ class NoiseMode(Section):
         if self.changes != "offset":
             share, of = 100.0 * size / self.signal_dn, _CHANGED[self.changes]
             at = "" if self.changes == "noise" else "at a signal "
-            form = ".2g" if self.burst is None else "+.2g"
+            form = ".2g" if abs(share) < 100.0 else ".0f"
+            form = form if self.burst is None else f"+{form}"
             what = f"{share:{form}} % of the {of}, {what} {at}of {self.signal_dn:.3g} DN"
         burst = "" if self.burst is None else f"in {100 * self.burst:.2g} % of the {self.of}s only"
         return ", ".join(part for part in (what, whole, burst, shared) if part)

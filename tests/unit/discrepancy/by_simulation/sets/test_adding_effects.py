@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pchem_pipeline.discrepancy.build_verdict import Findings
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
 from pchem_pipeline.discrepancy.by_simulation.additions import (
     unexplained_of_its_kind,
@@ -755,6 +756,30 @@ def test_what_is_found_enters_the_model_at_its_best_strength(monkeypatch: pytest
     assert [e.tag for e in search.model] == ["row_noise"]
     assert search.model[0].row_noise_dn == pytest.approx(0.5, rel=0.05)
     assert np.abs(extended.mean[0] - statistics(search.model)[0]) < 3.0
+
+
+@pytest.mark.parametrize("rest", [0.0, 30.0])
+def test_what_explains_all_but_is_not_certain_is_told_without_a_name(
+    monkeypatch: pytest.MonkeyPatch, rest: float
+) -> None:
+    """Weak over-dispersion, 4 standard errors strong, was 'unexplained: no known effect explains it'."""
+    world = World([effect("row_noise", 0.5)])
+    monkeypatch.setattr(Acceptance, "established", lambda *_: ())
+    left = rest * np.eye(M)[5]
+    world.z = Measured(world.z.train + left, world.z.test + left, world.z.final)
+    unlisted = SimpleNamespace(explains_all=lambda: False)
+    monkeypatch.setattr(FrameExplainer, "_unexplained", lambda _: unlisted)
+    search, extended = add(world, monkeypatch, hypothesis("row_noise"))
+    assert extended is None
+    told = search.probable()
+    assert (told is None) == (rest > 0.0)
+    if told is not None:
+        before = search.gap(world.null)
+        added = search.close(before, told, disagrees=False)
+        assert [(a.effect.tag, a.verdict) for a in added.additions] == [("row_noise", "ambiguous")]
+        found = Findings("frames", world.z, world.null, told, before, [], False, added)
+        assert found.state == "ambiguous"
+        assert found.model((), search.model) == ()
 
 
 def test_only_effects_that_account_for_what_they_move_are_kept_beside_what_is_measured(
