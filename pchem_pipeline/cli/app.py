@@ -136,15 +136,14 @@ def run(
     What is up to date is not done again. The path of the report is on stdout, all else on stderr.
     """
     from pchem_pipeline.commands.first_screen import run_to_first_screen
-    from pchem_pipeline.commands.new_run import find_or_start, first_try
-    from pchem_pipeline.config.load import dump_config
+    from pchem_pipeline.commands.new_run import find_or_start, first_try, unwritten
     from pchem_pipeline.runner.session import cropped, up_to
 
     given = {"integration_time": integration_time, "bit_depth": bit_depth, "kind": kind, "mode": mode}
     known = {name: value for name, value in given.items() if value is not None}
     wanted = command.options
     target, is_new = find_or_start(targets, store, known, wanted.roi, write=False)
-    text = dump_config(target.config) if is_new else None
+    text = unwritten(target) if is_new else None
     if is_new:
         target, command = cropped(target, command)
     stages = up_to(until, pipeline_of(target.config))

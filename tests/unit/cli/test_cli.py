@@ -107,7 +107,7 @@ def test_options_for_camera_files_do_not_fit_a_yaml(tmp_path):
 
 
 def test_missing_files_are_named(tmp_path):
-    with pytest.raises(ConfigError, match="does not exist"):
+    with pytest.raises(InputError, match="does not exist"):
         find_or_start([tmp_path / "none.tif"], None, {})
 
 
