@@ -126,7 +126,7 @@ def settings_of(store: Path) -> Path:
 
 
 def settings_there(path: Path, stated: Mapping[str, Any], command: str) -> RunConfig:
-    """Return the settings of a YAML file, which must agree with those that are stated; the others are its own.
+    """Return the settings of a YAML file, which must agree with those that are stated; others are its own.
 
     Args:
         path: the YAML file.

@@ -133,6 +133,12 @@ def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
             f"{mine.where} has codes of {depths[0]} bits, {first.where} of {depths[1]}; "
             "all samples must come from one sensor with the same settings"
         )
+    cameras = [each.sensor.camera.serial for each in (mine, first)]
+    if None not in cameras and cameras[0] != cameras[1]:
+        raise ConfigError(
+            f"{mine.where} is of the camera of serial number {cameras[0]}, {first.where} of {cameras[1]}; "
+            "all samples must come from one sensor"
+        )
     regions = [each.target.config.input.roi for each in (mine, first)]
     if regions[0] != regions[1]:
         raise ConfigError(
@@ -167,8 +173,8 @@ def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> NDArray
         time = sample.integration_time if given.integration_time is None else given.integration_time
         if time is None:
             raise ConfigError(
-                f"{where} has no integration time, so there is no slope for the charge rate; "
-                "give integration_time, s, or set input.against: none"
+                f"{where} has no integration time, so there is no slope for the charge rate; set "
+                "input.integration_time of that run, s, or input.against: none"
             )
         found[i] = time
     return found

@@ -79,7 +79,7 @@ def test_the_same_command_goes_on_with_a_yaml_that_says_more(tmp_path, file, mon
     """What a search names is written into the YAML, what a user sets too; the command that began goes on."""
     monkeypatch.chdir(tmp_path)
     place = tmp_path / "run.zarr"
-    target, _ = find_or_start([file], place, {"bit_depth": 12}, (0, 8, 8, 16))
+    find_or_start([file], place, {"bit_depth": 12}, (0, 8, 8, 16))
     RunStore.create(place).records.write(StageRecord("ingest", 1, "f", {}, finished=True))
     path = tmp_path / "run.yaml"
     effects = "effects: [{tag: row_noise, row_noise_dn: 1.0}]  # named"
