@@ -162,6 +162,12 @@ def flags(data: ReportData) -> list[Flag]:
     return sorted(found, key=lambda flag: order.index(flag.level))
 
 
+def _levels(data: ReportData) -> list[Flag]:
+    """Say where the frames are of several exposures: what else is odd follows from that."""
+    found = () if data.quick_look is None else data.quick_look.found
+    return [Flag(check.level, f"{check_sentence(check)}.") for check in found if check.name == "levels"]
+
+
 def _failed_pixels(data: ReportData) -> list[Flag]:
     pixels = pixel_counts(data)
     share = pixels.failed / max(pixels.total, 1)
@@ -315,7 +321,8 @@ def _quick_look(data: ReportData) -> list[Flag]:
         return []
     if not look.found:
         return [Flag("good", nothing_found(look))]
-    closer = f"; to look closer: {look.command}" if look.command and data.discrepancy is None else ""
+    known = not look.command or data.discrepancy is not None
+    closer = "" if known else f"; to look closer: {look.command}"
     return [
         # what the model has already speaks for it
         Flag(
@@ -323,6 +330,7 @@ def _quick_look(data: ReportData) -> list[Flag]:
             f"{check_sentence(check)}{closer if number == 0 else ''}.",
         )
         for number, check in enumerate(look.found)
+        if check.name != "levels"
     ]
 
 
@@ -365,8 +373,8 @@ def _model(data: ReportData, article: str = "The") -> str:
 
 #: What looks for remarks; a further check is a further row.
 CHECKS: tuple[Callable[[ReportData], list[Flag]], ...] = (
-    _spaced_codes, _failed_pixels, _unfitted, _flagged, _cautions, _goodness, _agreement, _quick_look,
-    _discrepancy, _conditions,
+    _spaced_codes, _levels, _failed_pixels, _unfitted, _flagged, _cautions, _goodness, _agreement,
+    _quick_look, _discrepancy, _conditions,
 )  # fmt: skip
 
 

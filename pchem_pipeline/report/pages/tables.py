@@ -15,6 +15,7 @@ from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.figures.plan import frames_text, target_text
 from pchem_pipeline.report.figures.samples import AXES, middle
 from pchem_pipeline.report.figures.trust import noise_shares
+from pchem_pipeline.report.pages.quick_look import check_title
 from pchem_pipeline.report.pages.quick_look import size_text as check_size
 from pchem_pipeline.report.pages.summary import summaries
 from pchem_pipeline.report.style.ranges import finite
@@ -55,7 +56,7 @@ def _quick_look(data: ReportData) -> Table:
     look = data.quick_look or QuickLook(())
     rows = tuple(
         (
-            check.title[:1].upper() + check.title[1:],
+            check_title(check),
             ("in the model" if check.in_model else "yes") if check.found else "no",
             check_size(check) if check.found else "",
             _limit_text(check),

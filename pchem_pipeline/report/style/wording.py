@@ -155,4 +155,5 @@ def percent(part: float, whole: float) -> str:
         return "< 0.01 %"
     if 99.99 < share < 100:
         return "> 99.99 %"
-    return f"{share:.{2 if share < 1 else 1 if share < 10 or share > 99 else 0}f} %".replace(".0 %", " %")
+    digits = 2 if share < 1 else 1 if share < 10 or 99 < share < 100 else 0
+    return f"{share:.{digits}f} %".replace(".0 %", " %")
