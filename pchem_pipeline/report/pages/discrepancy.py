@@ -24,7 +24,7 @@ from pchem_pipeline.report.pages.discrepancy_tables import (
 from pchem_pipeline.report.pages.pictures import Picture
 from pchem_pipeline.report.pages.summary import Flag, Level
 from pchem_pipeline.report.pages.tables import Table
-from pchem_pipeline.report.style.wording import count, measured, percent, short, unit_text
+from pchem_pipeline.report.style.wording import count, measured, percent, short, typeset, unit_text
 
 #: File of the verdict's own page in the folder of a run.
 DISCREPANCY_PAGE = "discrepancy.html"
@@ -162,7 +162,7 @@ def discrepancy_view(data: DiscrepancyData, pictures: Sequence[Picture]) -> Disc
             title = "Data and model side by side"
         empty = "" if shown or rows else _EMPTY[id_]
         parts.append(Part(f"discrepancy-part-{id_}", title, intro, empty, shown, rows))
-    sentence = data.found.sentence.replace(" -> ", " → ")
+    sentence = typeset(data.found.sentence)
     return DiscrepancyView(
         level, name, sentence, frames_text(data.found), key_facts(data), remarks(data), parts
     )

@@ -232,7 +232,8 @@ def _moved(steps: Sequence[Step]) -> Table:
     return Table(
         "discrepancy-moved",
         "How the delivered parameters moved",
-        "Median over the pixels of (with the effect − without it), also in standard errors of a pixel.",
+        "Median over all pixels of (with the effect − without it), also in standard errors of a pixel. An "
+        "effect in fewer than half of them moves no median.",
         ("parameter", "effect added", "moved by", "in standard errors"),
         tuple(rows),
     )

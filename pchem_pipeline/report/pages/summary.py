@@ -16,7 +16,15 @@ from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.pages.criteria import Criterion, criteria
 from pchem_pipeline.report.pages.quick_look import check_sentence, nothing_found
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.wording import count, measured, percent, scientific, short, symbol
+from pchem_pipeline.report.style.wording import (
+    count,
+    measured,
+    percent,
+    scientific,
+    short,
+    symbol,
+    typeset,
+)
 
 Level = Literal["good", "note", "caution", "serious"]
 
@@ -311,7 +319,7 @@ def _discrepancy(data: ReportData) -> list[Flag]:
         "named_in_part": "caution",
         "unexplained": "serious",
     }
-    return [Flag(levels.get(found.verdict, "note"), _as_sentence(found.sentence.replace(" -> ", " → ")))]
+    return [Flag(levels.get(found.verdict, "note"), _as_sentence(typeset(found.sentence)))]
 
 
 def _quick_look(data: ReportData) -> list[Flag]:

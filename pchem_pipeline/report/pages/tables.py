@@ -234,6 +234,18 @@ _RMSE_ROWS = (
 )
 
 
+def rmse_words(name: str) -> str:
+    """Return what a prediction of the ensemble is called, or the sampling noise beside it."""
+    words = {row[0]: row[1] for row in _RMSE_ROWS}
+    floors = {"noise_floor": "raw, sampling noise alone", "nuced_noise_floor": "NUCed, sampling noise alone"}
+    return {**words, **floors}.get(name, name.replace("_", " "))
+
+
+def rmse_unit(name: str) -> str:
+    """Return the unit of the densities of an ensemble, raw or after correction."""
+    return "1/e⁻" if name.startswith("nuced") else "1/DN"
+
+
 def _rmse(data: ReportData) -> Table:
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
     rows = []
@@ -241,7 +253,7 @@ def _rmse(data: ReportData) -> Table:
         if rmse.get(name) is None:
             continue
         floor = rmse.get(floor_name)
-        unit = "1/DN" if name.startswith("epcd") else "1/e⁻"
+        unit = rmse_unit(name)
         rows.append(
             (
                 words,
@@ -267,16 +279,18 @@ def _moments(data: ReportData) -> Table:
         observed, error = row.get("observed"), row.get("stderr")
         predicted = float(row["predicted"])
         if observed is None:
-            seen, difference = "", ""
+            expected, seen, difference = short(predicted), "", ""
         elif error:
+            # to the digits of the data that it is compared with
+            expected = measured(predicted, float(error)).partition(" ±")[0]
             seen = measured(float(observed), float(error))
             difference = signed((float(observed) - predicted) / float(error))
         else:
-            seen, difference = short(float(observed), 5), ""
+            expected, seen, difference = short(predicted, 5), short(float(observed), 5), ""
         rows.append(
             (
                 f"{row['quantity']} ({unit})" if unit else str(row["quantity"]),
-                short(predicted, 6),
+                expected,
                 seen,
                 difference,
             )

@@ -62,9 +62,18 @@ def without_formulas(text: str) -> str:
     return _FORMULA.sub(characters, text).replace(r"\$", "$")
 
 
+#: Electrons in plain text, not a word that is broken at a hyphen.
+_PLAIN_E = re.compile(r"(?<![\w.])e-(?!\w)")
+
+
 def unit_text(unit: str) -> str:
     """Return a stored unit as people write it, e.g. ``e-/DN`` as ``e⁻/DN``; ``1`` as nothing."""
     return _UNITS.get(unit, unit)
+
+
+def typeset(text: str) -> str:
+    """Return a plain sentence, as a verdict has it, with the signs of a page: ``e⁻``, ``→``."""
+    return _PLAIN_E.sub("e⁻", text.replace(" -> ", " → "))
 
 
 def symbol(name: str) -> tuple[str, str, str]:
