@@ -6,6 +6,8 @@ Heavy libraries are imported inside the commands, so that ``--help`` answers at 
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -419,6 +421,16 @@ def _fail(message: str, code: int) -> NoReturn:
     sys.exit(code)
 
 
+#: What a full or broken disk answers.
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+
+
+def _without_stdout(error: OSError) -> NoReturn:
+    """End where the results could not be written to stdout; what is left of them goes nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    _fail(f"stdout cannot be written ({error.strerror}); check where it goes to", ExitCode.INPUT)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; ends the process with the exit codes of :class:`ExitCode`."""
     from pchem_pipeline.compute.environment import prepare_environment
@@ -429,6 +441,10 @@ def main(arguments: list[str] | None = None) -> None:
         call(args=arguments, prog_name="pchem")
     except PchEmError as error:
         _fail(str(error), error.exit_code)
+    except OSError as error:
+        if error.errno not in _DISK or error.filename is not None:
+            raise
+        _without_stdout(error)
     except MemoryError:
         _fail("out of memory; use fewer --workers or --max-memory", ExitCode.INTERNAL)
     except KeyboardInterrupt:
