@@ -56,11 +56,17 @@ class OpenSample:
         """Seconds per frame, as its run says."""
         return self.target.config.input.integration_time or self.sensor.integration_time
 
-    @property
-    def content(self) -> Any:
-        """What tells its frames from those of another."""
-        files = [file.get("xxh3_128") for file in self.sensor.identity.get("files", [])]
-        return files if files and all(files) else id(self)
+    def shares_frames(self, other: OpenSample) -> bool:
+        """Tell whether it has frames of the same files, and of the same dataset in them, as another."""
+        files = [
+            [file.get("xxh3_128") for file in each.sensor.identity.get("files", [])] for each in (self, other)
+        ]
+        if files[0] != files[1] or not files[0] or not all(files[0]):
+            return False
+        mine, others = self.target.config.input, other.target.config.input
+        (first, end), (start, last) = (each.frame_range or (0, None) for each in (mine, others))
+        apart = (end is not None and end <= start) or (last is not None and last <= first)
+        return mine.dataset == others.dataset and not apart
 
 
 def sample_targets(config: RunConfig, base_dir: Path) -> list[Target]:
@@ -146,7 +152,7 @@ def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
             "all samples must show the same region of one sensor"
         )
     for other in others:
-        if other.content == mine.content:
+        if mine.shares_frames(other):
             raise ConfigError(f"{mine.where} holds the same frames as {other.where}; list each sample once")
 
 
