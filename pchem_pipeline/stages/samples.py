@@ -58,15 +58,16 @@ class OpenSample:
 
     def shares_frames(self, other: OpenSample) -> bool:
         """Tell whether it has frames of the same files, and of the same dataset in them, as another."""
-        files = [
-            [file.get("xxh3_128") for file in each.sensor.identity.get("files", [])] for each in (self, other)
-        ]
-        if files[0] != files[1] or not files[0] or not all(files[0]):
+        hashes = self._hashes()
+        if not hashes or not all(hashes) or hashes != other._hashes():
             return False
         mine, others = self.target.config.input, other.target.config.input
         (first, end), (start, last) = (each.frame_range or (0, None) for each in (mine, others))
         apart = (end is not None and end <= start) or (last is not None and last <= first)
         return mine.dataset == others.dataset and not apart
+
+    def _hashes(self) -> list[Any]:
+        return [file.get("xxh3_128") for file in self.sensor.identity.get("files", [])]
 
 
 def sample_targets(config: RunConfig, base_dir: Path) -> list[Target]:

@@ -173,7 +173,7 @@ def _data_digest(store: RunStore, sensor: SensorInfo) -> str:
     """Return what tells the frames of a run: content of the files, and what was taken of them."""
     record = store.records.read("ingest")
     settings = {} if record is None else record.content.get("settings", {})
-    taken = [settings.get(f"input.{name}") for name in ("roi", "frame_range", "bit_shift")]
+    taken = [settings.get(f"input.{name}") for name in ("dataset", "roi", "frame_range", "bit_shift")]
     return f"{sensor.identity.get('digest', '')} {taken} {sensor.n_frames} {sensor.shape}"
 
 
