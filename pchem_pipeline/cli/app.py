@@ -116,6 +116,12 @@ def run(
         float | None, typer.Option(help="camera files: integration time of a frame, s")
     ] = None,
     bit_depth: Annotated[int | None, typer.Option(help="camera files: bits of the ADC")] = None,
+    bit_shift: Annotated[
+        int | None, typer.Option(help="camera files: bits to shift right, of left-justified samples")
+    ] = None,
+    dataset: Annotated[
+        str | None, typer.Option(help="camera files: path of the frames inside an HDF5 or zarr file")
+    ] = None,
     kind: Annotated[
         Literal["dark", "light", "unknown"] | None,
         typer.Option(
@@ -141,7 +147,14 @@ def run(
     from pchem_pipeline.commands.new_run import find_or_start, first_try, unwritten
     from pchem_pipeline.runner.session import cropped, up_to
 
-    given = {"integration_time": integration_time, "bit_depth": bit_depth, "kind": kind, "mode": mode}
+    given = {
+        "integration_time": integration_time,
+        "bit_depth": bit_depth,
+        "bit_shift": bit_shift,
+        "dataset": dataset,
+        "kind": kind,
+        "mode": mode,
+    }
     known = {name: value for name, value in given.items() if value is not None}
     wanted = command.options
     target, is_new = find_or_start(targets, store, known, wanted.roi, write=False)

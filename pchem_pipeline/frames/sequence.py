@@ -162,7 +162,7 @@ class FrameSequence(FrameReader):
             if self.bit_shift < unused and not used >> unused >> depth:
                 raise InputError(
                     f"{text}, and their lowest {unused} bits are all zero: left-justified samples, it seems; "
-                    f"set input.bit_shift: {unused}"
+                    f"set input.bit_shift: {unused} (--bit-shift)"
                 )
             raise InputError(f"{text}; correct input.bit_depth, input.bit_shift or input.byte_order")
 

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -34,6 +35,20 @@ def test_a_wrong_option_is_one_line(tmp_path, file, given, words):
     with pytest.raises(ConfigError, match=f"^the command line: {words}"):
         find_or_start([file], tmp_path / "run.zarr", given)
     assert not (tmp_path / "run.yaml").exists()
+
+
+def test_what_files_do_not_say_of_themselves_has_an_option(tmp_path, monkeypatch):
+    """Left-justified samples in one of two datasets of an HDF5 file."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(1)
+    with h5py.File("a.h5", "w") as file:
+        for name in ("dark", "light"):
+            file[name] = rng.integers(100, 140, (20, 4, 4)).astype(np.uint16) << 4
+    options = ["--dataset", "light", "--bit-shift", "4", "--bit-depth", "12", "--until", "histogram"]
+    CliRunner().invoke(app, ["run", "a.h5", *options], catch_exceptions=False)
+    written = load_config(tmp_path / "run.yaml").input
+    assert (written.dataset, written.bit_shift, written.bit_depth) == ("light", 4, 12)
+    assert RunStore.open(tmp_path / "run.zarr").read("histogram/origin").min() < 140
 
 
 def test_the_region_is_written_into_the_yaml(tmp_path, file):
