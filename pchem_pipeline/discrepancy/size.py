@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
-from pchem_pipeline.discrepancy.verdict import RARE, Size
+from pchem_pipeline.discrepancy.verdict import RARE, Size, parameters_of
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -40,6 +40,8 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
         maps: fitted parameters, (y, x) each.
         n_frames: of the run.
     """
+    if _is_measured_noise(effect) and maps.usable.any():
+        return _of_noise(float(getattr(effect, effect.strength)), maps)
     blocks = _BLOCKS
     if effect.far_reaching:
         blocks = max(_BLOCKS * _MOST_ROWS**2 // maps.usable.size, _FEWEST_BLOCKS)
@@ -67,6 +69,25 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
         of_read_noise=dn / noise,
         samples=share,
     )
+
+
+def _is_measured_noise(effect: Effect) -> bool:
+    """Tell whether the strength of an effect is the measured standard deviation of what samples share, DN.
+
+    Where it is light that varies, samples change by whole electrons, most of them by their own chance.
+    """
+    return (
+        effect.measured_only
+        and effect.power == 2.0
+        and parameters_of(effect, 0.0)[effect.strength].unit == "DN"
+    )
+
+
+def _of_noise(dn: float, maps: PixelMaps) -> Size:
+    """Return the size of a noise of so many DN, at the gain and read noise of the median pixel."""
+    gain = float(np.median(maps.conversion_gain[maps.usable]))
+    noise = float(np.median(maps.read_noise_dn[maps.usable]))
+    return Size(electrons=dn * gain, dn=dn, of_read_noise=dn / noise)
 
 
 def _change(

@@ -40,6 +40,18 @@ def test_the_size_is_what_the_law_of_the_effect_says(
     assert size.of_read_noise == pytest.approx(size.dn / NOISE)
 
 
+@pytest.mark.parametrize("changes", ["offset", "light"])
+def test_a_measured_noise_has_the_size_that_was_measured(changes: str) -> None:
+    """Light that varies by 5 % changes few samples, by whole electrons: that is their shot noise."""
+    mode = {"of": "row", "share": 1.0, "changes": changes, "signal_dn": EXPOSURE / GAIN}
+    fields = {"tag": "empirical_noise", "noise_dn": 1.0, "modes": [mode]}
+    size = size_of(effect_class("empirical_noise").model_validate(fields), MAPS, 4000)
+    assert size is not None
+    assert size.model_dump() == pytest.approx(
+        {"electrons": GAIN, "dn": 1.0, "of_read_noise": 1.0 / NOISE, "samples": 1.0}
+    )
+
+
 def test_the_size_in_a_part_is_that_where_it_acts() -> None:
     effect = effect_class("row_noise").model_validate({"tag": "row_noise", "row_noise_dn": 0.5})
     part = effect.at_place(Region.model_validate({"columns": [[0, 4]]}))
