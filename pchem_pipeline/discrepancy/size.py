@@ -6,6 +6,7 @@ the same random numbers, is taken before anything is rounded; what is alike in a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -40,9 +41,11 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
         maps: fitted parameters, (y, x) each.
         n_frames: of the run.
     """
-    if _is_measured_noise(effect) and maps.usable.any():
+    if not maps.usable.any():
+        return None
+    if _is_measured_noise(effect):
         return _of_noise(float(getattr(effect, effect.strength)), maps)
-    blocks = _BLOCKS
+    blocks, noise = _BLOCKS, float(np.median(maps.read_noise_dn[maps.usable]))
     if effect.far_reaching:
         blocks = max(_BLOCKS * _MOST_ROWS**2 // maps.usable.size, _FEWEST_BLOCKS)
     else:
@@ -60,7 +63,6 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
         return None
     share = float(np.mean([np.mean(np.abs(change) > _CHANGED) for change in changes]))
     gain = np.where(maps.usable, maps.conversion_gain, np.median(maps.conversion_gain[maps.usable]))
-    noise = float(np.median(maps.read_noise_dn[maps.usable]))
     in_dn = effect.plane in _IN_DN
     dn = _spread([change if in_dn else change / gain for change in changes], share)
     return Size(
@@ -76,11 +78,9 @@ def _is_measured_noise(effect: Effect) -> bool:
 
     Where it is light that varies, samples change by whole electrons, most of them by their own chance.
     """
-    return (
-        effect.measured_only
-        and effect.power == 2.0
-        and parameters_of(effect, 0.0)[effect.strength].unit == "DN"
-    )
+    if not effect.measured_only or effect.power != 2.0:
+        return False
+    return parameters_of(effect, math.nan)[effect.strength].unit == "DN"
 
 
 def _of_noise(dn: float, maps: PixelMaps) -> Size:
