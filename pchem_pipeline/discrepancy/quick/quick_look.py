@@ -295,7 +295,7 @@ def _noise_check(
         "DN",
         limit=math.sqrt(_SURE * found.error),
         where=where,
-        advice="it is part of what is called read noise, but does not average out over pixels",
+        advice="it is in the noise of each pixel and does not average out over pixels",
     )
 
 
