@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.cli.app import app
+from pchem_pipeline.commands.joint import find_joint
 from pchem_pipeline.commands.new_run import find_or_start, first_try, unwritten
 from pchem_pipeline.config.load import dump_config, load_config
 from pchem_pipeline.store.records import StageRecord
@@ -110,6 +111,24 @@ def test_the_same_command_goes_on_with_a_yaml_that_says_more(tmp_path, file, mon
     with pytest.raises(ConfigError, match=r"\(input\.roi \[0, 8, 8, 16\] there, \[0, 8, 0, 8\] here\)"):
         find_or_start([file], place, {}, (0, 8, 0, 8))
     assert path.read_text() == edited
+
+
+def test_a_joint_fit_goes_on_with_its_edited_yaml(tmp_path, monkeypatch):
+    """Integration times are edited there, and what a search names is written there."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b"):
+        Path(f"{name}.yaml").write_text(f"run: {{store: {name}.zarr}}\ninput: {{files: [{name}.tif]}}\n")
+    runs = [Path("a.yaml"), Path("b.yaml")]
+    _, is_new = find_joint(runs, store=Path("j.zarr"))
+    assert is_new
+    edited = Path("j.yaml").read_text().replace("integration_time: null", "integration_time: 2.0", 1)
+    Path("j.yaml").write_text(edited)
+    again, is_new = find_joint(runs, store=Path("j.zarr"))
+    assert not is_new
+    assert again.config.input.samples[0].integration_time == 2.0
+    with pytest.raises(ConfigError, match="exists with other settings"):
+        find_joint(runs[::-1], store=Path("j.zarr"))
+    assert Path("j.yaml").read_text() == edited
 
 
 def test_a_refusal_that_names_a_setting_says_where_settings_are(tmp_path, monkeypatch):
