@@ -232,9 +232,10 @@ def test_offsets_that_jump_or_alternate_and_lamps_that_drift_are_no_two_exposure
     assert not by_name(alternating)["levels"].found
     lamp = looked(stack(rng, SHAPE, exposure=1.0 + t / 800.0))
     assert not by_name(lamp)["levels"].found
-    for seed in range(20):  # neither noise of frames nor a flickering lamp leaves a gap
-        noise = np.random.default_rng(seed).normal(200.0, 3.0, 64)
-        assert levels_check(noise, 8.0 * noise, GAIN).p == 1.0
+    for seed in range(300):  # neither noise of frames nor a flickering lamp leaves a gap
+        each = np.random.default_rng(seed)
+        for noise in (each.normal(200.0, 3.0, 32), each.uniform(190.0, 210.0, 32)):
+            assert levels_check(noise, 8.0 * noise, GAIN).p == 1.0
 
 
 def test_a_period_of_the_frames_and_even_and_odd_ones_are_told_apart() -> None:
