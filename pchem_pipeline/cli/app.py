@@ -6,6 +6,8 @@ Heavy libraries are imported inside the commands, so that ``--help`` answers at 
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -114,6 +116,12 @@ def run(
         float | None, typer.Option(help="camera files: integration time of a frame, s")
     ] = None,
     bit_depth: Annotated[int | None, typer.Option(help="camera files: bits of the ADC")] = None,
+    bit_shift: Annotated[
+        int | None, typer.Option(help="camera files: bits to shift right, of left-justified samples")
+    ] = None,
+    dataset: Annotated[
+        str | None, typer.Option(help="camera files: path of the frames inside an HDF5 or zarr file")
+    ] = None,
     kind: Annotated[
         Literal["dark", "light", "unknown"] | None,
         typer.Option(
@@ -136,15 +144,21 @@ def run(
     What is up to date is not done again. The path of the report is on stdout, all else on stderr.
     """
     from pchem_pipeline.commands.first_screen import run_to_first_screen
-    from pchem_pipeline.commands.new_run import find_or_start, first_try
-    from pchem_pipeline.config.load import dump_config
+    from pchem_pipeline.commands.new_run import find_or_start, first_try, unwritten
     from pchem_pipeline.runner.session import cropped, up_to
 
-    given = {"integration_time": integration_time, "bit_depth": bit_depth, "kind": kind, "mode": mode}
+    given = {
+        "integration_time": integration_time,
+        "bit_depth": bit_depth,
+        "bit_shift": bit_shift,
+        "dataset": dataset,
+        "kind": kind,
+        "mode": mode,
+    }
     known = {name: value for name, value in given.items() if value is not None}
     wanted = command.options
     target, is_new = find_or_start(targets, store, known, wanted.roi, write=False)
-    text = dump_config(target.config) if is_new else None
+    text = unwritten(target) if is_new else None
     if is_new:
         target, command = cropped(target, command)
     stages = up_to(until, pipeline_of(target.config))
@@ -420,6 +434,16 @@ def _fail(message: str, code: int) -> NoReturn:
     sys.exit(code)
 
 
+#: What a full or broken disk answers.
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+
+
+def _without_stdout(error: OSError) -> NoReturn:
+    """End where the results could not be written to stdout; what is left of them goes nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    _fail(f"stdout cannot be written ({error.strerror}); check where it goes to", ExitCode.INPUT)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; ends the process with the exit codes of :class:`ExitCode`."""
     from pchem_pipeline.compute.environment import prepare_environment
@@ -430,6 +454,10 @@ def main(arguments: list[str] | None = None) -> None:
         call(args=arguments, prog_name="pchem")
     except PchEmError as error:
         _fail(str(error), error.exit_code)
+    except OSError as error:
+        if error.errno not in _DISK or error.filename is not None:
+            raise
+        _without_stdout(error)
     except MemoryError:
         _fail("out of memory; use fewer --workers or --max-memory", ExitCode.INTERNAL)
     except KeyboardInterrupt:

@@ -29,6 +29,10 @@ def apply(
             "(of the characterisation), a number (e-), or a file with a map (npy, TIFF, FITS)"
         ),
     ] = "frames",
+    dataset: Annotated[
+        str | None,
+        typer.Option(help="path of the frames inside an HDF5 or zarr file  [default: as the run has it]"),
+    ] = None,
     format: Annotated[Literal["zarr", "tiff", "fits"], typer.Option(help="format of the output")] = "zarr",
     keep_modes: Annotated[
         bool,
@@ -50,6 +54,6 @@ def apply(
     from pchem_pipeline.run.target import find_run
 
     command = replace(command, options=replace(command.options, force=force))
-    wanted = ApplySettings(kinds_of(what), prior, not keep_modes, format)
+    wanted = ApplySettings(kinds_of(what), prior, not keep_modes, format, dataset)
     for path in apply_to_frames(find_run(target), frames, output, wanted, command):
         typer.echo(path)

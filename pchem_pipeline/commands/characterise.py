@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.commands.new_run import other_settings, settings_of
+from pchem_pipeline.commands.new_run import settings_of, settings_there
 from pchem_pipeline.commands.notebook import open_run, require_xarray
 from pchem_pipeline.config.load import dump_config, make_config
 from pchem_pipeline.frames.writing import write_frames
@@ -143,14 +143,15 @@ def _target(place: Path, given: Mapping[str, Any], settings: Mapping[str, Mappin
     path = settings_of(place)
     content: dict[str, Any] = {name: dict(section) for name, section in settings.items()}
     content["run"] = {**content.get("run", {}), "store": place.name}
-    known = {"files": [f"{path.stem}-frames.npy"], "mode": "reference", **given}
+    known = {"files": [f"{path.stem}-frames.npy"], "mode": "reference"}
+    known |= {name: value for name, value in given.items() if value is not None}
     content["input"] = {**known, **content.get("input", {})}
     config = make_config(content, "characterise")
-    text = dump_config(config)
-    if path.exists() and path.read_text(encoding="utf-8") != text:
-        raise ConfigError(other_settings(path, config, "run"))
-    place.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, text.encode())
+    if path.exists():
+        config = settings_there(path, content, "run")
+    else:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, dump_config(config).encode())
     return Target(config, path.parent, place, path)
 
 

@@ -102,8 +102,9 @@ def first_screen(numbers: Mapping[str, Any], run: str) -> list[str]:
     if numbers["headline"]:
         lines += ["", *_headline(numbers["headline"])]
     told = " ".join(answer["text"] for answer in numbers["answers"])
-    cautions = [f for f in numbers["flags"] if f["level"] == "caution" and f["text"] not in told]
-    lines += [line for flag in cautions for line in _wrapped(f"Caution: {flag['text']}", "  ", "")]
+    for flag in numbers["flags"]:
+        if flag["level"] in ("serious", "caution") and flag["text"] not in told:
+            lines += _wrapped(f"{flag['level'].capitalize()}: {flag['text']}", "  ", "")
     lines.append("")
     for i, step in enumerate(numbers["next"]):
         words = " ".join(run if word == "RUN" else word for word in step["command"].split(" "))

@@ -9,7 +9,7 @@ from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.commands.first_screen import run_to_first_screen
-from pchem_pipeline.commands.new_run import other_settings, settings_of
+from pchem_pipeline.commands.new_run import settings_of, settings_there
 from pchem_pipeline.config.load import dump_config, make_config
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.runner.session import Command
@@ -52,11 +52,11 @@ def find_joint(
     config = make_config(content, "the command line")
     for each in runs:
         find_run(each)
-    text, is_new = dump_config(config), write and not path.exists()
-    if path.exists() and path.read_text(encoding="utf-8") != text:
-        raise ConfigError(other_settings(path, config, "joint"))
-    if write:
-        write_atomic(path, text.encode())
+    is_new = write and not path.exists()
+    if path.exists():
+        config = settings_there(path, content, "joint")
+    if is_new:
+        write_atomic(path, dump_config(config).encode())
     return Target(config, path.parent, place, path), is_new
 
 

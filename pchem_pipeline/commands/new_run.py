@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import glob
 import os
+import re
+import shlex
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,7 +14,7 @@ from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quoted
 from pchem_pipeline.commands.compare.settings import settings_that_differ
-from pchem_pipeline.config.load import dump_config, load_config, make_config, parse_config
+from pchem_pipeline.config.load import dump_config, load_config, make_config, parse_config, yaml_content
 from pchem_pipeline.config.template import SCHEMA_NAME, commented_config, json_schema
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.target import Target, find_run
@@ -24,6 +26,8 @@ from pchem_pipeline.store.run_store import RunStore
 _YAML = (".yaml", ".yml")
 #: Settings that differ, as many as a message tells.
 _SHOWN = 4
+#: A setting as messages name it.
+_SETTING = re.compile(rf"\b(?:{'|'.join(RunConfig.model_fields)})\.[a-z_]+")
 
 
 def write_template(
@@ -59,10 +63,12 @@ def find_or_start(
 
     One YAML file or one store is an existing run. Anything else is camera files: a YAML with the
     settings in ``given`` and the region ``roi`` is written beside the store (unless
-    ``write`` is off), and used.
+    ``write`` is off), and used. One that is there and agrees with these is used as it is, whatever
+    else it sets.
 
     Raises:
         ConfigError: options do not fit the target, or the YAML exists with other settings.
+        InputError: camera files are missing.
     """
     first = place_of(targets[0])
     if len(targets) == 1 and (first.suffix.lower() in _YAML or (first / ".pchem").is_dir()):
@@ -75,24 +81,36 @@ def find_or_start(
         return find_run(first), False
     missing = [path for path in targets if not path.exists() and not set("*?[") & set(str(path))]
     if missing:
-        raise ConfigError(
+        raise InputError(
             f"{missing[0]} does not exist; give camera files, a folder of them, or a config.yaml"
         )
     place = place_of(store or Path("run.zarr")).resolve()
     remote, path = isinstance(place, RemotePath), settings_of(place)
-    config = make_config(
-        {
-            "run": {"store": str(place) if remote else place.name},
-            "input": {"files": _file_list(targets, path.parent), "roi": roi, **given},
-        },
-        "the command line",
-    )
-    text = dump_config(config)
-    if path.exists() and path.read_text(encoding="utf-8") != text and not _came_to_nothing(place, path):
-        raise ConfigError(other_settings(path, config, "run"))
-    if write:
+    region = {} if roi is None else {"roi": roi}
+    stated: dict[str, Any] = {
+        "run": {"store": str(place) if remote else place.name},
+        "input": {"files": _file_list(targets, path.parent), **region, **given},
+    }
+    config = make_config(stated, "the command line")
+    if path.exists() and not _came_to_nothing(place, path):
+        config = settings_there(path, stated, "run")
+    target = Target(config, path.parent, place, path)
+    text = unwritten(target)
+    if write and text is not None:
         write_atomic(path, text.encode())
-    return Target(config, path.parent, place, path), True
+    return target, True
+
+
+def unwritten(target: Target) -> str | None:
+    """Return the text of a run's YAML that is to be written; None where its file has these settings.
+
+    Raises:
+        ConfigError: the YAML is wrong.
+    """
+    path = target.config_path
+    if path is not None and path.exists() and load_config(path) == target.config:
+        return None
+    return dump_config(target.config)
 
 
 def settings_of(store: Path) -> Path:
@@ -107,30 +125,45 @@ def settings_of(store: Path) -> Path:
     return Path(name).resolve() if isinstance(store, RemotePath) else store.with_name(name)
 
 
-def other_settings(path: Path, config: RunConfig, command: str) -> str:
-    """Return in one line how the settings of a YAML file differ from those given, and the ways out.
+def settings_there(path: Path, stated: Mapping[str, Any], command: str) -> RunConfig:
+    """Return the settings of a YAML file, which must agree with those that are stated; others are its own.
 
     Args:
         path: the YAML file.
-        config: what was given.
+        stated: sections with the settings that the command line or the caller states.
         command: the command that takes the YAML.
 
     Raises:
-        ConfigError: the YAML is wrong.
+        ConfigError: the YAML is wrong, or says otherwise; in one line what differs, and the ways out.
     """
-    differ = settings_that_differ(load_config(path), config)
+    there = load_config(path)
+    content = _laid_over(yaml_content(dump_config(there), str(path)), stated)
+    differ = settings_that_differ(there, make_config(content, "the command line", path.parent))
+    if not differ:
+        return there
     shown = [f"{each.name} {each.one} there, {each.other} here" for each in differ[:_SHOWN]]
     more = [f"{len(differ) - _SHOWN} more"] if len(differ) > _SHOWN else []
-    keys = "; ".join([*shown, *more]) or "the same settings, written otherwise"
-    return (
-        f"{path} exists with other settings ({keys}); go on with those there: pchem {command} "
-        f"{quoted(path)}; or edit them there, or begin another run with --store NAME.zarr"
+    raise ConfigError(
+        f"{path} exists with other settings ({'; '.join([*shown, *more])}); go on with those there: pchem "
+        f"{command} {quoted(path)}; or edit them there, or begin another run with --store NAME.zarr"
     )
+
+
+def _laid_over(there: Any, stated: Any) -> Any:
+    """Return settings with those that are stated in their place, key by key; lists of sections one by one."""
+    if isinstance(there, Mapping) and isinstance(stated, Mapping):
+        return {**there, **{key: _laid_over(there.get(key), value) for key, value in stated.items()}}
+    sections = isinstance(there, list) and isinstance(stated, list) and len(there) == len(stated)
+    if sections and all(isinstance(each, Mapping) for each in (*there, *stated)):
+        return [_laid_over(one, other) for one, other in zip(there, stated, strict=True)]
+    return stated
 
 
 @contextlib.contextmanager
 def first_try(target: Target, text: str | None) -> Iterator[None]:
     """Write the YAML of a run; where the run is refused before any work, take away what was not there before.
+
+    A refusal whose cure is a setting then says where settings are, now that the YAML is gone.
 
     Args:
         target: the run.
@@ -143,12 +176,20 @@ def first_try(target: Target, text: str | None) -> Iterator[None]:
         write_atomic(path, text.encode())
     try:
         yield
-    except (ConfigError, InputError, StoreError):
-        if not had_store and _is_empty(target.store):
-            shutil.rmtree(target.store, ignore_errors=True)
-            if not had_yaml and path is not None:
-                path.unlink(missing_ok=True)
-        raise
+    except (ConfigError, InputError, StoreError) as error:
+        if had_store or not _is_empty(target.store):
+            raise
+        shutil.rmtree(target.store, ignore_errors=True)
+        if had_yaml or path is None:
+            raise
+        path.unlink(missing_ok=True)
+        if _SETTING.search(str(error)) is None:
+            raise
+        name = shlex.quote(path.name)
+        raise type(error)(
+            f"{error}; a setting without an option goes into a YAML: pchem init {name} FILES, then pchem run "
+            f"{name}"
+        ) from error
 
 
 def _is_empty(place: Path) -> bool:

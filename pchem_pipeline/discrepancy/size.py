@@ -6,6 +6,8 @@ the same random numbers, is taken before anything is rounded; what is alike in a
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
-from pchem_pipeline.discrepancy.verdict import RARE, Size
+from pchem_pipeline.discrepancy.verdict import RARE, Size, parameters_of
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -22,6 +24,8 @@ from pchem_pipeline.simulate.settings import SimulateSettings
 
 _MOST_ROWS = 12  # and columns: what all pixels of a frame share has one draw a frame
 _BLOCKS, _BLOCK_FRAMES = 100, 40  # spread over the run
+#: Frames that are drawn at least, in several stacks of a short run: a size is told to two digits.
+_FEWEST_FRAMES = 20_000
 _FEWEST_BLOCKS = 4  # of the whole sensor
 _BITS = 24
 _SEED = 1
@@ -37,44 +41,74 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
         maps: fitted parameters, (y, x) each.
         n_frames: of the run.
     """
-    blocks = _BLOCKS
+    if not maps.usable.any():
+        return None
+    if _is_measured_noise(effect):
+        return _of_noise(float(getattr(effect, effect.strength)), maps)
+    blocks, noise = _BLOCKS, float(np.median(maps.read_noise_dn[maps.usable]))
     if effect.far_reaching:
         blocks = max(_BLOCKS * _MOST_ROWS**2 // maps.usable.size, _FEWEST_BLOCKS)
     else:
         maps = PixelMaps(*(np.asarray(getattr(maps, name))[:_MOST_ROWS, :_MOST_ROWS] for name in _FIELDS))
     if not maps.usable.any():
         return None
-    seen: list[NDArray[np.float64]] = []
-    shape = maps.usable.shape
-    settings = SimulateSettings(
-        shape=(shape[0], shape[1]), n_frames=n_frames, seed=_SEED, bit_depth=_BITS, effects=()
-    ).model_copy(update={"effects": (_watched(effect, seen),)})
-    truth = truth_of(maps)
-    last = max(n_frames - _BLOCK_FRAMES, 0)
+    blocks = min(blocks, -(-n_frames // _BLOCK_FRAMES))
+    stacks = 1 if effect.far_reaching else -(-_FEWEST_FRAMES // (blocks * _BLOCK_FRAMES))
     try:
-        for first in np.unique(np.linspace(0, last, blocks).astype(int)).tolist():
-            simulate_block(truth, settings, (first, min(first + _BLOCK_FRAMES, n_frames)), electron_frames=0)
+        drawn = [_change(effect, maps, n_frames, blocks, _SEED + i) for i in range(stacks)]
     except PchEmError:
         return None
-    if not seen:
+    changes = [change for change in drawn if change is not None]
+    if not changes:
         return None
-    change = np.concatenate(seen)
-    share = float(np.mean(np.abs(change) > _CHANGED))
+    share = float(np.mean([np.mean(np.abs(change) > _CHANGED) for change in changes]))
     gain = np.where(maps.usable, maps.conversion_gain, np.median(maps.conversion_gain[maps.usable]))
-    noise = float(np.median(maps.read_noise_dn[maps.usable]))
     in_dn = effect.plane in _IN_DN
-    dn = _spread(change if in_dn else change / gain, share)
+    dn = _spread([change if in_dn else change / gain for change in changes], share)
     return Size(
-        electrons=_spread(change * gain if in_dn else change, share),
+        electrons=_spread([change * gain if in_dn else change for change in changes], share),
         dn=dn,
         of_read_noise=dn / noise,
         samples=share,
     )
 
 
-def _spread(change: NDArray[np.float64], share: float) -> float:
+def _is_measured_noise(effect: Effect) -> bool:
+    """Tell whether the strength of an effect is the measured standard deviation of what samples share, DN.
+
+    Where it is light that varies, samples change by whole electrons, most of them by their own chance.
+    """
+    if not effect.measured_only or effect.power != 2.0:
+        return False
+    return parameters_of(effect, math.nan)[effect.strength].unit == "DN"
+
+
+def _of_noise(dn: float, maps: PixelMaps) -> Size:
+    """Return the size of a noise of so many DN, at the gain and read noise of the median pixel."""
+    gain = float(np.median(maps.conversion_gain[maps.usable]))
+    noise = float(np.median(maps.read_noise_dn[maps.usable]))
+    return Size(electrons=dn * gain, dn=dn, of_read_noise=dn / noise)
+
+
+def _change(
+    effect: Effect, maps: PixelMaps, n_frames: int, blocks: int, seed: int
+) -> NDArray[np.float64] | None:
+    """Return what an effect does to the samples of one stack, (frame, y, x); None where it does nothing."""
+    seen: list[NDArray[np.float64]] = []
+    shape = maps.usable.shape
+    settings = SimulateSettings(
+        shape=(shape[0], shape[1]), n_frames=n_frames, seed=seed, bit_depth=_BITS, effects=()
+    ).model_copy(update={"effects": (_watched(effect, seen),)})
+    truth = truth_of(maps)
+    last = max(n_frames - _BLOCK_FRAMES, 0)
+    for first in np.unique(np.linspace(0, last, blocks).astype(int)).tolist():
+        simulate_block(truth, settings, (first, min(first + _BLOCK_FRAMES, n_frames)), electron_frames=0)
+    return np.concatenate(seen) if seen else None
+
+
+def _spread(changes: Sequence[NDArray[np.float64]], share: float) -> float:
     """Return by how much samples change from frame to frame, where they change if that is rare."""
-    mean_square = np.mean((change - change.mean(axis=0)) ** 2)
+    mean_square = np.mean([np.mean((change - change.mean(axis=0)) ** 2) for change in changes])
     return float(np.sqrt(mean_square / (share if 0.0 < share < RARE else 1.0)))
 
 

@@ -16,7 +16,7 @@ from typing import Any
 from pchem_pipeline.base.errors import InputError, MissingDependencyError, install_hint
 from pchem_pipeline.store.files import whole_file, write_atomic
 
-_URL = re.compile(r"^[a-z][a-z0-9+.-]+://")
+_URL = re.compile(r"^[a-z][a-z0-9+-]+://")
 _GLOB = re.compile(r"[*?\[]")
 #: descriptions that lie beside raw files
 _SIDECARS = (".json", ".yaml", ".yml")

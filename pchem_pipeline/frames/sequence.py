@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -36,7 +36,7 @@ class FrameSequence(FrameReader):
 
         Raises:
             InputError: too few frames, a region of interest or frame range outside of the stack, or
-                files that contradict each other on bit depth, bit shift or integration time.
+                files that contradict each other on bit depth, bit shift, integration time or camera.
         """
         self.report = report
         self._readers = tuple(readers)
@@ -86,6 +86,7 @@ class FrameSequence(FrameReader):
         stamps = [reader.timestamps for reader in readers]
         if all(each is not None for each in stamps):
             self.timestamps = np.concatenate([each for each in stamps if each is not None])[self._first : end]
+        _check_same_camera(readers)
         self.camera, moved = shared_facts(reader.camera for reader in readers)
         notes = [note for reader in readers for note in reader.notes] + ([moved] if moved else [])
         self.notes = tuple(dict.fromkeys(notes))
@@ -156,10 +157,14 @@ class FrameSequence(FrameReader):
         if self.bit_shift:
             np.right_shift(part, self.bit_shift, out=part)
         if used >> self.bit_shift >> depth:
-            raise InputError(
-                f"{name}: values need more than the bit depth of {depth}; correct input.bit_depth, "
-                "input.bit_shift or input.byte_order"
-            )
+            text = f"{name}: values need more than the bit depth of {depth}"
+            unused = (used & -used).bit_length() - 1
+            if self.bit_shift < unused and not used >> unused >> depth:
+                raise InputError(
+                    f"{text}, and their lowest {unused} bits are all zero: left-justified samples, it seems; "
+                    f"set input.bit_shift: {unused} (--bit-shift)"
+                )
+            raise InputError(f"{text}; correct input.bit_depth, input.bit_shift or input.byte_order")
 
     def close(self) -> None:
         """Close all readers."""
@@ -173,6 +178,19 @@ def _where(paths: Sequence[Path]) -> str:
     return str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
 
 
+def _check_same_camera(readers: Sequence[FrameReader]) -> None:
+    """Refuse files of different cameras: pixel by pixel, their frames are no samples of one law.
+
+    A number that differs in each of many files counts files, not cameras.
+    """
+    serials = {reader.paths[0].name: reader.camera.serial for reader in readers if reader.camera.serial}
+    distinct = set(serials.values())
+    if len(distinct) < 2 or 2 < len(readers) == len(distinct):
+        return
+    shown = ", ".join(f"serial number {value} in {file}" for file, value in _first_of_each(serials))
+    raise InputError(f"the files are of different cameras: {shown}; read them apart")
+
+
 def _agreed(readers: Sequence[FrameReader], name: str) -> Any:
     """Return a fact that all files state alike; None if a file does not state it."""
     values = {reader.paths[0].name: getattr(reader, name) for reader in readers}
@@ -183,7 +201,7 @@ def _agreed(readers: Sequence[FrameReader], name: str) -> Any:
     return distinct.pop() if len(distinct) == 1 else None
 
 
-def _first_of_each(values: dict[str, Any]) -> list[tuple[str, Any]]:
+def _first_of_each(values: Mapping[str, Any]) -> list[tuple[str, Any]]:
     seen: dict[Any, str] = {}
     for file, value in values.items():
         seen.setdefault(value, file)

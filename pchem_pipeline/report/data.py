@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
@@ -279,6 +281,11 @@ class ReportData:
         """Tell whether rounding, which the fit did not count, biases the estimates of most pixels."""
         status = self.fit.get("fit_status")
         return status is not None and bool(np.mean((status & int(FitStatus.COARSE_STEPS)) != 0) > 0.5)
+
+    @property
+    def typed_run(self) -> str:
+        """The run as it is typed in a command."""
+        return quoted(Path(str(self.run.get("store", "RUN"))))
 
     @property
     def often_flagged(self) -> bool:

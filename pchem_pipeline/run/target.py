@@ -34,7 +34,7 @@ def find_run(path: Path) -> Target:
 
     Raises:
         ConfigError: neither a YAML file nor a store, or its content is wrong.
-        StoreError: the store is damaged.
+        StoreError: the store is missing or damaged.
     """
     path = place_of(path)
     if path.is_dir():
@@ -51,8 +51,9 @@ def find_run(path: Path) -> Target:
             None if written is None else Path(written),
         )
     if path.suffix.lower() not in (".yaml", ".yml"):
-        what = "is neither a YAML file nor a run" if path.exists() else "does not exist"
-        raise ConfigError(f"{path} {what}; give a config.yaml or the store of a run")
+        if not path.exists():
+            raise StoreError(f"{path} does not exist; give a config.yaml or the store of a run")
+        raise ConfigError(f"{path} is neither a YAML file nor a run; give a config.yaml or a run's store")
     config = load_config(path)
     base_dir = path.resolve().parent
     return Target(config, base_dir, place_of(config.run.store, base_dir), path.resolve())

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
 from pchem_pipeline.discrepancy.quick.codes import CodeSample
@@ -50,7 +52,7 @@ def run_quick_look(store: RunStore, run: StoredRun, sums: StackSums | None) -> Q
         missing["codes"] = f"fewer than {_FEWEST} pixels with a fit that can be relied upon"
     else:
         codes = _codes(store, maps)
-    command = f"pchem discrepancy {run.name}"
+    command = f"pchem discrepancy {quoted(Path(run.name))}"
     return quick_look(sums, maps, codes, run.model.effects, missing, command)
 
 
@@ -74,7 +76,7 @@ def read_sums(store: RunStore) -> StackSums | None:
     """
     if not store.has("summary/frame_mean"):
         return None
-    mean = store.read("summary/frame_mean")
+    mean, variance = store.read("summary/frame_mean"), store.read("summary/frame_variance")
     starts = store.read("summary/block_start")
     n_blocks, ny, nx = store.array("summary/block_sum").shape
     lengths = np.diff(np.append(starts, mean.size))
@@ -96,7 +98,8 @@ def read_sums(store: RunStore) -> StackSums | None:
         some,
         _read(store, "column_sum", starts[chosen[some]], (starts + lengths)[chosen[some]], blocks),
         mean,
-        _repeated(store, mean),
+        variance,
+        _repeated(store, mean, variance),
         store.read("summary/lag1_covariance"),
         store.read("summary/neighbour_covariance_x"),
         store.read("summary/neighbour_covariance_y"),
@@ -125,9 +128,8 @@ def _read(
     return np.concatenate(parts)
 
 
-def _repeated(store: RunStore, mean: NDArray[np.float64]) -> NDArray[np.int64]:
+def _repeated(store: RunStore, mean: NDArray[np.float64], variance: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the frames with the sums, and sums of squares, of the one before in all rows."""
-    variance = store.read("summary/frame_variance")
     candidates = np.flatnonzero((mean[1:] == mean[:-1]) & (variance[1:] == variance[:-1])) + 1
     step = store.array("summary/row_sum").chunks[0]
     found: list[int] = []

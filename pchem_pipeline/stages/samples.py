@@ -56,11 +56,18 @@ class OpenSample:
         """Seconds per frame, as its run says."""
         return self.target.config.input.integration_time or self.sensor.integration_time
 
-    @property
-    def content(self) -> Any:
-        """What tells its frames from those of another."""
-        files = [file.get("xxh3_128") for file in self.sensor.identity.get("files", [])]
-        return files if files and all(files) else id(self)
+    def shares_frames(self, other: OpenSample) -> bool:
+        """Tell whether it has frames of the same files, and of the same dataset in them, as another."""
+        hashes = self._hashes()
+        if not hashes or not all(hashes) or hashes != other._hashes():
+            return False
+        mine, others = self.target.config.input, other.target.config.input
+        (first, end), (start, last) = (each.frame_range or (0, None) for each in (mine, others))
+        apart = (end is not None and end <= start) or (last is not None and last <= first)
+        return mine.dataset == others.dataset and not apart
+
+    def _hashes(self) -> list[Any]:
+        return [file.get("xxh3_128") for file in self.sensor.identity.get("files", [])]
 
 
 def sample_targets(config: RunConfig, base_dir: Path) -> list[Target]:
@@ -133,6 +140,12 @@ def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
             f"{mine.where} has codes of {depths[0]} bits, {first.where} of {depths[1]}; "
             "all samples must come from one sensor with the same settings"
         )
+    cameras = [each.sensor.camera.serial for each in (mine, first)]
+    if None not in cameras and cameras[0] != cameras[1]:
+        raise ConfigError(
+            f"{mine.where} is of the camera of serial number {cameras[0]}, {first.where} of {cameras[1]}; "
+            "all samples must come from one sensor"
+        )
     regions = [each.target.config.input.roi for each in (mine, first)]
     if regions[0] != regions[1]:
         raise ConfigError(
@@ -140,7 +153,7 @@ def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
             "all samples must show the same region of one sensor"
         )
     for other in others:
-        if other.content == mine.content:
+        if mine.shares_frames(other):
             raise ConfigError(f"{mine.where} holds the same frames as {other.where}; list each sample once")
 
 
@@ -167,8 +180,8 @@ def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> NDArray
         time = sample.integration_time if given.integration_time is None else given.integration_time
         if time is None:
             raise ConfigError(
-                f"{where} has no integration time, so there is no slope for the charge rate; "
-                "give integration_time, s, or set input.against: none"
+                f"{where} has no integration time, so there is no slope for the charge rate; set "
+                "input.integration_time of that run, s, or input.against: none"
             )
         found[i] = time
     return found

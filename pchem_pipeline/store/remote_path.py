@@ -23,8 +23,8 @@ from pchem_pipeline.base.settings import NO_SECRETS, holds_secret
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# Path makes one slash of two
-_URL = re.compile(r"^([a-z][a-z0-9+.-]+):/+(.*)$", re.DOTALL)
+# Path makes one slash of two; no storage has a dot in its name, but file.h5:/dataset has
+_URL = re.compile(r"^([a-z][a-z0-9+-]+):/+(.*)$", re.DOTALL)
 
 
 class RemoteError(StoreError, OSError):

@@ -109,7 +109,7 @@ class RunStore:
                 root = zarr.open_group(zarr_store(path, writable=writable), mode="r+" if writable else "r")
                 schema = root.attrs.get("pchem_schema")
         except (ValueError, KeyError, TypeError) as error:
-            raise StoreError(f"{path} is damaged ({error}); restore it or start the run again") from error
+            raise StoreError(f"{path} is damaged ({error}); restore it, or remove and redo it") from error
         if schema is None:
             raise StoreError(
                 f"{path} is a zarr store but no run; to read its frames: "
@@ -193,13 +193,15 @@ class RunStore:
             with _one_line(self.path, f"{self.path}: {name}"):
                 found = self._root[name]
         except KeyError as error:
-            raise StoreError(f"{self.path} has no {name}; run the stage that writes it") from error
+            raise StoreError(
+                f"{self.path} has no {name}; run the stage that writes it, with --force if that is up to date"
+            ) from error
         except (ValueError, TypeError) as error:
             raise StoreError(
                 f"{self.path}: {name} is damaged ({error}); redo the stage that writes it with --force"
             ) from error
         if not isinstance(found, zarr.Array):
-            raise StoreError(f"{self.path}: {name} is not an array; start the run again")
+            raise StoreError(f"{self.path}: {name} is no array; redo the stage that writes it with --force")
         if foreign := foreign_codecs(found):
             raise StoreError(
                 f"{self.path}: {name} is coded by {', '.join(foreign)}, which this program never writes and "

@@ -37,7 +37,7 @@ def write_hdf5(path, data=GOOD):
 
 
 CASES = {
-    "missing folder": ("nowhere", lambda p: None, 2, "does not exist"),
+    "missing folder": ("nowhere", lambda p: None, 4, "does not exist"),
     "empty folder": ("d", lambda p: (p / "d").mkdir(), 4, ""),
     "mixed shapes": ("*.tif", lambda p: (tiff(p / "a.tif"), tiff(p / "b.tif", GOOD[:, :4])), 4, "b.tif"),
     "mixed types": ("*.tif", lambda p: (tiff(p / "a.tif"), tiff(p / "b.tif", GOOD.astype("u1"))), 4, "b.tif"),

@@ -221,7 +221,7 @@ def test_the_history_against_the_temperature_that_the_files_state(shell, copies,
 def test_bad_input_gets_one_line(shell, finished):
     result = shell("compare", finished)
     assert (result.code, result.last) == (2, "pchem: compare: give two runs or more")
-    with pytest.raises(ConfigError, match=r"nothing\.zarr does not exist"):
+    with pytest.raises(StoreError, match=r"nothing\.zarr does not exist"):
         here(shell, finished, "nothing.zarr")
     RunStore.create(shell.folder / "empty.zarr")
     with pytest.raises(StoreError, match=r"empty\.zarr"):

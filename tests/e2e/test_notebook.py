@@ -116,7 +116,7 @@ def test_figures_are_those_of_the_report(run, finished, tmp_path):
 def test_what_is_missing_is_said(run, finished, tmp_path, monkeypatch):
     with pytest.raises(StoreError, match="has no truth yet; see what is missing with: pchem status"):
         _ = run.truth
-    with pytest.raises(ConfigError, match="does not exist"):
+    with pytest.raises(StoreError, match="does not exist"):
         pchem_pipeline.open_run(tmp_path / "none.zarr")
     assert repr(run).startswith("<Run run.zarr: 20 x 28 pixels, 1,200 frames; ")
     assert run.status()["report"] == "complete"

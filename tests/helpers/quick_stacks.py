@@ -47,7 +47,7 @@ def sums_of(frames: Array, block: int = 256) -> StackSums:
     blocks += rest
     lines = line_sums(frames)
     starts = block_starts(n, block)
-    mean, _ = frame_statistics(lines.row_sum, lines.row_sum_square, nx)
+    mean, variance = frame_statistics(lines.row_sum, lines.row_sum_square, nx)
     return StackSums(
         n,
         starts.size,
@@ -58,6 +58,7 @@ def sums_of(frames: Array, block: int = 256) -> StackSums:
         np.arange(starts.size),
         lines.column_sum,
         mean,
+        variance,
         1 + np.flatnonzero((frames[1:] == frames[:-1]).all(axis=(1, 2))),
         covariances.lag1_covariance,
         covariances.neighbour_covariance_x,

@@ -145,7 +145,7 @@ class _Made:
 def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted: ApplySettings) -> _Made:
     digest = check_run(run)
     sensor = SensorInfo.read(run)
-    frames = open_like_run(target, sensor, files)
+    frames = open_like_run(target, sensor, files, wanted.dataset)
     top = top_code(frames, sensor)
     modes = _modes(run, wanted, sensor.shape)
     calibration = read_calibration(run, top=top, removed=modes.removed)
@@ -177,6 +177,8 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         expected=numbers and overlap > 0,
     )
     version = model_of(run, "fit")
+    # outputs of versions that did not know it are gone on with
+    settings = {name: value for name, value in asdict(wanted).items() if name != "dataset" or value}
     content = {
         "product": _PRODUCT,
         "version": _VERSION,
@@ -186,7 +188,7 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         "model": "PCD" if version is None else model_words(version.effects),
         "frames": frames.quick_identity()["files"],
         "settings": {
-            **asdict(wanted),
+            **settings,
             "kinds": list(wanted.kinds),
             "prior": wanted.prior if prior_map is None else _digest(prior_map),
         },

@@ -28,12 +28,14 @@ class ApplySettings:
             frames), ``flat`` (none), ``run`` (of the characterisation), a number (e-), or a file with a map.
         remove: take the common modes that the model of the run names from the frames.
         format: one of `FORMATS`.
+        dataset: path of the frames inside an HDF5 or zarr file; None: as the run has it.
     """
 
     kinds: tuple[str, ...] = KINDS
     prior: str = "frames"
     remove: bool = True
     format: str = "zarr"
+    dataset: str | None = None
 
 
 def kinds_of(text: str) -> tuple[str, ...]:

@@ -29,13 +29,16 @@ _FAR_ABOVE = 30.0
 _OTHER_TEMPERATURE = 2.0
 
 
-def open_like_run(target: Target, sensor: SensorInfo, files: Sequence[str | Path]) -> FrameSequence:
-    """Open other frames with what the run says of its own: format, region, bits.
+def open_like_run(
+    target: Target, sensor: SensorInfo, files: Sequence[str | Path], dataset: str | None = None
+) -> FrameSequence:
+    """Open other frames with what the run says of its own: format, dataset, region, bits.
 
     Args:
         target: the run.
         sensor: of the run.
         files: camera files, globs, folders or URLs; relative to the present folder.
+        dataset: of the frames in the files, in place of the run's.
 
     Raises:
         InputError: the frames do not fit the pixels of the run.
@@ -46,6 +49,8 @@ def open_like_run(target: Target, sensor: SensorInfo, files: Sequence[str | Path
     settings = _settings(target).model_copy(
         update={"files": tuple(str(each) for each in files), "frame_range": None, "samples": ()}
     )
+    if dataset is not None:
+        settings = settings.model_copy(update={"dataset": dataset})
     if settings.roi is not None and _shape(settings) == sensor.shape:
         settings = settings.model_copy(update={"roi": None})  # the camera read that region alone
     frames = open_frames(settings, Path.cwd(), check_duplicates=False, least=1)

@@ -24,7 +24,7 @@ from pchem_pipeline.report.pages.compare import (
     render_comparison,
     sentence_of,
 )
-from pchem_pipeline.report.style.wording import count, short, symbol
+from pchem_pipeline.report.style.wording import count, measured, short, symbol
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target, find_run
@@ -173,7 +173,7 @@ def _data_digest(store: RunStore, sensor: SensorInfo) -> str:
     """Return what tells the frames of a run: content of the files, and what was taken of them."""
     record = store.records.read("ingest")
     settings = {} if record is None else record.content.get("settings", {})
-    taken = [settings.get(f"input.{name}") for name in ("roi", "frame_range", "bit_shift")]
+    taken = [settings.get(f"input.{name}") for name in ("dataset", "roi", "frame_range", "bit_shift")]
     return f"{sensor.identity.get('digest', '')} {taken} {sensor.n_frames} {sensor.shape}"
 
 
@@ -221,7 +221,9 @@ def _words(
     for name, why in reasons.items():
         text = []
         if why.shifted:
-            text.append(f"their median is {maps[name].median_z:+.3g} standard errors of a pixel")
+            each = maps[name]
+            median = measured(each.median, each.median_stderr, symbol(name)[2])
+            text.append(f"their median is {median}, {each.median_z:+.3g} standard errors of a pixel")
         if why.spread:
             text.append(f"they scatter by {maps[name].spread_z:.3g} standard errors")
         if why.pixels:

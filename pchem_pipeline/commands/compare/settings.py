@@ -12,7 +12,14 @@ from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.run_store import RunStore
 
 #: Settings that decide results by another way than a stage's list.
-_BESIDE = {"input.integration_time": ("maps",), "input.kind": ("maps",), "input.files": ("ingest",)}
+_BESIDE = {
+    "input.integration_time": ("maps",),
+    "input.kind": ("maps",),
+    "input.files": ("ingest",),
+    "input.samples": ("fit",),
+    "model.effects": ("fit",),
+    "model.set_aside_e": ("fit",),
+}
 
 
 def settings_that_differ(one: RunConfig, other: RunConfig) -> list[Setting]:

@@ -107,6 +107,7 @@ _SIGNS: dict[str, tuple[str, ...]] = {
         "frame.readout.variance", "frame.readout.slow", "frame.readout.trend",
         "frame.charge.variance", "frame.charge.slow", "frame.charge.trend", "frame.covariance",
     ),
+    "levels": ("frame.charge.variance", "frame.charge.slow", "frame.charge.trend"),
     "row_noise": ("space.row.readout.variance",),
     "column_noise": ("space.column.readout.variance",),
     "drift": (

@@ -26,6 +26,7 @@ from scipy import special
 from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLook, graded
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
+from pchem_pipeline.discrepancy.quick.levels import levels_check
 from pchem_pipeline.discrepancy.quick.places import (
     CellMap,
     SensorPlace,
@@ -77,17 +78,21 @@ def quick_look(
         command: what looks closer.
     """
     checks: list[Check] = []
-    if sums is not None and sums.freedom > 0:
-        checks += _stack_checks(sums, maps)
-    if codes is not None:
-        checks += code_checks(codes)
     usable = maps.usable
     gain, noise = (
         float(np.median(values[usable])) if usable.any() else math.nan
         for values in (maps.conversion_gain, maps.read_noise_dn)
     )
+    if sums is not None and sums.freedom > 0:
+        checks.append(levels_check(sums.frame_mean, sums.frame_variance, gain))
+        checks += _stack_checks(sums, maps)
+    if codes is not None:
+        checks += code_checks(codes)
     samples = 0 if sums is None else sums.n_frames * int(np.prod(sums.shape))
-    return QuickLook(graded(checks, gain, noise, model), missing or {}, samples, command)
+    found, unseen = graded(checks, gain, noise, model), dict(missing or {})
+    if found and found[0].name == "levels" and found[0].level == "serious":
+        found, unseen = found[:1], {**unseen, "all else": "the frames are of several exposures"}
+    return QuickLook(found, unseen, samples, command)
 
 
 @dataclass(frozen=True)
@@ -290,7 +295,7 @@ def _noise_check(
         "DN",
         limit=math.sqrt(_SURE * found.error),
         where=where,
-        advice="it is part of what is called read noise, but does not average out over pixels",
+        advice="it is in the noise of each pixel and does not average out over pixels",
     )
 
 
@@ -372,6 +377,11 @@ def _mean_correlation(z: FloatArray, common: _Common) -> tuple[float, float]:
     return float(kept.mean()) / math.sqrt(freedom), math.sqrt(common.inflation / freedom / kept.size)
 
 
+def _off(correlation: float) -> str:
+    """Return in which way charge that other samples take, or give, moves the fitted gain, e-/DN."""
+    return "high" if correlation > 0 else "low"
+
+
 def _lag_check(sums: StackSums, common: _Common) -> list[Check]:
     """Return whether samples of a pixel resemble those of the frame before, beyond what frames share."""
     some = (sums.variance > 0) & np.isfinite(sums.lag)
@@ -401,7 +411,7 @@ def _lag_check(sums: StackSums, common: _Common) -> list[Check]:
             mean,
             "1",
             limit=(_SURE + 0.2) * error,
-            advice="charge or signal is carried over: gain and exposure are off by about as much",
+            advice=f"charge or signal is carried over: the gain, e⁻/DN, reads {_off(mean)} by about as much",
         )
     ]
 
@@ -433,7 +443,8 @@ def _neighbour_checks(sums: StackSums, common: _Common) -> list[Check]:
                 mean,
                 "1",
                 limit=(_SURE + 0.2) * error,
-                advice="if neighbours couple, the gain reads low by about twice the correlation",
+                advice=f"if neighbours couple, the gain, e⁻/DN, reads {_off(mean)} by about twice the "
+                "correlation",
             )
         )
     return found

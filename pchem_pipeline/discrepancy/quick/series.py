@@ -81,7 +81,7 @@ def _drift(series: FloatArray, noise: float) -> tuple[FloatArray, Check]:
         "DN",
         limit=math.sqrt(16.0 * noise / n),
         where=f"{peak:.2g} DN from its lowest to its highest",
-        advice="it widens the read noise, and what is taken for dark current changes along the run",
+        advice="it widens the read noise, and what is taken for one exposure changes along the run",
     )
     return (smooth if p < 1e-3 else np.zeros(n)), check
 

@@ -66,7 +66,7 @@ class StackSums:
         row_sum: of the frames of these blocks, (frame, y), DN.
         column_blocks: which of these blocks have column sums at hand, increasing.
         column_sum: of the frames of those, sums over groups of rows, (frame, group, x), DN.
-        frame_mean: of all frames of the stack, over all pixels, DN.
+        frame_mean, frame_variance: of all frames of the stack, over all pixels, DN, DN^2.
         repeated: frames with the sums, and sums of squares, of the one before in every row.
         lag: covariance of successive frames within all blocks, (y, x), DN^2.
         next_x, next_y: covariance with the next pixel along x and y, NaN without one.
@@ -81,6 +81,7 @@ class StackSums:
     column_blocks: IntArray
     column_sum: NDArray[np.signedinteger]
     frame_mean: FloatArray
+    frame_variance: FloatArray
     repeated: IntArray
     lag: FloatArray
     next_x: FloatArray

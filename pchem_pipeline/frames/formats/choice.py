@@ -27,11 +27,12 @@ def choose_dataset(path: Path, shapes: Mapping[str, tuple[int, ...]], wanted: st
         if name in shapes:
             return name
         raise InputError(
-            f"{path}: no dataset {wanted!r}; there are: {listed or 'no images'}; correct input.dataset"
+            f"{path}: no dataset {wanted!r}; there are: {listed or 'no images'}; correct input.dataset "
+            "(--dataset)"
         )
     if not stacks and not images:
         raise InputError(f"{path}: holds no dataset of frames (frames, rows, columns); leave it out")
     candidates = stacks or images
     if len(candidates) > 1:
-        raise InputError(f"{path}: holds several datasets: {listed}; choose one in input.dataset")
+        raise InputError(f"{path}: holds several datasets: {listed}; choose one by input.dataset (--dataset)")
     return candidates[0]

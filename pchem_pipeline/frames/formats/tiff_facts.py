@@ -79,7 +79,7 @@ def _broken_chain(path: Path, pages: int, size: int) -> InputError:
     if not pages:
         return InputError(f"{path}: not a sound TIFF file, or truncated (no pages); copy it again")
     return InputError(
-        f"{path}: truncated: only {pages} pages are within the file's {size} bytes; copy it again"
+        f"{path}: truncated: its {size} bytes end after {pages} page{'s' * (pages != 1)}; copy it again"
     )
 
 

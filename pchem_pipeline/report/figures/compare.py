@@ -26,6 +26,8 @@ _HUES = ("ink", "blue", "vermilion", "green", "orange", "purple", "sky")
 _LINES: tuple[Dash, ...] = ("-", "--", "-.", ":")
 #: Colours end at the 99 % quantile of the differences, at least here, standard errors.
 _LEAST = 4.0
+#: Strips of differences reach at least so far, standard errors: beyond their band of two.
+_LEAST_STRIP = 3.0
 #: Halves of an ensemble: (part, axis, prefix of the data, unit, title).
 _HALVES = (
     ("raw", "dn", "", "DN", "raw ensemble"),
@@ -213,9 +215,10 @@ def _one_half(table: DataTable, unit: str, title: str) -> Stack:
             differences.append(Line(first[0], z, colour=colour, width=0.8, label=label, listed=False))
     margin = 0.04 * (high - low)
     marks = (Span(-2.0, 2.0, colour="band"), *differences, Level(0.0, colour="ink", width=0.5))
+    reach = max(_LEAST_STRIP, *(1.1 * float(np.max(np.abs(line.y), initial=0.0)) for line in differences))
     panels = (
         Panel(Axis(f"density (1/{unit})", low=0.0), tuple(lines), 3.0, legend="upper right", room=(1.3, 1.3)),
-        Panel(Axis("difference\n(std. errors)"), marks, 1.0),
+        Panel(Axis("difference\n(std. errors)", -reach, reach), marks, 1.0),
     )
     return Stack(panels, Axis(f"signal ({unit})", low - margin, high + margin), title, height_mm=72.0)
 

@@ -41,7 +41,7 @@ _GAP_CAPTION = (
     "way) leave. Open triangles at the edge are gaps below the axis. By family: before and after."
 )
 _PULLS_CAPTION = (
-    "The statistics farthest from chance, before (circles) and after the model grew (diamonds). The gray "
+    "The statistics farthest from chance, before (circles) and after effects were added (diamonds). The gray "
     "band is two standard deviations; with some hundred statistics the largest lies near 3 by chance."
 )
 

@@ -437,6 +437,10 @@ def _draw_frames(
     bar.set_label("sd of chance")
 
 
+#: By how much an axis reaches beyond its largest point, so that a legend above covers none.
+_LEGEND_ROOM = 1.35
+
+
 def _draw_scatter(axes: Axes, rms: FloatArray, line: str, first: int) -> None:
     colours = colours_of(axes)
     for channel, colour, marker in (("readout", colours.vermilion, "o"), ("charge", colours.blue, "s")):
@@ -445,7 +449,8 @@ def _draw_scatter(axes: Axes, rms: FloatArray, line: str, first: int) -> None:
     axes.axhline(1.0, color=colours.ink, linewidth=0.8)
     top = float(np.nanmax(rms)) if np.isfinite(rms).any() else 1.0
     low = float(np.nanmin(rms)) if np.isfinite(rms).any() else 1.0
-    axes.set_ylim(min(0.85, low - 0.05), max(1.25, 1.0 + 1.25 * (top - 1.0)))
+    bottom = min(0.85, low - 0.05)
+    axes.set_ylim(bottom, max(1.25, bottom + _LEGEND_ROOM * (top - bottom)))
     axes.set(
         xlabel=f"{'y' if line == 'row' else 'x'} (pixel)", ylabel="rms / rms of chance",
         title=f"scatter of the {LINE_WORDS[line]}",

@@ -15,6 +15,8 @@ from pchem_pipeline.report.style.wording import short, symbol
 _SHOWN = ("quanta_exposure", "charge_rate", "dark_current", "conversion_gain", "bias", "read_noise_e")
 
 
+#: Letters of the labels of all runs that an axis has room for, and ticks at most.
+_LETTERS, _MOST_TICKS = 48, 12
 #: Days of a history that is drawn against time.
 _SHORTEST = 0.04
 _AXES = {"date": "days since the first", "temperature": "sensor temperature, °C", "label": "label"}
@@ -60,19 +62,31 @@ def history_figures(rows: Sequence[HistoryRow], against: Against) -> list[Figure
             "Medians of the maps with their standard errors; the band is the scatter of the pixels.",
             f"From {first.label} to {last.label}: {words}.",
             (table,),
-            history_chart(table, tuple(shown), axis),
+            history_chart(table, tuple(shown), axis, () if ordered else _labels(rows)),
             PAGE_MM,
         )
     ]
 
 
-def history_chart(table: DataTable, names: tuple[str, ...], axis: str) -> Chart:
+def _labels(rows: Sequence[HistoryRow]) -> tuple[tuple[float, str], ...]:
+    """Return a tick for each run in its order, by its label where there is room, else by its letter."""
+    texts = [row.label for row in rows]
+    if sum(map(len, texts)) > _LETTERS:
+        texts = [row.run.label for row in rows]
+    every = -(-len(rows) // _MOST_TICKS)
+    return tuple((float(i), texts[i]) for i in range(0, len(rows), every))
+
+
+def history_chart(
+    table: DataTable, names: tuple[str, ...], axis: str, ticks: tuple[tuple[float, str], ...] = ()
+) -> Chart:
     """Return the chart with a panel for each map: median with its error, and the scatter of the pixels.
 
     Args:
         table: of the figure.
         names: the maps.
         axis: column against which they are drawn.
+        ticks: places and texts on it; empty: as the renderer finds them.
     """
     order = np.argsort(table[axis], kind="stable")
     at = table[axis].astype(np.float64)[order]
@@ -89,4 +103,4 @@ def history_chart(table: DataTable, names: tuple[str, ...], axis: str) -> Chart:
         )
         sign, _, unit = symbol(name)
         panels.append(Panel(Axis(f"{sign} ({unit})"), marks))
-    return Chart((Stack(tuple(panels), Axis(axis), height_mm=26.0 * len(names) + 10.0),))
+    return Chart((Stack(tuple(panels), Axis(axis, ticks=ticks), height_mm=26.0 * len(names) + 10.0),))

@@ -54,7 +54,8 @@ _EXAMPLE_CAPTION = (
     "(dashed)."
 )
 _CELLS_CAPTION = (
-    "The same for a pixel of this run: its histogram (gray), fitted density (line) and cell edges (dashed)."
+    "Histogram of the pixel (gray), its fitted density (line), and the edges of the cells in which each "
+    "electron number is the most likely one (dashed)."
 )
 _FITS_CAPTION = (
     "Gray: share of the frames at each digital number. Black: fitted density. Below: (observed − "

@@ -65,6 +65,8 @@ def frames_table(contours: Mapping[str, Any]) -> DataTable:
 
 
 _FRAMES = "frames for "
+#: Part of an axis at its ends where a label of a contour would be cut.
+_EDGE = 0.04
 
 
 def target_text(target: str) -> str:
@@ -102,6 +104,8 @@ def draw_frames_needed(look: Look, *, table: DataTable, mark: tuple[float, float
 def _panel(axes: Axes, x: Any, y: Any, frames: Any, words: str, mark: tuple[float, float] | None) -> None:
     colours = colours_of(axes)
     axes.set_facecolor(colours.no_value)
+    # first of all: labels of contours are placed and turned on the axes as they are
+    axes.set(xscale="log", xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     shown = np.ma.masked_invalid(np.where(np.isfinite(frames), np.clip(frames, 1.0, None), np.nan))
     axes.contourf(
         x,
@@ -113,19 +117,21 @@ def _panel(axes: Axes, x: Any, y: Any, frames: Any, words: str, mark: tuple[floa
         alpha=0.85,
     )
     lines = axes.contour(x, y, shown, levels=_LEVELS, colors="white", linewidths=0.9)
-    axes.clabel(
+    labels = axes.clabel(
         lines,
         fontsize=6.5,
         fmt=lambda level: power_of_ten(round(np.log10(level))),
         colors="black",
         inline_spacing=2,
     )
+    to_axes = axes.transData + axes.transAxes.inverted()
+    for label in labels:
+        if not all(_EDGE < each < 1.0 - _EDGE for each in to_axes.transform(label.get_position())):
+            label.remove()  # it would be cut
     best = np.ma.argmin(shown, axis=1)
     axes.plot(np.asarray(x)[best], y, ".", color="white", markersize=2.5)
     if mark is not None:
         axes.plot(*mark, "o", color=colours.vermilion, markersize=5, markeredgecolor="white", clip_on=False)
-    axes.set(xscale="log", xlabel="quanta exposure (e⁻)", ylabel="read noise (e⁻)")
-    axes.set_xlim(x[0], x[-1])
-    axes.set_ylim(y[0], y[-1])
+    axes.set(xlabel="quanta exposure (e⁻)", ylabel="read noise (e⁻)")
     axes.xaxis.set_major_formatter("{x:g}")
     axes.set_title(f"frames for {words.replace('_e to', ' to').replace('_', ' ').replace('e-', 'e⁻')}")

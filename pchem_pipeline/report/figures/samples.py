@@ -43,7 +43,7 @@ def exposure_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
         return []
     words, noun = AXES[samples.against][0], symbol(slope)[1]
     table = exposure_table(samples)
-    line = _median(data.maps[slope]), _median(data.maps["spurious_charge"])
+    line = (_median(data.maps[slope]), *middle(data.maps["spurious_charge"])[:2])
     centre, error, _low, _high = middle(data.maps[slope])
     return [
         Figure(
@@ -143,7 +143,7 @@ def middle(values: NDArray[Any]) -> tuple[float, float, float, float]:
     return centre, 0.5 * float(ends[1] - ends[0]), low, high
 
 
-def exposures_chart(table: DataTable, line: tuple[float, float]) -> Chart:
+def exposures_chart(table: DataTable, line: tuple[float, float, float]) -> Chart:
     """Return the chart of H against time or light with its line, and the residuals below.
 
     Points are medians over the pixels, bars the 16 to 84 % range between pixels; the error bars of the
@@ -151,10 +151,10 @@ def exposures_chart(table: DataTable, line: tuple[float, float]) -> Chart:
 
     Args:
         table: of :func:`exposure_table`.
-        line: slope and offset, e-.
+        line: slope, offset and standard error of the offset, e-.
     """
     against = list(table.columns)[1]
-    places, exposures, (slope, offset) = table[against].astype(np.float64), table["H"], line
+    places, exposures, (slope, offset) = table[against].astype(np.float64), table["H"], line[:2]
     grid = np.linspace(0.0, 1.05 * places.max(), 50)
     marks = (
         Line(grid, offset + slope * grid, colour="vermilion", label="median line of the pixels"),
@@ -163,7 +163,7 @@ def exposures_chart(table: DataTable, line: tuple[float, float]) -> Chart:
     )
     top = Panel(
         Axis("quanta exposure $H$ (e⁻)", low=min(0.0, 1.1 * offset)), marks, 2.0, legend="upper left",
-        note=f"offset {short(offset)} e⁻", corner="lower right",
+        note=f"offset {measured(*line[1:], 'e⁻')}", corner="lower right",
     )  # fmt: skip
     x = Axis(table.heading(against), 0.0, float(grid[-1]))
     return Chart((Stack((top, _residuals(places, table)), x, height_mm=92.0),))

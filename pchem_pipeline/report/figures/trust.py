@@ -216,7 +216,7 @@ def draw_left_out(look: Look, *, share: FloatArray, n_frames: int | None) -> Dra
         left.stairs(
             np.histogram(np.minimum(hit, edges[-1] - 1e-9), edges)[0], edges, fill=True, color=colours.bars
         )
-        left.xaxis.set_major_locator(MaxNLocator(6, integer=bool(n_frames)))
+        left.xaxis.set_major_locator(MaxNLocator(6, integer=bool(n_frames), min_n_ticks=1))
         left.yaxis.set_major_locator(MaxNLocator(5, integer=True))
         left.set_ylim(0.0, 1.18 * left.get_ylim()[1])  # room for the words above the bars
     else:
@@ -234,7 +234,7 @@ def draw_left_out(look: Look, *, share: FloatArray, n_frames: int | None) -> Dra
     top = max(float(np.max(hit, initial=1.0)), 1.0)
     options = {"cmap": colours.from_paper, "vmin": 0.0, "vmax": top}
     image = show_map(right, shown, samples.shape, panels=_panels(look), **options)
-    right.set_facecolor(colours.paper)
+    image.set_cmap(image.get_cmap().with_extremes(bad=colours.paper))
     bar = figure.colorbar(image, ax=right, fraction=0.06, pad=0.02, aspect=25)
     bar.set_label(label)
     if n_frames:

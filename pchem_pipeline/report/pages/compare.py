@@ -15,7 +15,7 @@ from pchem_pipeline.report.figures.history import history_figures
 from pchem_pipeline.report.pages.page import render_page
 from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
 from pchem_pipeline.report.pages.report_json import json_value
-from pchem_pipeline.report.pages.tables import Table
+from pchem_pipeline.report.pages.tables import Table, rmse_unit, rmse_words
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import count, measured, percent, scientific, short, symbol
 
@@ -245,7 +245,7 @@ def run_table(found: Comparison) -> Table:
         rows.append((f"{symbol(name)[1]} ({symbol(name)[2]}), median", *cells))
     for name in dict.fromkeys(each for run in runs for each in run.rmse):
         cells = [scientific(run.rmse[name]) if name in run.rmse else "not known" for run in runs]
-        rows.append((f"RMSE, {name.replace('_', ' ')}", *cells))
+        rows.append((f"RMSE, {rmse_words(name)} ({rmse_unit(name)})", *cells))
     return Table("runs", "The runs", "", ("", *(run.title for run in runs)), tuple(rows))
 
 

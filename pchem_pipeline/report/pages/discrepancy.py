@@ -24,7 +24,7 @@ from pchem_pipeline.report.pages.discrepancy_tables import (
 from pchem_pipeline.report.pages.pictures import Picture
 from pchem_pipeline.report.pages.summary import Flag, Level
 from pchem_pipeline.report.pages.tables import Table
-from pchem_pipeline.report.style.wording import count, measured, percent, short, unit_text
+from pchem_pipeline.report.style.wording import count, measured, percent, short, typeset, unit_text
 
 #: File of the verdict's own page in the folder of a run.
 DISCREPANCY_PAGE = "discrepancy.html"
@@ -160,12 +160,19 @@ def discrepancy_view(data: DiscrepancyData, pictures: Sequence[Picture]) -> Disc
             continue  # nothing disagrees, or nothing was kept to draw
         if id_ == "where" and not data.found.where:
             title = "Data and model side by side"
-        empty = "" if shown or rows else _EMPTY[id_]
+        empty = "" if shown or rows else _empty(data.found, id_)
         parts.append(Part(f"discrepancy-part-{id_}", title, intro, empty, shown, rows))
-    sentence = data.found.sentence.replace(" -> ", " → ")
+    sentence = typeset(data.found.sentence)
     return DiscrepancyView(
         level, name, sentence, frames_text(data.found), key_facts(data), remarks(data), parts
     )
+
+
+def _empty(found: Verdict, part: str) -> str:
+    """Return why a part of the page has nothing to show."""
+    if part == "evidence" and any(step.verdict == "described" for step in found.steps):
+        return "No known effect explains what disagrees. It was measured instead, and has no rivals."
+    return _EMPTY[part]
 
 
 #: Family of a statistic, or its beginning, to the figure that shows it.
@@ -195,7 +202,9 @@ def frames_text(found: Verdict) -> str:
         return f"{count(seen.histograms, 'histogram')}; their samples were dealt at random: {dealt}."
     share = f" ({percent(seen.share, 1.0)} of the run's samples)" if math.isfinite(seen.share) else ""
     place = f"rows {seen.rows[0]} to {seen.rows[1] - 1}, columns {seen.columns[0]} to {seen.columns[1] - 1}"
-    return f"{count(seen.frames, 'frame')} of {place}{share}: {dealt} that is left."
+    rest = seen.frames - seen.train - seen.test - seen.final
+    over = f"; a rest of {count(rest, 'frame')}, less than three blocks, is left out" if rest > 0 else ""
+    return f"{count(seen.frames, 'frame')} of {place}{share}: {dealt} that is left{over}."
 
 
 def verdict_level(found: Verdict) -> tuple[Level, str]:

@@ -119,7 +119,8 @@ def _sentence(data: DiscrepancyData, statistic: str) -> str:
 def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
     rows = []
     best = max((c.score for c in step.candidates if math.isfinite(c.score)), default=math.nan)
-    for candidate in step.candidates[:_MOST_CANDIDATES]:
+    # what is measured competes with nothing
+    for candidate in step.candidates[: 0 if step.verdict == "described" else _MOST_CANDIDATES]:
         behind = candidate.score - best
         rows.append(
             (
@@ -188,10 +189,16 @@ def _gaps(found: Verdict) -> Table:
     )
 
 
+def _how(step: Step) -> str:
+    """Return in which way an effect is known that was not named: measured, or but the likeliest."""
+    if step.effect:
+        return ""
+    return " (measured)" if step.verdict == "described" else " (the likeliest)"
+
+
 def _beside(step: Step) -> str:
-    """Return what stands beside the title of an effect: where it acts, whether it is but the likeliest."""
-    place = f", in {step.place}" if step.place else ""
-    return place if step.effect else f"{place} (the likeliest)"
+    """Return what stands beside the title of an effect: where it acts, and how it is known."""
+    return f"{f', in {step.place}' if step.place else ''}{_how(step)}"
 
 
 def _parameters(data: DiscrepancyData) -> Table:
@@ -205,7 +212,7 @@ def _parameters(data: DiscrepancyData) -> Table:
         for step in data.found.steps
         for tag in [step.likeliest]
         for name, p in step.parameters.items()
-        if tag and (step.effect or data.found.verdict == "ambiguous")
+        if tag and (step.effect or step.verdict == "described" or data.found.verdict == "ambiguous")
     )
     return Table(
         "discrepancy-parameters",
@@ -224,7 +231,7 @@ def _moved(steps: Sequence[Step]) -> Table:
             rows.append(
                 (
                     f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
-                    step.effect or f"{step.likeliest} (the likeliest)",
+                    f"{step.likeliest}{_how(step)}",
                     short(each.median) if math.isfinite(each.median) else "not known",
                     signed(each.in_stderr),
                 )
@@ -232,7 +239,8 @@ def _moved(steps: Sequence[Step]) -> Table:
     return Table(
         "discrepancy-moved",
         "How the delivered parameters moved",
-        "Median over the pixels of (with the effect − without it), also in standard errors of a pixel.",
+        "Median over all pixels of (with the effect − without it), also in standard errors of a pixel. An "
+        "effect in fewer than half of them moves no median.",
         ("parameter", "effect added", "moved by", "in standard errors"),
         tuple(rows),
     )

@@ -69,8 +69,7 @@ def emva_tables(data: ReportData) -> list[Table]:
         Table(
             "emva1288",
             "What a data sheet after EMVA 1288 can take",
-            f"Flagged {data.noun}s are left out. As a file: pchem export "
-            f"{data.run.get('store', 'RUN')} --format emva",
+            f"Flagged {data.noun}s are left out. As a file: pchem export {data.typed_run} --format emva",
             ("quantity", "symbol", "value", "here", "where it differs"),
             rows,
             "emva",

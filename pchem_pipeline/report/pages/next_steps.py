@@ -42,6 +42,14 @@ def next_steps(data: ReportData) -> list[Step]:
             ),
             Step(f"pchem view {RUN}", "look at the histograms"),
         ]
+    if data.quick_look is not None and any(check.name == "levels" for check in data.quick_look.found):
+        return [
+            Step(
+                "pchem run FILES_OF_ONE --store one.zarr",
+                "the frames are of several exposures: make a run of each, from its own files, then fit them "
+                "together (pchem joint)",
+            )
+        ]
     found = []
     if data.often_flagged and data.samples is None:
         found += [

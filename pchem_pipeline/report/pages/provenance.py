@@ -52,7 +52,7 @@ def _stages(data: ReportData) -> Table:
                 str(stage.get("state", "")),
                 f"{float(stage['seconds']):.1f} s" if stage.get("seconds") is not None else "",
                 f"{float(stage['cpu_seconds']):.1f} s" if stage.get("cpu_seconds") is not None else "",
-                size_text(float(memory)) if memory else "",
+                f"{float(memory) / 2**20:.0f} MiB" if memory else "",
                 str(stage.get("started", "")),
             )
         )

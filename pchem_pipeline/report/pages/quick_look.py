@@ -11,9 +11,24 @@ from pchem_pipeline.report.style.wording import percent, short
 _SUBJECTS = "frames, rows, columns, neighbours, successive samples and codes"
 
 
+#: What a check of resemblance finds where the correlation is negative.
+_OPPOSED = {
+    "lag": "samples differ from those of the frame before more than chance makes them",
+    "frame_lag": "the mean of a frame differs from that of the frame before more than chance makes it",
+    "neighbours_x": "neighbours in a row differ more than chance makes them",
+    "neighbours_y": "neighbours in a column differ more than chance makes them",
+}
+
+
+def check_title(check: Check) -> str:
+    """Return what was looked for, or where the opposite was found that."""
+    title = _OPPOSED.get(check.name, check.title) if check.found and check.size < 0 else check.title
+    return f"{title[:1].upper()}{title[1:]}"
+
+
 def check_sentence(check: Check) -> str:
     """Return what a check found, without the full stop."""
-    text = f"{check.title[:1].upper()}{check.title[1:]}: {size_text(check)}"
+    text = f"{check_title(check)}: {size_text(check)}"
     if check.where:
         text += f" ({check.where})"
     if check.in_model:
@@ -23,6 +38,8 @@ def check_sentence(check: Check) -> str:
 
 def size_text(check: Check) -> str:
     """Return the size of what a check found, in DN, e- and as a share of the read noise."""
+    if check.name == "levels":
+        return f"{short(check.size, 2)} DN apart"
     if check.unit == "DN":
         size = f"{short(check.size, 2)} DN"
         if math.isfinite(check.size_e):

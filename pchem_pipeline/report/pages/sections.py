@@ -175,7 +175,7 @@ def _summary(material: Material) -> Section:
         "numbers": key_numbers(data),
         "sentence": "" if pixel_counts(data).fitted else sentence(data),
         "stepped_back": key_numbers(data, with_flagged=True) if data.mostly_flagged else [],
-        "next": [(step.of(str(data.run.get("store", "RUN"))), step.why) for step in next_steps(data)],
+        "next": [(step.of(data.typed_run), step.why) for step in next_steps(data)],
         "flags": [flag for flag in remarks if flag.level != "good"],
         "passed": [flag for flag in remarks if flag.level == "good" and flag.about == "results"],
         "pictures": [each for each in material.pictures if each.figure.section == "summary"],
@@ -223,7 +223,7 @@ def _discrepancy(material: Material) -> Section:
         "found": look is not None and bool(look.found),
         "view": material.view,
         "tables": [table for table in material.tables if table.section == "discrepancy"],
-        "command": f"pchem discrepancy {material.data.run.get('store', 'RUN')}",
+        "command": f"pchem discrepancy {material.data.typed_run}",
     }
     return Section("discrepancy", "What the model is missing", "discrepancy", content)
 

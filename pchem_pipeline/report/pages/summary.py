@@ -16,7 +16,15 @@ from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.pages.criteria import Criterion, criteria
 from pchem_pipeline.report.pages.quick_look import check_sentence, nothing_found
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.wording import count, measured, percent, scientific, short, symbol
+from pchem_pipeline.report.style.wording import (
+    count,
+    measured,
+    percent,
+    scientific,
+    short,
+    symbol,
+    typeset,
+)
 
 Level = Literal["good", "note", "caution", "serious"]
 
@@ -162,6 +170,12 @@ def flags(data: ReportData) -> list[Flag]:
     return sorted(found, key=lambda flag: order.index(flag.level))
 
 
+def _levels(data: ReportData) -> list[Flag]:
+    """Say where the frames are of several exposures: what else is odd follows from that."""
+    found = () if data.quick_look is None else data.quick_look.found
+    return [Flag(check.level, f"{check_sentence(check)}.") for check in found if check.name == "levels"]
+
+
 def _failed_pixels(data: ReportData) -> list[Flag]:
     pixels = pixel_counts(data)
     share = pixels.failed / max(pixels.total, 1)
@@ -305,7 +319,7 @@ def _discrepancy(data: ReportData) -> list[Flag]:
         "named_in_part": "caution",
         "unexplained": "serious",
     }
-    return [Flag(levels.get(found.verdict, "note"), _as_sentence(found.sentence.replace(" -> ", " → ")))]
+    return [Flag(levels.get(found.verdict, "note"), _as_sentence(typeset(found.sentence)))]
 
 
 def _quick_look(data: ReportData) -> list[Flag]:
@@ -315,7 +329,8 @@ def _quick_look(data: ReportData) -> list[Flag]:
         return []
     if not look.found:
         return [Flag("good", nothing_found(look))]
-    closer = f"; to look closer: {look.command}" if look.command and data.discrepancy is None else ""
+    known = not look.command or data.discrepancy is not None
+    closer = "" if known else f"; to look closer: {look.command}"
     return [
         # what the model has already speaks for it
         Flag(
@@ -323,6 +338,7 @@ def _quick_look(data: ReportData) -> list[Flag]:
             f"{check_sentence(check)}{closer if number == 0 else ''}.",
         )
         for number, check in enumerate(look.found)
+        if check.name != "levels"
     ]
 
 
@@ -365,8 +381,8 @@ def _model(data: ReportData, article: str = "The") -> str:
 
 #: What looks for remarks; a further check is a further row.
 CHECKS: tuple[Callable[[ReportData], list[Flag]], ...] = (
-    _spaced_codes, _failed_pixels, _unfitted, _flagged, _cautions, _goodness, _agreement, _quick_look,
-    _discrepancy, _conditions,
+    _spaced_codes, _levels, _failed_pixels, _unfitted, _flagged, _cautions, _goodness, _agreement,
+    _quick_look, _discrepancy, _conditions,
 )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.figures.plan import frames_text, target_text
 from pchem_pipeline.report.figures.samples import AXES, middle
 from pchem_pipeline.report.figures.trust import noise_shares
+from pchem_pipeline.report.pages.quick_look import check_title
 from pchem_pipeline.report.pages.quick_look import size_text as check_size
 from pchem_pipeline.report.pages.summary import summaries
 from pchem_pipeline.report.style.ranges import finite
@@ -55,7 +56,7 @@ def _quick_look(data: ReportData) -> Table:
     look = data.quick_look or QuickLook(())
     rows = tuple(
         (
-            check.title[:1].upper() + check.title[1:],
+            check_title(check),
             ("in the model" if check.in_model else "yes") if check.found else "no",
             check_size(check) if check.found else "",
             _limit_text(check),
@@ -233,6 +234,18 @@ _RMSE_ROWS = (
 )
 
 
+def rmse_words(name: str) -> str:
+    """Return what a prediction of the ensemble is called, or the sampling noise beside it."""
+    words = {row[0]: row[1] for row in _RMSE_ROWS}
+    floors = {"noise_floor": "raw, sampling noise alone", "nuced_noise_floor": "NUCed, sampling noise alone"}
+    return {**words, **floors}.get(name, name.replace("_", " "))
+
+
+def rmse_unit(name: str) -> str:
+    """Return the unit of the densities of an ensemble, raw or after correction."""
+    return "1/e⁻" if name.startswith("nuced") else "1/DN"
+
+
 def _rmse(data: ReportData) -> Table:
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
     rows = []
@@ -240,7 +253,7 @@ def _rmse(data: ReportData) -> Table:
         if rmse.get(name) is None:
             continue
         floor = rmse.get(floor_name)
-        unit = "1/DN" if name.startswith("epcd") else "1/e⁻"
+        unit = rmse_unit(name)
         rows.append(
             (
                 words,
@@ -266,16 +279,18 @@ def _moments(data: ReportData) -> Table:
         observed, error = row.get("observed"), row.get("stderr")
         predicted = float(row["predicted"])
         if observed is None:
-            seen, difference = "", ""
+            expected, seen, difference = short(predicted), "", ""
         elif error:
+            # to the digits of the data that it is compared with
+            expected = measured(predicted, float(error)).partition(" ±")[0]
             seen = measured(float(observed), float(error))
             difference = signed((float(observed) - predicted) / float(error))
         else:
-            seen, difference = short(float(observed), 5), ""
+            expected, seen, difference = short(predicted, 5), short(float(observed), 5), ""
         rows.append(
             (
                 f"{row['quantity']} ({unit})" if unit else str(row["quantity"]),
-                short(predicted, 6),
+                expected,
                 seen,
                 difference,
             )

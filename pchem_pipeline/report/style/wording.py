@@ -62,9 +62,18 @@ def without_formulas(text: str) -> str:
     return _FORMULA.sub(characters, text).replace(r"\$", "$")
 
 
+#: Electrons in plain text, not a word that is broken at a hyphen.
+_PLAIN_E = re.compile(r"(?<![\w.])e-(?!\w)")
+
+
 def unit_text(unit: str) -> str:
     """Return a stored unit as people write it, e.g. ``e-/DN`` as ``e⁻/DN``; ``1`` as nothing."""
     return _UNITS.get(unit, unit)
+
+
+def typeset(text: str) -> str:
+    """Return a plain sentence, as a verdict has it, with the signs of a page: ``e⁻``, ``→``."""
+    return _PLAIN_E.sub("e⁻", text.replace(" -> ", " → "))
 
 
 def symbol(name: str) -> tuple[str, str, str]:
@@ -155,4 +164,5 @@ def percent(part: float, whole: float) -> str:
         return "< 0.01 %"
     if 99.99 < share < 100:
         return "> 99.99 %"
-    return f"{share:.{2 if share < 1 else 1 if share < 10 or share > 99 else 0}f} %".replace(".0 %", " %")
+    digits = 2 if share < 1 else 1 if share < 10 or 99 < share < 100 else 0
+    return f"{share:.{digits}f} %".replace(".0 %", " %")

@@ -105,7 +105,8 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
 
 
 def _beaten(effect: str, rival: Rival) -> list[str]:
-    behind = f" ({-rival.behind:.3g} nats behind)" if math.isfinite(rival.behind) else ""
+    nats = -rival.behind
+    behind = f" ({nats:{',.0f' if nats >= 100.0 else '.3g'}} nats behind)" if math.isfinite(nats) else ""
     return _wrapped(
         f"{effect}, not {rival.effect}{behind}: {rival.why}"
         if rival.why

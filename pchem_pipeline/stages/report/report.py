@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.effects.framework.compose import model_words
@@ -132,7 +132,9 @@ def _warnings(data: ReportData) -> list[str]:
     if look is None or data.discrepancy is not None:
         return []
     found = [check_sentence(check) for check in look.found if check.level in ("caution", "serious")]
-    return [*found, f"to look closer: {look.command}"] if found else []
+    if not found or look.found[0].name == "levels":
+        return found
+    return [*found, f"to look closer: {look.command}"]
 
 
 def gather(
@@ -341,7 +343,7 @@ def _missing(run: StoredRun, maps: Mapping[str, NDArray[Any]]) -> dict[str, str]
         words = "methods are compared in the run of a sample, with the others beside it (--with)"
         found["methods"] = words
     elif run.methods is None:
-        found["methods"] = f"not compared in this run; to do so, run: pchem methods {run.name}"
+        found["methods"] = f"not compared in this run; to do so, run: pchem methods {quoted(Path(run.name))}"
     return found
 
 

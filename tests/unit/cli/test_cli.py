@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pchem_pipeline import __version__
-from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.base.errors import ConfigError, ExitCode, InputError
 from pchem_pipeline.cli import app
 from pchem_pipeline.commands import first_screen, new_run
 from pchem_pipeline.commands.new_run import find_or_start
@@ -107,7 +107,7 @@ def test_options_for_camera_files_do_not_fit_a_yaml(tmp_path):
 
 
 def test_missing_files_are_named(tmp_path):
-    with pytest.raises(ConfigError, match="does not exist"):
+    with pytest.raises(InputError, match="does not exist"):
         find_or_start([tmp_path / "none.tif"], None, {})
 
 
@@ -177,3 +177,19 @@ def test_out_of_memory_and_ctrl_c_have_their_codes(monkeypatch, capsys):
             app.main([])
         assert caught.value.code == code
         assert capsys.readouterr().err.startswith("pchem: ")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")
+def test_a_full_disk_behind_stdout_is_one_line():
+    with Path("/dev/full").open("w") as full:
+        found = subprocess.run(
+            [sys.executable, "-m", "pchem_pipeline", "--version"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert found.returncode == ExitCode.INPUT
+    assert (
+        found.stderr == "pchem: stdout cannot be written (No space left on device); check where it goes to\n"
+    )

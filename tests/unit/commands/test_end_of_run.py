@@ -26,7 +26,8 @@ def numbers(level: str) -> dict:
              "criteria": []},
         ],
         "headline": [{"label": "read noise", "value": "0.280 ± 0.001 e⁻", "spread": "0.2 to 0.3 e⁻"}],
-        "flags": [{"level": "caution", "text": "Rounding."}, {"level": "good", "text": "Fine."}],
+        "flags": [{"level": "serious", "text": "Two."}, {"level": "caution", "text": "Rounding."},
+                  {"level": "good", "text": "Fine."}],
         "next": [{"command": "pchem view RUN", "why": "look"}],
     }  # fmt: skip
 
@@ -58,7 +59,7 @@ def test_the_first_screen_is_told_and_the_path_alone_is_a_result(target, capsys)
     assert "All right? Yes." in lines
     assert "  NOT hot pixels         2 %  (≤ 1 %)" in lines
     assert "median read noise  0.280 ± 0.001 e⁻   (5 to 95 %: 0.2 to 0.3 e⁻)" in lines
-    assert "Caution: Rounding." in lines
+    assert lines[lines.index("Caution: Rounding.") - 1] == "Serious: Two."
     assert lines[-1] == "  pchem view 'my run.yaml'"
 
 

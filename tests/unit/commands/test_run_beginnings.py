@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -9,7 +10,8 @@ from typer.testing import CliRunner
 
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.cli.app import app
-from pchem_pipeline.commands.new_run import find_or_start, first_try
+from pchem_pipeline.commands.joint import find_joint
+from pchem_pipeline.commands.new_run import find_or_start, first_try, unwritten
 from pchem_pipeline.config.load import dump_config, load_config
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
@@ -34,6 +36,20 @@ def test_a_wrong_option_is_one_line(tmp_path, file, given, words):
     with pytest.raises(ConfigError, match=f"^the command line: {words}"):
         find_or_start([file], tmp_path / "run.zarr", given)
     assert not (tmp_path / "run.yaml").exists()
+
+
+def test_what_files_do_not_say_of_themselves_has_an_option(tmp_path, monkeypatch):
+    """Left-justified samples in one of two datasets of an HDF5 file."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(1)
+    with h5py.File("a.h5", "w") as file:
+        for name in ("dark", "light"):
+            file[name] = rng.integers(100, 140, (20, 4, 4)).astype(np.uint16) << 4
+    options = ["--dataset", "light", "--bit-shift", "4", "--bit-depth", "12", "--until", "histogram"]
+    CliRunner().invoke(app, ["run", "a.h5", *options], catch_exceptions=False)
+    written = load_config(tmp_path / "run.yaml").input
+    assert (written.dataset, written.bit_shift, written.bit_depth) == ("light", 4, 12)
+    assert RunStore.open(tmp_path / "run.zarr").read("histogram/origin").min() < 140
 
 
 def test_the_region_is_written_into_the_yaml(tmp_path, file):
@@ -73,6 +89,60 @@ def test_an_edited_yaml_is_never_replaced(tmp_path, file):
     with pytest.raises(ConfigError, match="exists with other settings"):
         find_or_start([file], place, {"bit_depth": 12})
     assert (tmp_path / "run.yaml").read_text() == edited
+
+
+def test_the_same_command_goes_on_with_a_yaml_that_says_more(tmp_path, file, monkeypatch):
+    """What a search names is written into the YAML, what a user sets too; the command that began goes on."""
+    monkeypatch.chdir(tmp_path)
+    place = tmp_path / "run.zarr"
+    find_or_start([file], place, {"bit_depth": 12}, (0, 8, 8, 16))
+    RunStore.create(place).records.write(StageRecord("ingest", 1, "f", {}, finished=True))
+    path = tmp_path / "run.yaml"
+    effects = "effects: [{tag: row_noise, row_noise_dn: 1.0}]  # named"
+    edited = path.read_text().replace("effects: []", effects).replace("tail_guard: 0.001", "tail_guard: 0")
+    path.write_text(edited)
+    for given, roi in (({"bit_depth": 12}, (0, 8, 8, 16)), ({}, None)):
+        again, is_new = find_or_start([file], place, given, roi)
+        assert (is_new, again.config.fit.tail_guard, again.config.input.bit_depth) == (True, 0.0, 12)
+        assert [effect.tag for effect in again.config.model.effects] == ["row_noise"]
+        assert unwritten(again) is None
+    with pytest.raises(ConfigError, match=r"\(input\.bit_depth 12 there, 14 here\); go on"):
+        find_or_start([file], place, {"bit_depth": 14})
+    with pytest.raises(ConfigError, match=r"\(input\.roi \[0, 8, 8, 16\] there, \[0, 8, 0, 8\] here\)"):
+        find_or_start([file], place, {}, (0, 8, 0, 8))
+    assert path.read_text() == edited
+
+
+def test_a_joint_fit_goes_on_with_its_edited_yaml(tmp_path, monkeypatch):
+    """Integration times are edited there, and what a search names is written there."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b"):
+        Path(f"{name}.yaml").write_text(f"run: {{store: {name}.zarr}}\ninput: {{files: [{name}.tif]}}\n")
+    runs = [Path("a.yaml"), Path("b.yaml")]
+    _, is_new = find_joint(runs, store=Path("j.zarr"))
+    assert is_new
+    edited = Path("j.yaml").read_text().replace("integration_time: null", "integration_time: 2.0", 1)
+    Path("j.yaml").write_text(edited)
+    again, is_new = find_joint(runs, store=Path("j.zarr"))
+    assert not is_new
+    assert again.config.input.samples[0].integration_time == 2.0
+    with pytest.raises(ConfigError, match="exists with other settings"):
+        find_joint(runs[::-1], store=Path("j.zarr"))
+    assert Path("j.yaml").read_text() == edited
+
+
+def test_a_refusal_that_names_a_setting_says_where_settings_are(tmp_path, monkeypatch):
+    """The YAML of a first try that is refused is taken away: `pchem init` makes it."""
+    monkeypatch.chdir(tmp_path)
+    np.save("f.npy", np.full((9, 8, 8), 1 << 13, np.uint16))
+    with pytest.raises(InputError, match=r"; a setting .*: pchem init 'my run.yaml' FILES, then pchem run"):
+        CliRunner().invoke(
+            app, ["run", "f.npy", "--store", "my run.zarr", "--bit-depth", "12"], catch_exceptions=False
+        )
+    assert [path.name for path in tmp_path.iterdir()] == ["f.npy"]
+    with pytest.raises(InputError) as refused:
+        CliRunner().invoke(app, ["run", "g.npy"], catch_exceptions=False)
+    assert "pchem init" not in str(refused.value)
 
 
 def test_commands_in_messages_can_be_pasted(tmp_path):

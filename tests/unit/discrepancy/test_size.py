@@ -23,19 +23,33 @@ MAPS = PixelMaps(
 @pytest.mark.parametrize(
     ("tag", "fields", "electrons", "draws"),
     [
-        ("row_noise", {"row_noise_dn": 0.5}, 0.5 * GAIN, 12 * 4000),
-        ("frame_noise", {"frame_noise_dn": 0.2}, 0.2 * GAIN, 4000),
-        ("signal_dependent_noise", {"noise_e": 0.1}, 0.1 * np.sqrt(EXPOSURE), 144 * 4000),
+        ("row_noise", {"row_noise_dn": 0.5}, 0.5 * GAIN, 12 * 20_000),
+        ("frame_noise", {"frame_noise_dn": 0.2}, 0.2 * GAIN, 20_000),
+        ("signal_dependent_noise", {"noise_e": 0.1}, 0.1 * np.sqrt(EXPOSURE), 144 * 20_000),
     ],
 )
+@pytest.mark.parametrize("n_frames", [300, 4000])
 def test_the_size_is_what_the_law_of_the_effect_says(
-    tag: str, fields: dict[str, float], electrons: float, draws: int
+    tag: str, fields: dict[str, float], electrons: float, draws: int, n_frames: int
 ) -> None:
-    size = size_of(effect_class(tag).model_validate({"tag": tag, **fields}), MAPS, 4000)
+    """Of a short run no less well than of a long one: the draws are as many."""
+    size = size_of(effect_class(tag).model_validate({"tag": tag, **fields}), MAPS, n_frames)
     assert size is not None
     assert size.electrons == pytest.approx(electrons, rel=4.0 / np.sqrt(2.0 * draws) + 0.005)
     assert size.dn == pytest.approx(size.electrons / GAIN)
     assert size.of_read_noise == pytest.approx(size.dn / NOISE)
+
+
+@pytest.mark.parametrize("changes", ["offset", "light"])
+def test_a_measured_noise_has_the_size_that_was_measured(changes: str) -> None:
+    """Light that varies by 5 % changes few samples, by whole electrons: that is their shot noise."""
+    mode = {"of": "row", "share": 1.0, "changes": changes, "signal_dn": EXPOSURE / GAIN}
+    fields = {"tag": "empirical_noise", "noise_dn": 1.0, "modes": [mode]}
+    size = size_of(effect_class("empirical_noise").model_validate(fields), MAPS, 4000)
+    assert size is not None
+    assert size.model_dump() == pytest.approx(
+        {"electrons": GAIN, "dn": 1.0, "of_read_noise": 1.0 / NOISE, "samples": 1.0}
+    )
 
 
 def test_the_size_in_a_part_is_that_where_it_acts() -> None:

@@ -14,6 +14,7 @@ import tifffile
 import zarr
 from astropy.io import fits
 
+from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
     CameraFacts,
     bits_of,
@@ -127,7 +128,7 @@ def test_several_files_share_what_they_state_alike(tmp_path: Path) -> None:
     for i, temperature in enumerate((-20.0, -20.4, -17.0)):
         image = fits.PrimaryHDU(STACK[i])
         image.header["INSTRUME"], image.header["CCD-TEMP"] = "C", temperature
-        image.header["SERIALNO"] = f"{i // 2}"
+        image.header["SERIALNO"] = f"{i}"  # counts the files
         image.header["DATE-OBS"] = f"2026-01-31T12:00:0{i}"
         image.writeto(tmp_path / f"{i}.fits")
     with open_frames(InputSettings(files=("*.fits",)), tmp_path) as frames:
@@ -136,6 +137,20 @@ def test_several_files_share_what_they_state_alike(tmp_path: Path) -> None:
     steady, remark = shared_facts([CameraFacts(temperature=1.0), CameraFacts(temperature=1.9)])
     assert (steady.temperature, remark) == (1.45, "")
     assert shared_facts([CameraFacts(temperature=1.0), CameraFacts()])[0].temperature is None
+
+
+def test_files_of_two_cameras_are_no_stack(tmp_path: Path) -> None:
+    for i, serial in enumerate(("A1", "A1", "B2", "B2")):
+        image = fits.PrimaryHDU(STACK[i])
+        image.header["SERIALNO"] = serial
+        image.writeto(tmp_path / f"{i}.fits")
+    words = r"of different cameras: serial number A1 in 0\.fits, serial number B2 in 2\.fits; read them apart"
+    for files in (("*.fits",), ("1.fits", "2.fits")):
+        with pytest.raises(InputError, match=words.replace("0", files[0][0].replace("*", "0"))):
+            open_frames(InputSettings(files=files), tmp_path)
+    fits.PrimaryHDU(STACK[4]).writeto(tmp_path / "4.fits")  # says nothing, contradicts nothing
+    with open_frames(InputSettings(files=("0.fits", "1.fits", "4.fits")), tmp_path) as frames:
+        assert frames.camera.serial is None
 
 
 @pytest.mark.parametrize(

@@ -193,7 +193,15 @@ def test_bit_depth_is_checked(tmp_path: Path) -> None:
         open_frames(InputSettings(files=("a.npy",), bit_depth=12), tmp_path).read(), STACK
     )
     reader = open_frames(InputSettings(files=("a.npy",), bit_depth=11), tmp_path)
-    with pytest.raises(InputError, match=r"a\.npy: values need more than the bit depth of 11"):
+    with pytest.raises(InputError, match=r"a\.npy: values need more than the bit depth of 11; correct"):
+        reader.read()
+
+
+@pytest.mark.parametrize("shift", [0, 2])
+def test_left_justified_values_above_the_bit_depth_say_their_shift(tmp_path: Path, shift: int) -> None:
+    np.save(tmp_path / "a.npy", STACK << 4)  # 12 bits in 16
+    reader = open_frames(InputSettings(files=("a.npy",), bit_depth=12, bit_shift=shift), tmp_path)
+    with pytest.raises(InputError, match=r"lowest 4 bits are all zero.*; set input\.bit_shift: 4$"):
         reader.read()
 
 

@@ -48,6 +48,7 @@ def test_other_paths_stay_what_they_are():
     assert place_of("run.zarr") == Path("run.zarr")
     assert place_of("run.zarr", Path("/data")) == Path("/data/run.zarr")
     assert not isinstance(place_of("/data/s3:/x"), RemotePath)
+    assert not isinstance(place_of("two.h5:/dark/frames"), RemotePath)
 
 
 def test_the_files_of_a_run(folder):

@@ -75,7 +75,7 @@ def test_a_flipped_bit_is_never_silent(store):
 
 
 def test_missing_array_names_the_cure(store):
-    with pytest.raises(StoreError, match="run the stage that writes it"):
+    with pytest.raises(StoreError, match="run the stage that writes it, with --force"):
         store.read("fit/bias")
 
 

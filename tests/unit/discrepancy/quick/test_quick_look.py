@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 from helpers.quick_stacks import EXPOSURE, GAIN, READ_NOISE, codes_of, maps_of, stack, sums_of
 
+from pchem_pipeline import fit_counts
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.quick.checks import _SIGNS, SIGNIFICANCE, Check, QuickLook
+from pchem_pipeline.discrepancy.quick.levels import levels_check
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
 from pchem_pipeline.effects.analog.column_noise import ColumnNoise
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.model.histogram.count import histogram_frames
 
 SHAPE = (800, 32, 32)
 SIGMA = READ_NOISE / GAIN  # DN
@@ -49,7 +52,7 @@ def clean() -> QuickLook:
 def test_a_clean_stack_passes_all_checks(clean: QuickLook) -> None:
     assert clean.found == ()
     assert {check.level for check in clean.checks} == {"good"}
-    assert len(clean.checks) == 15
+    assert len(clean.checks) == 16
     assert clean.samples == np.prod(SHAPE)
 
 
@@ -190,6 +193,51 @@ def test_a_drift_is_found_with_its_rms_and_is_nothing_else() -> None:
     assert check.size == pytest.approx(rms, abs=5 * np.sqrt(VARIANCE / np.prod(SHAPE)) * 4)
 
 
+@pytest.mark.parametrize("order", ["one after the other", "mixed"])
+def test_frames_of_two_exposures_are_told_and_nothing_else(order: str) -> None:
+    rng = np.random.default_rng(31)
+    light = np.arange(SHAPE[0]) >= 300
+    if order == "mixed":
+        rng.shuffle(light)
+    look = looked(stack(rng, SHAPE, exposure=np.where(light, 2.5, 0.15)[:, None, None]))
+    assert [check.name for check in look.checks] == ["levels"]
+    (check,) = look.found
+    assert check.level == "serious"
+    # means over half the frames of 1,024 pixels each: far below 1 % of the difference
+    assert check.size == pytest.approx(2.35 / GAIN, rel=0.01)
+    first = "frames 0 to 299 at 201" if order != "mixed" else "300 frames from "
+    assert check.where.startswith(first)
+    assert "all else" in look.missing
+
+
+def test_three_exposures_are_three_levels() -> None:
+    rng = np.random.default_rng(32)
+    exposure = np.repeat([0.2, 0.8, 3.0], 200)[:, None, None]
+    (check,) = looked(stack(rng, (600, 32, 32), exposure=exposure)).found
+    assert check.where.count("frames ") == 3
+    assert check.size == pytest.approx(2.8 / GAIN, rel=0.01)
+
+
+def test_offsets_that_jump_or_alternate_and_lamps_that_drift_are_no_two_exposures() -> None:
+    """The variance does not grow with an offset; a lamp leaves no gap. The gap alone would be found."""
+    rng = np.random.default_rng(33)
+    t = np.arange(SHAPE[0])[:, None, None]
+    jumped = looked(stack(rng, SHAPE, lambda dn: dn + 10.0 * (t >= 300)))
+    assert not by_name(jumped)["levels"].found
+    assert by_name(jumped)["drift"].found
+    mean, variance = (np.where(np.arange(800) < 300, *values) for values in ((200.0, 210.0), (60.0, 140.0)))
+    assert levels_check(mean, variance, GAIN).p < SIGNIFICANCE
+    assert levels_check(mean, np.full(800, 60.0), GAIN).p == 1.0
+    alternating = looked(stack(rng, SHAPE, lambda dn: dn + 5.0 * (-1.0) ** t))
+    assert not by_name(alternating)["levels"].found
+    lamp = looked(stack(rng, SHAPE, exposure=1.0 + t / 800.0))
+    assert not by_name(lamp)["levels"].found
+    for seed in range(300):  # neither noise of frames nor a flickering lamp leaves a gap
+        each = np.random.default_rng(seed)
+        for noise in (each.normal(200.0, 3.0, 32), each.uniform(190.0, 210.0, 32)):
+            assert levels_check(noise, 8.0 * noise, GAIN).p == 1.0
+
+
 def test_a_period_of_the_frames_and_even_and_odd_ones_are_told_apart() -> None:
     rng = np.random.default_rng(6)
     t = np.arange(SHAPE[0])[:, None, None]
@@ -211,6 +259,7 @@ def test_charge_of_the_frame_before_and_of_neighbours_is_found() -> None:
 
     look = looked(stack(rng, SHAPE, charge=memory))
     assert [check.name for check in look.found] == ["lag"]
+    assert "the gain, e⁻/DN, reads high by about as much" in look.found[0].advice
     expected = 0.02 * EXPOSURE / GAIN**2 / VARIANCE
     assert look.found[0].size == pytest.approx(expected, abs=5 / np.sqrt(np.prod(SHAPE)))
 
@@ -221,6 +270,25 @@ def test_charge_of_the_frame_before_and_of_neighbours_is_found() -> None:
     assert [check.name for check in look.found] == ["neighbours_x"]
     expected = 0.02 * EXPOSURE / GAIN**2 / VARIANCE
     assert look.found[0].size == pytest.approx(expected, abs=6 / np.sqrt(np.prod(SHAPE)))
+
+
+def test_the_gain_moves_as_the_advice_on_correlations_says() -> None:
+    """Charge that couples to neighbours, or is carried over, makes the gain in e-/DN read high."""
+    rng = np.random.default_rng(34)
+    electrons = rng.poisson(EXPOSURE, (1500, 12, 12)).astype(float)
+    sides = sum(np.roll(electrons, step, axis) for step in (-1, 1) for axis in (1, 2))
+    for moved, axis, times in (
+        (0.92 * electrons + 0.02 * sides, 2, 2.0),
+        (0.95 * electrons + 0.05 * np.roll(electrons, 1, axis=0), 0, 1.0),
+    ):
+        dn = np.rint(200.0 + (moved + 0.25 * rng.standard_normal(moved.shape)) / GAIN).astype(np.uint16)
+        rest = np.moveaxis(dn - dn.mean(axis=0), axis, 0)
+        correlation = float(np.mean(rest[1:] * rest[:-1]) / np.mean(rest**2))
+        counts = histogram_frames(dn)
+        gain = fit_counts(counts.counts, counts.origin).conversion_gain
+        high, error = np.median(gain) / GAIN - 1.0, 1.253 * gain.std() / np.sqrt(gain.size) / GAIN
+        assert high > 10.0 * error
+        assert high == pytest.approx(times * correlation, rel=0.25)
 
 
 def test_repeated_and_single_frames_are_told_by_their_numbers() -> None:

@@ -9,8 +9,9 @@ from pchem_pipeline.commands.compare.settings import settings_that_differ
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.checks.run_differences import MapDifference, compare_maps
 from pchem_pipeline.report.charts.on_paper import draw_chart
-from pchem_pipeline.report.comparison import RunFacts
+from pchem_pipeline.report.comparison import HistoryRow, RunFacts
 from pchem_pipeline.report.figures.compare import draw_difference, ensemble_tables, ensembles_chart
+from pchem_pipeline.report.figures.history import history_figures
 from pchem_pipeline.report.style.style import Drawing, Look
 
 
@@ -80,3 +81,34 @@ def test_settings_that_differ_name_their_readers() -> None:
     assert rows["input.integration_time"].stages == ("maps",)
     assert (rows["simulate"].one, rows["simulate"].stages) == ("not set", ("simulate",))
     assert settings_that_differ(one, one) == []
+    effects = {"model": {"effects": [{"tag": "row_noise", "row_noise_dn": 1.0}]}}
+    extended = RunConfig.model_validate({"input": {"files": ["a.tif"], "integration_time": 1.0}, **effects})
+    (row,) = settings_that_differ(one, extended)
+    assert (row.name, row.stages) == ("model.effects", ("fit",))
+
+
+@pytest.mark.parametrize(
+    ("labels", "ticks"),
+    [
+        (["before", "after"], [(0.0, "before"), (1.0, "after")]),
+        (["2026-01-31T12:00:00+00:00"] * 2, [(0.0, "A"), (1.0, "B")]),
+    ],
+)
+def test_runs_in_their_order_are_told_by_label_or_letter(
+    labels: list[str], ticks: list[tuple[float, str]]
+) -> None:
+    summary = {"bias": (100.0, 0.1, 2.0)}
+    rows = [
+        HistoryRow(label, "", None, np.nan, RunFacts(letter, "r.zarr", (8, 8), 9, "", summary=summary))
+        for letter, label in zip("AB", labels, strict=True)
+    ]
+    (figure,) = history_figures(rows, "label")
+    axis = figure.draw(Look()).axes[-1].xaxis
+    assert list(zip(axis.get_ticklocs(), [t.get_text() for t in axis.get_ticklabels()], strict=True)) == ticks
+
+
+def test_the_strip_below_equal_ensembles_reaches_beyond_its_band() -> None:
+    """Ticks at its ends would run into those of the panel above."""
+    same = [run_facts("A", 100.0), run_facts("B", 100.0)]
+    strip = draw_chart(Look(180.0), ensembles_chart(ensemble_tables(same))).axes[1]
+    assert strip.get_ylim() == (-3.0, 3.0)

@@ -12,7 +12,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.discrepancy_material import UNTESTABLE, VERDICTS, discrepancy_data, evidence, result, verdict_of
+from helpers.discrepancy_material import (
+    UNTESTABLE,
+    VERDICTS,
+    discrepancy_data,
+    evidence,
+    result,
+    step,
+    verdict_of,
+)
 from helpers.report_material import report_data
 from matplotlib.collections import LineCollection
 
@@ -27,13 +35,13 @@ from pchem_pipeline.report.figures.discrepancy_gap import largest_pulls
 from pchem_pipeline.report.figures.discrepancy_sensor import largest_maps, regions_of
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages import report as report_module
-from pchem_pipeline.report.pages.discrepancy import remarks
+from pchem_pipeline.report.pages.discrepancy import frames_text, remarks
 from pchem_pipeline.report.pages.discrepancy_tables import discrepancy_tables, place_text
 from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.style import Look
+from pchem_pipeline.report.style.style import PAGE_MM, Look
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays, path_arrays
 
 DISCREPANCY_NAMES = [name for _, name in DISCREPANCY_FIGURES]
@@ -156,6 +164,43 @@ def test_a_named_effect_has_all_its_evidence(base: ReportData) -> None:
         "Janesick 2007",
     ):
         assert words in text, words
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_what_is_measured_has_its_numbers_and_no_rivals(base: ReportData) -> None:
+    measured = step(None, "described", 120.0, 0.4)
+    measured["candidates"] = [{**measured["candidates"][0], "effect": "empirical_noise"}]
+    measured["separate"] = {}
+    measured["parameters"] = {"noise_dn": {"value": 0.784, "stderr": 0.021, "unit": "DN"}}
+    drawn = discrepancy_data("unexplained", steps=[measured], unexplained=[])
+    data = replace(drawn, found=drawn.found.model_copy(update={"verdict": "described"}))
+    tables = {table.id: table for part in discrepancy_tables(data).values() for table in part}
+    assert not [name for name in tables if name.startswith("discrepancy-candidates")]
+    (row,) = tables["discrepancy-parameters"].rows
+    assert row[:2] == ("empirical_noise: noise_dn", "0.784 ± 0.021 DN")
+    assert row[2].endswith("(measured)")
+    text = Page(rendered(base, data).pages["discrepancy.html"]).text
+    assert "It was measured instead, and has no rivals." in text
+
+
+def test_the_legend_over_the_scatter_of_lines_covers_no_point() -> None:
+    data = discrepancy_data("named")
+    (figure,) = [each for each in discrepancy_figures(data) if each.name == "discrepancy_lines"]
+    drawn = [axes for axes in figure.draw(Look(PAGE_MM)).axes if axes.get_legend() is not None]
+    assert drawn
+    for axes in drawn:
+        low, high = axes.get_ylim()
+        top = max(float(np.nanmax(line.get_ydata())) for line in axes.lines)
+        assert (top - low) / (high - low) < 0.8
+
+
+def test_frames_that_no_part_has_are_told() -> None:
+    seen = {"frames": 1000, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320,
+            "histograms": None}  # fmt: skip
+    words = "; a rest of 40 frames, less than three blocks, is left out."
+    assert frames_text(discrepancy_data("named", examined=seen).found).endswith(words)
+    whole = {**seen, "frames": 960}
+    assert "rest" not in frames_text(discrepancy_data("named", examined=whole).found)
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -12,6 +12,7 @@ from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook, graded
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.pages.next_steps import next_steps
 from pchem_pipeline.report.pages.report_json import report_numbers
 from pchem_pipeline.report.pages.summary import answers, flags
 from pchem_pipeline.report.pages.tables import result_tables
@@ -64,6 +65,30 @@ def test_what_is_small_or_in_the_model_is_a_remark(data: ReportData) -> None:
     known = looked(data, 1e-30, 2.0, (RowNoise(row_noise_dn=2.0),))
     assert answers(known)[1].word == "Yes"
     assert any("the model has an effect like it" in flag.text for flag in flags(known))
+
+
+def test_a_negative_correlation_is_no_resemblance(data: ReportData) -> None:
+    lag = Check("lag", "samples resemble those of the frame before", 1e-30, -0.2, "1", limit=0.004)
+    found = replace(data, quick_look=QuickLook(graded([lag], 0.1, 3.0, ()), {}, 1000, ""))
+    words = "Samples differ from those of the frame before more than chance makes them"
+    assert any(flag.text.startswith(f"{words}: correlation −0.2") for flag in flags(found))
+    [table] = [each for each in result_tables(found) if each.id == "quick-look"]
+    assert table.rows[0][0] == words
+
+
+def test_several_exposures_come_first_and_are_taken_apart_next(data: ReportData) -> None:
+    """Whatever else is serious follows from that: it is told first, with what to do."""
+    where = "frames 0 to 299 at 201 DN; frames 300 to 599 at 220 DN"
+    title, advice = "the frames are of several exposures", "make a run of each"
+    apart = Check("levels", title, 1e-12, 19.0, "DN", where=where, advice=advice)
+    look = QuickLook(graded([apart], 0.1, 3.0, ()), {}, 1000, "pchem discrepancy run.zarr")
+    poor = {**data.fit, "goodness_p": np.zeros((40, 40))}
+    found = replace(data, quick_look=look, fit=poor)
+    assert answers(found)[1].text.startswith(
+        "The frames are of several exposures: 19 DN apart (frames 0 to 299 at 201 DN; frames 300 to 599 at "
+        "220 DN); make a run of each."
+    )
+    assert [step.command.split()[1] for step in next_steps(found)] == ["run"]
 
 
 def test_table_and_json_hold_all_checks(data: ReportData) -> None:

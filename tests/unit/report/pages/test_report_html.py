@@ -20,6 +20,7 @@ from pchem_pipeline.report.data import MAP_NAMES, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import REPORT_FIGURES, report_figures
 from pchem_pipeline.report.figures.figure import DataTable, Figure, csv_text
 from pchem_pipeline.report.figures.stability import stability_figures
+from pchem_pipeline.report.figures.trust import draw_left_out
 from pchem_pipeline.report.inspector.inspector import script
 from pchem_pipeline.report.pages import report as report_module
 from pchem_pipeline.report.pages.cite import citation
@@ -28,7 +29,9 @@ from pchem_pipeline.report.pages.page import chart_script, figure_tables, page_s
 from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.report.pages.summary import flags, key_numbers, sentence
+from pchem_pipeline.report.pages.tables import result_tables
 from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.style import Look
 
 #: Of one exposure, with nothing compared or planned.
 NOT_HERE = {
@@ -204,7 +207,7 @@ def test_figures_carry_their_numbers(page: Page, report: RenderedReport, data: R
         "algorithm: newton",
         "xxh3_128:0123456789abcdef",
         "45.6 s",
-        "512.0 MB",
+        "488 MiB",
         "raw, independent parameters",
         "2026-01-02T03:04:05Z",
     ],
@@ -370,6 +373,24 @@ def test_settings_decide_files_and_stretch() -> None:
 def test_settings_refuse_doubles() -> None:
     with pytest.raises(ValueError, match="listed twice"):
         ReportSettings(figure_formats=("svg", "svg"))
+
+
+def test_moments_have_the_digits_of_the_data_that_they_are_compared_with() -> None:
+    data = report_data((24, 32))
+    part = {"quantity": "of which read noise", "unit": "DN2", "predicted": 5.552184}
+    (table,) = [
+        each for each in result_tables(replace(data, moments=[*data.moments, part])) if each.id == "moments"
+    ]
+    assert [row[1] for row in table.rows] == ["121.340", "251.30", "5.55"]
+
+
+def test_no_sample_left_out_is_white_and_samples_are_whole_numbers() -> None:
+    share = np.zeros((8, 8))
+    share[2, 3] = 1e-3
+    left, right = draw_left_out(Look(), share=share, n_frames=1000).axes[:2]
+    assert all(float(place).is_integer() for place in left.get_xticks())
+    (image,) = right.images
+    assert image.get_cmap().get_bad()[:3].tolist() == [1.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from pchem_pipeline.report.style.wording import (
     short,
     signed,
     symbol,
+    typeset,
     unit_text,
 )
 
@@ -58,6 +59,7 @@ def test_measured_rounds_to_two_digits_of_the_error(value: float, error: float, 
         (5, 1000, "0.50 %"),
         (1, 3, "33 %"),
         (999, 1000, "99.9 %"),
+        (2.065, 1.0, "206 %"),
         (999_999, 1_000_000, "> 99.99 %"),
         (7, 7, "100 %"),
         (0, 0, "0 %"),
@@ -108,3 +110,8 @@ def test_the_units_of_maps_are_those_of_the_store() -> None:
 )
 def test_signed(value: float, text: str) -> None:
     assert signed(value) == text
+
+
+def test_plain_sentences_get_the_signs_of_a_page() -> None:
+    plain = "5 -> 3 e-, 0.1 e-/DN: one-sided, 1e-3"
+    assert typeset(plain) == "5 → 3 e⁻, 0.1 e⁻/DN: one-sided, 1e-3"

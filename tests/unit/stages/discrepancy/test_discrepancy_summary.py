@@ -43,6 +43,14 @@ def test_a_verdict_says_why_the_next_rivals_lost() -> None:
     assert "(+9.1 sd)" in text
 
 
+def test_nats_are_plain_numbers() -> None:
+    found = verdict_of("named")
+    (rival, *_), first = found.steps[0].rivals, found.steps[0]
+    far = rival.model_copy(update={"behind": -6594.2})
+    found = found.model_copy(update={"steps": (first.model_copy(update={"rivals": (far,)}),)})
+    assert "(6,594 nats behind)" in " ".join(verdict_text(found).split())
+
+
 def test_an_unexplained_verdict_says_what_is_left() -> None:
     lines = verdict_text(verdict_of("unexplained")).splitlines()
     at = lines.index("left unexplained:")

@@ -1,0 +1,108 @@
+"""Whether the frames of a stack are of several exposures, as where dark and light frames lie in one folder.
+
+Their means then lie at levels with nothing between, and the variance over their pixels grows with the mean
+as shot noise does. A jump of the offset parts the means alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.quick.checks import Check
+
+FloatArray = NDArray[np.float64]
+
+#: Of 16 frames, evenly spread, chance leaves such a gap in one of 400 runs; of 32 in none of 4,000.
+_FEWEST_FRAMES = 32
+#: Frames of a level, at least, and as a share of all.
+_FEWEST_OF_LEVEL, _LEAST_SHARE = 4, 0.01
+#: Gap between two levels, in standard deviations within them. The halves of a normal or a uniform
+#: distribution of n frames are some 4/n apart.
+_CLEAN = 4.0
+#: Growth of the variance with the mean, as a share of that of shot noise; an offset has none.
+_SHOT_SHARE = 0.25
+_MOST_LEVELS = 8
+_SHOWN = 3
+
+
+def levels_check(mean: FloatArray, variance: FloatArray, gain: float) -> Check:
+    """Return whether frames are of several exposures.
+
+    Args:
+        mean: of each frame over its pixels, DN, (n,).
+        variance: likewise, DN^2.
+        gain: of the median pixel, e-/DN.
+    """
+    levels = sorted(_parted(mean, variance, gain), key=lambda frames: float(mean[frames].mean()))
+    several = len(levels) > 1
+    centres = [float(mean[frames].mean()) for frames in levels]
+    return Check(
+        "levels",
+        "the frames are of several exposures",
+        1e-12 if several else 1.0,
+        centres[-1] - centres[0] if several else 0.0,
+        "DN",
+        where="; ".join(
+            f"{_frame_words(frames)} at {centre:.4g} DN"
+            for frames, centre in zip(levels[:_SHOWN], centres, strict=False)
+        )
+        + (f" and {len(levels) - _SHOWN} levels more" if len(levels) > _SHOWN else "")
+        if several
+        else "",
+        advice="make a run of each, from its own files or by input.frame_range, and fit them together with "
+        "pchem joint",
+    )
+
+
+def _parted(mean: FloatArray, variance: FloatArray, gain: float) -> list[NDArray[np.int64]]:
+    """Return the frames of each level; all of them where there is one."""
+    levels = [np.arange(mean.size)]
+    if mean.size < _FEWEST_FRAMES:
+        return levels
+    fewest = max(_FEWEST_OF_LEVEL, int(np.ceil(_LEAST_SHARE * mean.size)))
+    while len(levels) < _MOST_LEVELS:
+        for number, frames in enumerate(levels):
+            halves = _halves(frames, mean, fewest)
+            if halves is not None and _shot_noise_grows(halves, mean, variance, gain):
+                levels[number : number + 1] = halves
+                break
+        else:
+            break
+    return levels
+
+
+def _halves(frames: NDArray[np.int64], mean: FloatArray, fewest: int) -> list[NDArray[np.int64]] | None:
+    """Return frames in two parts between which the means leave a clean gap; None where there is no such gap.
+
+    Of all cuts through the sorted means the one with the least variance within both parts (Otsu 1979).
+    """
+    n = frames.size
+    if n < 2 * fewest:
+        return None
+    ordered = frames[np.argsort(mean[frames], kind="stable")]
+    values = mean[ordered] - mean[ordered].mean()
+    count = np.arange(fewest, n - fewest + 1)
+    below = np.cumsum(values)[count - 1]
+    cut = int(count[np.argmax(below**2 / (count * (n - count)))])
+    low, high = values[:cut], values[cut:]
+    within = float(np.sqrt((cut * low.var() + (n - cut) * high.var()) / n))
+    if high[0] - low[-1] <= _CLEAN * within:
+        return None
+    return [np.sort(ordered[:cut]), np.sort(ordered[cut:])]
+
+
+def _shot_noise_grows(
+    halves: list[NDArray[np.int64]], mean: FloatArray, variance: FloatArray, gain: float
+) -> bool:
+    """Tell whether the variance grows between two levels as the shot noise of their electrons would."""
+    low, high = halves
+    grown = float(np.median(variance[high]) - np.median(variance[low]))
+    return grown * gain > _SHOT_SHARE * float(mean[high].mean() - mean[low].mean())
+
+
+def _frame_words(frames: NDArray[np.int64]) -> str:
+    """Return frames as one range, or as their number where others lie between."""
+    first, last = int(frames[0]), int(frames[-1])
+    whole = last - first + 1 == frames.size
+    return f"frames {first} to {last}" if whole else f"{frames.size:,} frames from {first} to {last}"
