@@ -7,6 +7,7 @@ the group ``pchem_pipeline.effects`` (name: the tag; value: ``package.module:Cla
 
 from __future__ import annotations
 
+import difflib
 import functools
 import importlib
 import logging
@@ -51,9 +52,11 @@ def effect_class(tag: str) -> type[Effect]:
     """
     found = _discover()
     if tag not in found.classes:
+        close = difflib.get_close_matches(tag, found.classes, 1)
+        hint = f"; did you mean {close[0]}?" if close else ""
         message = (
-            f"effect {tag!r} is unknown; known are {', '.join(found.classes)}; for one of another package, "
-            "install that package"
+            f"effect {tag!r} is unknown{hint}; known are {', '.join(found.classes)}; for one of another "
+            "package, install that package"
         )
         if tag in found.broken:
             message = f"effect {tag!r} comes from a plug-in that was left out: {found.broken[tag]}"

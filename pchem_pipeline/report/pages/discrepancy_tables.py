@@ -239,8 +239,8 @@ def _moved(steps: Sequence[Step]) -> Table:
     return Table(
         "discrepancy-moved",
         "How the delivered parameters moved",
-        "Median over all pixels of (with the effect − without it), also in standard errors of a pixel. An "
-        "effect in fewer than half of them moves no median.",
+        "Median of (with the effect − without it) over the pixels of its place, also in standard errors of a "
+        "pixel. An effect that fewer than half of these have, a few at random, moves no median.",
         ("parameter", "effect added", "moved by", "in standard errors"),
         tuple(rows),
     )

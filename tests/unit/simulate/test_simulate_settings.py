@@ -66,6 +66,7 @@ def test_every_field_says_what_it_is():
         ({"parameters": {"bias": {"kind": "cauchy"}}}, "cauchy"),
         ({"parameters": {"dead_fraction": 0.6, "stuck_fraction": 0.6}}, "above 1"),
         ({"effects": ["earthquake"]}, "unknown; known are"),
+        ({"effects": ["rownoise"]}, "unknown; did you mean row_noise.; known are"),
         ({"effects": [{"row_noise_dn": 1}]}, "needs a tag"),
         ({"effects": [{"tag": "row_noise", "row_noise": 1}]}, "row_noise_dn"),
     ],

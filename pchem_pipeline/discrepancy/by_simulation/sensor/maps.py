@@ -56,8 +56,8 @@ class Refit:
 
     Attributes:
         maps: H, g, mu, sigma of the pixels themselves.
-        moved: by parameter: median change against the maps before, the same in standard errors of a pixel,
-            and the unit.
+        moved: by parameter: median change against the maps before, of the pixels on which the effects act,
+            the same in standard errors of a pixel, and the unit.
         covariance: of (H, g, mu, sigma) of each pixel, shape (y, x, 4, 4).
         components: of the law of a sample, with all effects.
         evaluations: of the likelihood of a pixel, on average.
@@ -132,14 +132,22 @@ def refit_maps(
     new = fit.maps
     good = maps.usable.ravel() & np.isfinite(fit.columns).all(axis=1)
     stderr = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)).T
+    inside = good & _acted_on(effects, (shape[0], shape[1])).ravel()
     moved = {
-        name: _change(after[good] - before[good], error[good], unit)
+        name: _change(after[inside] - before[inside], error[inside], unit)
         for (name, unit), before, after, error in zip(_UNITS.items(), flat, new, stderr, strict=True)
     }
     new_maps = PixelMaps.known(new, good.reshape(shape))
     covariance = fit.covariance[:, :4, :4].reshape(*shape, 4, 4)
     evaluations, learnt = float(fit.n_iterations.mean()), not law.free_satellites
     return Refit(new_maps, moved, covariance, law.components, evaluations, added, learnt)
+
+
+def _acted_on(effects: Sequence[Effect], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return the pixels, (y, x), that any of the effects is about: all of them where one has no place."""
+    regions = [effect.region for effect in effects]
+    inside = [np.ones(shape, np.bool_) if region is None else region.mask(shape) for region in regions]
+    return np.asarray(np.logical_or.reduce(inside)) if inside else np.ones(shape, np.bool_)
 
 
 def _off_by(start: FloatArray, electrons: float) -> FloatArray:

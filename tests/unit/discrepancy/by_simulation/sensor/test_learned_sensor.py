@@ -17,10 +17,12 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import (
 )
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
+from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.exposure.persistence import Persistence
 from pchem_pipeline.effects.framework.added_exposure import added_exposures
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.region import Region
 
 SPREAD = (0.25, 0.015, 0.06, 3.0)
 
@@ -226,3 +228,21 @@ def test_a_bias_that_the_plain_fit_has_off_by_an_electron_is_found_under_the_rig
 
     assert np.mean(off(seen.maps)) > 0.2
     assert np.mean(off(fit.maps)) < 0.03
+
+
+def test_parameters_move_by_the_pixels_that_an_effect_is_about():
+    """Row noise in two of eight columns takes a part of their read noise, and moves no median of all."""
+    camera, rng = PlainCamera(0.3, 2.0, 12.0, (8, 8), 900), np.random.default_rng(3)
+    frames = camera.frames(4).astype(np.int64)
+    frames[:, :, 6:] += np.rint(2.5 * rng.standard_normal((900, 8, 1))).astype(np.int64)
+    frames = np.maximum(frames, 0).astype(np.uint16)
+    seen = observe(frames, np.arange(900), n_run=900, block_frames=50)
+    noise = RowNoise(row_noise_dn=2.5, region=Region(columns=((6, 8),)))
+    fit = refit_maps(frames, seen.maps, [noise], seen.covariance)
+    # 12 x 0.3 = 3.6 DN of read noise, and 4.4 with 2.5 more
+    error = 4.4 / np.sqrt(2 * 900 * 16)
+    moved = fit.moved["read_noise_dn"]["median"]
+    assert moved < -0.5
+    assert abs(moved + (np.hypot(3.6, 2.5) - 3.6)) < 10 * error
+    beside = fit.maps.read_noise_dn[:, :6] - seen.maps.read_noise_dn[:, :6]
+    assert abs(np.median(beside)) < error
