@@ -124,7 +124,7 @@ def observe(
         **nearer_statistics(frames, edges, maps),
         **follow_statistics(frames, edges, laws, maps),
         **line_statistics(lines, alike, len(frames)),
-        **square_statistics(squares, counts, origin, maps.usable),
+        **square_statistics(squares, counts, origin, maps.usable, int(frames.max())),
         **misplaced_z,
     }
     time = _time_series(view, lags, n_run)

@@ -17,16 +17,25 @@ _MOST_CODES = 1 << 26  # of all pixels together
 
 
 def equal_squares(frames: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.int64]:
-    """Return how often all samples of 2 x 2 pixels of frames (frame, y, x) are equal, (y-1, x-1)."""
+    """Return how often all samples of 2 x 2 pixels of frames (frame, y, x) are equal, (y-1, x-1).
+
+    Those at the highest DN of all do not count: a particle's cloud leaves all of its pixels at the limit.
+    """
+    top = frames.max(initial=0)
     found = np.zeros((max(frames.shape[1] - 1, 0), max(frames.shape[2] - 1, 0)), np.int64)
     for frame in frames:
         rows = frame[1:] == frame[:-1]
-        found += rows[:, 1:] & rows[:, :-1] & (frame[1:, 1:] == frame[1:, :-1])
+        equal = rows[:, 1:] & rows[:, :-1] & (frame[1:, 1:] == frame[1:, :-1])
+        found += equal & (frame[1:, 1:] != top)
     return found
 
 
 def square_statistics(
-    found: NDArray[np.int64], counts: NDArray[Any], origin: NDArray[np.int64], usable: NDArray[np.bool_]
+    found: NDArray[np.int64],
+    counts: NDArray[Any],
+    origin: NDArray[np.int64],
+    usable: NDArray[np.bool_],
+    top: int,
 ) -> dict[str, float]:
     """Return the statistic of squares of equal samples; none without squares of usable pixels.
 
@@ -37,6 +46,7 @@ def square_statistics(
         counts: histograms, (n, B).
         origin: DN of bin 0, (n,).
         usable: pixels that count, (y, x).
+        top: the highest DN of all, which does not count.
     """
     good = usable[1:, 1:] & usable[1:, :-1] & usable[:-1, 1:] & usable[:-1, :-1]
     first = int(origin[usable.ravel()].min(initial=origin.max(initial=0)))
@@ -48,6 +58,7 @@ def square_statistics(
     columns = (origin[inside] - first)[:, None] + np.arange(counts.shape[1])
     total = np.maximum(counts[inside].sum(axis=1, keepdims=True), 1)
     aligned[inside[:, None], columns] = counts[inside] / total
+    aligned[:, top - first : top - first + 1] = 0.0
     chance = aligned.reshape(*usable.shape, length)
     down = chance[1:] * chance[:-1]
     alike = np.einsum("yxc,yxc->yx", down[:, 1:], down[:, :-1])
