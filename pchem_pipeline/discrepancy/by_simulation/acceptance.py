@@ -28,6 +28,9 @@ _CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing wa
 # the same of what is measured without a name, in either: few forms of it are tried, and only where the data
 # disagree with all that has one
 _MEASURED = 3.0
+# standard deviations of the plain model beyond the others' part from which on an effect is there, however badly
+# its strength is known: so few errors of that do then
+_OVERWHELMING = 30.0
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,8 @@ class Acceptance:
 
         Those had no part in finding them: a true effect of 4.5 standard errors in two thirds of the frames
         misses them once in seventy times; a chance passes once in six. What is measured without a name needs
-        3 standard errors in either.
+        3 standard errors in either. The variance of a noise of n frames is known to sqrt(2 / n) of itself,
+        however strong it is: where that is beyond doubt 3 of these are enough.
         """
         first, n = self.first, len(added.vectors)
         certain = _certain(added, self.z.both - first.mean, noise_of_splits(first, 2, self.model_error))
@@ -78,7 +82,8 @@ class Acceptance:
         noise = replace(noise, covariance=added.covariance * (1.0 + 1.0 / n))
         final = replace(fit_set(added.hypotheses, self.z.final - first.mean, noise), certain=certain)
         measured = np.array([type(h.effect).measured_only for h in added.hypotheses])
-        clear = np.exp(added.change) > np.where(measured, _MEASURED, _ESTABLISHED) * added.stderr
+        sure = measured | _overwhelming(added.parts, self.z.both - first.mean, first.std)
+        clear = np.exp(added.change) > np.where(sure, _MEASURED, _ESTABLISHED) * added.stderr
         proven = final.factors > np.where(measured, _MEASURED, _CONFIRMED) * final.stderr
         there = (clear & proven) | certain
         return tuple(h for h, is_there in zip(added.hypotheses, there, strict=True) if is_there)
@@ -101,6 +106,20 @@ class Acceptance:
             return 0.0
         parts = np.concatenate([this.added.parts for this in rounds])
         return tolerance(parts, self.allowed, self.first.events)
+
+
+def _overwhelming(parts: FloatArray, shift: FloatArray, scatter: FloatArray) -> NDArray[np.bool_]:
+    """Tell of which effects some statistic stands out far beyond what all the others make of it.
+
+    Args:
+        parts: shifts of the statistics by effect, shape (e, m).
+        shift: what is seen of all, shape (m,).
+        scatter: standard deviations of the statistics without any effect, shape (m,).
+    """
+    others = np.abs(parts).sum(axis=0) - np.abs(parts)
+    beyond = (np.abs(shift) - others) * np.sign(shift)
+    least = _OVERWHELMING * scatter
+    return np.asarray(((beyond * np.sign(parts) > least) & (np.abs(parts) > least)).any(axis=1))
 
 
 def _certain(added: Refitted, shift: FloatArray, noise: Noise) -> NDArray[np.bool_]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -825,6 +825,29 @@ def test_what_gets_no_name_needs_fewer_errors_and_more_of_them_in_the_final_fram
         final = world.null.mean + np.eye(M)[0] * in_final
         accept = Acceptance(world.null, Measured(final, final, final), unused, 0.0)
         assert bool(accept.established(added)) is there
+
+
+@pytest.mark.parametrize(
+    ("size", "other", "there"), [(6.0, 0.0, False), (300.0, 0.0, True), (300.0, 290.0, False)]
+)
+def test_an_effect_beyond_doubt_is_there_though_few_frames_know_its_strength_badly(
+    size: float, other: float, there: bool
+) -> None:
+    """Light that flickers in 97 of 1,000 frames moved statistics by 480 sd; its strength had 4.3 errors."""
+    world, unused = World([]), cast("Any", None)
+    parts = np.array([np.eye(M)[0] * size, np.eye(M)[0] * other])[: 2 if other else 1]
+    tags = ("row_noise", "frame_noise")
+    added: Any = SimpleNamespace(
+        hypotheses=tuple(Hypothesis(effect(t, 0.1), p) for t, p in zip(tags, parts, strict=False)),
+        parts=parts,
+        change=np.zeros(len(parts)),
+        stderr=np.full(len(parts), 0.26),
+        vectors=np.zeros((400, M)),
+        covariance=np.eye(M),
+    )
+    seen = world.null.mean + np.eye(M)[0] * size
+    accept = Acceptance(world.null, Measured(seen, seen, seen), unused, 0.0)
+    assert ("row_noise" in {h.tag for h in accept.established(added)}) is there
 
 
 def test_what_the_final_frames_do_not_show_stays_outside(monkeypatch: pytest.MonkeyPatch) -> None:
