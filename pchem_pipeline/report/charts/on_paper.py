@@ -82,12 +82,12 @@ def draw_chart(look: Look, chart: Chart) -> Drawing:
     grid = drawing.add_gridspec(len(rows), columns, height_ratios=heights, width_ratios=widths)
     handles: dict[str, Handle] = {}
     for place, stack in ((grid[i, j], stack) for i, row in enumerate(rows) for j, stack in enumerate(row)):
-        inner = place.subgridspec(
-            len(stack.panels), 1, height_ratios=[panel.height for panel in stack.panels]
-        )
+        shares = [panel.height for panel in stack.panels]
+        # a panel alone is laid out with those of the other stacks
+        inner = place.subgridspec(len(shares), 1, height_ratios=shares) if len(shares) > 1 else [place]
         first: Axes | None = None
         for i, panel in enumerate(stack.panels):
-            axes = drawing.add_subplot(inner[i, 0], sharex=first)
+            axes = drawing.add_subplot(inner[i], sharex=first)
             panel = replace(panel, y=tick_rows(panel.y, look.width_mm / columns))
             handles |= _draw_panel(axes, panel, stack, last=i == len(stack.panels) - 1)
             if first is None:

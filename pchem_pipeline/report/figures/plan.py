@@ -111,11 +111,14 @@ def _stack(x: FloatArray, y: FloatArray, frames: FloatArray, words: str, mark: A
     """Return the frames for one target over exposures x and read noises y."""
     # a picture cannot lie on a logarithmic axis
     across, power = np.log10(x), np.log10(np.where(np.isfinite(frames), np.clip(frames, 1.0, None), np.nan))
-    marks: list[Mark] = [Image(_finer(power), even_edges(*_ENDS), _half_steps(across), _half_steps(y))]
+    fine = _finer(power)
+    places, heights = (np.linspace(a[0], a[-1], n) for a, n in ((across, fine.shape[1]), (y, fine.shape[0])))
+    marks: list[Mark] = [Image(fine, even_edges(*_ENDS), _half_steps(across), _half_steps(y))]
     for level in _LEVELS:
-        height = _crossing(power, y, float(level))
-        if np.isfinite(height).any():
-            marks += [Line(across, height, colour="#FFFFFF", width=0.9), _named(across, y, height, level)]
+        contour = _crossing(fine, heights, float(level))
+        if np.isfinite(contour).any():
+            line = Line(places, _joined(contour, y), colour="#FFFFFF", width=0.9)
+            marks += [line, _named(places, y, contour, level)]
     known = np.isfinite(power).any(axis=1)
     best = np.argmin(np.where(np.isfinite(power), power, np.inf), axis=1)
     marks.append(Points(across[best][known], y[known], size=1.8, colour="#FFFFFF"))
@@ -150,16 +153,23 @@ def _finer(values: FloatArray) -> FloatArray:
 
 
 def _crossing(power: FloatArray, y: FloatArray, level: float) -> FloatArray:
-    """Return the read noise at which each exposure needs so many frames, NaN where none does.
+    """Return the read noise at which each exposure needs so many frames; more read noise needs more.
 
-    More read noise needs more frames.
+    Infinite where no read noise, or even none, needs so many.
     """
     found = np.full(power.shape[1], np.nan)
     for j, column in enumerate(power.T):
         known = np.isfinite(column)
-        if known.sum() > 1 and column[known][0] <= level <= column[known][-1]:
-            found[j] = np.interp(level, column[known], y[known])
+        if known.sum() > 1:
+            found[j] = np.interp(level, column[known], y[known], left=-np.inf, right=np.inf)
     return found
+
+
+def _joined(height: FloatArray, y: FloatArray) -> FloatArray:
+    """Return a contour that goes on to the end of the axis where the next exposure does not cross it."""
+    finite = np.isfinite(height)
+    beside = np.convolve(finite, np.ones(3), "same") > 0
+    return np.where(beside, np.clip(height, y[0], y[-1]), np.nan)
 
 
 def _named(across: FloatArray, y: FloatArray, height: FloatArray, level: int) -> Words:
@@ -167,4 +177,5 @@ def _named(across: FloatArray, y: FloatArray, height: FloatArray, level: int) ->
     known = np.flatnonzero(np.isfinite(height))
     at = known[int((0.25 + 0.06 * level) * (known.size - 1))]
     up = (height[at] - y[0]) / (y[-1] - y[0])
-    return Words(float(across[at]), float(np.clip(up, 0.01, 0.93)), power_of_ten(level), colour="#000000")
+    x = np.clip(across[at], *np.interp([0.05, 0.95], [0.0, 1.0], across[[0, -1]]))
+    return Words(float(x), float(np.clip(up, 0.01, 0.93)), power_of_ten(level), colour="#000000")
