@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Literal
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.commands.figures import millimetres
+from pchem_pipeline.report.charts.chart import COLUMN_MM
+from pchem_pipeline.report.charts.on_paper import draw_chart
 from pchem_pipeline.report.figures.catalogue import run_figures
-from pchem_pipeline.report.figures.maps import draw_map, map_tables
+from pchem_pipeline.report.figures.maps import map_chart, map_tables
 from pchem_pipeline.report.figures.paper import FORMATS
-from pchem_pipeline.report.style.style import COLUMN_MM, Look, drawing_bytes
+from pchem_pipeline.report.style.style import Look, drawing_bytes
 from pchem_pipeline.store.files import write_atomic
 
 if TYPE_CHECKING:
@@ -130,13 +132,9 @@ class Plots:
         if name not in maps or name.endswith("_stderr"):
             known = ", ".join(each for each in maps if not each.endswith("_stderr"))
             raise StoreError(f"this run has no map {name}; it has {known}")
-        bins = self._settings.histogram_bins
-        return draw_map(
-            Look(width_of(width)),
-            tables=map_tables(maps[name], name, maps.get(f"{name}_stderr"), bins),
-            name=name,
-            stretch=stretch or self._settings.map_stretch,
-        )
+        tables = map_tables(maps[name], name, maps.get(f"{name}_stderr"), self._settings.histogram_bins)
+        chart = map_chart(tables, name, stretch or self._settings.map_stretch)
+        return draw_chart(Look(width_of(width)), chart)
 
     def maps(self, *names: str, width: float | str = COLUMN_MM) -> Figures:
         """Draw several maps; without names the four parameters."""

@@ -352,12 +352,14 @@ def _split_json(plan: SamplesPlan, targets: Sequence[Target]) -> dict[str, Any]:
 
 
 def _draw(path: Path, targets: Sequence[Target], content: dict[str, Any], gain: float) -> None:
-    from pchem_pipeline.report.figures.plan import draw_frames_needed, frames_table
-    from pchem_pipeline.report.style.style import COLUMN_MM, Look, drawing_bytes
+    from pchem_pipeline.report.charts.chart import COLUMN_MM
+    from pchem_pipeline.report.charts.on_paper import draw_chart
+    from pchem_pipeline.report.figures.plan import frames_chart, frames_table
+    from pchem_pipeline.report.style.style import Look, drawing_bytes
 
     mark = None
     if content["samples"] == 1:
         mark = (content["quanta_exposure"], content["read_noise_e"])
     look = Look(COLUMN_MM * min(len(targets), 2))
-    drawing = draw_frames_needed(look, table=frames_table(contour_data(targets, gain)), mark=mark)
+    drawing = draw_chart(look, frames_chart(frames_table(contour_data(targets, gain)), mark))
     write_atomic(path, drawing_bytes(drawing, path.suffix[1:], title="Frames needed"))

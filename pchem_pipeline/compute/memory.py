@@ -15,7 +15,7 @@ from pchem_pipeline.compute.executor import DaskPoolExecutor, Executor
 
 #: the program with its libraries and compiled kernels
 BASE_BYTES = 260 << 20
-#: the least that a command needs: a run of few pixels, to its report (with matplotlib)
+#: the least that a command needs: a run of few pixels, to its report
 LEAST_BYTES = 300 << 20
 #: a second program beside it that compiles kernels
 SECOND_PROGRAM_BYTES = 400 << 20

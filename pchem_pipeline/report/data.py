@@ -21,6 +21,7 @@ from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
+from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.inspector.inspector_data import InspectorData
 from pchem_pipeline.report.settings import Criteria
 
@@ -232,6 +233,7 @@ class ReportData:
     samples: Samples | None = None
     _summaries: dict[tuple[str, bool], MapSummary] = field(default_factory=dict, init=False, repr=False)
     _errors: dict[tuple[str, bool], float | None] = field(default_factory=dict, init=False, repr=False)
+    _ordered: dict[str, Ordered] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def noun(self) -> str:
@@ -304,6 +306,13 @@ class ReportData:
         """Tell whether a map exists and at least one pixel has a value in it."""
         return name in self.maps and self.summary(name, with_flagged=True).n_valid > 0
 
+    def ordered(self, name: str) -> Ordered:
+        """Return the values of a map in their order; the last one is kept, which many ask for in turn."""
+        if name not in self._ordered:
+            self._ordered.clear()
+            self._ordered[name] = Ordered.of(self.maps[name])
+        return self._ordered[name]
+
     def summary(self, name: str, *, with_flagged: bool = False) -> MapSummary:
         """Describe a map by order statistics, once: the map is large, and many ask.
 
@@ -314,7 +323,7 @@ class ReportData:
         key = name, with_flagged or not self.any_flagged
         if key not in self._summaries:
             self._summaries[key] = summarise(
-                self.maps[name],
+                self.ordered(name) if key[1] else self.maps[name],
                 left_out=None if key[1] else self.flagged,
                 percentiles=tuple(dict.fromkeys((*self.percentiles, 5.0, 95.0))),
                 outlier_sigmas=self.outlier_sigmas,
@@ -333,7 +342,6 @@ class ReportData:
             return None
         key = name, with_flagged or not self.any_flagged
         if key not in self._errors:
-            known = np.isfinite(errors) if key[1] else np.isfinite(errors) & ~self.flagged
-            values = errors[known].astype(np.float64, copy=False)
-            self._errors[key] = float(np.median(values, overwrite_input=True)) if values.size else None
+            known = Ordered.of(errors, None if key[1] else self.flagged)
+            self._errors[key] = known.median if known.size else None
         return self._errors[key]

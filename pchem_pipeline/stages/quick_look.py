@@ -61,7 +61,8 @@ def _maps(run: StoredRun) -> PixelMaps | None:
     if status is None or not all(name in run.maps for name in PARAMETERS):
         return None
     values = [np.asarray(run.maps[name], np.float64) for name in PARAMETERS]
-    usable = ((status & int(UNTRUSTWORTHY)) == 0) & np.isfinite(values).all(axis=0)
+    known = np.logical_and.reduce([np.isfinite(each) for each in values])
+    usable = ((status & int(UNTRUSTWORTHY)) == 0) & known
     return PixelMaps.known(values, usable) if usable.any() else None
 
 
@@ -125,7 +126,7 @@ def _read(
         store.read(f"summary/{name}", (slice(int(a[0]), int(b[-1])), *others))
         for a, b in zip(np.split(first, cuts), np.split(end, cuts), strict=True)
     ]
-    return np.concatenate(parts)
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _repeated(store: RunStore, mean: NDArray[np.float64], variance: NDArray[np.float64]) -> NDArray[np.int64]:

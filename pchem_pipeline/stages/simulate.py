@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 TRUTH_FILE = "truth.npz"
+# rows that are decoded together
+_BAND_ROWS = 64
 # memory for the frames in the making, over all workers
 _BUDGET = 256 << 20
 # true electron numbers are stored in chunks of about this size
@@ -92,11 +94,14 @@ def run(context: StageContext) -> None:
     _write_truth(folder / TRUTH_FILE, truth, settings, [name for name, _, _ in files])
     electron_units = _electron_units(settings)
     if electron_units:
-        step = electron_units[0].stop
+        step, (rows, columns) = electron_units[0].stop, settings.shape
+        band = min(rows, _BAND_ROWS)
         context.create(
             "truth/electron_number",
-            (electron_units[-1].stop, *settings.shape),
-            chunks=(step, *settings.shape),
+            (electron_units[-1].stop, rows, columns),
+            # the ensemble reads them by bands
+            chunks=(step, band, columns),
+            shards=(step, band * math.ceil(rows / band), columns),
         )
     units = [*_frame_units(files), *electron_units]
     task = functools.partial(

@@ -19,7 +19,8 @@ from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.commands.view import make_server
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.model.law.pcd import pcd
-from pchem_pipeline.model.maps.maps import display_transform
+from pchem_pipeline.model.maps.maps import display_edges
+from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.style.wording import measured, short, symbol
 from pchem_pipeline.stages.report.inspector import StoredMaps, packed_map
 from pchem_pipeline.store.run_store import RunStore
@@ -327,10 +328,10 @@ def test_colours_by_rank_are_those_of_the_paper(tab: Tab, store: RunStore) -> No
     tab.page.select_option("#inspector-colours", "beta")
     labels = [float(text) for text in tab.page.locator("#inspector-scale .ticks span").all_inner_texts()]
     values = store.read("maps/read_noise_e")
-    level = display_transform(values)
-    for label, wanted in zip(labels, (0.0, 0.25, 0.5, 0.75, 1.0), strict=True):
-        nearest = values.ravel()[np.nanargmin(np.abs(level.ravel() - wanted))]
-        assert label == pytest.approx(nearest, rel=0.01)
+    known = Ordered.of(values)
+    inner = display_edges(known, [0.25, 0.5, 0.75])
+    for label, wanted in zip(labels, (known.values[0], *inner, known.values[-1]), strict=True):
+        assert label == pytest.approx(wanted, rel=0.01)
 
 
 def test_the_status_map_has_its_words_and_selects_by_them(tab: Tab, store: RunStore) -> None:

@@ -1,6 +1,7 @@
 """What a command imports decides how fast it answers: lists are compared here, no clock."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -66,6 +67,15 @@ def test_fit_imports_its_kernels_and_not_those_who_draw_or_read_cameras(librarie
     found = libraries("fit", "{store}", "--force", "--quiet", "--backend", "serial")
     assert "numba" in found
     assert not found & (HEAVY - {"numba", "scipy"})
+
+
+def test_a_report_without_files_of_figures_imports_nobody_who_draws(libraries, tmp_path):
+    config = tmp_path / "run.zarr/.pchem/config.yaml"
+    text = re.sub(r"figure_formats:\s*(\[svg\]|- svg)", "figure_formats: []", config.read_text())
+    config.write_text(text)
+    found = libraries("report", "{store}", "--force", "--quiet", "--backend", "serial")
+    assert "jinja2" in found
+    assert not found & {"matplotlib", "PIL", "contourpy", "fontTools"}
 
 
 def test_a_command_that_knows_of_effects_does_not_import_what_few_of_them_call():

@@ -28,8 +28,8 @@ _CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing wa
 # the same of what is measured without a name, in either: few forms of it are tried, and only where the data
 # disagree with all that has one
 _MEASURED = 3.0
-# standard deviations of the plain model beyond the others' part from which on an effect is there, however badly
-# its strength is known: so few errors of that do then
+# standard deviations of the plain model beyond the others' part from which on an effect is there, though its
+# strength be known badly: so few errors of that do then
 _OVERWHELMING = 30.0
 
 

@@ -120,6 +120,11 @@ class StackSums:
         return np.asarray(within.sum(axis=0) / float(lengths.sum() - lengths.size))
 
     @cached_property
+    def mean_signal(self) -> FloatArray:
+        """Mean of each pixel over the frames of the blocks at hand, (y, x), DN."""
+        return np.asarray(self.block_sum.sum(axis=0) / float(self.lengths.sum()))
+
+    @cached_property
     def variance(self) -> FloatArray:
         """Variance of each pixel within blocks, (y, x), DN^2."""
         return self._variance(slice(None))

@@ -182,18 +182,12 @@ class NumberTables:
         )
         return out, int(beyond)
 
-    def outcomes(self, n_k: int, data: KnownPixels | None = None) -> Outcomes:
-        """Return the probability of each estimated number and of an error.
+    def outcomes(self, n_k: int) -> Outcomes:
+        """Return the probability of each estimated number and of an error; of tables with all details.
 
         Args:
             n_k: number of electron numbers in the result.
-            data: what the samples follow, the codes of which should lie within the tables; None: what the
-                tables were made of, with all details.
         """
-        if data is not None:
-            out, errors = np.zeros(n_k), np.empty(self.first.size)
-            electrons_numba.sum_outcomes(self._tables, data.exposure, data.kernel_inputs(), out, errors)
-            return Outcomes(out, errors)
         pixel = np.repeat(np.arange(self.first.size), np.diff(self.start))
         right = np.bincount(pixel, self.right, self.first.size)
         estimated = np.bincount(self.number, self.mass, n_k)[:n_k]

@@ -158,48 +158,6 @@ def fill_tables(
 
 
 @kernel
-def sum_outcomes(
-    tables: CodeTables, exposure: FloatArray, pixels: PixelLaws, out: FloatArray, errors: FloatArray
-) -> None:
-    """Add, over pixels, the probability that the number in the table is k; ``errors[p]`` that it is wrong.
-
-    Args:
-        tables: by whole DN.
-        exposure: of the pixels, e-, shape (n,).
-        pixels: what the data follow.
-        out: out, by electron number.
-        errors: out, shape (n,); what lies beyond the table counts as wrong; NaN without parameters.
-    """
-    first, start, number = tables.first, tables.start, tables.number
-    parameters, satellites, law = pixels
-    most = _longest(start)
-    pixel, scratch = pixel_scratch(most + 2, law)
-    theta, share = scratch.small[OWN], share_scratch(most)
-    for p in range(first.size):
-        at, n = start[p], start[p + 1] - start[p]
-        errors[p] = math.nan
-        placed, codes = place_codes(p, first[p], n, 1, law, satellites, pixel)
-        if n == 0 or not known_theta(parameters[p], placed.centre, satellites[p, 1], theta):
-            continue
-        cells = cells_of(placed, np.int64(0))
-        right, rest = 0.0, 1.0 - cells.outlier_share
-        lowest, end = number_range(theta, cells, codes)
-        for k in range(lowest, end):
-            mass = rest * number_mass(k, exposure[p], cells)
-            if mass < _LEAST_LIKELY:
-                continue
-            low, high = fill_level(k, mass, theta, cells, codes, share)
-            for i in range(low, high):
-                joint = mass * share[0, i - low]
-                found = np.int64(number[at + i])
-                if found < out.size:
-                    out[found] += joint
-                if found == k:
-                    right += joint
-        errors[p] = 1.0 - right
-
-
-@kernel
 def tally_numbers(
     counts: NDArray[Any], origin: IntArray, tables: CodeTables, missing: int, out: IntArray
 ) -> np.int64:

@@ -7,12 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
+from pchem_pipeline.model.electrons.thresholds import errors_by_thresholds
 from pchem_pipeline.model.ensemble.totals import EnsembleTotals
-from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
-from pchem_pipeline.model.law.sample_law import SampleLaw
-
-_CHUNK = 1 << 16  # pixels whose tables are held at a time
+from pchem_pipeline.model.law.parameters import UsablePixels
 
 
 def error_rates(totals: EnsembleTotals, pixels: UsablePixels, true: UsablePixels | None) -> dict[str, Any]:
@@ -43,22 +40,10 @@ def error_rates(totals: EnsembleTotals, pixels: UsablePixels, true: UsablePixels
         "samples_compared": compared,
     }
     if true is not None:
-        error, least = (_error(true, deciding) for deciding in (pixels, true))
+        error, least = (errors_by_thresholds(deciding, true) for deciding in (pixels, true))
         facts |= {
             "expected_error_rate_from_truth": float(error.mean()),
             "error_rate_stderr": math.sqrt(float(np.mean(error * (1.0 - error))) / compared),
             "least_error_rate": float(least.mean()),
         }
     return facts
-
-
-def _error(true: UsablePixels, deciding: UsablePixels) -> FloatArray:
-    """Return how often numbers that some parameters decide are wrong in data of others, shape (n,)."""
-    out = np.empty(len(true))
-    for first in range(0, out.size, _CHUNK):
-        part = slice(first, first + _CHUNK)
-        data, decided = (
-            KnownPixels([column[part] for column in each.maps], SampleLaw()) for each in (true, deciding)
-        )
-        out[part] = number_tables(*data.codes(), decided.exposure, decided).outcomes(1, data).error
-    return out

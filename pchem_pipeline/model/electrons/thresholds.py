@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.electrons import thresholds_numba
 from pchem_pipeline.model.electrons.electrons import LARGEST_NUMBER, Outcomes
 from pchem_pipeline.model.law.inputs import kernel_counts
-from pchem_pipeline.model.law.parameters import UsablePixels
+from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
 
 def numbers_by_thresholds(
@@ -33,3 +33,15 @@ def numbers_by_thresholds(
     inputs = kernel_counts(counts), np.asarray(origin, np.int64), pixels.columns
     beyond = thresholds_numba.sum_by_thresholds(*inputs, LARGEST_NUMBER, observed, expected, errors)
     return observed, int(beyond), Outcomes(expected, errors)
+
+
+def errors_by_thresholds(deciding: UsablePixels, data: UsablePixels) -> FloatArray:
+    """Return how often numbers that some parameters decide are wrong in samples of others, shape (n,).
+
+    Args:
+        deciding: n pixels.
+        data: what their samples follow.
+    """
+    errors = np.empty(len(deciding))
+    thresholds_numba.fill_errors(deciding.columns, data.columns, errors)
+    return errors

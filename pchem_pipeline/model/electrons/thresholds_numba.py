@@ -53,27 +53,13 @@ def sum_by_thresholds(
         expected: in and out, sum over pixels of the probability that the estimated number is k.
         errors: out, probability that it is wrong, shape (n,).
     """
-    weights = np.zeros(capacity(parameters[:, 0]))
-    rows = np.empty((2, weights.size + 1 + 2 * SIMD_WIDTH))
-    logs, log_factorial = np.log(np.arange(1.0, weights.size + 1.0)), log_factorials(weights.size)
-    beyond = np.int64(0)
+    weights, logs, rows = _scratch(parameters)
+    log_factorial, beyond = log_factorials(weights.size), np.int64(0)
     for p in range(origin.size):
         exposure, step, bias = parameters[p, 0], 1.0 / parameters[p, 1], parameters[p, 2]
-        variance = max(parameters[p, 3] * parameters[p, 3] - QUANTISATION_VARIANCE, _LEAST_VARIANCE)
-        low, high = poisson_weights(exposure, weights)
         log_exposure = math.log(exposure) if exposure > 0.0 else -_INFINITE
-        while low < high and weights[low] < _LEAST_LIKELY:
-            low += 1
-        while high > low and weights[high] < _LEAST_LIKELY:
-            high -= 1
-        rows[_EDGE, 0] = -_INFINITE
-        for k in range(low, high):
-            rows[_EDGE, k + 1 - low] = max(
-                _last_code(k, logs[k] - log_exposure, step, bias, variance, weights) + 0.5,
-                rows[_EDGE, k - low],
-            )
+        low, high, variance = _place_edges(parameters[p], logs, weights, rows)
         n, sd, right = high + 1 - low, math.sqrt(variance), 0.0
-        rows[_EDGE, n : n + 1 + SIMD_WIDTH] = _INFINITE
         for j in range(n):
             if weights[low + j] < _NEGLIGIBLE:  # all to its own number
                 right += weights[low + j]
@@ -105,6 +91,75 @@ def sum_by_thresholds(
             beyond += _add(samples, low + j, largest, observed)
             begin = stop
     return beyond
+
+
+@kernel
+def fill_errors(deciding: FloatArray, data: FloatArray, errors: FloatArray) -> None:
+    """Fill how often the numbers that some parameters decide are wrong in samples of others.
+
+    Args:
+        deciding: (H, g, mu, sigma), shape (n, 4); all known.
+        data: what the samples follow, likewise.
+        errors: out, probability that a number is wrong, shape (n,).
+    """
+    weights, logs, rows = _scratch(deciding)
+    shares = np.zeros(capacity(data[:, 0]))
+    for p in range(errors.size):
+        first, last, _ = _place_edges(deciding[p], logs, weights, rows)
+        low, high = poisson_weights(data[p, 0], shares)
+        per_sd, right = 1.0 / math.sqrt(_analog_variance(data[p, 3])), 0.0
+        for k in range(max(low, first), min(high, last) + 1):
+            mean, j = data[p, 2] + k / data[p, 1], k - first
+            below, above = (rows[_EDGE, j] - mean) * per_sd, (rows[_EDGE, j + 1] - mean) * per_sd
+            right += shares[k] * normal_mass(below, above)
+        errors[p] = 1.0 - right
+
+
+@kernel
+def _scratch(parameters: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return memory for weights of the electron numbers, the logarithms of 1, 2, ..., memory for edges."""
+    room = capacity(parameters[:, 0])
+    return np.zeros(room), np.log(np.arange(1.0, room + 1.0)), np.empty((2, room + 1 + 2 * SIMD_WIDTH))
+
+
+@kernel(borrows=True)
+def _analog_variance(read_noise: float) -> float:
+    """Return the variance of the samples of a level before rounding, DN^2."""
+    return max(read_noise * read_noise - QUANTISATION_VARIANCE, _LEAST_VARIANCE)
+
+
+@kernel(borrows=True)
+def _place_edges(
+    theta: FloatArray, logs: FloatArray, weights: FloatArray, rows: FloatArray
+) -> tuple[int, int, float]:
+    """Fill the edges between the electron numbers that a pixel shows, DN, infinite at either end.
+
+    Args:
+        theta: (H, g, mu, sigma).
+        logs: logarithms of 1, 2, ...
+        weights: out, probabilities of the numbers.
+        rows: out, in its row of edges that below the first number, then that above each.
+
+    Returns:
+        The first and the last number, and the variance of a level, DN^2.
+    """
+    exposure, step, bias = theta[0], 1.0 / theta[1], theta[2]
+    variance = _analog_variance(theta[3])
+    low, high = poisson_weights(exposure, weights)
+    log_exposure = math.log(exposure) if exposure > 0.0 else -_INFINITE
+    while low < high and weights[low] < _LEAST_LIKELY:
+        low += 1
+    while high > low and weights[high] < _LEAST_LIKELY:
+        high -= 1
+    rows[_EDGE, 0] = -_INFINITE
+    for k in range(low, high):
+        rows[_EDGE, k + 1 - low] = max(
+            _last_code(k, logs[k] - log_exposure, step, bias, variance, weights) + 0.5,
+            rows[_EDGE, k - low],
+        )
+    n = high + 1 - low
+    rows[_EDGE, n : n + 1 + SIMD_WIDTH] = _INFINITE
+    return low, high, variance
 
 
 @kernel(borrows=True)

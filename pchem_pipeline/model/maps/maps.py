@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
@@ -177,23 +177,23 @@ def summarise(
     )
 
 
-def display_transform(values: FloatArray, ordered: Ordered | None = None) -> FloatArray:
-    """Shape a map's histogram into a Beta(2,2) for display (Hendrickson et al. 2023, Appendix C).
+def display_edges(ordered: Ordered, levels: ArrayLike) -> FloatArray:
+    """Return the values from which pixels are at or above levels of a display of Beta(2,2) shape.
 
-    ``x' = F^-1(F~(x))`` with the empirical distribution function F~ and the quantile function of Beta(2,2),
-    ``F(q) = 3 q^2 - 2 q^3``. Equal values share the middle of their ranks, so that ties stay ties and the
-    transform is symmetric under a change of sign.
+    The level of a value is ``F^-1(F~(x))`` (Hendrickson et al. 2023, Appendix C) with the empirical
+    distribution function F~ and the quantile function of Beta(2,2), ``F(q) = 3 q^2 - 2 q^3``. Equal values
+    share the middle of their ranks, so that ties stay ties and a change of sign turns the display round.
 
     Args:
-        values: the map, or some of its pixels; NaN where there is no value.
-        ordered: all values of the map; None: these.
+        ordered: all values of the map, at least one.
+        levels: between 0 and 1.
 
     Returns:
-        Values in 0..1, same shape, in the same order; NaN stays NaN.
+        The values, of the shape of the levels; infinite where no pixel is as high.
     """
-    shown = np.full(values.shape, np.nan)
-    valid = np.isfinite(values)
-    rank = (ordered or Ordered.of(values)).shares(values[valid])
-    # the root of 3 q^2 - 2 q^3 = p in 0..1, in closed form
-    shown[valid] = 0.5 - np.sin(np.arcsin(1.0 - 2.0 * rank) / 3.0)
-    return shown
+    level = np.asarray(levels, dtype=np.float64)
+    rank = ordered.size * level**2 * (3.0 - 2.0 * level)
+    found = ordered.values[np.minimum(rank.astype(np.int64), ordered.size - 1)]
+    first, last = (np.searchsorted(ordered.values, found, side) for side in ("left", "right"))
+    higher = np.append(ordered.values, np.inf)[last]
+    return np.where(0.5 * (first + last) >= rank, found, higher)

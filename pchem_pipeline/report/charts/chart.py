@@ -1,14 +1,15 @@
 """What a chart shows: marks in panels, panels over each other in stacks, stacks in columns.
 
-A figure of curves, bars and points is described once, in these words. ``on_paper`` draws it with matplotlib,
-``on_page`` writes it as the numbers that the page's script draws, ``picture`` as the plain picture of a page
-without scripts. A colour is the name of one in the ``Palette``, or ``#rrggbb``; texts may hold mathtext.
+A figure is described once, in these words. ``on_paper`` draws it with matplotlib, ``on_page`` writes it as
+the numbers that the page's script draws, ``picture`` as the plain picture of a page without scripts. A colour
+is the name of one in the ``Palette``, or ``#rrggbb``; texts may hold mathtext.
 """
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -17,7 +18,17 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 Values = NDArray[Any]
 Dash = Literal["-", "--", "-.", ":", "-...", ".."]
+Shape = Literal["o", "s", "x", "D", "d", "^", "v", "<", "P", "X", "*", "h", "|"]
 
+#: Widths of one column and of a page of a journal, mm; columns stand side by side beyond half as much again.
+COLUMN_MM, PAGE_MM = 88.0, 180.0
+#: Colours of a scale, and the number that stands for none of them.
+SHADES = NO_COLOUR = 255
+#: Height of a map over its width, at most; ratio of its sides beyond which pixels are not square.
+TALLEST, LONGEST = 1.6, 4.0
+#: Letters of a tick's text for a millimetre of a stack's width; height of a row with a text, and of each
+#: further line, mm.
+_TICK_LETTERS, _ROW_MM, _LINE_MM = 0.31, 6.2, 3.2
 #: Margin of an axis whose end is not given, of what it shows.
 _MARGIN = 0.05
 
@@ -33,6 +44,7 @@ class Axis:
         linear_to: logarithmic to both sides beyond this, linear between; 0: not so.
         whole: ticks at whole numbers alone.
         ticks: places and texts of the ticks; empty: as the renderer finds them.
+        down: its values grow downwards; both ends are given.
     """
 
     label: str
@@ -42,6 +54,7 @@ class Axis:
     linear_to: float = 0.0
     whole: bool = False
     ticks: tuple[tuple[float, str], ...] = ()
+    down: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,16 +125,18 @@ class Points(Mark):
     """Points (n,).
 
     Attributes:
-        mark: disk, square or cross.
+        mark: its shape, as matplotlib calls it; the page's script draws disks, squares and crosses.
         size: diameter, points.
+        face: colour within an outline, ``none`` of nothing; empty: filled.
         error: lengths of the error bars below and above, (2, n); None: there are none.
         cap: length of the bars' ends, points.
     """
 
     x: Values
     y: Values
-    mark: Literal["o", "s", "x"] = "o"
+    mark: Shape = "o"
     size: float = 3.5
+    face: str = ""
     error: Values | None = None
     cap: float = 0.0
 
@@ -164,6 +179,53 @@ class Words(Mark):
 
 
 @dataclass(frozen=True)
+class Image(Mark):
+    """A map: the values of pixels (row, column) as colours; of many rows and columns some are drawn.
+
+    Attributes:
+        values: of the pixels, NaN where there is none.
+        edges: values between one colour and the next, rising.
+        x: left and right end on the axis of x.
+        y: end of the first and of the last row on the upright axis.
+        scale: name of a scale of colours, or the colours themselves, one more than edges.
+        none: colour of pixels without a value.
+        bar: places along a bar of the colours, 0 to 1, and their texts; empty: no bar.
+        unit: what the bar shows.
+    """
+
+    values: Values
+    edges: Values
+    x: tuple[float, float]
+    y: tuple[float, float]
+    scale: str | tuple[str, ...] = ""
+    none: str = "no_value"
+    bar: tuple[tuple[float, str], ...] = ()
+    unit: str = ""
+
+    def shown(self, dots: float) -> tuple[Values, tuple[float, float], tuple[float, float]]:
+        """Return the rows and columns that so many dots from left to right can show, and the ends of these.
+
+        Every k-th is taken; k is odd, so that what differs from one row or column to the next is seen.
+        """
+        rows, columns = self.values.shape
+        step = max(1, int(columns / dots), int(rows / (TALLEST * dots)))
+        step -= 1 - step % 2
+        some = self.values[::step, ::step]
+        ends = (
+            (first, first + (last - first) * step * n / whole)
+            for (first, last), n, whole in zip((self.y, self.x), some.shape, (rows, columns), strict=True)
+        )
+        y, x = ends
+        return some, x, y
+
+    def index(self, values: Values) -> NDArray[np.uint8]:
+        """Return the number of the colour of values; 255 where there is none."""
+        found = np.searchsorted(self.edges, values, side="right").astype(np.uint8)
+        found[np.isnan(values)] = NO_COLOUR
+        return found
+
+
+@dataclass(frozen=True)
 class Panel:
     """Marks between two axes.
 
@@ -176,6 +238,7 @@ class Panel:
         room: factor by which the upper end of y is raised for it on paper, on a page and in a column.
         note: small words in a corner.
         corner: which one.
+        square: one is as long on both axes; the height of its stack follows from its width.
     """
 
     y: Axis
@@ -186,6 +249,7 @@ class Panel:
     room: tuple[float, float] = (1.0, 1.0)
     note: str = ""
     corner: str = "upper right"
+    square: bool = False
 
 
 @dataclass(frozen=True)
@@ -209,19 +273,27 @@ class Stack:
 
 @dataclass(frozen=True)
 class Chart:
-    """A figure of curves, bars and points.
+    """What a figure draws.
 
     Attributes:
         stacks: from left to right and from top to bottom.
         widths: shares of the columns where stacks have room side by side; one below the other elsewhere.
         legend: columns of a legend below all on paper, on a page and in a column; 0: none.
+        keys: colours and what they mean, in lines below all.
         empty: what is said where there is no stack.
     """
 
     stacks: tuple[Stack, ...]
     widths: tuple[float, ...] = (1.0,)
     legend: tuple[int, int] = (0, 0)
+    keys: tuple[tuple[str, str], ...] = ()
     empty: str = ""
+
+    @property
+    def still(self) -> bool:
+        """Whether it is a plain picture on the page, too: a map, or rows, with no value to read along x."""
+        panels = [panel for stack in self.stacks for panel in stack.panels]
+        return any(panel.y.down or any(isinstance(m, Image) for m in panel.marks) for panel in panels)
 
 
 def points_of(mark: Mark) -> tuple[Values, Values]:
@@ -239,6 +311,8 @@ def points_of(mark: Mark) -> tuple[Values, Values]:
             return ends, np.concatenate([mark.low, mark.high])
         case Band():
             return np.tile(mark.x, 2), np.concatenate([mark.low, mark.high])
+        case Image():
+            return np.array(mark.x), np.array(mark.y)
     return np.empty(0), np.empty(0)
 
 
@@ -282,3 +356,21 @@ def y_window(panel: Panel) -> tuple[float, float]:
         isinstance(mark, Bars | Sticks) or (isinstance(mark, Steps) and mark.filled) for mark in panel.marks
     )
     return window(panel.y, (points_of(mark)[1] for mark in panel.marks), 0.0 if solid else None)
+
+
+def height_of(stack: Stack, width_mm: float) -> float:
+    """Return the height of a stack on paper, mm; of square pixels and of rows it follows from the width."""
+    panel = stack.panels[-1] if stack.panels else None
+    if panel is not None and panel.square:
+        (left, right), (low, high) = x_window(stack), y_window(panel)
+        inner = max(width_mm - 24.0, 0.75 * width_mm)
+        return float(np.clip(inner * (high - low) / (right - left), 22.0, TALLEST * inner)) + 10.0
+    rows = [] if panel is None else tick_rows(panel.y, width_mm).ticks
+    needed = sum(_LINE_MM * text.count("\n") + _ROW_MM for _, text in rows)
+    return max(stack.height_mm, needed + 18.0)
+
+
+def tick_rows(axis: Axis, width_mm: float) -> Axis:
+    """Return an axis whose ticks have texts in lines that fit beside a stack of some width."""
+    ticks = ((place, textwrap.fill(text, int(_TICK_LETTERS * width_mm))) for place, text in axis.ticks)
+    return replace(axis, ticks=tuple(ticks))

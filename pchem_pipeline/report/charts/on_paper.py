@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import re
+import textwrap
+from dataclasses import replace
 from typing import Any, cast
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, NullLocator, ScalarFormatter
 
 from pchem_pipeline.report.charts.chart import (
+    NO_COLOUR,
     Axis,
     Band,
     Bars,
     Chart,
     Dash,
+    Image,
     Level,
     Line,
     Mark,
@@ -26,12 +33,16 @@ from pchem_pipeline.report.charts.chart import (
     Steps,
     Sticks,
     Words,
+    height_of,
+    tick_rows,
 )
 from pchem_pipeline.report.style.palette import Palette
-from pchem_pipeline.report.style.style import Drawing, Look, colours_of, look_of, note, styled
+from pchem_pipeline.report.style.style import Drawing, Look, colours_of, inches, look_of, note, styled
 
-#: Height of a further line of a title, mm; letters of a title on a millimetre.
+#: Height of a further line of a title or of a legend, mm; letters of a title on a millimetre.
 _LINE_MM, _LETTERS = 3.5, 0.66
+#: Rows or columns of a map up to which a vector file keeps each pixel.
+_MOST_KEPT = 800
 _DASHES: dict[Dash, Any] = {"-...": (0, (5, 1, 1, 1, 1, 1)), "..": (0, (1, 1))}
 #: Points beyond which they are an image in a vector file.
 _MOST_POINTS = 1000
@@ -53,9 +64,15 @@ def draw_chart(look: Look, chart: Chart) -> Drawing:
     rows = [stacks[i : i + columns] for i in range(0, len(stacks), columns)]
     titles = {id(stack): _broken(stack.title, look.width_mm / columns) for stack in stacks}
     heights = [
-        max(stack.height_mm + _LINE_MM * titles[id(stack)].count("\n") for stack in row) for row in rows
+        max(
+            height_of(stack, look.width_mm / columns) + _LINE_MM * titles[id(stack)].count("\n")
+            for stack in row
+        )
+        for row in rows
     ]
-    drawing = look.empty(sum(heights) or 40.0)
+    keys = _keys(chart, look)
+    lines = sum(1 + text.count("\n") for text in keys)
+    drawing = look.empty((sum(heights) or 40.0) + (5.0 + _LINE_MM * lines if keys else 0.0))
     if not rows:
         axes = drawing.add_subplot()
         axes.text(0.5, 0.5, chart.empty, ha="center", va="center", transform=axes.transAxes)
@@ -65,16 +82,19 @@ def draw_chart(look: Look, chart: Chart) -> Drawing:
     grid = drawing.add_gridspec(len(rows), columns, height_ratios=heights, width_ratios=widths)
     handles: dict[str, Handle] = {}
     for place, stack in ((grid[i, j], stack) for i, row in enumerate(rows) for j, stack in enumerate(row)):
-        inner = place.subgridspec(
-            len(stack.panels), 1, height_ratios=[panel.height for panel in stack.panels]
-        )
+        shares = [panel.height for panel in stack.panels]
+        # a panel alone is laid out with those of the other stacks
+        inner = place.subgridspec(len(shares), 1, height_ratios=shares) if len(shares) > 1 else [place]
         first: Axes | None = None
         for i, panel in enumerate(stack.panels):
-            axes = drawing.add_subplot(inner[i, 0], sharex=first)
+            axes = drawing.add_subplot(inner[i], sharex=first)
+            panel = replace(panel, y=tick_rows(panel.y, look.width_mm / columns))
             handles |= _draw_panel(axes, panel, stack, last=i == len(stack.panels) - 1)
             if first is None:
                 axes.set_title(titles[id(stack)], fontsize=7.0 if "\n" in titles[id(stack)] else None)
             first = first or axes
+    if keys:
+        drawing.legend(handles=[*keys.values()], labels=[*keys], loc="outside lower left")
     if any(chart.legend) and handles:
         drawing.legend(
             list(handles.values()), list(handles), loc="outside lower center",
@@ -83,22 +103,41 @@ def draw_chart(look: Look, chart: Chart) -> Drawing:
     return drawing
 
 
+def _keys(chart: Chart, look: Look) -> dict[str, Handle]:
+    """Return what the legend shows of colours that have a meaning, by this in lines that fit."""
+    return {
+        textwrap.fill(text, int(_LETTERS * look.width_mm)): Patch(
+            facecolor=colour_of(colour, look.palette), edgecolor="#888888"
+        )
+        for colour, text in chart.keys
+    }
+
+
 def _broken(title: str, width_mm: float) -> str:
-    """Break the lines of a title that are too long, at three blanks; a formula is about two letters wide."""
+    """Break the lines of a title that are too long, at three blanks if any; a formula is two letters wide."""
     lines = []
     for line in title.split("\n"):
         fits = len(_MATH.sub("MM", line)) < _LETTERS * width_mm
-        lines += [line] if fits else line.split("   ")
+        broken = line.split("   ") if "   " in line else textwrap.wrap(line, int(_LETTERS * width_mm))
+        lines += [line] if fits else broken
     return "\n".join(lines)
 
 
 def _draw_panel(axes: Axes, panel: Panel, stack: Stack, *, last: bool) -> dict[str, Handle]:
     """Draw a panel and return what its legend shows by label; one of its own is drawn here."""
-    _scale(axes, "x", stack.x)
-    _scale(axes, "y", panel.y)
+    most = 5 if any(isinstance(mark, Image) for mark in panel.marks) else 8
+    both = (("x", stack.x), ("y", panel.y))
+    for name, axis in both:
+        _scale(axes, name, axis, most)
+        if axis.low is not None and axis.high is not None:
+            _end(axes, name, axis)  # so that no mark is asked for its ends
+    if panel.square:
+        axes.set_aspect("equal")
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(True)
     drawn = [(mark, _draw_mark(axes, mark, i)) for i, mark in enumerate(panel.marks)]
-    _end(axes, "x", stack.x)
-    _end(axes, "y", panel.y)
+    for name, axis in both:
+        _end(axes, name, axis)
     handles = {mark.label: artist for mark, artist in drawn if mark.label and mark.listed}
     room = panel.room[0 if look_of(axes).wide else 1]
     if room != 1.0:
@@ -116,8 +155,8 @@ def _draw_panel(axes: Axes, panel: Panel, stack: Stack, *, last: bool) -> dict[s
     return handles
 
 
-def _scale(axes: Axes, name: str, axis: Axis) -> None:
-    """Set scale and ticks of an axis."""
+def _scale(axes: Axes, name: str, axis: Axis, most: int) -> None:
+    """Set scale and ticks of an axis; of whole numbers at most so many."""
     one, set_scale = getattr(axes, f"{name}axis"), getattr(axes, f"set_{name}scale")
     if axis.log:
         set_scale("log")
@@ -128,15 +167,16 @@ def _scale(axes: Axes, name: str, axis: Axis) -> None:
         one.set_ticks(places, labels=texts)
         one.set_minor_locator(NullLocator())
     elif axis.whole:
-        one.set_major_locator(MaxNLocator(8, integer=True))
+        one.set_major_locator(MaxNLocator(most, integer=True))
     if not axis.ticks and isinstance(one.get_major_formatter(), ScalarFormatter):
         one.get_major_formatter().set_useOffset(False)
 
 
 def _end(axes: Axes, name: str, axis: Axis) -> None:
     """Set the ends of an axis that are given; the others follow the marks."""
-    if axis.low is not None or axis.high is not None:
-        getattr(axes, f"set_{name}lim")(axis.low, axis.high)
+    ends = (axis.high, axis.low) if axis.down else (axis.low, axis.high)
+    if ends != (None, None):
+        getattr(axes, f"set_{name}lim")(*ends)
 
 
 def _style(mark: Mark, colours: Palette) -> dict[str, Any]:
@@ -181,13 +221,16 @@ def _draw_mark(axes: Axes, mark: Mark, order: int) -> Handle:
             return axes.stairs(mark.values, mark.edges, **style)
         case Bars():
             heights = np.asarray(mark.high) - np.asarray(mark.low)
-            return axes.bar(mark.x, heights, width=mark.broad, bottom=mark.low, linewidth=0, **area)[0]
+            axes.bar(mark.x, heights, width=mark.broad, bottom=mark.low, linewidth=0, **area)
+            return Patch(linewidth=0, **area)
         case Sticks():
             options = {"colors": style.pop("color"), "linestyles": style.pop("linestyle")}
             return axes.vlines(mark.x, 0.0, mark.y, **options, **style)
         case Points():
             # many points would make a vector file large
             style |= {"linestyle": "none", "marker": mark.mark, "rasterized": mark.y.size > _MOST_POINTS}
+            if mark.face:
+                style |= {"markerfacecolor": colour_of(mark.face, colours), "markeredgewidth": 0.8}
             if mark.error is None:
                 [points] = axes.plot(mark.x, mark.y, markersize=mark.size, **style)
                 return points
@@ -203,9 +246,43 @@ def _draw_mark(axes: Axes, mark: Mark, order: int) -> Handle:
             return (axes.axhspan if mark.axis == "y" else axes.axvspan)(
                 mark.low, mark.high, linewidth=0, **area
             )
+        case Image():
+            _draw_image(axes, mark)
         case Words():
             axes.text(
                 mark.x, mark.up, mark.text, ha=mark.align, va="bottom", fontsize=7.0, color=style["color"],
                 transform=axes.get_xaxis_transform(),
             )  # fmt: skip
     return Line2D([], [])
+
+
+def _draw_image(axes: Axes, mark: Image) -> None:
+    """Draw a map with its bar of colours; those pixels that the resolution can show."""
+    look, figure = look_of(axes), axes.figure
+    beside = axes.get_subplotspec()
+    columns = 1 if beside is None else beside.get_topmost_subplotspec().get_gridspec().ncols
+    values, x, y = mark.shown(inches(look.width_mm) * look.dpi / columns)
+    index = mark.index(values)
+    colours = _colours(mark, look).with_extremes(bad=colour_of(mark.none, look.palette))
+    shown = np.where(index == NO_COLOUR, np.nan, (index + 0.5) / colours.N).astype(np.float32)
+    axes.set_facecolor(colour_of(mark.none, look.palette))
+    # a vector file keeps the pixels as they are, but for more of them than it can show
+    kept = "none" if max(mark.values.shape) <= _MOST_KEPT else "nearest"
+    image = axes.imshow(
+        shown, colours, vmin=0.0, vmax=1.0, origin="upper", interpolation=kept, aspect=axes.get_aspect(),
+        extent=(*x, *y[::-1]),
+    )  # fmt: skip
+    if mark.bar:
+        places, texts = zip(*mark.bar, strict=True)
+        bar = figure.colorbar(image, ax=axes, ticks=list(places), fraction=0.06, pad=0.02, aspect=25)
+        bar.ax.set_yticklabels(list(texts))
+        bar.ax.minorticks_off()
+        bar.set_label(mark.unit)
+
+
+def _colours(mark: Image, look: Look) -> Colormap:
+    """Return the colours of a map."""
+    if isinstance(mark.scale, str):
+        name = colour_of(mark.scale, look.palette) or str(mpl.rcParams["image.cmap"])
+        return mpl.colormaps[name].resampled(NO_COLOUR)
+    return ListedColormap([colour_of(each, look.palette) for each in mark.scale])

@@ -2,35 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from html import escape
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.report.charts.chart import (
+    COLUMN_MM,
+    NO_COLOUR,
     Axis,
     Band,
     Bars,
     Chart,
     Dash,
+    Image,
     Level,
     Line,
     Mark,
     Panel,
     Points,
+    Shape,
     Span,
     Stack,
     Steps,
     Sticks,
     Words,
+    height_of,
+    tick_rows,
     x_window,
     y_window,
 )
+from pchem_pipeline.report.charts.png import png_url
 from pchem_pipeline.report.charts.thinning import fewer_steps, some_points, thinned
 from pchem_pipeline.report.charts.ticks import scaled, ticks
-from pchem_pipeline.report.style.palette import LIGHT
-from pchem_pipeline.report.style.style import COLUMN_MM
+from pchem_pipeline.report.style.palette import LIGHT, MAP_COLOURS, shades
 from pchem_pipeline.report.style.wording import without_formulas
 
 #: Dots of a millimetre on paper, size of the letters and their mean width, all px; columns of a curve.
@@ -38,12 +46,29 @@ _MM, _LETTER, _WIDE, _COLUMNS = 4.5, 11, 6.8, 300
 #: Room beside and below panels, between them, and of a line of the legend, px.
 _LEFT, _RIGHT, _BELOW, _BETWEEN, _LINE = 68.0, 10.0, 38.0, 8.0, 15.0
 _POINT = 1.35  # px
+#: Dots of a map on a px of the picture; width of the bar of its colours and room around it, px.
+_DOTS, _BAR, _ROOM = 2.5, 11.0, 8.0
 _DASHES: dict[Dash, str] = {
     "--": "5 3",
     ":": "1.5 2.5",
     "-.": "6 3 1.5 3",
     "-...": "7 2 1.5 2 1.5 2",
     "..": "1.5 1.5",
+}
+#: Of the shapes of points: tips, how far in the corners between them lie (0: there are none), and the turn.
+_SHAPES: dict[Shape, tuple[int, float, float]] = {
+    "s": (4, 0.0, 45.0),
+    "D": (4, 0.0, 0.0),
+    "d": (4, 0.0, 0.0),
+    "^": (3, 0.0, 0.0),
+    "v": (3, 0.0, 180.0),
+    "<": (3, 0.0, -90.0),
+    "h": (6, 0.0, 0.0),
+    "*": (5, 0.4, 0.0),
+    "P": (4, 0.5, 0.0),
+    "X": (4, 0.5, 45.0),
+    "x": (4, 0.1, 45.0),
+    "|": (2, 0.1, 0.0),
 }
 
 FloatArray = NDArray[np.float64]
@@ -89,6 +114,10 @@ def chart_picture(chart: Chart, width_mm: float) -> tuple[bytes, int, int]:
             parts += drawn
             left, tallest = left + width, max(tallest, height)
         top += tallest
+    keys, high = _legend(
+        {without_formulas(text): _named(colour) for colour, text in chart.keys}, _LEFT, top, whole
+    )
+    parts, top = [*parts, *keys], top + high
     if not stacks:
         parts, top = [_text(whole / 2, 60.0, chart.empty, "middle")], 120.0
     size = f'width="{whole:.0f}" height="{top:.0f}"'
@@ -102,27 +131,45 @@ def chart_picture(chart: Chart, width_mm: float) -> tuple[bytes, int, int]:
 
 def _stack(stack: Stack, left: float, top: float, width: float) -> tuple[list[str], float]:
     """Draw the panels of a stack with title and legend; return the elements and the height."""
+    panels = tuple(replace(panel, y=tick_rows(panel.y, width / _MM)) for panel in stack.panels)
+    stack = replace(stack, panels=panels)
     lines = [line for line in without_formulas(stack.title).split("\n") if line]
-    parts = [_text(left + _LEFT, top + 13.0 + i * 14.0, line, bold=i == 0) for i, line in enumerate(lines)]
+    start = left + _beside(stack)
+    parts = [_text(start, top + 13.0 + i * 14.0, line, bold=i == 0) for i, line in enumerate(lines)]
     at = top + 8.0 + 14.0 * len(lines)
-    room = stack.height_mm * _MM - _BELOW - _BETWEEN * len(stack.panels)
+    across = left + width - _RIGHT - start - max(map(_bar_room, stack.panels), default=0.0)
+    room = height_of(stack, width / _MM) * _MM - _BELOW - _BETWEEN * len(stack.panels)
     shares = sum(panel.height for panel in stack.panels)
     x = (stack.x, *x_window(stack))
     for i, panel in enumerate(stack.panels):
-        frame = Frame(
-            left + _LEFT,
-            at,
-            width - _LEFT - _RIGHT,
-            room * panel.height / shares,
-            x,
-            (panel.y, *y_window(panel)),
-        )
+        y, height = (panel.y, *y_window(panel)), room * panel.height / shares
+        if panel.square:
+            dot = min(across / (x[2] - x[1]), height / (y[2] - y[1]))
+            across, height = dot * (x[2] - x[1]), dot * (y[2] - y[1])
+        frame = Frame(start, at, across, height, x, y)
         parts += _panel(panel, frame, named=i == len(stack.panels) - 1)
         at += frame.height + _BETWEEN
     at += _BELOW - _BETWEEN
-    parts += [_text(left + _LEFT + (width - _LEFT - _RIGHT) / 2, at - 8.0, stack.x.label, "middle")]
-    legend, height = _legend(stack, left + _LEFT, at + 8.0, width - _LEFT)
+    parts += [_text(start + across / 2, at - 8.0, stack.x.label, "middle")]
+    labels: dict[str, Mark | str] = {}
+    for mark in (mark for panel in stack.panels for mark in panel.marks if mark.label and mark.listed):
+        labels.setdefault(without_formulas(mark.label), mark)
+    legend, height = _legend(labels, start, at + 8.0, left + width)
     return [*parts, *legend], at + height + 10.0 - top
+
+
+def _beside(stack: Stack) -> float:
+    """Return the room left of the panels of a stack, px: that of the longest text of their ticks."""
+    texts = [line for panel in stack.panels for _, text in panel.y.ticks for line in text.split("\n")]
+    named = any(panel.y.label for panel in stack.panels)
+    longest = _WIDE * max(map(len, texts), default=0) + (30.0 if named else 10.0)
+    return max(_LEFT, longest)
+
+
+def _bar_room(panel: Panel) -> float:
+    """Return the room right of a panel for a bar of colours, px."""
+    texts = [text for mark in panel.marks if isinstance(mark, Image) for _, text in mark.bar]
+    return _ROOM + _BAR + 6.0 + _WIDE * max(map(len, texts)) + 16.0 if texts else 0.0
 
 
 def _text(
@@ -139,7 +186,10 @@ def _panel(panel: Panel, frame: Frame, *, named: bool) -> list[str]:
     place = f'x="{frame.left:.1f}" y="{frame.top:.1f}" width="{frame.width:.1f}" height="{frame.height:.1f}"'
     bottom, right = frame.top + frame.height, frame.left + frame.width
     parts = [f'<svg {place} overflow="hidden">{marks}</svg>']
+    parts += [each for mark in panel.marks if isinstance(mark, Image) for each in _bar(mark, frame)]
     path = f"M{frame.left:.1f} {frame.top:.1f}V{bottom:.1f}H{right:.1f}"
+    if panel.square:
+        path += f"V{frame.top:.1f}H{frame.left:.1f}"
     for place_, text in ticks(*frame.x, most=max(2, int(frame.width // 55))):
         across = frame.left + float(frame.across(place_))
         path += f"M{across:.1f} {bottom:.1f}v4"
@@ -148,7 +198,9 @@ def _panel(panel: Panel, frame: Frame, *, named: bool) -> list[str]:
     for place_, text in ticks(*frame.y, most=max(3, int(frame.height // 28))):
         down = frame.top + float(frame.down(place_))
         path += f"M{frame.left:.1f} {down:.1f}h-4"
-        parts.append(_text(frame.left - 6.0, down + 4.0, text, "end"))
+        lines = text.split("\n")
+        start = down + 4.0 - 6.0 * (len(lines) - 1)
+        parts += [_text(frame.left - 6.0, start + 12.0 * i, line, "end") for i, line in enumerate(lines)]
     parts.append(f'<path d="{path}" fill="none" stroke="{LIGHT.edge}"/>')
     words = without_formulas(panel.y.label).split("\n")
     for i, line in enumerate(words):
@@ -164,47 +216,99 @@ def _panel(panel: Panel, frame: Frame, *, named: bool) -> list[str]:
     return parts
 
 
-def _legend(stack: Stack, left: float, top: float, width: float) -> tuple[list[str], float]:
-    """Draw the labels of all marks of a stack in lines, and return the height."""
-    seen: dict[str, Mark] = {}
-    for mark in (mark for panel in stack.panels for mark in panel.marks if mark.label and mark.listed):
-        seen.setdefault(without_formulas(mark.label), mark)
-    parts, across, down = [], 0.0, 0.0
-    for label, mark in seen.items():
-        length = 26.0 + _WIDE * len(label)
+def _legend(
+    labels: Mapping[str, Mark | str], left: float, top: float, right: float
+) -> tuple[list[str], float]:
+    """Draw the labels of marks, or of colours, in lines, and return the height."""
+    width = right - left
+    parts, across, down, high = [], 0.0, 0.0, 0.0
+    for label, what in labels.items():
+        lines = textwrap.wrap(label, max(12, int((width - 26.0) / _WIDE)))
+        length = 26.0 + _WIDE * max(map(len, lines))
         if across and across + length > width:
-            across, down = 0.0, down + _LINE
-        colour = _colour(mark)
-        solid = isinstance(mark, Bars | Band | Span) or (isinstance(mark, Steps) and mark.filled)
-        at, middle = left + across, top + down
-        if colour != "none":
-            parts.append(
-                f'<rect x="{at:.1f}" y="{middle - 4.5:.1f}" width="13" height="9" fill="{colour}" '
-                f'fill-opacity="{mark.alpha:g}"/>'
-                if solid
-                else f'<circle cx="{at + 7:.1f}" cy="{middle:.1f}" r="2.5" {_fill(mark)}/>'
-                if isinstance(mark, Points)
-                else f'<path d="M{at:.1f} {middle:.1f}h15" {_stroke(mark, 1.8)}/>'
-            )
-        parts.append(_text(at + 20.0, middle + 4.0, label))
-        across += length
-    return parts, down + _LINE if seen else 0.0
+            across, down, high = 0.0, down + high, 0.0
+        parts.append(_handle(what, left + across, top + down))
+        parts += [
+            _text(left + across + 20.0, top + down + 4.0 + 13.0 * i, each) for i, each in enumerate(lines)
+        ]
+        across, high = across + length, max(high, _LINE + 13.0 * (len(lines) - 1))
+    return parts, down + high
 
 
-def _colour(mark: Mark) -> str:
-    return str(getattr(LIGHT, mark.colour, mark.colour))
+def _handle(what: Mark | str, at: float, middle: float) -> str:
+    """Return what a legend shows of a mark, or of a colour."""
+    box = f'<rect x="{at:.1f}" y="{middle - 4.5:.1f}" width="13" height="9" '
+    if isinstance(what, str):
+        return f'{box}fill="{what}" stroke="#888888" stroke-width="0.6"/>'
+    if what.colour == "none":
+        return ""
+    if isinstance(what, Bars | Band | Span) or (isinstance(what, Steps) and what.filled):
+        return f"{box}{_fill(what)}/>"
+    if isinstance(what, Points):
+        return f'<path d="M{at + 7.0:.1f} {middle:.1f}{_outline(what, 3.0)}" {_paint(what)}/>'
+    return f'<path d="M{at:.1f} {middle:.1f}h15" {_stroke(what, 1.8)}/>'
+
+
+def _named(colour: str) -> str:
+    return str(getattr(LIGHT, colour, colour))
 
 
 def _stroke(mark: Mark, width: float | None = None) -> str:
     dash = f' stroke-dasharray="{_DASHES[mark.dash]}"' if mark.dash in _DASHES else ""
     alpha = f' stroke-opacity="{mark.alpha:g}"' if mark.alpha != 1.0 else ""
     thick = _POINT * mark.width if width is None else width
-    return f'fill="none" stroke="{_colour(mark)}" stroke-width="{thick:.1f}"{dash}{alpha}'
+    return f'fill="none" stroke="{_named(mark.colour)}" stroke-width="{thick:.1f}"{dash}{alpha}'
 
 
 def _fill(mark: Mark) -> str:
     alpha = f' fill-opacity="{mark.alpha:g}"' if mark.alpha != 1.0 else ""
-    return f'fill="{_colour(mark)}"{alpha}'
+    return f'fill="{_named(mark.colour)}"{alpha}'
+
+
+def _image(mark: Image, frame: Frame) -> str:
+    """Return a map as an element: a picture of a colour for each of the pixels that it can show."""
+    values, x, y = mark.shown(_DOTS * frame.width)
+    (left, right), (top, bottom) = frame.across(x).tolist(), frame.down(y).tolist()
+    if top > bottom:
+        values, top, bottom = values[::-1], bottom, top
+    place = f'x="{left:.2f}" y="{top:.2f}" width="{right - left:.2f}" height="{bottom - top:.2f}"'
+    href = png_url(mark.index(values), np.vstack([_colours(mark), _rgb((_named(mark.none),))]))
+    return f'<image {place} preserveAspectRatio="none" style="image-rendering:pixelated" href="{href}"/>'
+
+
+def _colours(mark: Image) -> NDArray[np.uint8]:
+    """Return the colours of a map, those that it does not have at the end of the list too."""
+    if isinstance(mark.scale, str):
+        return shades(_named(mark.scale) if mark.scale else MAP_COLOURS, NO_COLOUR)
+    own = _rgb([_named(each) for each in mark.scale])
+    return np.vstack([own, np.zeros((NO_COLOUR - len(own), 3), np.uint8)])
+
+
+def _rgb(colours: Sequence[str]) -> NDArray[np.uint8]:
+    return np.array([list(bytes.fromhex(each[1:])) for each in colours], np.uint8)
+
+
+def _bar(mark: Image, frame: Frame) -> list[str]:
+    """Draw the bar of a map's colours, right of the panel."""
+    if not mark.bar:
+        return []
+    left, top, high = frame.left + frame.width + _ROOM, frame.top, frame.height
+    href = png_url(np.arange(NO_COLOUR, dtype=np.uint8)[::-1, None], _colours(mark))
+    place = f'x="{left:.1f}" y="{top:.1f}" width="{_BAR}" height="{high:.1f}"'
+    parts = [
+        f'<image {place} preserveAspectRatio="none" href="{href}"/>',
+        f'<rect {place} fill="none" stroke="{LIGHT.edge}" stroke-width="0.6"/>',
+    ]
+    right, path = left + _BAR, ""
+    for part, text in mark.bar:
+        down = top + high * (1.0 - part)
+        path += f"M{right:.1f} {down:.1f}h3"
+        parts.append(_text(right + 6.0, down + 4.0, text))
+    parts.append(f'<path d="{path}" stroke="{LIGHT.edge}"/>')
+    at = right + 6.0 + _WIDE * max(len(text) for _, text in mark.bar) + 12.0
+    turned = f'transform="translate({at:.1f} {top + high / 2:.1f}) rotate(-90)"'
+    parts.append(f'<text {turned} text-anchor="middle">{escape(without_formulas(mark.unit))}</text>')
+    return parts
 
 
 def _mark(mark: Mark, frame: Frame) -> str:
@@ -243,6 +347,8 @@ def _mark(mark: Mark, frame: Frame) -> str:
             return f'<path d="{path}" {_stroke(mark)}/>'
         case Points():
             return _points(mark, frame)
+        case Image():
+            return _image(mark, frame)
         case Band():
             x, low, high = mark.x, mark.low, mark.high
             if mark.step:
@@ -268,30 +374,44 @@ def _mark(mark: Mark, frame: Frame) -> str:
                 frame.height * (1.0 - mark.up),
                 mark.text,
                 anchor,
-                colour=_colour(mark),
+                colour=_named(mark.colour),
             )
     raise TypeError(f"no picture of a {type(mark).__name__}")
 
 
 def _points(mark: Points, frame: Frame) -> str:
-    mark, half = some_points(mark, 4 * _COLUMNS), max(_POINT * mark.size / 2, 0.8)
+    mark, half = some_points(mark, 4 * _COLUMNS), max(_POINT * mark.size / 2, 1.2)
     parts = ""
     if mark.error is not None:
         reach = np.nan_to_num(mark.error)
         low, high = frame.down(mark.y - reach[0]).tolist(), frame.down(mark.y + reach[1]).tolist()
         bars = zip(frame.across(mark.x).tolist(), low, high, strict=True)
         path = "".join(f"M{a:.1f} {b:.1f}V{c:.1f}" for a, b, c in bars if b == b)
-        parts = f'<path d="{path}" fill="none" stroke="{_colour(mark)}"/>'
-    if mark.mark == "o":
+        parts = f'<path d="{path}" fill="none" stroke="{_named(mark.colour)}"/>'
+    if mark.mark == "o" and not mark.face:
         return parts + _dots(frame, mark, mark.x, mark.y, half)
-    shape = f"m-{half:.1f} -{half:.1f}" + (
-        f"h{2 * half:.1f}v{2 * half:.1f}h-{2 * half:.1f}z"
-        if mark.mark == "s"
-        else f"l{2 * half:.1f} {2 * half:.1f}m0 -{2 * half:.1f}l-{2 * half:.1f} {2 * half:.1f}"
-    )
+    shape = _outline(mark, half)
     places = zip(frame.across(mark.x).tolist(), frame.down(mark.y).tolist(), strict=True)
     path = "".join(f"M{a:.1f} {b:.1f}{shape}" for a, b in places if b == b)
-    return parts + f'<path d="{path}" {_fill(mark) if mark.mark == "s" else _stroke(mark, 1.2)}/>'
+    return f'{parts}<path d="{path}" {_paint(mark)}/>'
+
+
+def _outline(mark: Points, half: float) -> str:
+    """Return the outline of a point, from its centre."""
+    if mark.mark == "o":
+        arc = f"a{half:.1f} {half:.1f} 0 1 0"
+        return f"m-{half:.1f} 0{arc} {2 * half:.1f} 0{arc} -{2 * half:.1f} 0z"
+    tips, inner, turn = _SHAPES[mark.mark]
+    angle = np.radians(turn + np.arange(0.0, 360.0, 180.0 / tips if inner else 360.0 / tips))
+    radius = 1.25 * half * np.resize([1.0, inner] if inner else [1.0], angle.size)
+    x, y = (0.7 if mark.mark == "d" else 1.0) * radius * np.sin(angle), -radius * np.cos(angle)
+    steps = zip(np.diff(x, prepend=0.0).tolist(), np.diff(y, prepend=0.0).tolist(), strict=True)
+    return "".join(f"{'l' if i else 'm'}{a:.1f} {b:.1f}" for i, (a, b) in enumerate(steps)) + "z"
+
+
+def _paint(mark: Points) -> str:
+    edge = f'stroke="{_named(mark.colour)}"'
+    return f'fill="{_named(mark.face)}" {edge}' if mark.face else _fill(mark)
 
 
 def _dots(frame: Frame, mark: Mark, x: FloatArray, y: FloatArray, half: float) -> str:
@@ -299,7 +419,7 @@ def _dots(frame: Frame, mark: Mark, x: FloatArray, y: FloatArray, half: float) -
     places = zip(frame.across(x).tolist(), frame.down(y).tolist(), strict=True)
     path = "".join(f"M{a:.1f} {b:.1f}h0" for a, b in places if b == b)
     thick = f'stroke-width="{2 * half:.1f}" stroke-linecap="round"'
-    return f'<path d="{path}" fill="none" stroke="{_colour(mark)}" {thick}/>'
+    return f'<path d="{path}" fill="none" stroke="{_named(mark.colour)}" {thick}/>'
 
 
 def _held(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

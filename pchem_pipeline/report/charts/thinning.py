@@ -13,14 +13,14 @@ def thinned(x: Values, y: Values, columns: int) -> tuple[Values, Values]:
     """Return a curve with the least and the largest value of each of so many columns of the axis.
 
     It looks the same where it is drawn that wide or narrower; curves of up to two points a column are
-    returned as they are. Gaps (NaN) that fill a column stay.
+    returned as they are, also those that do not go from left to right. Gaps (NaN) that fill a column stay.
 
     Args:
-        x: places in rising order, (n,).
+        x: places, (n,).
         y: values, (n,).
         columns: number of them.
     """
-    if x.size <= 2 * columns:
+    if x.size <= 2 * columns or np.any(np.diff(x) < 0):
         return x, y
     starts = np.unique(np.linspace(0, x.size, columns + 1).astype(np.int64)[:-1])
     ends = np.append(starts[1:], x.size)

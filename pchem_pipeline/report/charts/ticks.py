@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,10 +22,10 @@ def ticks(axis: Axis, low: float, high: float, most: int = 6) -> Ticks:
     if axis.ticks:
         found = [(place, without_formulas(text)) for place, text in axis.ticks]
         return [each for each in found if low <= each[0] <= high]
-    return _powers(low, high, most) if axis.log else _steps(low, high, most, whole=axis.whole)
+    return _powers(low, high, most) if axis.log else ticks_between(low, high, most, whole=axis.whole)
 
 
-def _steps(low: float, high: float, most: int, *, whole: bool) -> Ticks:
+def ticks_between(low: float, high: float, most: int, *, whole: bool = False) -> Ticks:
     """Return multiples of 1, 2 or 5 times a power of ten."""
     rough = (high - low) / most
     power = math.floor(math.log10(rough))
@@ -56,6 +57,8 @@ def _powers(low: float, high: float, most: int) -> Ticks:
 
 def scaled(values: ArrayLike, axis: Axis, low: float, high: float) -> NDArray[np.float64]:
     """Return where values lie along an axis, as parts of its length; what has no logarithm far below."""
+    if axis.down:
+        return 1.0 - scaled(values, replace(axis, down=False), low, high)
     values = np.asarray(values, dtype=np.float64)
     if axis.log:
         shown = np.log10(np.where(values > 0, values, np.where(np.isnan(values), np.nan, low * 1e-3)))

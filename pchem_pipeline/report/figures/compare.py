@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
-from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.checks.run_differences import FAR, MapDifference
-from pchem_pipeline.report.charts.chart import Axis, Chart, Dash, Level, Line, Panel, Span, Stack
+from pchem_pipeline.report.charts.chart import (
+    PAGE_MM,
+    Axis,
+    Chart,
+    Dash,
+    Image,
+    Level,
+    Line,
+    Panel,
+    Points,
+    Span,
+    Stack,
+    Steps,
+)
 from pchem_pipeline.report.comparison import Pair, RunFacts
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.maps import is_strip, show_map, shown_pixels
+from pchem_pipeline.report.figures.maps import image_stack, is_strip, place_of
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, colours_of, note, plain, styled
-from pchem_pipeline.report.style.wording import count, power_of_ten, short, symbol
+from pchem_pipeline.report.style.stretch import even_bar, even_edges
+from pchem_pipeline.report.style.wording import count, plain, power_of_ten, short, symbol
 
 FloatArray = NDArray[np.float64]
 
@@ -66,7 +77,7 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
         f"{pair.other.label} − {pair.one.label}, each pixel in its own standard errors. {caption}",
         alt,
         (DataTable({"difference": each.z}, {"difference": "standard errors"}),),
-        partial(draw_difference, z=each.z, n_far=each.n_far, title=title, same_data=pair.same_data),
+        difference_chart(each.z, each.n_far, title, same_data=pair.same_data),
     )
 
 
@@ -112,43 +123,33 @@ def ensemble_tables(runs: Sequence[RunFacts]) -> tuple[DataTable, ...]:
     return tuple(tables)
 
 
-@styled
-def draw_difference(look: Look, *, z: FloatArray, n_far: int, title: str, same_data: bool) -> Drawing:
-    """Draw the difference of a map of two runs in standard errors, and its histogram beside chance.
+def difference_chart(z: FloatArray, n_far: int, title: str, *, same_data: bool) -> Chart:
+    """Return the difference of a map of two runs in standard errors, and its histogram beside chance.
 
     Args:
-        look: width and colours.
         z: the difference in standard errors, (y, x).
         n_far: good pixels that moved far.
         title: what is subtracted from what.
         same_data: both are fits of the same frames, for which N(0, 1) is not what chance gives.
     """
-    ny, nx = z.shape
-    known, colours = finite(z), look.palette
+    known = finite(z)
     limit = _limit(known, _LEAST if not same_data else 0.0)
     unit, label = _unit(limit)
-    strip = is_strip(z.shape)
-    square = 0.25 <= ny / nx <= 4.0
-    map_mm = (
-        40.0 if strip else float(np.clip((look.width_mm - 24.0) * (ny / nx if square else 0.6), 26.0, 130.0))
-    )
-    figure = look.empty(map_mm + 46.0)
-    top, bottom = figure.subplots(2, 1, height_ratios=(map_mm, 28.0))
-    if strip:
-        top.axhspan(-2.0, 2.0, color=colours.band, linewidth=0)
-        top.plot(np.arange(z.size), z.ravel() / unit, "o", color=colours.blue, markersize=3)
-        top.set(xlabel="channel", ylabel=label, xlim=(-0.5, z.size - 0.5))
+    values, end = z / unit, limit / unit
+    if is_strip(z.shape):
+        marks = (
+            Span(-2.0, 2.0, colour="band"),
+            Points(np.arange(z.size), values.ravel(), size=3.0, label=label),
+        )
+        x = Axis("channel", -0.5, z.size - 0.5, whole=True)
+        top = Stack((Panel(Axis(label), marks),), x, plain(title), height_mm=40.0)
     else:
-        end = limit / unit
-        image = show_map(top, shown_pixels(look, z) / unit, z.shape, cmap=DIVERGING, vmin=-end, vmax=end)
-        bar = figure.colorbar(image, ax=top, fraction=0.05, pad=0.02, aspect=25, extend="both")
-        bar.set_label(label)
-    top.set_title(plain(title), fontsize=7.5)
+        bar = even_bar(-end, end)
+        image = Image(values, even_edges(-end, end), *place_of(z.shape), scale=DIVERGING, bar=bar, unit=label)
+        top = image_stack(image, title=plain(title))
     edge = limit if same_data else max(limit, FAR)
-    _distribution(bottom, z / unit, edge / unit, chance=not same_data)
-    bottom.set_xlabel(f"difference ({label})")
-    note(bottom, f"{count(n_far, 'good pixel')} beyond ±{FAR:g}")
-    return figure
+    note = f"{count(n_far, 'good pixel')} beyond ±{FAR:g}"
+    return Chart((top, _distribution(known / unit, edge / unit, label, note, chance=not same_data)))
 
 
 def _unit(limit: float) -> tuple[float, str]:
@@ -166,19 +167,18 @@ def _limit(known: FloatArray, least: float) -> float:
     return max(least, quantile if quantile > 0 else float(sizes.max()))
 
 
-def _distribution(axes: Axes, z: FloatArray, edge: float, *, chance: bool) -> None:
-    known, colours = finite(z), colours_of(axes)
-    edges = np.linspace(-edge, edge, 61)
-    counts = np.histogram(np.clip(known, -edge, edge), edges)[0]
-    axes.stairs(counts, edges, fill=True, color=colours.bars)
+def _distribution(known: FloatArray, edge: float, label: str, note: str, *, chance: bool) -> Stack:
+    """Return the histogram of differences, those beyond the edge in the last bins, beside N(0, 1)."""
+    counts, edges = np.histogram(np.clip(known, -edge, edge), 60, (-edge, edge))
+    marks: tuple[Steps | Line, ...] = (Steps(edges, counts, filled=True, colour="bars"),)
     highest = float(np.max(counts, initial=1))
     if chance:
         x = np.linspace(-edge, edge, 601)
         normal = known.size * (edges[1] - edges[0]) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-        axes.plot(x, normal, color=colours.blue, linewidth=0.9)
+        marks += (Line(x, normal, width=0.9),)
         highest = max(highest, float(normal.max()))
-    axes.set_yscale("log")
-    axes.set(xlim=(-edge, edge), ylim=(0.5, 5.0 * highest), ylabel="pixels")
+    panel = Panel(Axis("pixels", 0.5, 5.0 * highest, log=True), marks, note=note)
+    return Stack((panel,), Axis(f"difference ({label})", -edge, edge), height_mm=36.0)
 
 
 def ensembles_chart(tables: Sequence[DataTable]) -> Chart:

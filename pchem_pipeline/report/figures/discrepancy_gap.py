@@ -7,21 +7,30 @@ statistics, per sample; its floor is what chance alone makes of it.
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from pchem_pipeline.discrepancy.verdict import MOST_PULLS, Pull, Verdict, micronats
+from pchem_pipeline.report.charts.chart import (
+    PAGE_MM,
+    Axis,
+    Chart,
+    Level,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Shape,
+    Span,
+    Stack,
+    Words,
+)
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.style.palette import Palette
-from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, colours_of, plain, styled
-from pchem_pipeline.report.style.wording import short
+from pchem_pipeline.report.style.wording import plain, short
 
 #: The gap is shown in millionths of a nat per sample.
 MICRO = 1e6
@@ -60,7 +69,7 @@ def gap_figures(data: DiscrepancyData) -> list[Figure]:
             _GAP_CAPTION,
             f"Gap in micronats (10⁻⁶ nats) per sample: {_gap_alt(found)}.",
             tables,
-            partial(draw_gap, bars=gap_bars(found), families=families(found), floor=MICRO * found.gap.floor),
+            gap_chart(gap_bars(found), families(found), MICRO * found.gap.floor),
             PAGE_MM,
         )
     ]
@@ -85,7 +94,7 @@ def pull_figures(data: DiscrepancyData) -> list[Figure]:
             _PULLS_CAPTION,
             f"Standard deviations of chance. {_pull_text(rows)}.",
             (DataTable(columns, dict.fromkeys(("before", "after"), "standard deviations")),),
-            partial(draw_pulls, rows=rows),
+            pulls_chart(rows),
             PAGE_MM,
         )
     ]
@@ -208,7 +217,7 @@ def families(found: Verdict) -> list[tuple[str, float, float]]:
     return sorted(rows, key=lambda row: -row[1] if math.isfinite(row[1]) else 0.0)
 
 
-_ROLES = {
+_ROLES: dict[str, tuple[str, Shape]] = {
     "before": ("vermilion", "o"),
     "after": ("blue", "D"),
     "runner-up": ("orange", "s"),
@@ -216,45 +225,19 @@ _ROLES = {
 }
 
 
-def _mark(colours: Palette, role: str) -> tuple[str, str]:
-    """Return the colour and the marker of a role."""
-    hue, marker = _ROLES[role]
-    return getattr(colours, hue), marker
-
-
-@styled
-def draw_gap(
-    look: Look, *, bars: Sequence[GapBar], families: Sequence[tuple[str, float, float]], floor: float
-) -> Drawing:
-    """Draw the gap before and after against its floor, with runner-up and placebo, and by family.
+def gap_chart(bars: Sequence[GapBar], families: Sequence[tuple[str, float, float]], floor: float) -> Chart:
+    """Return the gap before and after against its floor, with runner-up and placebo, and by family.
 
     Args:
-        look: width and colours; a column stacks the panels.
         bars: of :func:`gap_bars`, at least one.
         families: of :func:`families`.
         floor: 1e-6 nats; NaN where it is not known.
     """
-    wide, parts = look.wide, families
-    heights = (14.0 + 8.0 * len(bars), 14.0 + 8.0 * len(parts))
-    if not parts:
-        figure = look.empty(12.0 + heights[0])
-        both = [figure.add_subplot()]
-    elif wide:
-        figure = look.empty(12.0 + max(heights))
-        both = list(figure.subplots(1, 2, width_ratios=(1.0, 1.0)))
-    else:
-        figure = look.empty(22.0 + sum(heights))
-        both = list(figure.subplots(2, 1, height_ratios=heights))
-    left, right = _limits(bars, parts, floor)
-    _gap_lines(both[0], bars, floor, left)
-    if parts:
-        _family_lines(both[1], parts, left)
-    for axes in both:
-        axes.set_xscale("log")
-        axes.set_xlim(left, right)
-        axes.set_xlabel("gap (micronats per sample)")
-        axes.grid(axis="x", color=look.palette.grid, linewidth=0.5)
-    return figure
+    ends = _limits(bars, families, floor)
+    stacks = [_gap_rows(bars, floor, ends)]
+    if families:
+        stacks.append(_family_rows(families, ends))
+    return Chart(tuple(stacks), (1.0,) * len(stacks), legend=(2, 2) if families else (0, 0))
 
 
 def _limits(
@@ -271,97 +254,84 @@ def _limits(
     return min(10.0 ** math.floor(math.log10(least)), top / 100.0), top
 
 
-def _gap_lines(axes: Axes, bars: Sequence[GapBar], floor: float, left: float) -> None:
-    colours = colours_of(axes)
+def _rows(labels: Sequence[str], marks: Sequence[Mark], x: Axis) -> Stack:
+    """Return marks in rows that have a text each, from top to bottom."""
+    rows = tuple((float(row), plain(label)) for row, label in enumerate(labels))
+    y = Axis("", -0.6, len(labels) - 0.5, ticks=rows, down=True)
+    return Stack((Panel(y, tuple(marks)),), x, height_mm=30.0)
+
+
+def _gap_axis(ends: tuple[float, float]) -> tuple[Axis, list[Mark]]:
+    """Return the axis of gaps, and a line at each power of ten."""
+    powers = range(math.ceil(math.log10(ends[0])) + 1, math.ceil(math.log10(ends[1])))
+    grid: list[Mark] = [Level(10.0**power, "x", colour="grid", width=0.5) for power in powers]
+    return Axis("gap (micronats per sample)", *ends, log=True), grid
+
+
+def _gap_rows(bars: Sequence[GapBar], floor: float, ends: tuple[float, float]) -> Stack:
+    x, marks = _gap_axis(ends)
+    left = ends[0]
     if math.isfinite(floor) and floor > 0:
-        axes.axvspan(left, floor, color=colours.bars, alpha=0.4, linewidth=0)
-        axes.axvline(floor, color=colours.ink, linewidth=0.9)
-        axes.text(
-            floor, 1.01, "floor", transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=6.5
-        )
-    for y, bar in enumerate(bars):
-        colour, marker = _mark(colours, bar.role)
+        marks += [
+            Span(left, floor, "x", colour="bars", alpha=0.4),
+            Level(floor, "x", colour="ink", width=0.9),
+            Words(floor, 0.93, " floor", "left", colour="ink"),
+        ]
+    for row, bar in enumerate(bars):
         if math.isfinite(bar.low) and math.isfinite(bar.high):
-            axes.plot([max(bar.low, left), max(bar.high, left)], [y, y], color=colour, linewidth=1.6)
-        _point(axes, bar.gap, y, left, colour, marker)
-    axes.set_yticks(range(len(bars)), [plain(textwrap.fill(bar.label, 24)) for bar in bars])
-    axes.set_ylim(len(bars) - 0.5, -0.6)
+            marks.append(_bar_line(row, max(bar.low, left), max(bar.high, left), _ROLES[bar.role][0], 1.6))
+        marks.append(_point(bar.gap, row, left, bar.role))
+    return _rows([bar.label for bar in bars], marks, x)
 
 
-def _family_lines(axes: Axes, parts: Sequence[tuple[str, float, float]], left: float) -> None:
-    colours = colours_of(axes)
-    for y, (_, before, after) in enumerate(parts):
+def _family_rows(parts: Sequence[tuple[str, float, float]], ends: tuple[float, float]) -> Stack:
+    x, marks = _gap_axis(ends)
+    labels = {"before": "before", "after": "after"}
+    for row, (_, before, after) in enumerate(parts):
         if math.isfinite(after) and math.isfinite(before):
-            axes.plot(
-                [max(before, left), max(after, left)], [y, y], color=colours.bars, linewidth=1.2, zorder=0
-            )
+            marks.append(_bar_line(row, max(before, ends[0]), max(after, ends[0]), "bars", 1.2))
         for value, role in ((before, "before"), (after, "after")):
             if math.isfinite(value):
-                _point(axes, value, y, left, *_mark(colours, role))
-    axes.set_yticks(range(len(parts)), [plain(textwrap.fill(words, 22)) for words, _, _ in parts])
-    axes.set_ylim(len(parts) - 0.5, -0.6)
-    colour, marker = _mark(colours, "before")
-    axes.plot([], [], marker, color=colour, label="before")
-    if any(math.isfinite(after) for _, _, after in parts):
-        colour, marker = _mark(colours, "after")
-        axes.plot([], [], marker, color=colour, label="after")
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.1)
+                label = labels.pop(role, "") if value > ends[0] else ""
+                marks.append(_point(value, row, ends[0], role, label))
+    return _rows([words for words, _, _ in parts], marks, x)
 
 
-def _point(axes: Axes, value: float, y: float, left: float, colour: str, marker: str) -> None:
-    """Draw a gap; one below the axis (a gap can come out negative by chance) is an arrow at its edge."""
+def _bar_line(row: int, low: float, high: float, colour: str, width: float) -> Line:
+    return Line(np.array([low, high]), np.array([row, row]), colour=colour, width=width)
+
+
+def _point(value: float, row: int, left: float, role: str, label: str = "") -> Points:
+    """Return a gap; one below the axis (a gap can come out negative by chance) is an arrow at its edge."""
+    colour, shape = _ROLES[role]
+    y = np.array([row])
     if value > left:
-        axes.plot(value, y, marker, color=colour, markersize=5)
-    else:
-        axes.plot(
-            left * 1.12,
-            y,
-            "<",
-            color=colour,
-            markersize=5,
-            markerfacecolor=colours_of(axes).paper,
-            clip_on=False,
-        )
+        return Points(np.array([value]), y, shape, 5.0, colour=colour, label=label)
+    return Points(np.array([left * 1.12]), y, "<", 5.0, face="paper", colour=colour)
 
 
-@styled
-def draw_pulls(look: Look, *, rows: Sequence[Pull]) -> Drawing:
-    """Draw the largest pulls before and after, in standard deviations of chance.
+def pulls_chart(rows: Sequence[Pull]) -> Chart:
+    """Return the largest pulls before and after, in standard deviations of chance.
 
     Args:
-        look: width and colours.
         rows: the statistics, the farthest first; ``after`` is NaN where nothing was added.
     """
-    colours = look.palette
-    wide = look.wide
-    labels = [textwrap.fill(row.sentence or row.statistic, 62 if wide else 26) for row in rows]
-    lines = sum(label.count("\n") + 1 for label in labels)
-    figure = look.empty(20.0 + (6.6 * len(rows) if wide else 3.2 * lines + 3.0 * len(rows)))
-    axes = figure.add_subplot()
-    axes.axvspan(-2, 2, color=colours.band, linewidth=0)
-    axes.axvline(0.0, color=colours.ink, linewidth=0.6)
-    for y, row in enumerate(rows):
-        if math.isfinite(row.after) and math.isfinite(row.before):
-            axes.plot([row.before, row.after], [y, y], color=colours.bars, linewidth=1.4, zorder=1)
-        for value, role in ((row.before, "before"), (row.after, "after")):
-            if math.isfinite(value):
-                colour, marker = _mark(colours, role)
-                axes.plot(value, y, marker, color=colour, markersize=4.5, zorder=2)
-    known = [v for row in rows for v in (row.before, row.after) if math.isfinite(v)]
-    reach = max(float(np.abs(known).max()) if known else 0.0, 6.0)
-    if reach > 12.0:
-        axes.set_xscale("symlog", linthresh=4.0)
-        ticks = [t for t in (2, 4, 10, 100, 1000, 10_000, 100_000) if t <= 1.3 * reach]
-        axes.set_xticks([*(-t for t in reversed(ticks)), 0, *ticks])
-        axes.set_xticklabels([f"{t:g}".replace("-", "−") for t in axes.get_xticks()])
-        axes.minorticks_off()
-    axes.set_xlim(-1.4 * reach, 1.4 * reach)
-    axes.set_yticks(range(len(rows)), [plain(label) for label in labels])
-    axes.set_ylim(len(rows) - 0.4, -0.6)
-    axes.set_xlabel("standard deviations of chance")
+    marks: list[Mark] = [Span(-2.0, 2.0, "x", colour="band"), Level(0.0, "x", colour="ink", width=0.6)]
+    places = np.arange(len(rows))
+    values = {role: np.array([getattr(row, role) for row in rows]) for role in ("before", "after")}
+    for row, (before, after) in enumerate(zip(*values.values(), strict=True)):
+        if math.isfinite(after) and math.isfinite(before):
+            marks.append(_bar_line(row, before, after, "bars", 1.4))
     for role, words in (("before", "plain model"), ("after", "with effects")):
-        if role == "before" or any(math.isfinite(row.after) for row in rows):
-            colour, marker = _mark(colours, role)
-            axes.plot([], [], marker, color=colour, label=words)
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.1)
-    return figure
+        known = np.isfinite(values[role])
+        if known.any():
+            colour, shape = _ROLES[role]
+            marks.append(Points(values[role][known], places[known], shape, 4.5, colour=colour, label=words))
+    known_values = np.concatenate(list(values.values()))
+    reach = max(float(np.nanmax(np.abs(known_values), initial=0.0)), 6.0)
+    x = Axis("standard deviations of chance", -1.4 * reach, 1.4 * reach)
+    if reach > 12.0:
+        steps = [t for t in (2, 4, 10, 100, 1000, 10_000, 100_000) if t <= 1.3 * reach]
+        signed = [*(-t for t in reversed(steps)), 0, *steps]
+        x = replace(x, linear_to=4.0, ticks=tuple((float(t), f"{t:g}".replace("-", "−")) for t in signed))
+    return Chart((_rows([row.sentence or row.statistic for row in rows], marks, x),), legend=(2, 2))

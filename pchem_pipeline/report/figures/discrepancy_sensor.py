@@ -2,27 +2,37 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.where import PAIRS, map_of
 from pchem_pipeline.effects.framework.evidence import SCORES
 from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.report.charts.chart import (
+    PAGE_MM,
+    Axis,
+    Chart,
+    Image,
+    Level,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Shape,
+    Span,
+    Stack,
+    Steps,
+)
 from pchem_pipeline.report.data import CHANNELS, DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.maps import is_strip
+from pchem_pipeline.report.figures.maps import image_stack, is_strip, place_of
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, colours_of, note, styled
+from pchem_pipeline.report.style.stretch import even_bar, even_edges
 from pchem_pipeline.report.style.wording import count
 
 FloatArray = NDArray[np.float64]
@@ -94,7 +104,7 @@ def sensor_figures(data: DiscrepancyData) -> list[Figure]:
             _MAPS_CAPTION,
             "Maps in standard deviations of chance. " + "; ".join(words).replace("-", "−") + ".",
             (table,),
-            partial(draw_sensor, maps=maps, flagged=flagged, origin=origin),
+            sensor_chart(maps, flagged, origin),
             PAGE_MM,
         )
     ]
@@ -115,7 +125,7 @@ def line_figures(data: DiscrepancyData) -> list[Figure]:
             _LINES_CAPTION,
             "Scatter of the means over the frames, relative to chance (1). " + "; ".join(words) + ".",
             tables,
-            partial(draw_lines, arrays=_line_arrays(data.arrays), origin=origin),
+            lines_chart(data.arrays, origin),
             PAGE_MM,
         )
     ]
@@ -123,11 +133,6 @@ def line_figures(data: DiscrepancyData) -> list[Figure]:
 
 def _lines(arrays: Mapping[str, NDArray[Any]]) -> list[str]:
     return [line for line in LINE_WORDS if arrays.get(f"{line}_rms", np.empty(0)).size]
-
-
-def _line_arrays(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    names = [f"{line}_{what}" for line in _lines(arrays) for what in ("rms", "image")]
-    return {name: arrays[name] for name in names if name in arrays}
 
 
 def line_tables(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int]) -> tuple[DataTable, ...]:
@@ -245,90 +250,44 @@ def _pixel_map(words: str, values: NDArray[Any], region: Region | None = None) -
     return PixelMap(words, z, float(max(departures)), outliers, region)
 
 
-@styled
-def draw_sensor(
-    look: Look,
-    *,
-    maps: Sequence[PixelMap],
-    flagged: Sequence[tuple[int, int]] = (),
-    origin: tuple[int, int] = (0, 0),
-) -> Drawing:
-    """Draw maps of what each pixel shows, each over its histogram beside that of chance.
+def sensor_chart(
+    maps: Sequence[PixelMap], flagged: Sequence[tuple[int, int]] = (), origin: tuple[int, int] = (0, 0)
+) -> Chart:
+    """Return maps of what each pixel shows, and below their histograms beside that of chance.
 
     Args:
-        look: width and colours; a column stacks the maps.
         maps: as :func:`largest_maps` returns them.
         flagged: pixels (y, x) of the sensor that the verdict points to; they are ringed.
         origin: row and column of the sensor of the maps' first pixel.
     """
-    shown = list(maps)
-    beside = len(shown) if look.wide else 1
-    stacked = -(-len(shown) // beside)
-    ny, nx = shown[0].z.shape
-    panel_mm = look.width_mm / beside - 14.0
-    ratio = ny / nx
-    square = 0.25 <= ratio <= 4.0
-    map_mm = float(np.clip(panel_mm * (ratio if square else 0.5), 22.0, 1.4 * panel_mm))
-    figure = look.empty(stacked * (map_mm + 36.0))
-    grid = figure.add_gridspec(2 * stacked, beside, height_ratios=[map_mm, 20.0] * stacked)
-    for i, each in enumerate(shown):
-        row, column = divmod(i, beside)
-        top = figure.add_subplot(grid[2 * row, column])
-        bottom = figure.add_subplot(grid[2 * row + 1, column])
-        limit = (
-            float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
-            if each.far > 0
-            else _LEAST
-        )
-        if is_strip(each.z.shape):
-            _draw_line(top, each)
-        else:
-            _draw_map(figure, top, each, limit, flagged, origin)
-        _draw_distribution(bottom, each, _inside(each, origin))
-        top.set_title(textwrap.fill(each.title, 26), fontsize=7.0)
-    return figure
+    shown = [
+        _channels(each) if is_strip(each.z.shape) else _map_stack(each, flagged, origin) for each in maps
+    ]
+    below = [_distribution(each, _inside(each, origin)) for each in maps]
+    return Chart((*shown, *below), (1.0,) * len(maps))
 
 
-def _draw_map(
-    figure: Drawing,
-    axes: Axes,
-    each: PixelMap,
-    limit: float,
-    flagged: Sequence[tuple[int, int]],
-    origin: tuple[int, int],
-) -> None:
-    colours = colours_of(axes)
+def _map_stack(each: PixelMap, flagged: Sequence[tuple[int, int]], origin: tuple[int, int]) -> Stack:
     (y0, x0), (ny, nx) = origin, each.z.shape
-    axes.set_facecolor(colours.no_value)
-    extent = (x0 - 0.5, x0 + nx - 0.5, y0 + ny - 0.5, y0 - 0.5)
-    image = axes.imshow(
-        each.z, cmap=DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest", origin="upper",
-        extent=extent, aspect="equal" if 0.25 <= ny / nx <= 4.0 else "auto",
+    limit = _LEAST
+    if each.far > 0:
+        limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
+    image = Image(
+        each.z, even_edges(-limit, limit), *place_of(each.z.shape, origin), scale=DIVERGING,
+        bar=even_bar(-limit, limit), unit="sd of chance",
     )  # fmt: skip
     inside = _inside(each, origin)
+    marks: list[Mark] = []
     if inside is not None:
-        _outline(axes, inside, origin)
+        marks.append(_outline(inside, origin))
     rings = {(y, x) for y, x in flagged if y0 <= y < y0 + ny and x0 <= x < x0 + nx}
     beyond = np.argwhere(np.abs(np.nan_to_num(each.z)) > _STANDS_OUT)
     if len(beyond) <= _MOST_RINGS:
         rings |= {(y0 + int(y), x0 + int(x)) for y, x in beyond}
     if 0 < len(rings) <= _MOST_RINGS:
         ys, xs = np.array(sorted(rings)).T
-        axes.plot(
-            xs,
-            ys,
-            "o",
-            markersize=5,
-            markerfacecolor="none",
-            markeredgecolor=colours.ink,
-            markeredgewidth=0.6,
-        )
-        axes.set(xlim=extent[:2], ylim=extent[2:])
-    axes.set(xlabel="x (pixel)", ylabel="y (pixel)")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(5, integer=True))
-    bar = figure.colorbar(image, ax=axes, fraction=0.05, pad=0.02, aspect=25, extend="both")
-    bar.set_label("sd of chance")
+        marks.append(Points(xs, ys, size=5.0, face="none", colour="ink"))
+    return image_stack(image, *marks, title=each.title)
 
 
 def _inside(each: PixelMap, origin: tuple[int, int]) -> NDArray[np.bool_] | None:
@@ -345,114 +304,96 @@ def _inside(each: PixelMap, origin: tuple[int, int]) -> NDArray[np.bool_] | None
     return region.mask((rows, columns))[y, x]
 
 
-def _outline(axes: Axes, inside: NDArray[np.bool_], origin: tuple[int, int]) -> None:
-    """Draw the edges of a set of pixels."""
+def _outline(inside: NDArray[np.bool_], origin: tuple[int, int]) -> Line:
+    """Return the edges of a set of pixels."""
     padded = np.pad(inside, 1)
-    across, down = padded[:, 1:] != padded[:, :-1], padded[1:] != padded[:-1]
     y, x = origin
-    # each edge of a pixel that parts inside from outside is a line of its own
-    lines = [[(x + j - 0.5, y + i - 1.5), (x + j - 0.5, y + i - 0.5)] for i, j in np.argwhere(across)]
-    lines += [[(x + j - 1.5, y + i - 0.5), (x + j - 0.5, y + i - 0.5)] for i, j in np.argwhere(down)]
-    axes.add_collection(LineCollection(lines, colors=colours_of(axes).ink, linewidths=1.1))
+    # each edge of a pixel that parts inside from outside is a line of its own, between gaps
+    down, across = np.nonzero(padded[:, 1:] != padded[:, :-1])
+    upright = np.stack([x + across - 0.5] * 3), np.stack([y + down - 1.5, y + down - 0.5, down * np.nan])
+    down, across = np.nonzero(padded[1:] != padded[:-1])
+    level = (
+        np.stack([x + across - 1.5, x + across - 0.5, x + across]),
+        np.stack([y + down - 0.5] * 2 + [down * np.nan]),
+    )
+    xs, ys = (np.concatenate([a.T.ravel(), b.T.ravel()]) for a, b in zip(upright, level, strict=True))
+    return Line(xs, ys, colour="ink", width=1.1)
 
 
-def _draw_line(axes: Axes, each: PixelMap) -> None:
-    """Draw a line of channels."""
-    colours = colours_of(axes)
-    z = each.z.ravel()
-    axes.axhspan(-2, 2, color=colours.bars, alpha=0.4, linewidth=0)
-    axes.plot(np.arange(z.size), z, "o", color=colours.blue, markersize=3)
-    axes.set(xlabel="channel", ylabel="standard deviations", xlim=(-0.5, z.size - 0.5))
-    axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+def _channels(each: PixelMap) -> Stack:
+    """Return a line of channels."""
+    z, label = each.z.ravel(), "standard deviations"
+    points = Points(np.arange(z.size), z, size=3.0, label=label, listed=False)
+    x = Axis("channel", -0.5, z.size - 0.5, whole=True)
+    return Stack((Panel(Axis(label), (Span(-2.0, 2.0, colour="band"), points)),), x, each.title)
 
 
-def _draw_distribution(axes: Axes, each: PixelMap, inside: NDArray[np.bool_] | None = None) -> None:
-    colours = colours_of(axes)
+def _distribution(each: PixelMap, inside: NDArray[np.bool_] | None = None) -> Stack:
     known = finite(each.z)
     edge = float(np.clip(np.abs(known).max() if known.size else 5.0, 5.0, 15.0))
-    edges = np.linspace(-edge, edge, 61)
-    axes.stairs(np.histogram(np.clip(known, -edge, edge), edges)[0], edges, fill=True, color=colours.bars)
+    counts, edges = np.histogram(np.clip(known, -edge, edge), 60, (-edge, edge))
+    marks: list[Mark] = [Steps(edges, counts, filled=True, colour="bars")]
     if inside is not None:
-        part = np.clip(finite(each.z[inside]), -edge, edge)
-        axes.stairs(np.histogram(part, edges)[0], edges, color=colours.vermilion, linewidth=0.9)
+        part = np.histogram(np.clip(finite(each.z[inside]), -edge, edge), edges)[0]
+        marks.append(Steps(edges, part, colour="vermilion", width=0.9))
     x = np.linspace(-edge, edge, 301)
     chance = known.size * (edges[1] - edges[0]) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-    axes.plot(x, chance, color=colours.blue, linewidth=0.9)
-    axes.set_yscale("log")
-    axes.set_ylim(0.5, max(3.0 * chance.max(), 3.0))
-    axes.set(xlim=(-edge, edge), xlabel="standard deviations", ylabel="pixels")
-    note(axes, f"{count(each.outliers, 'pixel')} beyond ±5")
+    marks.append(Line(x, chance, width=0.9))
+    y = Axis("pixels", 0.5, max(3.0 * float(chance.max()), 3.0), log=True)
+    panel = Panel(y, tuple(marks), note=f"{count(each.outliers, 'pixel')} beyond ±5")
+    return Stack((panel,), Axis("standard deviations", -edge, edge), height_mm=30.0)
 
 
-@styled
-def draw_lines(
-    look: Look, *, arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int] = (0, 0)
-) -> Drawing:
-    """Draw the means of rows and of columns: the first frames as a picture, and the scatter of each line.
+def lines_chart(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int] = (0, 0)) -> Chart:
+    """Return the means of rows and of columns: the first frames as a picture, and the scatter of each line.
 
     Args:
-        look: width and colours; a column stacks the panels.
         arrays: ``row_image``, ``row_rms``, ``column_image``, ``column_rms`` of group ``discrepancy``.
         origin: row and column of the sensor of the first of them.
     """
-    lines, wide = _lines(arrays), look.wide
-    columns = 3 if wide else 1
-    stacked = len(lines) if wide else 3 * len(lines)
-    figure = look.empty(stacked * (50.0 if wide else 44.0))
-    grid = figure.add_gridspec(stacked, columns)
-    for i, line in enumerate(lines):
-        places = [(i, j) if wide else (3 * i + j, 0) for j in range(3)]
+    stacks = []
+    for line in _lines(arrays):
         image, first = arrays.get(f"{line}_image"), origin[0 if line == "row" else 1]
-        for j, channel in enumerate(("readout", "charge")):
-            axes = figure.add_subplot(grid[places[j]])
+        for channel in ("readout", "charge"):
             shown = None if image is None else image[CHANNELS.index(channel)]
-            _draw_frames(figure, axes, shown, line, channel, first)
-        _draw_scatter(figure.add_subplot(grid[places[2]]), np.asarray(arrays[f"{line}_rms"]), line, first)
-    return figure
+            stacks.append(_frames(shown, line, channel, first))
+        stacks.append(_scatter(np.asarray(arrays[f"{line}_rms"]), line, first))
+    return Chart(tuple(stacks), (1.0, 1.0, 1.0))
 
 
-def _draw_frames(
-    figure: Drawing, axes: Axes, image: NDArray[Any] | None, line: str, channel: str, first: int
-) -> None:
-    colours = colours_of(axes)
-    axes.set_title(f"{channel}: means of {LINE_WORDS[line]}")
-    axes.set(xlabel="frame (the first ones examined)", ylabel=f"{'y' if line == 'row' else 'x'} (pixel)")
+def _frames(image: NDArray[Any] | None, line: str, channel: str, first: int) -> Stack:
+    """Return the means of the rows or columns of the first frames as a picture."""
+    title, axis = f"{channel}: means of {LINE_WORDS[line]}", "y (pixel)" if line == "row" else "x (pixel)"
+    x, y = Axis("frame (the first ones examined)", whole=True), Axis(axis, whole=True)
     if image is None or image.size == 0:
-        note(axes, "not kept")
-        return
-    axes.set_facecolor(colours.no_value)
-    n_frames, n_lines = image.shape
-    drawn = axes.imshow(
-        image.T,
-        extent=(-0.5, n_frames - 0.5, first + n_lines - 0.5, first - 0.5),
-        cmap=DIVERGING,
-        vmin=-_LEAST,
-        vmax=_LEAST,
-        interpolation="nearest",
-        aspect="auto",
-    )
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(5, integer=True))
-    bar = figure.colorbar(drawn, ax=axes, fraction=0.05, pad=0.02, aspect=25, extend="both")
-    bar.set_label("sd of chance")
+        return Stack((Panel(y, (), note="not kept"),), x, title, height_mm=46.0)
+    across, down = place_of(image.T.shape, (first, 0))
+    marks = (
+        Image(
+            image.T, even_edges(-_LEAST, _LEAST), across, down, scale=DIVERGING,
+            bar=even_bar(-_LEAST, _LEAST), unit="sd of chance",
+        ),
+    )  # fmt: skip
+    x = replace(x, low=across[0], high=across[1])
+    panel = Panel(replace(y, low=down[0], high=down[1], down=True), marks)
+    return Stack((panel,), x, title, height_mm=46.0)
 
 
 #: By how much an axis reaches beyond its largest point, so that a legend above covers none.
 _LEGEND_ROOM = 1.35
 
 
-def _draw_scatter(axes: Axes, rms: FloatArray, line: str, first: int) -> None:
-    colours = colours_of(axes)
-    for channel, colour, marker in (("readout", colours.vermilion, "o"), ("charge", colours.blue, "s")):
+def _scatter(rms: FloatArray, line: str, first: int) -> Stack:
+    marks: list[Mark] = []
+    shapes: tuple[tuple[str, str, Shape], ...] = (("readout", "vermilion", "o"), ("charge", "blue", "s"))
+    for channel, colour, shape in shapes:
         values = rms[CHANNELS.index(channel)]
-        axes.plot(first + np.arange(values.size), values, marker, markersize=2.2, color=colour, label=channel)
-    axes.axhline(1.0, color=colours.ink, linewidth=0.8)
-    top = float(np.nanmax(rms)) if np.isfinite(rms).any() else 1.0
-    low = float(np.nanmin(rms)) if np.isfinite(rms).any() else 1.0
-    bottom = min(0.85, low - 0.05)
-    axes.set_ylim(bottom, max(1.25, bottom + _LEGEND_ROOM * (top - bottom)))
-    axes.set(
-        xlabel=f"{'y' if line == 'row' else 'x'} (pixel)", ylabel="rms / rms of chance",
-        title=f"scatter of the {LINE_WORDS[line]}",
-    )  # fmt: skip
-    axes.legend(loc="upper right", ncols=2)
+        places = first + np.arange(values.size)
+        marks.append(Points(places, values, shape, 2.2, colour=colour, label=channel))
+    marks.append(Level(1.0, colour="ink", width=0.8))
+    known = finite(rms) if np.isfinite(rms).any() else np.ones(1)
+    bottom, high = min(0.85, float(known.min()) - 0.05), float(known.max())
+    y = Axis("rms / rms of chance", bottom, max(1.25, bottom + _LEGEND_ROOM * (high - bottom)))
+    panel = Panel(y, tuple(marks), legend="upper right", columns=2)
+    x = Axis(f"{'y' if line == 'row' else 'x'} (pixel)", whole=True)
+    return Stack((panel,), x, f"scatter of the {LINE_WORDS[line]}", height_mm=46.0)

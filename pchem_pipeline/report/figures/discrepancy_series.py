@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.report.charts.chart import (
+    PAGE_MM,
     Axis,
     Band,
     Chart,
@@ -26,7 +27,6 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import CHANNELS, DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.style.style import PAGE_MM
 from pchem_pipeline.report.style.wording import count, short
 
 FloatArray = NDArray[np.float64]

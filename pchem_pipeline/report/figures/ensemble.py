@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.report.charts.chart import (
+    PAGE_MM,
     Axis,
     Band,
     Bars,
@@ -25,7 +26,6 @@ from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.figures.pixels import shown_bins
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.style import PAGE_MM
 from pchem_pipeline.report.style.wording import power_of_ten, scientific, short
 
 FloatArray = NDArray[np.float64]

@@ -1,24 +1,24 @@
-"""A figure: its words, its data as tables, and what draws it.
+"""A figure: its words, its data as tables, and the chart that is drawn of them.
 
 The tables are made from plain arrays before anything is drawn; CSV files beside figures for papers hold them
-(:func:`csv_text`). Curves, bars and points are a ``Chart``, which matplotlib draws on paper and the
-page itself; maps are drawn by functions.
+(:func:`csv_text`).
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.report.charts.chart import Chart
-from pchem_pipeline.report.charts.on_paper import draw_chart
-from pchem_pipeline.report.style.style import COLUMN_MM, Drawing, Look
+from pchem_pipeline.report.charts.chart import COLUMN_MM, Chart
+
+if TYPE_CHECKING:
+    from pchem_pipeline.report.style.style import Drawing, Look
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Figure:
         caption: what is drawn and how to read it.
         alt: what a reader who does not see it should know, with the numbers.
         tables: its data, the main part first.
-        content: a chart, or what draws the figure in a look; another process can be sent either.
+        chart: what is drawn.
         width_mm: width at which it is saved.
     """
 
@@ -95,17 +95,15 @@ class Figure:
     caption: str
     alt: str
     tables: tuple[DataTable, ...]
-    content: Chart | Callable[[Look], Drawing]
+    chart: Chart
     width_mm: float = COLUMN_MM
-
-    @property
-    def chart(self) -> Chart | None:
-        """The chart; None of a figure that a function draws."""
-        return self.content if isinstance(self.content, Chart) else None
 
     def draw(self, look: Look) -> Drawing:
         """Draw it with matplotlib."""
-        return draw_chart(look, self.content) if isinstance(self.content, Chart) else self.content(look)
+        # takes as long as all else that a small report imports
+        from pchem_pipeline.report.charts.on_paper import draw_chart
+
+        return draw_chart(look, self.chart)
 
 
 def csv_text(table: DataTable) -> str:

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Line, Panel, Points, Stack
+from pchem_pipeline.report.charts.chart import PAGE_MM, Axis, Band, Chart, Line, Panel, Points, Stack
 from pchem_pipeline.report.comparison import Against, HistoryRow
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.style.style import PAGE_MM
 from pchem_pipeline.report.style.wording import short, symbol
 
 _SHOWN = ("quanta_exposure", "charge_rate", "dark_current", "conversion_gain", "bias", "read_noise_e")

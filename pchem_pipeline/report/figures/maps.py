@@ -2,38 +2,56 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping, Sequence
-from functools import partial
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm, ListedColormap
-from matplotlib.image import AxesImage
-from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.maps.ordered import Ordered
+from pchem_pipeline.report.charts.chart import (
+    LONGEST,
+    Axis,
+    Bars,
+    Chart,
+    Image,
+    Level,
+    Mark,
+    Panel,
+    Points,
+    Span,
+    Stack,
+    Steps,
+    Words,
+    y_window,
+)
 from pchem_pipeline.report.data import FEW_CHANNELS, LINE_MAPS, MAP_NAMES, ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.ranges import DisplayRange, finite, histogram_edges, robust_range
-from pchem_pipeline.report.style.stretch import stretch_map
-from pchem_pipeline.report.style.style import Drawing, Look, colours_of, inches, look_of, note, plain, styled
-from pchem_pipeline.report.style.wording import count, measured, percent, short, stored_unit, symbol
+from pchem_pipeline.report.style.ranges import DisplayRange, histogram_edges, robust_range
+from pchem_pipeline.report.style.stretch import map_colours
+from pchem_pipeline.report.style.wording import count, measured, percent, plain, short, stored_unit, symbol
 
 FloatArray = NDArray[np.float64]
 
 #: Sensors with so few rows or columns are drawn as points, not as an image.
 _STRIP = 2
-#: Images longer than this ratio are stretched to fit instead of keeping square pixels.
-_LONGEST_RATIO = 4.0
-#: Height of an image over the width of the figure, at most.
-_TALLEST = 1.6
-#: Rows or columns of an image up to which a vector file keeps each pixel.
-_MOST_KEPT = 800
+#: Most channels of which each has a tick.
+_FEW_TICKS = 12
+#: Colours of the reasons of a fit status: a good fit, each reason in its order, not fitted yet.
+_STATUS_COLOURS = (
+    "band",
+    "vermilion",
+    "ink",
+    "orange",
+    "purple",
+    "blue",
+    "sky",
+    "green",
+    "yellow",
+    "#8C8C8C",
+)
 
 _CAPTIONS = {
     "charge_rate": "Charge rate: quanta exposure over integration time; what made the charge is not said.",
@@ -64,9 +82,9 @@ def map_figures(data: ReportData, settings: ReportSettings) -> list[Figure]:
 
 
 def _map(data: ReportData, name: str, settings: ReportSettings) -> Figure:
-    values = data.maps[name]
+    values, known = data.maps[name], data.ordered(name)
     strip = is_strip(values.shape)
-    tables = map_tables(values, name, data.maps.get(f"{name}_stderr"), settings.histogram_bins)
+    tables = map_tables(values, name, data.maps.get(f"{name}_stderr"), settings.histogram_bins, known)
     return Figure(
         f"map_{name}",
         "summary" if name == "read_noise_e" else "maps",
@@ -74,7 +92,7 @@ def _map(data: ReportData, name: str, settings: ReportSettings) -> Figure:
         _CAPTIONS[name],
         _map_alt(data, name, "Values of the channels" if strip else "Histogram and map"),
         tables,
-        partial(draw_map, tables=tables, name=name, stretch=settings.map_stretch),
+        map_chart(tables, name, settings.map_stretch, known),
     )
 
 
@@ -95,10 +113,9 @@ def read_noise_figures(data: ReportData, settings: ReportSettings) -> list[Figur
     """Return the histogram of the read noise; a line of few channels is shown with the maps."""
     if not data.has_values("read_noise_e") or data.few_channels:
         return []
-    values = data.maps["read_noise_e"]
-    known = finite(values)
-    below = percent(float((known < 0.4).sum()), known.size)
-    bins = histogram_table(values, "read_noise_e", settings.histogram_bins)
+    known = data.ordered("read_noise_e")
+    below = percent(known.n_below(0.4), known.size)
+    bins = histogram_table(known, "read_noise_e", settings.histogram_bins)
     return [
         Figure(
             "read_noise_histogram",
@@ -108,7 +125,7 @@ def read_noise_figures(data: ReportData, settings: ReportSettings) -> list[Figur
             _map_alt(data, "read_noise_e", "Histogram")
             + f" {below} of the {data.noun}s with a value lie below 0.4 e⁻.",
             (bins,),
-            partial(draw_read_noise, values=values, bins=bins),
+            read_noise_chart(known, bins),
         )
     ]
 
@@ -130,13 +147,17 @@ def status_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             _STATUS_CAPTION,
             "Map of the fit status. " + "; ".join(parts) + ".",
             (DataTable({"fit_status": status}), *([DataTable(reasons, part="reasons")] if rows else [])),
-            partial(draw_status, status=status, rows=rows, unfitted=data.unfitted),
+            status_chart(status, rows, data.unfitted),
         )
     ]
 
 
 def map_tables(
-    values: NDArray[Any], name: str, stderr: NDArray[Any] | None, bins: int
+    values: NDArray[Any],
+    name: str,
+    stderr: NDArray[Any] | None,
+    bins: int,
+    known: Ordered | None = None,
 ) -> tuple[DataTable, ...]:
     """Return a map with its standard errors, and its histogram where one is drawn.
 
@@ -145,17 +166,19 @@ def map_tables(
         name: name of the map in the store, e.g. ``"dark_current"``.
         stderr: standard errors (y, x).
         bins: largest number of bins.
+        known: the values in their order; None: they are sorted.
     """
     unit = stored_unit(name)
     columns = {name: values} if stderr is None else {name: values, "standard error": stderr}
     table = DataTable(columns, dict.fromkeys(columns, unit))
+    known = known or Ordered.of(values)
     if not is_strip(values.shape):
-        return table, histogram_table(values, name, bins, "histogram")
-    many = finite(values).size >= FEW_CHANNELS
-    return (table, histogram_table(values, name, min(bins, 64), "histogram")) if many else (table,)
+        return table, histogram_table(known, name, bins, "histogram")
+    many = known.size >= FEW_CHANNELS
+    return (table, histogram_table(known, name, min(bins, 64), "histogram")) if many else (table,)
 
 
-def histogram_table(values: NDArray[Any], name: str, most: int, part: str = "") -> DataTable:
+def histogram_table(values: NDArray[Any] | Ordered, name: str, most: int, part: str = "") -> DataTable:
     """Return the histogram of a map as it is drawn: pixels in each bin, and its ends.
 
     Args:
@@ -176,182 +199,105 @@ def is_strip(shape: tuple[int, ...]) -> bool:
     return min(shape) < _STRIP
 
 
-@styled
-def draw_map(
-    look: Look, *, tables: Sequence[DataTable], name: str, stretch: Literal["beta", "linear"] = "beta"
-) -> Drawing:
-    """Draw the histogram of a map on top and the map below (Appendix C; fig:iD_map to fig:sigmaR_map).
+def map_chart(
+    tables: Sequence[DataTable],
+    name: str,
+    stretch: Literal["beta", "linear"] = "beta",
+    known: Ordered | None = None,
+) -> Chart:
+    """Return the histogram of a map on top and the map below (Appendix C; fig:iD_map to fig:sigmaR_map).
 
     A sensor of one row or column (ready-made histograms) is drawn as points with error bars.
 
     Args:
-        look: width and colours.
         tables: of :func:`map_tables`.
         name: name of the map in the store.
         stretch: colours by rank (``beta``) or by value (``linear``).
+        known: the values in their order; None: they are sorted.
     """
     full = tables[0][name]
     sign, words, unit = symbol(name)
     label = f"{words} {sign} ({unit})"
     if is_strip(full.shape):
-        return _draw_channels(look, tables, full.ravel().astype(np.float64), label)
-    map_height = _map_height(full.shape, look.width_mm - 24.0)
-    figure = look.empty(34.0 + map_height)
-    top, bottom = figure.subplots(2, 1, height_ratios=(30.0, map_height))
-    known = Ordered.of(full)
-    _draw_histogram(top, known, tables[1], label)
-    _draw_image(figure, bottom, full, known, f"{sign} ({unit})", stretch)
-    return figure
+        return _channels_chart(tables, full.ravel().astype(np.float64), label)
+    known = known or Ordered.of(full)
+    edges, bar = map_colours(known, stretch)
+    keys = (("no_value", f"no value: {count(known.n_missing, 'pixel')}"),) if known.n_missing else ()
+    image = Image(full, edges, *place_of(full.shape), bar=bar, unit=f"{sign} ({unit})")
+    return Chart((_histogram_stack(known, tables[1], label), image_stack(image)), keys=keys)
 
 
-def _map_height(shape: tuple[int, ...], width_mm: float) -> float:
-    ratio = shape[0] / shape[1]
-    if ratio > _LONGEST_RATIO or ratio < 1.0 / _LONGEST_RATIO:
-        ratio = 1.0
-    return float(np.clip(width_mm * ratio, 28.0, _TALLEST * width_mm)) + 10.0
+def place_of(
+    shape: tuple[int, ...], origin: tuple[int, int] = (0, 0)
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the ends of a map on the axes x and y.
+
+    Args:
+        shape: rows and columns.
+        origin: row and column of its first pixel.
+    """
+    y, x = ((first - 0.5, first + n - 0.5) for first, n in zip(origin, shape, strict=True))
+    return x, y
 
 
-def _draw_histogram(axes: Axes, known: Ordered, bins: DataTable, label: str) -> DisplayRange:
-    """Draw the histogram of a map with its median; return the range drawn."""
-    colours = colours_of(axes)
+def image_stack(image: Image, *others: Mark, title: str = "") -> Stack:
+    """Return a map of the sensor, square pixels unless it is very long, with other marks over it."""
+    rows, columns = image.values.shape
+    x, y = Axis("x (pixel)", *image.x, whole=True), Axis("y (pixel)", *image.y, whole=True, down=True)
+    square = 1.0 / LONGEST <= rows / columns <= LONGEST
+    return Stack((Panel(y, (image, *others), square=square),), x, title, height_mm=76.0)
+
+
+def _histogram_stack(
+    known: Ordered, bins: DataTable, label: str, *marks: Mark, height_mm: float = 34.0, note: str = ""
+) -> Stack:
+    """Return the histogram of a map with its median, and other marks over it."""
     shown = robust_range(known)
-    axes.set(xlabel=label, ylabel="pixels")
-    if known.size == 0:
-        axes.set_yticks([])
-        note(axes, "no pixel has a value")
-        return shown
-    if shown.logarithmic:
-        axes.set_xscale("log")
-    low, high, counts = (bins[name] for name in bins.columns)
-    axes.stairs(counts, [*low, high[-1]], fill=True, color=colours.bars)
-    axes.axvline(known.median, color=colours.blue, linewidth=1.0)
-    axes.set_xlim(shown.low, shown.high)
-    if not shown.logarithmic:
-        axes.xaxis.set_major_locator(MaxNLocator(5))
-    axes.set_title(shown.remark(), fontsize=6.5, color=colours.faint)
-    return shown
+    left, right, counts = (bins[name] for name in bins.columns)
+    x = Axis(label, shown.low, shown.high, log=shown.logarithmic)
+    edges = np.append(left, right[-1])
+    outline = Steps(edges, counts, filled=True, colour="bars", label="pixels", listed=False)
+    median = (Level(known.median, "x", width=1.0, label="median", listed=False),) if known.size else ()
+    words = note or shown.remark() if known.size else "no pixel has a value"
+    # room for the words above the bars
+    high = (1.3 if words else 1.05) * max(float(counts.max()), 1.0)
+    panel = Panel(Axis("pixels", 0.0, high), (outline, *median, *marks), note=words)
+    return Stack((panel,), x, height_mm=height_mm)
 
 
-def _draw_image(
-    figure: Drawing,
-    axes: Axes,
-    values: NDArray[Any],
-    known: Ordered,
-    label: str,
-    stretch: Literal["beta", "linear"],
-) -> None:
-    some = shown_pixels(figure.look, values)
-    drawn = stretch_map(some, stretch, known)
-    image = show_map(axes, drawn.colour, values.shape, vmin=0.0, vmax=1.0)
-    if known.n_missing:
-        words = f"no value: {count(known.n_missing, 'pixel')}"
-        patch = Patch(facecolor=figure.look.palette.no_value, edgecolor="#888888", label=words)
-        figure.legend(handles=[patch], loc="outside lower left")
-    if drawn.levels:
-        bar = figure.colorbar(image, ax=axes, ticks=list(drawn.levels), fraction=0.06, pad=0.02, aspect=25)
-        bar.ax.set_yticklabels(list(drawn.labels))
-        bar.ax.minorticks_off()
-        bar.set_label(label)
-
-
-def shown_pixels(look: Look, values: NDArray[Any], *, panels: int = 1) -> NDArray[Any]:
-    """Return the rows and columns of a map that an image can show: every k-th where there are more.
-
-    Args:
-        look: of the figure.
-        values: the map, (y, x).
-        panels: side by side in the figure.
-    """
-    step = _step(look, values.shape, panels)
-    return values[::step, ::step]
-
-
-def _step(look: Look, shape: tuple[int, ...], panels: int) -> int:
-    """Return k; it is odd, so that what differs from one row or column to the next is seen."""
-    dots = inches(look.width_mm) * look.dpi / panels
-    step = max(1, int(shape[1] / dots), int(shape[0] / (_TALLEST * dots)))
-    return step if step % 2 else step - 1
-
-
-def show_map(
-    axes: Axes, colour: NDArray[Any], shape: tuple[int, ...], *, panels: int = 1, **options: Any
-) -> AxesImage:
-    """Draw an image of the pixels, square unless the sensor is very long; NaN has the colour of no value.
-
-    Args:
-        axes: where.
-        colour: what the colour stands for, (y, x), of the pixels of :func:`shown_pixels`.
-        shape: of the sensor.
-        panels: side by side in the figure.
-        options: of matplotlib's ``imshow``.
-    """
-    ny, nx = shape
-    square = 1.0 / _LONGEST_RATIO <= ny / nx <= _LONGEST_RATIO
-    axes.set_facecolor(colours_of(axes).no_value)
-    # a vector file keeps the pixels as they are, but for more of them than it can show
-    kept = "none" if max(ny, nx) <= _MOST_KEPT else "nearest"
-    step = _step(look_of(axes), shape, panels)
-    bottom, right = (step * n - 0.5 for n in colour.shape)
-    image = axes.imshow(
-        colour,
-        origin="upper",
-        interpolation=kept,
-        aspect="equal" if square else "auto",
-        extent=(-0.5, right, bottom, -0.5),
-        **options,
-    )
-    axes.set(xlim=(-0.5, nx - 0.5), ylim=(ny - 0.5, -0.5))
-    image.set_cmap(image.get_cmap().with_extremes(bad=colours_of(axes).no_value))
-    axes.set(xlabel="x (pixel)", ylabel="y (pixel)")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(6, integer=True))
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(True)
-    return image
-
-
-def _draw_channels(look: Look, tables: Sequence[DataTable], values: FloatArray, label: str) -> Drawing:
-    """Draw a line of channels as points with error bars, and their histogram if they are many."""
-    many, colours = len(tables) > 1, look.palette
-    stderr = tables[0]["standard error"].ravel() if "standard error" in tables[0] else None
-    figure = look.empty(92.0 if many else 52.0)
-    if many:
-        top, axes = figure.subplots(2, 1, height_ratios=(1.0, 1.4))
-        _draw_histogram(top, Ordered.of(values), tables[1], label)
-    else:
-        axes = figure.add_subplot()
-    known = np.isfinite(values)
-    channel = np.arange(values.size)
-    shown = robust_range(values)
-    if shown.logarithmic:
-        axes.set_yscale("log")
-    inside = known & (values >= shown.low) & (values <= shown.high)
+def _channels_chart(tables: Sequence[DataTable], values: FloatArray, label: str) -> Chart:
+    """Return a line of channels as points with error bars, and their histogram if they are many."""
+    many, shown = len(tables) > 1, robust_range(values)
+    stderr = tables[0].get("standard error")
+    inside = np.isfinite(values) & (values >= shown.low) & (values <= shown.high)
     errors = None
     if stderr is not None and not shown.logarithmic:
-        errors = np.nan_to_num(stderr[inside], nan=0.0, posinf=0.0)
-    size, cap = (1.5, 0) if many else (3, 2)
-    points = {"fmt": "o", "markersize": size, "capsize": cap, "elinewidth": 0.8, "color": colours.blue}
-    axes.errorbar(channel[inside], values[inside], yerr=errors, **points)
-    axes.set(xlabel="channel", ylabel=label)
-    _channel_axis(axes, values.size)
+        errors = np.tile(np.nan_to_num(stderr.ravel()[inside], nan=0.0, posinf=0.0), (2, 1))
+    size, cap = (1.5, 0.0) if many else (3.0, 2.0)
+    channels = np.arange(values.size)
+    points = Points(
+        channels[inside], values[inside], size=size, error=errors, cap=cap, label=label, listed=False
+    )
+    y = Axis(label, log=shown.logarithmic)
     if many or shown.n_outside:
-        axes.set_ylim(*_padded(shown))
-    missing = channel[~known]
+        low, high = _padded(shown)
+        y = replace(y, low=low, high=high)
+    missing, remark = channels[~np.isfinite(values)], shown.remark()
+    marks: tuple[Mark, ...] = (points,)
     if missing.size:
-        axes.plot(missing, np.full(missing.size, 0.03), "x", color=colours.vermilion, markersize=4,
-                  transform=axes.get_xaxis_transform())  # fmt: skip
-    if shown.remark():
-        cross = " (×)" if missing.size else ""
-        note(axes, shown.remark() + cross)
-    return figure
+        low, high = y_window(Panel(y, marks))
+        bottom = low * (high / low) ** 0.03 if y.log else low + 0.03 * (high - low)
+        crosses = Points(missing, np.full(missing.size, bottom), mark="x", size=4.0, colour="vermilion")
+        marks, remark, y = (points, crosses), f"{remark} (×)", replace(y, low=low, high=high)
+    stack = Stack((Panel(y, marks, note=remark),), _channel_axis(values.size), height_mm=52.0)
+    if not many:
+        return Chart((stack,))
+    return Chart((_histogram_stack(Ordered.of(values), tables[1], label, height_mm=40.0), stack))
 
 
-def _channel_axis(axes: Axes, n_channels: int) -> None:
-    axes.set_xlim(-0.5, n_channels - 0.5)
-    if n_channels <= 12:
-        axes.set_xticks(np.arange(n_channels))
-    else:
-        axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+def _channel_axis(n_channels: int) -> Axis:
+    ticks = tuple((float(i), str(i)) for i in range(n_channels)) if n_channels <= _FEW_TICKS else ()
+    return Axis("channel", -0.5, n_channels - 0.5, whole=True, ticks=ticks)
 
 
 def _padded(shown: DisplayRange) -> tuple[float, float]:
@@ -361,42 +307,30 @@ def _padded(shown: DisplayRange) -> tuple[float, float]:
     return shown.low - margin, shown.high + margin
 
 
-@styled
-def draw_read_noise(look: Look, *, values: NDArray[Any], bins: DataTable) -> Drawing:
-    """Draw the histogram of the read noise with its median marked (fig:sigma_r_dist).
+def read_noise_chart(values: NDArray[Any] | Ordered, bins: DataTable) -> Chart:
+    """Return the histogram of the read noise with its median marked (fig:sigma_r_dist).
 
     Args:
-        look: width and colours.
-        values: map of sigma_e-, e-, NaN where there is no value.
+        values: map of sigma_e-, e-, NaN where there is no value, or its values in their order.
         bins: its histogram, of :func:`histogram_table`.
     """
-    figure, colours = look.empty(56.0), look.palette
-    axes = figure.add_subplot()
     sign, words, unit = symbol("read_noise_e")
     known = Ordered.of(values)
-    shown = _draw_histogram(axes, known, bins, f"{words} {sign} ({unit})")
-    axes.set_ylim(0.0, 1.1 * axes.get_ylim()[1])
+    shown, note = robust_range(known), ""
+    marks: list[Mark] = []
     if known.size:
-        median = f"median {short(known.median)} {unit}"
-        axes.set_title("; ".join(filter(None, (median, shown.remark()))), fontsize=6.5, color=colours.faint)
-    if known.size and shown.low < 0.5 < shown.high:
-        axes.axvline(0.5, color=colours.vermilion, linewidth=0.9, linestyle=":")
-        axes.text(
-            0.5, 0.03, " 0.5 e⁻", color=colours.vermilion, fontsize=6.5, transform=axes.get_xaxis_transform()
-        )
+        note = "; ".join(filter(None, (f"median {short(known.median)} {unit}", shown.remark())))
     if known.size > 1 and not shown.logarithmic:
         low, high = known.quantiles([0.05, 0.95]).tolist()
-        axes.axvspan(low, high, color=colours.sky, alpha=0.18, linewidth=0, zorder=0)
-        axes.text(
-            low,
-            0.98,
-            "5–95 %",
-            fontsize=6.5,
-            va="top",
-            transform=axes.get_xaxis_transform(),
-            color=colours.faint,
-        )
-    return figure
+        marks += [
+            Span(low, high, "x", colour="sky", alpha=0.18),
+            Words(low, 0.76, "5–95 %", "left", colour="faint"),
+        ]
+    if known.size and shown.low < 0.5 < shown.high:
+        limit = Level(0.5, "x", colour="vermilion", width=0.9, dash=":")
+        marks += [limit, Words(0.5, 0.03, " 0.5 e⁻", "left", colour="vermilion")]
+    stack = _histogram_stack(known, bins, f"{words} {sign} ({unit})", *marks, height_mm=56.0, note=note)
+    return Chart((stack,))
 
 
 def status_counts(fit_status: NDArray[Any], words: Mapping[int, str]) -> list[tuple[int, str, int]]:
@@ -419,65 +353,49 @@ def status_counts(fit_status: NDArray[Any], words: Mapping[int, str]) -> list[tu
     return [row for row in counts if row[2]]
 
 
-@styled
-def draw_status(
-    look: Look,
-    *,
-    status: NDArray[Any],
-    rows: Sequence[tuple[int, str, int]],
-    unfitted: NDArray[np.bool_] | None = None,
-) -> Drawing:
-    """Draw where fits failed or deserve caution, with a legend of sentences.
+def status_chart(
+    status: NDArray[Any], rows: Sequence[tuple[int, str, int]], unfitted: NDArray[np.bool_] | None = None
+) -> Chart:
+    """Return where fits failed or deserve caution, with a legend of sentences.
 
     A pixel with several bits has the colour of the first of them in ``rows``; the legend counts every bit.
 
     Args:
-        look: width and colours.
         status: status words (y, x).
         rows: of :func:`status_counts`.
         unfitted: pixels that no fit has reached yet (y, x).
     """
-    c = look.palette
-    palette = [c.band, c.vermilion, c.ink, c.orange, c.purple, c.blue, c.sky, c.green, c.yellow, "#8C8C8C"]
-    last = len(palette) - 1
-    missing = np.zeros(status.shape, dtype=bool) if unfitted is None else unfitted
-    strip = is_strip(status.shape)
-    some, gone = (each if strip else shown_pixels(look, each) for each in (status.astype(np.int64), missing))
-    colour = np.where(gone & (some == 0), last, 0)
+    last = len(_STATUS_COLOURS) - 1
+    missing = None if unfitted is None or not unfitted.any() else unfitted & (status == 0)
+    colour_of_word = np.zeros(int(status.max(initial=0)) + 1, np.uint8)
     for index in range(len(rows), 0, -1):
-        colour[(some & rows[index - 1][0]) != 0] = min(index, last - 1)
-    good = int(np.count_nonzero(status == 0)) - int(np.count_nonzero(missing & (status == 0)))
-    legend = [(palette[0], f"good fit: {_share(good, status.size)}")]
-    if missing.any():
-        legend.append((palette[last], f"not fitted yet: {_share(int(missing.sum()), status.size)}"))
-    legend += [
-        (palette[min(i + 1, last - 1)], f"{text}: {_share(n, status.size)}")
+        colour_of_word[(np.arange(colour_of_word.size) & rows[index - 1][0]) != 0] = min(index, last - 1)
+    colour = colour_of_word[status]
+    good = int(np.count_nonzero(status == 0))
+    keys = [("band", f"good fit: {_share(good, status.size)}")]
+    if missing is not None:
+        colour[missing] = last
+        n_missing = int(missing.sum())
+        keys = [
+            ("band", f"good fit: {_share(good - n_missing, status.size)}"),
+            (_STATUS_COLOURS[last], f"not fitted yet: {_share(n_missing, status.size)}"),
+        ]
+    keys += [
+        (_STATUS_COLOURS[min(i + 1, last - 1)], plain(f"{text}: {_share(n, status.size)}"))
         for i, (_, text, n) in enumerate(rows)
     ]
-    legend = [(colour_, plain(textwrap.fill(text, int(look.width_mm * 0.62)))) for colour_, text in legend]
-    legend_mm = 3.6 * sum(1 + text.count("\n") for _, text in legend) + 5.0
-    if strip:
-        figure = look.empty(30.0 + legend_mm)
-        axes = figure.add_subplot()
-        axes.bar(
-            np.arange(status.size),
-            1.0,
-            width=1.0,
-            color=[palette[c] for c in colour.ravel()],
-            edgecolor=c.paper,
-        )
-        axes.set(xlabel="channel", yticks=[], ylim=(0.0, 1.0))
-        _channel_axis(axes, status.size)
-    else:
-        figure = look.empty(_map_height(status.shape, look.width_mm - 14.0) + legend_mm)
-        axes = figure.add_subplot()
-        norm = BoundaryNorm(np.arange(len(palette) + 1) - 0.5, len(palette))
-        show_map(axes, colour, status.shape, cmap=ListedColormap(palette), norm=norm)
-    figure.legend(
-        handles=[Patch(facecolor=c, edgecolor="#888888", label=text) for c, text in legend],
-        loc="outside lower left",
-    )
-    return figure
+    if not is_strip(status.shape):
+        edges = np.arange(last) + 0.5
+        image = Image(colour, edges, *place_of(status.shape), scale=_STATUS_COLOURS)
+        return Chart((image_stack(image),), keys=tuple(keys))
+    flat = colour.ravel()
+    bars = []
+    for found, text in keys:
+        places = np.flatnonzero(flat == _STATUS_COLOURS.index(found))
+        ends = np.zeros(places.size), np.ones(places.size)
+        bars.append(Bars(places, *ends, broad=0.9, colour=found, label=text, listed=False))
+    panel = Panel(Axis("", 0.0, 1.0, ticks=((-1.0, ""),)), tuple(bars))
+    return Chart((Stack((panel,), _channel_axis(status.size), height_mm=30.0),), keys=tuple(keys))
 
 
 def _share(part: int, whole: int) -> str:

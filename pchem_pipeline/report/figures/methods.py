@@ -4,17 +4,28 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 
+from pchem_pipeline.report.charts.chart import (
+    PAGE_MM,
+    Axis,
+    Chart,
+    Dash,
+    Level,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Shape,
+    Stack,
+    Words,
+    x_window,
+)
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.palette import Palette
-from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, colours_of, styled
 from pchem_pipeline.report.style.wording import short
 
 _CAPTION = (
@@ -27,7 +38,7 @@ _CAPTION = (
 )
 
 #: Method to the hue, or colour, of its line, and its marker.
-_MARKS = {
+_MARKS: dict[str, tuple[str, Shape]] = {
     "pchem_em": ("blue", "o"),
     "plain_em": ("sky", "v"),
     "pchem_em_joint": ("#003A5C", "d"),
@@ -38,6 +49,11 @@ _MARKS = {
     "cumulants": ("purple", "P"),
     "peak_valley": ("#8C6D1F", "X"),
 }
+_BOUNDS: tuple[tuple[str, Dash, str], ...] = (
+    ("one sample", "-", "bound, one sample"),
+    ("a dark and a bright sample", "--", "bound, dark and bright"),
+)
+_OTHER: tuple[str, Shape] = ("#666666", "h")
 _RANGE = (0.03, 60.0)  # %
 
 
@@ -60,7 +76,7 @@ def method_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             _CAPTION,
             f"Root mean square error of the gain on this run's pixels. {'; '.join(words)}.{crossing}",
             method_tables(result),
-            partial(draw_methods, result=result),
+            methods_chart(result),
             PAGE_MM,
         )
     ]
@@ -97,68 +113,44 @@ def percent_text(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.3g}"
 
 
-def _mark(colours: Palette, name: str) -> tuple[str, str]:
-    """Return the colour and the marker of a method."""
-    hue, marker = _MARKS.get(name, ("#666666", "h"))
-    return (hue if hue.startswith("#") else getattr(colours, hue)), marker
-
-
-@styled
-def draw_methods(look: Look, *, result: Mapping[str, Any]) -> Drawing:
-    """Draw the error of the gain against the read noise (simulated), and that on the run's own pixels.
+def methods_chart(result: Mapping[str, Any]) -> Chart:
+    """Return the error of the gain against the read noise (simulated), and that on the run's own pixels.
 
     Args:
-        look: width and colours.
         result: content of ``methods.json``.
     """
     study, known = result["study"], [m for m in result["methods"] if m["errors"]]
-    panels = [draw for draw, there in ((_study, study), (_run, known)) if there]
-    wide = look.wide and len(panels) == 2
-    heights = [86.0 if draw is _study else 16.0 + 7.0 * len(known) for draw in panels]
-    figure = look.empty(max(heights) if wide else max(sum(heights), 40.0))
-    if not panels:
-        axes = figure.add_subplot()
-        axes.set_axis_off()
-        axes.text(0.5, 0.5, "nothing to compare", ha="center", va="center")
-        return figure
-    layout: dict[str, Any] = {"width_ratios": (1.5, 1.0)} if wide else {"height_ratios": heights}
-    rows, columns = (1, len(panels)) if wide else (len(panels), 1)
-    grid = figure.subplots(rows, columns, squeeze=False, **layout).ravel()
-    for axes, draw, letter in zip(grid, panels, "ab", strict=False):
-        draw(axes, study if draw is _study else known, f"({letter})" if len(panels) > 1 else "")
-    return figure
+    letters = ("(a) ", "(b) ") if study and known else ("", "")
+    stacks = [_study(study, letters[0])] if study else []
+    stacks += [_run(known, letters[1])] if known else []
+    return Chart(tuple(stacks), (1.5, 1.0) if len(stacks) > 1 else (1.0,), empty="nothing to compare")
 
 
-def _study(axes: Axes, study: Sequence[Mapping[str, Any]], letter: str) -> None:
-    noise, colours = np.array([point["read_noise_e"] for point in study]), colours_of(axes)
+def _study(study: Sequence[Mapping[str, Any]], letter: str) -> Stack:
+    noise = np.array([point["read_noise_e"] for point in study])
+    marks: list[Mark] = []
     for name, method in study[0]["methods"].items():
-        colour, marker = _mark(colours, name)
+        colour, shape = _MARKS.get(name, _OTHER)
         rmse, share = _curve(study, name)
         many = share >= 0.9
-        axes.plot(noise, rmse, color=colour, linewidth=0.8, alpha=0.75)
-        axes.plot(noise[many], rmse[many], marker, color=colour, markersize=4, label=method["title"])
-        axes.plot(
-            noise[~many], rmse[~many], marker, color=colour, markersize=4, markerfacecolor=colours.paper
-        )
-    bounds = (
-        ("one sample", "-", "bound, one sample"),
-        ("a dark and a bright sample", "--", "bound, dark and bright"),
-    )
-    for name, dashes, label in bounds:
+        marks += [
+            Line(noise, rmse, colour=colour, width=0.8, alpha=0.75),
+            Points(noise[many], rmse[many], shape, 4.0, colour=colour, label=method["title"]),
+            Points(noise[~many], rmse[~many], shape, 4.0, face="paper", colour=colour),
+        ]
+    for name, dash, label in _BOUNDS:
         values = [point["bounds"][name] for point in study]
-        shown = [np.nan if v is None else 100 * v for v in values]
-        axes.plot(noise, shown, dashes, color=colours.ink, label=label)
+        shown = np.array([np.nan if v is None else 100 * v for v in values])
+        marks.append(Line(noise, shown, colour="ink", dash=dash, label=label))
     crossing = bound_crossing(study)
     if crossing is not None:
-        axes.axvline(crossing, ymax=0.75, color="#999999", linewidth=0.7, linestyle=":")
-        axes.text(crossing, _RANGE[0] * 1.15, f" {crossing:.2f} e⁻", fontsize=6.5, color=colours.faint)
-    axes.set(yscale="log", ylim=_RANGE, xlabel="read noise (e⁻)", ylabel="rms error of the gain (%)")
-    axes.set_title(f"{letter} simulated pixels, as many frames for each".strip())
-    axes.legend(
-        fontsize=6.0, loc="upper left", ncols=2, handlelength=1.2, columnspacing=0.8, labelspacing=0.25
-    )
-    axes.set_ylim(_RANGE[0], 40 * _RANGE[1])
-    axes.set_yticks([0.1, 1.0, 10.0, 100.0], ["0.1", "1", "10", "100"])
+        words = Words(crossing, 0.02, f" {crossing:.2f} e⁻", "left", colour="faint")
+        marks += [Level(crossing, "x", colour="#999999", width=0.7, dash=":"), words]
+    ticks = ((0.1, "0.1"), (1.0, "1"), (10.0, "10"), (100.0, "100"))
+    y = Axis("rms error of the gain (%)", _RANGE[0], 40 * _RANGE[1], log=True, ticks=ticks)
+    panel = Panel(y, tuple(marks), legend="upper left", columns=2)
+    title = f"{letter}simulated pixels, as many frames for each"
+    return Stack((panel,), Axis("read noise (e⁻)"), title, height_mm=86.0)
 
 
 def _curve(
@@ -175,31 +167,25 @@ def _curve(
     return np.array(rmse), np.array(share)
 
 
-def _run(axes: Axes, known: Sequence[Mapping[str, Any]], letter: str) -> None:
-    rows, colours = np.arange(len(known))[::-1], colours_of(axes)
-    for row, method in zip(rows, known, strict=True):
+def _run(known: Sequence[Mapping[str, Any]], letter: str) -> Stack:
+    marks: list[Mark] = [Level(float(row), colour="grid", width=0.5) for row in range(len(known))]
+    for row, method in enumerate(known):
         gain = method["errors"]["conversion_gain"]
-        colour, marker = _mark(colours, method["name"])
-        if gain["rmse"] is not None:
-            axes.plot(100 * gain["rmse"], row, marker, color=colour, markersize=5)
-        if gain["robust_sd"]:
-            axes.plot(
-                100 * gain["robust_sd"],
-                row,
-                marker,
-                color=colour,
-                markersize=5,
-                markerfacecolor=colours.paper,
-            )
-        if gain["bound"] is not None:
-            axes.plot(100 * gain["bound"], row, "|", color=colours.ink, markersize=9, markeredgewidth=1.4)
-    axes.set_yticks(rows, [method["title"] for method in known], fontsize=6.5)
-    axes.set(xscale="log", ylim=(-0.6, len(known) - 0.4), xlabel="error of the gain (%)")
+        colour, shape = _MARKS.get(method["name"], _OTHER)
+        for value, what in (
+            (gain["rmse"], {"mark": shape, "size": 5.0, "colour": colour}),
+            (gain["robust_sd"] or None, {"mark": shape, "size": 5.0, "colour": colour, "face": "paper"}),
+            (gain["bound"], {"mark": "|", "size": 9.0, "colour": "ink"}),
+        ):
+            if value is not None:
+                marks.append(Points(np.array([100 * value]), np.array([row]), **what))
+    rows = tuple((float(row), method["title"]) for row, method in enumerate(known))
+    y = Axis("", -0.6, len(known) - 0.4, ticks=rows, down=True)
+    stack = Stack((Panel(y, tuple(marks)),), Axis("error of the gain (%)", log=True), height_mm=30.0)
     # a method that repeats the reference has no scatter against it
-    axes.set_xlim(left=max(axes.get_xlim()[0], 0.03))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.grid(axis="y", color=colours.grid, linewidth=0.5)
-    axes.set_title(f"{letter} this run's pixels".strip())
+    low, high = x_window(stack)
+    x = Axis("error of the gain (%)", max(low, _RANGE[0]), high, log=True)
+    return Stack(stack.panels, x, f"{letter}this run's pixels", height_mm=30.0)
 
 
 def gain_rmse(point: Mapping[str, Any], name: str) -> float | None:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.law.pcd import pcd, thresholds
 from pchem_pipeline.report.charts.chart import (
+    COLUMN_MM,
+    PAGE_MM,
     Axis,
     Chart,
     Level,
@@ -27,8 +29,7 @@ from pchem_pipeline.report.charts.chart import (
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.style import COLUMN_MM, PAGE_MM, plain
-from pchem_pipeline.report.style.wording import measured, short, stored_unit, symbol
+from pchem_pipeline.report.style.wording import measured, plain, short, stored_unit, symbol
 
 FloatArray = NDArray[np.float64]
 

@@ -4,20 +4,35 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
+from numpy.typing import NDArray
 
+from pchem_pipeline.report.charts.chart import (
+    PAGE_MM,
+    Axis,
+    Chart,
+    Image,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Stack,
+    Words,
+)
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, colours_of, styled
+from pchem_pipeline.report.style.stretch import even_edges
 from pchem_pipeline.report.style.wording import power_of_ten
 
-_LEVELS = np.logspace(1, 8, 8)
+FloatArray = NDArray[np.float64]
+
+#: Powers of ten of the frames where the colours end, and of the contours.
+_ENDS, _LEVELS = (0.0, 8.0), range(1, 9)
+#: Ticks of the exposure, e-; points of the picture for one of the grid, along each axis.
+_EXPOSURES, _FINER = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0), 8
 
 _CAPTION = (
     "Frames with which one sample reaches the precision in the title, one standard deviation of a pixel, by "
@@ -44,7 +59,7 @@ def plan_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             _CAPTION,
             f"Contours of the frames needed over exposure and read noise. For the median pixel, {words}.",
             (table,),
-            partial(draw_frames_needed, table=table, mark=plan["mark"]),
+            frames_chart(table, plan["mark"]),
             PAGE_MM,
         )
     ]
@@ -79,59 +94,90 @@ def frames_text(frames: float) -> str:
     return f"{frames:,.0f}" if math.isfinite(frames) else "none suffice"
 
 
-@styled
-def draw_frames_needed(look: Look, *, table: DataTable, mark: tuple[float, float] | None = None) -> Drawing:
-    """Draw contours of the frames needed, one panel a target.
+def frames_chart(table: DataTable, mark: tuple[float, float] | None = None) -> Chart:
+    """Return contours of the frames needed, one panel a target.
 
     Args:
-        look: width and colours.
         table: of :func:`frames_table`.
         mark: exposure and read noise of a pixel to show.
     """
     names = [name for name in table.columns if name.startswith(_FRAMES)]
     y, x = (np.unique(table[name]) for name in ("read_noise_e", "quanta_exposure"))
-    columns = 2 if look.wide and len(names) > 1 else 1
-    rows = -(-len(names) // columns)
-    figure = look.empty(70.0 * rows)
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes in grid[len(names) :]:
-        axes.set_axis_off()
-    for axes, name in zip(grid, names, strict=False):
-        _panel(axes, x, y, table[name].reshape(y.size, x.size), name.removeprefix(_FRAMES), mark)
-    return figure
+    stacks = [
+        _stack(x, y, table[name].reshape(y.size, x.size), name.removeprefix(_FRAMES), mark) for name in names
+    ]
+    return Chart(tuple(stacks), (1.0, 1.0) if len(stacks) > 1 else (1.0,))
 
 
-def _panel(axes: Axes, x: Any, y: Any, frames: Any, words: str, mark: tuple[float, float] | None) -> None:
-    colours = colours_of(axes)
-    axes.set_facecolor(colours.no_value)
-    # first of all: labels of contours are placed and turned on the axes as they are
-    axes.set(xscale="log", xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
-    shown = np.ma.masked_invalid(np.where(np.isfinite(frames), np.clip(frames, 1.0, None), np.nan))
-    axes.contourf(
-        x,
-        y,
-        shown,
-        levels=np.logspace(0, 8, 33),
-        norm=LogNorm(1, 1e8),
-        extend="max",
-        alpha=0.85,
-    )
-    lines = axes.contour(x, y, shown, levels=_LEVELS, colors="white", linewidths=0.9)
-    labels = axes.clabel(
-        lines,
-        fontsize=6.5,
-        fmt=lambda level: power_of_ten(round(np.log10(level))),
-        colors="black",
-        inline_spacing=2,
-    )
-    to_axes = axes.transData + axes.transAxes.inverted()
-    for label in labels:
-        if not all(_EDGE < each < 1.0 - _EDGE for each in to_axes.transform(label.get_position())):
-            label.remove()  # it would be cut
-    best = np.ma.argmin(shown, axis=1)
-    axes.plot(np.asarray(x)[best], y, ".", color="white", markersize=2.5)
+def _stack(x: FloatArray, y: FloatArray, frames: FloatArray, words: str, mark: Any) -> Stack:
+    """Return the frames for one target over exposures x and read noises y."""
+    # a picture cannot lie on a logarithmic axis
+    across, power = np.log10(x), np.log10(np.where(np.isfinite(frames), np.clip(frames, 1.0, None), np.nan))
+    fine = _finer(power)
+    places, heights = (np.linspace(a[0], a[-1], n) for a, n in ((across, fine.shape[1]), (y, fine.shape[0])))
+    marks: list[Mark] = [Image(fine, even_edges(*_ENDS), _half_steps(across), _half_steps(y))]
+    for level in _LEVELS:
+        contour = _crossing(fine, heights, float(level))
+        if np.isfinite(contour).any():
+            line = Line(places, _joined(contour, y), colour="#FFFFFF", width=0.9)
+            marks += [line, _named(places, y, contour, level)]
+    known = np.isfinite(power).any(axis=1)
+    best = np.argmin(np.where(np.isfinite(power), power, np.inf), axis=1)
+    marks.append(Points(across[best][known], y[known], size=1.8, colour="#FFFFFF"))
     if mark is not None:
-        axes.plot(*mark, "o", color=colours.vermilion, markersize=5, markeredgecolor="white", clip_on=False)
-    axes.set(xlabel="quanta exposure (e⁻)", ylabel="read noise (e⁻)")
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.set_title(f"frames for {words.replace('_e to', ' to').replace('_', ' ').replace('e-', 'e⁻')}")
+        spot = np.log10([mark[0]]), np.array([mark[1]])
+        marks += [Points(*spot, size=6.5, colour="#FFFFFF"), Points(*spot, size=5.0, colour="vermilion")]
+    ticks = tuple((math.log10(each), f"{each:g}") for each in _EXPOSURES)
+    title = f"frames for {words.replace('_e to', ' to').replace('_', ' ').replace('e-', 'e⁻')}"
+    panel = Panel(Axis("read noise (e⁻)", float(y[0]), float(y[-1])), tuple(marks))
+    ends = float(across[0]), float(across[-1])
+    return Stack((panel,), Axis("quanta exposure (e⁻)", *ends, ticks=ticks), title, height_mm=66.0)
+
+
+def _half_steps(places: FloatArray) -> tuple[float, float]:
+    """Return the ends of a picture whose first and last points lie on the first and last of some places."""
+    half = (places[-1] - places[0]) / (places.size - 1) / _FINER / 2
+    return float(places[0] - half), float(places[-1] + half)
+
+
+def _finer(values: FloatArray) -> FloatArray:
+    """Return values of a grid between whose points others are interpolated; NaN beside NaN."""
+    for _ in range(2):
+        n = len(values)
+        at = np.linspace(0.0, n - 1.0, (n - 1) * _FINER + 1)
+        below = np.minimum(at.astype(np.int64), n - 2)
+        part = (at - below)[:, None]
+        with np.errstate(invalid="ignore"):
+            mixed = (1.0 - part) * values[below] + part * values[below + 1]
+        exact = np.where(part == 0.0, values[below], np.where(part == 1.0, values[below + 1], mixed))
+        values = exact.T
+    return values
+
+
+def _crossing(power: FloatArray, y: FloatArray, level: float) -> FloatArray:
+    """Return the read noise at which each exposure needs so many frames; more read noise needs more.
+
+    Infinite where no read noise, or even none, needs so many.
+    """
+    found = np.full(power.shape[1], np.nan)
+    for j, column in enumerate(power.T):
+        known = np.isfinite(column)
+        if known.sum() > 1:
+            found[j] = np.interp(level, column[known], y[known], left=-np.inf, right=np.inf)
+    return found
+
+
+def _joined(height: FloatArray, y: FloatArray) -> FloatArray:
+    """Return a contour that goes on to the end of the axis where the next exposure does not cross it."""
+    finite = np.isfinite(height)
+    beside = np.convolve(finite, np.ones(3), "same") > 0
+    return np.where(beside, np.clip(height, y[0], y[-1]), np.nan)
+
+
+def _named(across: FloatArray, y: FloatArray, height: FloatArray, level: int) -> Words:
+    """Return the words on a contour, a little farther to the right on each."""
+    known = np.flatnonzero(np.isfinite(height))
+    at = known[int((0.25 + 0.06 * level) * (known.size - 1))]
+    up = (height[at] - y[0]) / (y[-1] - y[0])
+    x = np.clip(across[at], *np.interp([0.05, 0.95], [0.0, 1.0], across[[0, -1]]))
+    return Words(float(x), float(np.clip(up, 0.01, 0.93)), power_of_ten(level), colour="#000000")

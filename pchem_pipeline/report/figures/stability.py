@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
+from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Level, Line, Panel, Stack
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.style.wording import count, short
@@ -131,14 +132,9 @@ def power_table(sums: StackSums) -> DataTable:
     return DataTable(columns, {"frequency": "1/frame"}, "spectrum")
 
 
-def _mean_signal(sums: StackSums) -> FloatArray:
-    """Return the mean of each pixel over the frames whose sums are at hand, DN."""
-    return np.asarray(sums.block_sum.sum(axis=0) / float(sums.lengths.sum()))
-
-
 def _robust(values: FloatArray) -> tuple[float, float]:
-    middle = float(np.median(values))
-    return middle, 1.4826 * float(np.median(np.abs(values - middle)))
+    known = Ordered.of(values)
+    return known.median, known.robust_sd
 
 
 def profile_table(sums: StackSums, axis: int) -> DataTable:
@@ -146,7 +142,7 @@ def profile_table(sums: StackSums, axis: int) -> DataTable:
 
     Chance are two standard errors of the median of that many pixels drawn from the whole sensor.
     """
-    image = _mean_signal(sums)
+    image = sums.mean_signal
     middle, width = _robust(image)
     reach = 2.0 * _WIDTH * width / math.sqrt(image.shape[1 - axis])
     medians = np.median(image, axis=1 - axis)
@@ -161,7 +157,7 @@ def profile_table(sums: StackSums, axis: int) -> DataTable:
 
 def pattern_spectra(sums: StackSums) -> tuple[DataTable, ...]:
     """Return the power of the means of rows and columns by frequency, over that of unrelated pixels."""
-    image = _mean_signal(sums)
+    image = sums.mean_signal
     middle, width = _robust(image)
     image = np.clip(image - middle, -_CLIP * width, _CLIP * width)
     found = []

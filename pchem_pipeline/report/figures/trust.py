@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.checks.multiple_testing import misfit
-from pchem_pipeline.report.charts.chart import Axis, Bars, Chart, Level, Line, Mark, Panel, Stack, Words
+from pchem_pipeline.report.charts.chart import (
+    PAGE_MM,
+    Axis,
+    Bars,
+    Chart,
+    Image,
+    Level,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Span,
+    Stack,
+    Steps,
+    Words,
+)
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.maps import is_strip, show_map, shown_pixels
+from pchem_pipeline.report.figures.maps import image_stack, is_strip, place_of
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.style import PAGE_MM, Drawing, Look, note, styled
+from pchem_pipeline.report.style.stretch import even_bar, even_edges
 from pchem_pipeline.report.style.wording import count, percent, symbol
 
 FloatArray = NDArray[np.float64]
@@ -25,7 +36,8 @@ _P_BINS = 20
 #: Deviates beyond these have the end colours.
 _DEVIATES = (-4.0, 6.0)
 _MOST_MARKS = 400
-
+#: Widths of two stacks side by side.
+_TWO = (1.0, 1.15)
 
 #: Maps of which the figure of uncertainties tells the share of noise.
 _UNCERTAIN = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
@@ -71,7 +83,7 @@ def goodness_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             _GOODNESS_CAPTION.format(rate=rate),
             text,
             (table,),
-            partial(draw_goodness, table=table, false_discovery_rate=rate),
+            goodness_chart(table, rate),
             PAGE_MM,
         )
     ]
@@ -92,7 +104,7 @@ def left_out_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             f"{count(hit, data.noun)} of {share.size:,} lost samples, at most "
             f"{percent(float(np.max(share, initial=0.0)), 1.0)} of their frames.",
             (DataTable({"share left out": share}),),
-            partial(draw_left_out, share=share, n_frames=data.n_frames),
+            left_out_chart(share, data.n_frames),
             PAGE_MM,
         )
     ]
@@ -144,103 +156,73 @@ def noise_shares(data: ReportData, names: tuple[str, ...]) -> dict[str, float]:
     return found
 
 
-@styled
-def draw_goodness(look: Look, *, table: DataTable, false_discovery_rate: float) -> Drawing:
-    """Draw the p-values of all pixels against what chance gives, and a map of the goodness of fit.
+def goodness_chart(table: DataTable, false_discovery_rate: float) -> Chart:
+    """Return the p-values of all pixels against what chance gives, and a map of the goodness of fit.
 
     Args:
-        look: width and colours.
         table: ``p``, ``q`` and ``misfit``, each (y, x).
         false_discovery_rate: pixels with a q-value up to it are marked.
     """
-    deviate, colours = table["misfit"], look.palette
-    left, right, figure = _two(look, deviate.shape)
-    known = finite(table["p"])
-    edges = np.linspace(0.0, 1.0, _P_BINS + 1)
+    deviate, known = table["misfit"], finite(table["p"])
+    counts, edges = np.histogram(known, _P_BINS, (0.0, 1.0))
     mean = known.size / _P_BINS
     spread = np.sqrt(mean * (1.0 - 1.0 / _P_BINS))
-    left.axhspan(mean - 2 * spread, mean + 2 * spread, color=colours.band, linewidth=0)
-    left.axhline(mean, color=colours.ink, linewidth=0.6)
-    left.stairs(np.histogram(known, edges)[0], edges, color=colours.blue, linewidth=1.2)
-    left.set(xlabel="p-value of the goodness of fit", ylabel="pixels", xlim=(0.0, 1.0), ylim=(0.0, None))
-    marked = np.argwhere(table["q"] <= false_discovery_rate)
+    marks = (
+        Span(mean - 2 * spread, mean + 2 * spread, colour="band"),
+        Level(mean, colour="ink", width=0.6),
+        Steps(edges, counts, width=1.2),
+    )
+    high = 1.05 * max(float(counts.max()), mean + 2 * spread)
+    left = Stack((Panel(Axis("pixels", 0.0, high), marks),), Axis("p-value of the goodness of fit", 0.0, 1.0))
+    found = np.argwhere(table["q"] <= false_discovery_rate)
     if is_strip(deviate.shape):
-        right.plot(deviate.ravel(), "o", markersize=2.5, color=colours.blue)
-        right.plot(
-            marked.max(axis=1), deviate[tuple(marked.T)], "o", markersize=5, mec=colours.vermilion, mfc="none"
-        )
-        right.set(xlabel="channel", ylabel="misfit (σ)")
-        right.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-        return figure
-    shown = np.clip(shown_pixels(look, deviate, panels=_panels(look)), *_DEVIATES)
-    image = show_map(right, shown, deviate.shape, panels=_panels(look), vmin=-4.0, vmax=6.0)
-    if len(marked) <= _MOST_MARKS:
-        right.plot(marked[:, 1], marked[:, 0], "o", markersize=5, mec=colours.vermilion, mfc="none", mew=0.8)
-    bar = figure.colorbar(image, ax=right, fraction=0.06, pad=0.02, aspect=25)
-    bar.set_label("misfit (σ)")
-    return figure
+        values, places = deviate.ravel(), found.max(axis=1)
+        return Chart((left, _channels(values, "misfit (σ)", _ring(places, values[places]))), _TWO)
+    rings = (_ring(found[:, 1], found[:, 0]),) if 0 < len(found) <= _MOST_MARKS else ()
+    image = Image(
+        deviate, even_edges(*_DEVIATES), *place_of(deviate.shape), bar=even_bar(*_DEVIATES, whole=True),
+        unit="misfit (σ)",
+    )  # fmt: skip
+    return Chart((left, image_stack(image, *rings)), _TWO)
 
 
-def _panels(look: Look) -> int:
-    """Return how many axes of two stand side by side."""
-    return 2 if look.wide else 1
+def _ring(x: NDArray[np.int64], y: NDArray[np.int64]) -> Points:
+    return Points(x, y, size=5.0, face="none", colour="vermilion")
 
 
-def _two(look: Look, shape: tuple[int, ...]) -> tuple[Axes, Axes, Drawing]:
-    """Return two axes, side by side on a page, one above the other in a column."""
-    if _panels(look) > 1:
-        figure = look.empty(62.0)
-        left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
-    else:
-        figure = look.empty(52.0 + (40.0 if is_strip(shape) else 62.0))
-        left, right = figure.subplots(2, 1, height_ratios=(1.0, 1.2))
-    return left, right, figure
+def _channels(values: FloatArray, label: str, *others: Mark) -> Stack:
+    """Return a value of each channel of a line."""
+    points = Points(np.arange(values.size), values, size=2.5, label=label, listed=False)
+    return Stack((Panel(Axis(label), (points, *others)),), Axis("channel", whole=True))
 
 
-@styled
-def draw_left_out(look: Look, *, share: FloatArray, n_frames: int | None) -> Drawing:
-    """Draw how many samples of each pixel the tail guard left out, as a histogram and as a map.
+def left_out_chart(share: FloatArray, n_frames: int | None) -> Chart:
+    """Return how many samples of each pixel the tail guard left out, as a histogram and as a map.
 
     Args:
-        look: width and colours.
         share: of the frames of each pixel, (y, x).
         n_frames: frames of a pixel; None where pixels differ, and shares are drawn.
     """
-    (left, right, figure), colours = _two(look, share.shape), look.palette
-    samples = np.rint(share * n_frames) if n_frames else 100.0 * share
-    label = "frames left out" if n_frames else "samples left out (%)"
-    hit = samples[samples > 0]
-    if hit.size:
-        top = float(hit.max())
-        edges = np.arange(0.5, min(top, 60.0) + 1.5) if n_frames else np.linspace(0.0, 1.05 * top, 21)
-        left.stairs(
-            np.histogram(np.minimum(hit, edges[-1] - 1e-9), edges)[0], edges, fill=True, color=colours.bars
-        )
-        left.xaxis.set_major_locator(MaxNLocator(6, integer=bool(n_frames), min_n_ticks=1))
-        left.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-        left.set_ylim(0.0, 1.18 * left.get_ylim()[1])  # room for the words above the bars
-    else:
-        left.set(xticks=[], yticks=[])
-    left.set(xlabel=f"{label} of a pixel", ylabel="pixels")
-    note(left, f"{count(int(hit.size), 'pixel')} of {samples.size:,} with any")
-    if is_strip(samples.shape):
-        right.plot(samples.ravel(), "o", markersize=2.5, color=colours.blue)
-        right.set(xlabel="channel", ylabel=label)
-        right.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-        return figure
     # nothing is white, a single sample is seen
-    some = shown_pixels(look, samples, panels=_panels(look))
-    shown = np.where(some > 0, some, np.nan)
+    lost = share > 0
+    samples = np.where(lost, np.rint(share * n_frames) if n_frames else 100.0 * share, np.nan)
+    label = "frames left out" if n_frames else "samples left out (%)"
+    hit = samples[lost]
     top = max(float(np.max(hit, initial=1.0)), 1.0)
-    options = {"cmap": colours.from_paper, "vmin": 0.0, "vmax": top}
-    image = show_map(right, shown, samples.shape, panels=_panels(look), **options)
-    image.set_cmap(image.get_cmap().with_extremes(bad=colours.paper))
-    bar = figure.colorbar(image, ax=right, fraction=0.06, pad=0.02, aspect=25)
-    bar.set_label(label)
-    if n_frames:
-        bar.locator = MaxNLocator(6, integer=True)
-        bar.update_ticks()
-    return figure
+    edges = np.arange(0.5, min(top, 60.0) + 1.5) if n_frames else np.linspace(0.0, 1.05 * top, 21)
+    counts = np.histogram(np.minimum(hit, edges[-1] - 1e-9), edges)[0]
+    x = Axis(f"{label} of a pixel", float(edges[0]), float(edges[-1]), whole=bool(n_frames))
+    # room for the words above the bars
+    y = Axis("pixels", 0.0, 1.18 * max(float(counts.max()), 1.0), whole=True)
+    note = f"{count(int(hit.size), 'pixel')} of {samples.size:,} with any"
+    left = Stack((Panel(y, (Steps(edges, counts, filled=True, colour="bars"),), note=note),), x)
+    if is_strip(samples.shape):
+        return Chart((left, _channels(np.where(lost, samples, 0.0).ravel(), label)), _TWO)
+    image = Image(
+        samples, even_edges(0.0, top), *place_of(samples.shape), scale="from_paper", none="paper",
+        bar=even_bar(0.0, top, whole=bool(n_frames)), unit=label,
+    )  # fmt: skip
+    return Chart((left, image_stack(image)), _TWO)
 
 
 def uncertainty_chart(maps: DataTable, ensemble: DataTable) -> Chart:
@@ -250,7 +232,7 @@ def uncertainty_chart(maps: DataTable, ensemble: DataTable) -> Chart:
         maps: parts of the maps' variance that the errors of the estimates make, by map.
         ensemble: ``dn``, ``counts``, ``epcd_exact``, and ``epcd_stderr`` where it is known.
     """
-    return Chart((_noise_stack(maps), _error_stack(ensemble)), (1.0, 1.15))
+    return Chart((_noise_stack(maps), _error_stack(ensemble)), _TWO)
 
 
 def _noise_stack(maps: DataTable) -> Stack:

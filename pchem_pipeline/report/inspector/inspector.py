@@ -10,14 +10,13 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from markupsafe import Markup, escape
 
 from pchem_pipeline.report.data import MAP_NAMES, ReportData
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
 from pchem_pipeline.report.inspector.packing import PackedMap, pack_counts
-from pchem_pipeline.report.style.palette import MAP_COLOURS
+from pchem_pipeline.report.style.palette import MAP_COLOURS, shades
 from pchem_pipeline.report.style.wording import symbol, unit_text
 
 #: The part of the policy that forbids every connection, and that of a page which ``pchem view`` serves.
@@ -111,7 +110,6 @@ def json_for_html(content: Any) -> Markup:
 
 def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
     """Return what the script must know beside the maps."""
-    colours = (mpl.colormaps[MAP_COLOURS](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0).round().astype(int)
     sample = shown.sample
     return {
         "shape": list(data.shape),
@@ -123,7 +121,7 @@ def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
         "model": data.run.get("model", ""),
         "command": shown.command,
         "keptTo": shown.kept_to,
-        "colours": "".join(f"{r:02x}{g:02x}{b:02x}" for r, g, b in colours),
+        "colours": shades(MAP_COLOURS).tobytes().hex(),
         "maps": [map_facts(entry) for entry in shown.maps],
         "panel": list(PANEL_MAPS),
         "sample": {

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.style.ranges import DECADES
 
 FloatArray = NDArray[np.float64]
@@ -88,18 +89,18 @@ def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0
     if flat.dtype.kind in "iub" and flat.size:
         low, high = float(flat.min()), float(flat.max())
         return Scale(low, max(1.0, np.ceil((high - low) / (_LAST - _FIRST))))
-    known = some_of(flat)
-    known = known[np.isfinite(known)].astype(np.float64)
+    known = Ordered.of(some_of(flat))
     if known.size == 0:
         return Scale(0.0, 1.0)
     log = False
-    if known.min() >= 0 and (known > 0).any():
-        bulk = np.quantile(known[known > 0], [0.01, 0.99])
-        log = bool(bulk[1] > DECADES * bulk[0]) or bool((known == 0).any() and bulk[1] > bulk[0])
-        known = np.log10(known[known > 0]) if log else known
-    low, q25, middle, q75, high = np.quantile(known, [_TAIL, 0.25, 0.5, 0.75, 1.0 - _TAIL])
+    if known.values[0] >= 0 and known.values[-1] > 0:
+        above = Ordered(known.values[known.size - known.n_above(0.0) :])
+        bulk = above.quantiles([0.01, 0.99])
+        log = bool(bulk[1] > DECADES * bulk[0]) or bool(known.values[0] == 0 and bulk[1] > bulk[0])
+        known = Ordered(np.log10(above.values)) if log else known
+    low, q25, middle, q75, high = known.quantiles([_TAIL, 0.25, 0.5, 0.75, 1.0 - _TAIL]).tolist()
     margin = 3.0 * (high - low)
-    first, last = max(float(known.min()), low - margin), min(float(known.max()), high + margin)
+    first, last = max(float(known.values[0]), low - margin), min(float(known.values[-1]), high + margin)
     fine = _LOG_STEP if log else step or float(q75 - q25) / 1.35 / 64.0
     smallest = max((last - first) / (_LAST - _FIRST - 257), abs(float(middle)) * 1e-9, 1e-300)
     wide = float(max(fine * coarse, smallest))
@@ -165,13 +166,15 @@ def _empty_bars(flat: NDArray[Any], scale: Scale) -> Bars | None:
     The axis is that of the script: from the 1st to the 99th percentile and 0.3 of it beyond, where there are
     values.
     """
-    place = _places(some_of(flat), scale)
-    place = place[np.isfinite(place)]
-    if flat.dtype.kind in "iub" or place.size < 2:
+    if flat.dtype.kind in "iub":
         return None
-    low, high = np.quantile(place, [0.01, 0.99])
+    place = Ordered.of(_places(some_of(flat), scale))
+    if place.size < 2:
+        return None
+    low, high = place.quantiles([0.01, 0.99])
     margin = 0.3 * (high - low)
-    first, last = np.rint([max(low - margin, place.min(), 0.0), min(high + margin, place.max())]).astype(int)
+    ends = max(low - margin, place.values[0], 0.0), min(high + margin, place.values[-1])
+    first, last = np.rint(ends).astype(int)
     wanted = np.clip(2.0 * np.cbrt(flat.size), _FEWEST_BARS, _MOST_BARS)
     parts = round(float(wanted) / max(int(last - first) + 1, 1))
     if parts < 2 or not high > low:

@@ -33,7 +33,7 @@ def render_page(name: str, figures: Sequence[Figure], /, *scripts: str, **conten
         scripts: further ones that its template holds.
         content: what its template shows.
     """
-    charts = {figure.name: figure.chart for figure in figures if figure.chart is not None}
+    charts = {figure.name: figure.chart for figure in figures if not figure.chart.still}
     always = (page_script(), *((chart_script(),) if charts else ()))
     return _template(name).render(
         policy=content_policy(*always, *scripts),

@@ -35,16 +35,16 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
 
     The keys ``summary``, ``ensemble`` (with ``rmse``) and ``fit_status`` are always there.
     """
-    facts = dict(data.ensemble_facts)
+    facts, remarks = dict(data.ensemble_facts), flags(data)
     rmse = dict(facts.pop("rmse", {}))
     numbers: dict[str, Any] = json_value(
         {
             "report_version": REPORT_VERSION,
             "title": data.title,
             "sentence": sentence(data),
-            "answers": [asdict(answer) for answer in answers(data)],
+            "answers": [asdict(answer) for answer in answers(data, remarks)],
             "headline": [asdict(number) for number in key_numbers(data)],
-            "flags": [asdict(flag) for flag in flags(data)],
+            "flags": [asdict(flag) for flag in remarks],
             "next": [asdict(step) for step in next_steps(data)],
             "sensor": {
                 "ny": data.shape[0],

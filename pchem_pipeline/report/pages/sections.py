@@ -170,7 +170,7 @@ def _summary(material: Material) -> Section:
     data = material.data
     remarks = flags(data)
     content = {
-        "answers": answers(data),
+        "answers": answers(data, remarks),
         "caption": f"unflagged {data.noun}s" if data.often_flagged else f"{data.noun}s",
         "numbers": key_numbers(data),
         "sentence": "" if pixel_counts(data).fitted else sentence(data),

@@ -409,9 +409,14 @@ class Answer:
     criteria: tuple[Criterion, ...] = ()
 
 
-def answers(data: ReportData) -> tuple[Answer, Answer]:
-    """Answer 'is this sensor all right' and 'can I believe it' from the maps and the remarks."""
-    sensor, belief = _sensor(data), _belief(data, flags(data))
+def answers(data: ReportData, remarks: list[Flag] | None = None) -> tuple[Answer, Answer]:
+    """Answer 'is this sensor all right' and 'can I believe it' from the maps and the remarks.
+
+    Args:
+        data: what the run found.
+        remarks: of :func:`flags`; None: they are made.
+    """
+    sensor, belief = _sensor(data), _belief(data, flags(data) if remarks is None else remarks)
     if belief.level == "serious" and sensor.level == "good":
         text = f"{sensor.text.rstrip('.')}, by results that are not to be believed as they are."
         sensor = replace(sensor, level="caution", word="Not known", text=text)

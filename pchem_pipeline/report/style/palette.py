@@ -1,4 +1,4 @@
-"""Colours of figures by what they stand for: for light and dark paper, and from a user's style sheet.
+"""Colours of figures by what they stand for, for light and dark paper, and scales of colours for maps.
 
 Colours of lines are those of Okabe and Ito (2008), which the colour-blind can tell apart; maps use
 ``viridis``, whose lightness rises evenly, differences a diverging scale whose ends everyone can tell apart.
@@ -6,17 +6,23 @@ Colours of lines are those of Okabe and Ito (2008), which the colour-blind can t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-from matplotlib.colors import to_hex, to_rgb
+import numpy as np
+from numpy.typing import NDArray
 
 MAP_COLOURS = "viridis"
 DIVERGING = "RdBu_r"
 
+#: Colours of matplotlib's scales at equal distances; between them they are linear, to 2 of 255.
+_SCALES = {
+    "viridis": "440154471164482071472e7c443b843f488939558c34618d2f6c8e2a768e26818e228b8d"
+    "1f958b1fa08824aa832fb47c40bd7256c66770cf578bd646a8db34c5e021e2e418fde725",
+    "RdBu": "67001fb2182bd6604df4a582fddbc7f7f7f7d1e5f092c5de4393c32166ac053061",
+}
 #: Hues in the order in which lines without a colour of their own take them.
-_CYCLE = ("blue", "vermilion", "green", "orange", "sky", "purple", "yellow", "ink")
+CYCLE = ("blue", "vermilion", "green", "orange", "sky", "purple", "yellow", "ink")
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,7 @@ class Palette:
     @property
     def cycle(self) -> tuple[str, ...]:
         """Colours of lines, in their order."""
-        return tuple(getattr(self, name) for name in _CYCLE)
+        return tuple(getattr(self, name) for name in CYCLE)
 
     def parameters(self) -> dict[str, Any]:
         """Return the parameters of matplotlib that hold colours."""
@@ -84,20 +90,16 @@ DARK = Palette(
 )
 
 
-def palette_of(sheet: Mapping[str, Any]) -> Palette:
-    """Return the palette of a matplotlib style sheet: its paper and text, its cycle of colours.
+def shades(name: str, n: int = 256) -> NDArray[np.uint8]:
+    """Return the colours of a scale in equal steps, red, green and blue, shape (n, 3).
 
     Args:
-        sheet: name to value; what it does not say is that of ``LIGHT``, of ``DARK`` where its paper is dark.
+        name: as matplotlib calls it; ``_r``: from its end to its beginning.
+        n: number of steps.
     """
-    paper = sheet.get("axes.facecolor", sheet.get("figure.facecolor", LIGHT.paper))
-    red, green, blue = to_rgb(paper)
-    base = DARK if 0.3 * red + 0.59 * green + 0.11 * blue < 0.5 else LIGHT
-    names = {"text.color": ("ink", "faint"), "axes.edgecolor": ("edge",)}
-    found = {name: to_hex(sheet[key]) for key, names_ in names.items() if key in sheet for name in names_} | (
-        {"paper": to_hex(paper)} if base is DARK or paper != LIGHT.paper else {}
-    )
-    cycle = sheet["axes.prop_cycle"].by_key().get("color", []) if "axes.prop_cycle" in sheet else []
-    if cycle:
-        found |= {name: to_hex(cycle[i % len(cycle)]) for i, name in enumerate(_CYCLE[:-1])}
-    return replace(base, **found)
+    known = np.frombuffer(bytes.fromhex(_SCALES[name.removesuffix("_r")]), np.uint8).reshape(-1, 3)
+    if name.endswith("_r"):
+        known = known[::-1]
+    places = np.linspace(0.0, len(known) - 1.0, n)
+    colours = [np.interp(places, np.arange(len(known)), column) for column in known.T]
+    return np.rint(np.stack(colours, axis=1)).astype(np.uint8)

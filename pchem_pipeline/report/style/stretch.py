@@ -1,77 +1,70 @@
-"""Drawing a map with the Beta(2,2) stretch of Appendix C: colours by rank, a colour bar in physical units."""
+"""Colours of a map by the rank of its pixels (the Beta(2,2) stretch of Appendix C) or by their values."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.maps.maps import display_transform
+from pchem_pipeline.model.maps.maps import display_edges
 from pchem_pipeline.model.maps.ordered import Ordered
+from pchem_pipeline.report.charts.chart import SHADES
+from pchem_pipeline.report.charts.ticks import ticks_between
 from pchem_pipeline.report.style.wording import short
 
 FloatArray = NDArray[np.float64]
 
-#: Colour levels at which the colour bar is labelled, and the share of pixels below each.
-STRETCH_LEVELS = (0.0, 0.25, 0.5, 0.75, 1.0)
+Bar = tuple[tuple[float, str], ...]
+
+#: Levels at which the bar of colours is labelled.
+_LEVELS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
 
 
-@dataclass(frozen=True)
-class StretchedMap:
-    """A map as it is drawn.
+def map_colours(known: Ordered, stretch: Literal["beta", "linear"] = "beta") -> tuple[FloatArray, Bar]:
+    """Return the values between the colours of a map, and places and texts of the bar of its colours.
 
-    Attributes:
-        colour: level of each pixel in 0..1, NaN where there is no value; shape (y, x).
-        levels: levels at which the colour bar is labelled.
-        labels: physical values at these levels, as text.
-    """
-
-    colour: FloatArray
-    levels: tuple[float, ...]
-    labels: tuple[str, ...]
-
-
-def stretch_map(
-    values: NDArray[Any], stretch: Literal["beta", "linear"] = "beta", ordered: Ordered | None = None
-) -> StretchedMap:
-    """Return colour levels of a map and the labels of its colour bar.
-
-    ``beta`` is the transform of Hendrickson et al. 2023, Appendix C: the level is the Beta(2,2) quantile of
-    the value's rank, so that the levels 0, 1/4, 1/2, 3/4, 1 are the minimum, the 15.6, 50 and 84.4 %
-    quantiles and the maximum. ``linear`` runs from the 1st to the 99th percentile; values beyond have the
-    end colours.
+    ``beta``: the level of a colour is the Beta(2,2) quantile of the value's rank, so that the levels 0, 1/4,
+    1/2, 3/4, 1 are the minimum, the 15.6, 50 and 84.4 % quantiles and the maximum (Hendrickson et al. 2023,
+    Appendix C). ``linear`` runs from the 1st to the 99th percentile; values beyond have the end colours.
 
     Args:
-        values: map (y, x), or some of its rows and columns; NaN where there is no value.
+        known: the values.
         stretch: which of the two.
-        ordered: all values of the map; None: these.
     """
-    full = np.asarray(values, dtype=np.float64)
-    known = ordered or Ordered.of(full)
     if known.size == 0:
-        return StretchedMap(np.full(full.shape, np.nan), (), ())
-    if known.values[0] == known.values[-1]:
-        colour = np.where(np.isfinite(full), 0.5, np.nan)
-        return StretchedMap(colour, (0.5,), (short(float(known.values[0])),))
-    level = np.asarray(STRETCH_LEVELS)
+        return np.zeros(SHADES - 1), ()
+    lowest = float(known.values[0])
+    if lowest == known.values[-1]:
+        middle = np.where(np.arange(SHADES - 1) < SHADES // 2, lowest, np.inf)
+        return middle, ((0.5, short(lowest)),)
     if stretch == "beta":
-        physical = known.quantiles(level**2 * (3.0 - 2.0 * level))
-        return StretchedMap(display_transform(full, known), STRETCH_LEVELS, _labels(physical))
+        edges = display_edges(known, np.arange(1, SHADES) / SHADES)
+        texts = _labels(known.quantiles(_LEVELS**2 * (3.0 - 2.0 * _LEVELS)))
+        return edges, tuple(zip(_LEVELS.tolist(), texts, strict=True))
     low, high = known.quantiles([0.01, 0.99]).tolist()
-    span = high - low if high > low else 1.0
-    physical = low + level * span
+    high = high if high > low else low + 1.0
     signs = ["≤ ", "", "", "", "≥ "]
-    labels = tuple(sign + text for sign, text in zip(signs, _labels(physical), strict=True))
-    return StretchedMap(np.clip((full - low) / span, 0.0, 1.0), STRETCH_LEVELS, labels)
+    texts = [sign + text for sign, text in zip(signs, _labels(low + _LEVELS * (high - low)), strict=True)]
+    return even_edges(low, high), tuple(zip(_LEVELS.tolist(), texts, strict=True))
 
 
-def _labels(physical: FloatArray) -> tuple[str, ...]:
+def even_edges(low: float, high: float) -> FloatArray:
+    """Return the values between colours in equal steps from a low to a high value."""
+    return np.linspace(low, high, SHADES + 1)[1:-1]
+
+
+def even_bar(low: float, high: float, *, whole: bool = False) -> Bar:
+    """Return places and texts of a bar of colours in equal steps: round numbers."""
+    found = ticks_between(low, high, 5, whole=whole)
+    return tuple(((place - low) / (high - low), text) for place, text in found)
+
+
+def _labels(physical: FloatArray) -> list[str]:
     """Return texts with as many digits as tell the middle labels apart."""
     texts: list[str] = []
     for digits in range(3, 8):
         texts = [short(float(value), digits) for value in physical]
         if len(set(texts)) == len(set(physical.tolist())):
             break
-    return tuple(texts)
+    return texts

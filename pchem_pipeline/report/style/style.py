@@ -1,6 +1,6 @@
-"""One look for all figures: print sizes, type, and files that repeat to the byte.
+"""One look for all figures on paper: type, colours, and files that repeat to the byte.
 
-Figures are made with matplotlib's objects alone (no ``pyplot``), so that drawing leaves no state behind.
+They are made with matplotlib's objects alone (no ``pyplot``), so that drawing leaves no state behind.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import io
 import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Concatenate, ParamSpec, cast
 
 import matplotlib as mpl
@@ -21,6 +21,7 @@ import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure as MatplotlibFigure
 from matplotlib.lines import Line2D
 from matplotlib.markers import TICKDOWN, TICKLEFT
@@ -28,12 +29,9 @@ from matplotlib.ticker import Formatter, LogFormatterSciNotation, NullLocator
 from numpy.typing import NDArray
 from PIL import Image
 
-from pchem_pipeline.report.style.palette import LIGHT, MAP_COLOURS, Palette, palette_of
+from pchem_pipeline.report.charts.chart import COLUMN_MM
+from pchem_pipeline.report.style.palette import CYCLE, DARK, LIGHT, MAP_COLOURS, Palette
 from pchem_pipeline.report.style.wording import SUPERSCRIPT
-
-#: Widths of one column and of a page of a journal, mm.
-COLUMN_MM = 88.0
-PAGE_MM = 180.0
 
 _STYLE: Any = {
     "axes.axisbelow": True,
@@ -135,6 +133,25 @@ class Drawing(MatplotlibFigure):
     def _repr_png_(self) -> bytes:
         """Return the figure as a notebook shows it."""
         return drawing_bytes(self, "png", dpi=150)
+
+
+def palette_of(sheet: Mapping[str, Any]) -> Palette:
+    """Return the palette of a matplotlib style sheet: its paper and text, its cycle of colours.
+
+    Args:
+        sheet: name to value; what it does not say is that of ``LIGHT``, of ``DARK`` where its paper is dark.
+    """
+    paper = sheet.get("axes.facecolor", sheet.get("figure.facecolor", LIGHT.paper))
+    red, green, blue = to_rgb(paper)
+    base = DARK if 0.3 * red + 0.59 * green + 0.11 * blue < 0.5 else LIGHT
+    names = {"text.color": ("ink", "faint"), "axes.edgecolor": ("edge",)}
+    found = {name: to_hex(sheet[key]) for key, names_ in names.items() if key in sheet for name in names_} | (
+        {"paper": to_hex(paper)} if base is DARK or paper != LIGHT.paper else {}
+    )
+    cycle = sheet["axes.prop_cycle"].by_key().get("color", []) if "axes.prop_cycle" in sheet else []
+    if cycle:
+        found |= {name: to_hex(cycle[i % len(cycle)]) for i, name in enumerate(CYCLE[:-1])}
+    return replace(base, **found)
 
 
 @contextlib.contextmanager
@@ -278,11 +295,6 @@ def _lay_out(drawing: Drawing) -> None:
     engine.execute(drawing)
     with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
         drawing.set_layout_engine(None)
-
-
-def plain(text: str) -> str:
-    """Return a text of others so that it is shown as it is, not read as a formula."""
-    return text.replace("$", r"\$")
 
 
 def inches(millimetres: float) -> float:

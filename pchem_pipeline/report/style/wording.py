@@ -66,6 +66,11 @@ def without_formulas(text: str) -> str:
 _PLAIN_E = re.compile(r"(?<![\w.])e-(?!\w)")
 
 
+def plain(text: str) -> str:
+    """Return a text of others so that it is shown as it is, not read as a formula."""
+    return text.replace("$", r"\$")
+
+
 def unit_text(unit: str) -> str:
     """Return a stored unit as people write it, e.g. ``e-/DN`` as ``e⁻/DN``; ``1`` as nothing."""
     return _UNITS.get(unit, unit)

@@ -21,6 +21,7 @@ from pchem_pipeline.base.variables import CHARGE_RATES, VARIABLES, Variable
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import MEANINGS
+from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
 from pchem_pipeline.report.inspector.packing import PackedMap, choose_scale, pack_map, some_of
 from pchem_pipeline.stages.report.stored import FittedModel
@@ -255,9 +256,8 @@ def _coarse(n_pixels: int) -> tuple[float, str]:
 
 
 def _median(values: NDArray[Any]) -> float:
-    some = some_of(values.ravel())
-    known = some[np.isfinite(some)]
-    return float(np.median(known)) if known.size else 0.0
+    known = Ordered.of(some_of(values.ravel()))
+    return known.median if known.size else 0.0
 
 
 def _multiple_of_exposure(maps: StoredMaps, variable: Variable) -> tuple[str, float] | None:

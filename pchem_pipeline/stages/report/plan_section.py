@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.planning.frames import contour_data, frames_needed, precision
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import Target, parse_target
@@ -27,10 +28,10 @@ def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict
         n_frames: frames of the run, or None where pixels differ.
     """
     names = ("quanta_exposure", "read_noise_e", "conversion_gain")
-    known = [maps[name][np.isfinite(maps[name])] for name in names if name in maps]
-    if len(known) < len(names) or any(values.size == 0 for values in known):
+    medians = [Ordered.of(maps[name]).median for name in names if name in maps]
+    if len(medians) < len(names) or not np.isfinite(medians).all():
         return None
-    exposure, noise, gain = (float(np.median(values)) for values in known)
+    exposure, noise, gain = medians
     try:
         point = Point(exposure, noise, gain)
     except ConfigError:

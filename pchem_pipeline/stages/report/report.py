@@ -88,7 +88,7 @@ def run(context: StageContext) -> None:
         context.config,
         context.integration_time,
         _stage_rows(context),
-        # in this process: another would spend more on importing matplotlib than on its share of the figures
+        # in this process: another would spend more on its imports than on its share of the figures
         draw_by_workers(1, context.reporter, context.stage),
     )
     done = context.run_units([WHOLE], task, unit_name="report", unit_bytes=ny * nx * _PIXEL_BYTES)

@@ -17,9 +17,10 @@ from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.split import best_samples, best_split, split_frames
 from pchem_pipeline.planning.targets import TARGET_NAMES, parse_target
 from pchem_pipeline.planning.verify import verify, verify_samples
+from pchem_pipeline.report.charts.chart import Line
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import csv_text
-from pchem_pipeline.report.figures.plan import plan_figures
+from pchem_pipeline.report.figures.plan import frames_chart, frames_table, plan_figures
 from pchem_pipeline.report.pages.tables import result_tables
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.style import Look
@@ -321,3 +322,19 @@ def test_the_section_of_the_report_is_of_the_median_pixel():
     assert len(csv_text(numbers).splitlines()) == 1 + section["contours"]["exposures"].size ** 2
     assert plan_section({name: np.full((2, 2), np.nan) for name in maps}, 10) is None
     assert plan_figures(ReportData(title="a run", shape=(2, 2)), settings) == []
+
+
+def test_contours_lie_where_so_many_frames_are_needed():
+    exposures, noises = np.geomspace(0.05, 30.0, 14), np.linspace(0.15, 0.9, 14)
+    power = 8.0 * noises[:, None] + 0.5 * np.log10(exposures)
+    contours = {"exposures": exposures, "read_noises": noises, "frames": {"bias_e to 1": 10.0**power}}
+    [stack] = frames_chart(frames_table(contours)).stacks
+    lines = [mark for mark in stack.panels[0].marks if isinstance(mark, Line)]
+    assert len(lines) == 7  # 10^1 ... 10^7
+    for level, line in enumerate(lines, start=1):
+        inside = (line.y > 0.15) & (line.y < 0.9)
+        assert inside.sum() > 5
+        np.testing.assert_allclose(8.0 * line.y[inside] + 0.5 * line.x[inside], level, atol=1e-9)
+    # the lowest one leaves at the lower end, on the left at the noise that few electrons allow
+    ends = lines[0].y[np.isfinite(lines[0].y)][[0, -1]]
+    assert ends[0] > ends[1] == 0.15

@@ -51,13 +51,15 @@ ENSEMBLE: dict[str, tuple[Any, ...]] = {
     ),
 }
 PLAIN = np.stack([H, G, MU, SIGMA], axis=1)
-THRESHOLDS = (COUNTS, ORIGIN, PLAIN, 9, np.zeros(8, dtype=np.int64), np.zeros(8), np.zeros(3))
+THRESHOLDS: dict[str, tuple[Any, ...]] = {
+    "sum_by_thresholds": (COUNTS, ORIGIN, PLAIN, 9, np.zeros(8, dtype=np.int64), np.zeros(8), np.zeros(3)),
+    "fill_errors": (PLAIN, PLAIN[::-1].copy(), np.zeros(3)),
+}
 ELECTRONS: dict[str, tuple[Any, ...]] = {
     "count_errors": (NUMBERS, TRUE, 65535, np.zeros(4, dtype=np.int64)),
     "tally_numbers": (COUNTS, ORIGIN, NUMBER_TABLES, 65535, np.zeros(5, dtype=np.int64)),
     "find_reach": (H, PIXELS, np.zeros((3, 2), dtype=np.int64)),
     "fill_tables": (EMPTY_TABLES, 1, H, PIXELS, 9, 65535),
-    "sum_outcomes": (NUMBER_TABLES, H, PIXELS, np.zeros(6), np.zeros(3)),
 }
 
 
@@ -66,9 +68,9 @@ ELECTRONS: dict[str, tuple[Any, ...]] = {
     [
         *((getattr(ensemble_numba, name), arguments) for name, arguments in ENSEMBLE.items()),
         *((getattr(electrons_numba, name), arguments) for name, arguments in ELECTRONS.items()),
-        (thresholds_numba.sum_by_thresholds, THRESHOLDS),
+        *((getattr(thresholds_numba, name), arguments) for name, arguments in THRESHOLDS.items()),
     ],
-    ids=[*ENSEMBLE, *ELECTRONS, "sum_by_thresholds"],
+    ids=[*ENSEMBLE, *ELECTRONS, *THRESHOLDS],
 )
 def test_compiled_and_plain_agree(kernel: Any, arguments: tuple[Any, ...]) -> None:
     results = []

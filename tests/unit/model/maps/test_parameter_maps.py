@@ -1,4 +1,4 @@
-"""Derived maps, quality, robust summaries and the display transform."""
+"""Derived maps, quality, robust summaries and the display."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from pchem_pipeline.model.maps.maps import (
     GOOD,
     NO_VALUE,
     derived_maps,
-    display_transform,
+    display_edges,
     quality_map,
     status_counts,
     summarise,
 )
+from pchem_pipeline.model.maps.ordered import Ordered
 
 PARAMETERS = {
     "quanta_exposure": np.array([[2.0, 1.0]]),
@@ -124,23 +125,29 @@ def test_median_error_of_a_normal_map() -> None:
     assert summarise(values).median_stderr == pytest.approx(expected, rel=5 / np.sqrt(200))
 
 
-def test_display_transform_has_the_beta_shape() -> None:
+def displayed(values: np.ndarray, n: int = 1000) -> np.ndarray:
+    """The level of each value, to 1 / n."""
+    edges = display_edges(Ordered.of(values), np.arange(1, n) / n)
+    return np.searchsorted(edges, values, side="right") / n
+
+
+def test_a_display_has_the_beta_shape() -> None:
     values = np.random.default_rng(6).lognormal(0, 2, size=(40, 50))
-    shown = display_transform(values)
     rank = (values.ravel().argsort().argsort() + 0.5) / values.size
-    np.testing.assert_allclose(shown.ravel(), beta(2, 2).ppf(rank), atol=1e-12)
-    np.testing.assert_allclose(display_transform(-values), 1 - shown, atol=1e-12)
+    level = beta(2, 2).ppf(rank)
+    above = level - displayed(values).ravel()
+    assert -1e-12 < above.min() < above.max() < 1e-3 + 1e-12
+    np.testing.assert_allclose(displayed(-values).ravel(), 1 - level, atol=1.001e-3)
 
 
-def test_display_transform_keeps_order_ties_and_gaps() -> None:
-    values = np.array([[1.0, 1.0, 5.0], [np.nan, -2.0, 1e9]])
-    shown = display_transform(values)
-    assert np.isnan(shown[1, 0])
-    assert shown[0, 0] == shown[0, 1]
-    assert shown[1, 1] < shown[0, 0] < shown[0, 2] < shown[1, 2]
-    assert shown[0, 0] == pytest.approx(beta(2, 2).ppf(0.4))
-    assert np.isnan(display_transform(np.full(3, np.nan))).all()
-    np.testing.assert_allclose(display_transform(np.ones(5)), 0.5)
+def test_a_display_keeps_order_and_ties() -> None:
+    values = np.array([1.0, 1.0, 5.0, -2.0, 1e9])
+    shown = displayed(values)
+    assert shown[0] == shown[1] == pytest.approx(beta(2, 2).ppf(0.4), abs=1e-3)
+    assert shown[3] < shown[0] < shown[2] < shown[4]
+    np.testing.assert_allclose(displayed(np.ones(5)), 0.5)
+    few = np.array([3.0, 3.0, 3.0, 7.0])
+    assert displayed(few).tolist() == pytest.approx(beta(2, 2).ppf([0.375] * 3 + [0.875]), abs=1e-3)
 
 
 def test_settings_refuse_nonsense() -> None:

@@ -1,20 +1,29 @@
 """Charts: one description, and what paper, the page and the plain picture make of it."""
 
+import base64
+import io
 import json
+import re
 from dataclasses import replace
 from xml.etree import ElementTree
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 from helpers.discrepancy_material import discrepancy_data
 from helpers.quick_stacks import stack, sums_of
 from helpers.report_material import report_data
+from PIL import Image as PngImage
 
 from pchem_pipeline.report.charts.chart import (
+    COLUMN_MM,
+    NO_COLOUR,
+    PAGE_MM,
     Axis,
     Band,
     Bars,
     Chart,
+    Image,
     Level,
     Line,
     Panel,
@@ -30,6 +39,7 @@ from pchem_pipeline.report.charts.chart import (
 from pchem_pipeline.report.charts.on_page import page_chart, rounded
 from pchem_pipeline.report.charts.on_paper import draw_chart
 from pchem_pipeline.report.charts.picture import chart_picture
+from pchem_pipeline.report.charts.png import png_of
 from pchem_pipeline.report.charts.thinning import fewer_steps, some_points, thinned
 from pchem_pipeline.report.charts.ticks import ticks
 from pchem_pipeline.report.figures.catalogue import run_figures
@@ -37,7 +47,9 @@ from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.inspector.inspector import json_for_html
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.style import COLUMN_MM, PAGE_MM, Look
+from pchem_pipeline.report.style.palette import DIVERGING, LIGHT, MAP_COLOURS, shades
+from pchem_pipeline.report.style.stretch import even_edges
+from pchem_pipeline.report.style.style import Look
 from pchem_pipeline.report.style.wording import symbol, without_formulas
 
 HOSTILE = "</script><script>alert(1)</script><!-- & $\\mu$"
@@ -51,7 +63,7 @@ def charts() -> dict[str, Figure]:
         stability=stability_figures(sums_of(frames)),
         discrepancy=discrepancy_data("named"),
     )
-    return {each.name: each for each in run_figures(data, ReportSettings()) if each.chart is not None}
+    return {each.name: each for each in run_figures(data, ReportSettings())}
 
 
 def every_mark(label: str = "a") -> Chart:
@@ -80,18 +92,18 @@ def values_of(x: list[float] | dict[str, float]) -> np.ndarray:
     return np.array(x, dtype=np.float64)
 
 
-def test_curves_of_a_run_are_charts(charts: dict[str, Figure]) -> None:
-    assert set(charts) >= {
+def test_curves_of_a_run_are_drawn_by_the_page_and_maps_are_still(charts: dict[str, Figure]) -> None:
+    assert {name for name in charts if not charts[name].chart.still} >= {
         "cluster_edges_pixel", "pixel_fits", "frame_means", "profiles", "spatial_spectra", "ensemble",
         "electron_numbers", "component_widths", "rounding", "uncertainty", "discrepancy_codes",
         "discrepancy_frames",
     }  # fmt: skip
+    still = {"map_bias", "fit_status", "goodness", "discrepancy_maps", "discrepancy_lines", "discrepancy_gap"}
+    assert all(charts[name].chart.still for name in still)
 
 
 def test_the_page_has_the_numbers_that_paper_shows(charts: dict[str, Figure]) -> None:
-    for figure in charts.values():
-        chart = figure.chart
-        assert chart is not None
+    for chart in (figure.chart for figure in charts.values() if not figure.chart.still):
         described = page_chart(chart)
         json.dumps(described, allow_nan=False)
         for stack_, shown in zip(chart.stacks, described["stacks"], strict=True):
@@ -110,9 +122,7 @@ def test_the_page_has_the_numbers_that_paper_shows(charts: dict[str, Figure]) ->
     axes = charts["rounding"].draw(Look()).axes[0]
     lines = {line.get_label(): line.get_ydata() for line in axes.lines}
     [read_noise] = [
-        mark
-        for mark in charts["rounding"].chart.stacks[0].panels[0].marks
-        if mark.label == "read noise"  # type: ignore[union-attr]
+        mark for mark in charts["rounding"].chart.stacks[0].panels[0].marks if mark.label == "read noise"
     ]
     assert isinstance(read_noise, Line)
     np.testing.assert_array_equal(lines["read noise"], read_noise.y)
@@ -121,7 +131,6 @@ def test_the_page_has_the_numbers_that_paper_shows(charts: dict[str, Figure]) ->
 @pytest.mark.parametrize("width", [COLUMN_MM, PAGE_MM])
 def test_pictures_are_whole_and_repeat(charts: dict[str, Figure], width: float) -> None:
     for figure in charts.values():
-        assert figure.chart is not None
         svg, across, down = chart_picture(figure.chart, width)
         assert chart_picture(figure.chart, width) == (svg, across, down)
         root = ElementTree.fromstring(svg)
@@ -145,6 +154,85 @@ def test_every_mark_is_drawn_everywhere() -> None:
     svg = chart_picture(chart, COLUMN_MM)[0].decode()
     assert svg.count("<path") >= 9
     assert "<rect" in svg
+
+
+def map_chart(values: np.ndarray, *, square: bool = True, **more: object) -> Chart:
+    """A map of values from 0 to 1 at rows 10, 11, ... and columns 20, 21, ..."""
+    rows, columns = values.shape
+    x, y = (19.5, 19.5 + columns), (9.5, 9.5 + rows)
+    image = Image(values, even_edges(0.0, 1.0), x, y, **more)  # type: ignore[arg-type]
+    panel = Panel(Axis("y", *y, whole=True, down=True), (image,), square=square)
+    return Chart((Stack((panel,), Axis("x", *x, whole=True)),))
+
+
+def dots_of(svg: bytes) -> np.ndarray:
+    """Colours of the first map of a picture, (row, column, 3)."""
+    found = re.search(rb"<image [^>]*base64,([^\"]*)", svg)
+    assert found is not None
+    with PngImage.open(io.BytesIO(base64.b64decode(found[1]))) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def test_a_map_has_the_same_colours_on_the_page_and_on_paper() -> None:
+    values = np.random.default_rng(3).random((6, 9))
+    values[2, 4] = np.nan
+    for scale, name in (("", MAP_COLOURS), (DIVERGING, DIVERGING)):
+        chart = map_chart(values, scale=scale)
+        drawn = dots_of(chart_picture(chart, COLUMN_MM)[0])
+        assert drawn.shape == (6, 9, 3)
+        assert tuple(drawn[2, 4]) == tuple(bytes.fromhex(LIGHT.no_value[1:]))
+        level = np.floor(values * NO_COLOUR) / (NO_COLOUR - 1)
+        expected = 255.0 * mpl.colormaps[name](level)[..., :3]
+        known = np.isfinite(values)
+        assert np.abs(drawn[known] - expected[known]).max() <= 3
+        [shown] = draw_chart(Look(), chart).axes[0].images
+        on_paper = shown.to_rgba(shown.get_array(), bytes=True)[..., :3].astype(int)
+        assert np.abs(on_paper - drawn.astype(int)).max() <= 3
+        assert np.ptp(drawn.astype(int), axis=(0, 1)).min() > 60  # the test can fail
+
+
+def test_a_map_lies_where_its_axes_say() -> None:
+    values = np.zeros((4, 8))
+    axes = draw_chart(Look(), map_chart(values)).axes[0]
+    assert (axes.get_xlim(), axes.get_ylim()) == ((19.5, 27.5), (13.5, 9.5))
+    assert axes.images[0].get_extent() == [19.5, 27.5, 13.5, 9.5]
+    assert axes.get_aspect() == 1.0
+    root = ElementTree.fromstring(chart_picture(map_chart(values), COLUMN_MM)[0])
+    image = next(root.iter("{http://www.w3.org/2000/svg}image"))
+    assert float(image.get("width", 0)) == pytest.approx(2 * float(image.get("height", 0)), rel=1e-3)
+    # upwards, the first row is the lowest
+    upwards = np.linspace(0.0, 1.0, 5)[:, None].repeat(3, axis=1)
+    panel = Panel(Axis("y", 0.0, 5.0), (Image(upwards, even_edges(0.0, 1.0), (0.0, 3.0), (0.0, 5.0)),))
+    chart = Chart((Stack((panel,), Axis("x", 0.0, 3.0)),))
+    np.testing.assert_array_equal(
+        dots_of(chart_picture(chart, COLUMN_MM)[0])[-1, 0], shades(MAP_COLOURS, 255)[0]
+    )
+    axes = draw_chart(Look(), chart).axes[0]
+    assert axes.get_ylim() == (0.0, 5.0)
+    assert axes.images[0].get_extent() == [0.0, 3.0, 5.0, 0.0]
+
+
+def test_of_many_pixels_every_odd_th_is_drawn_and_none_moves() -> None:
+    values = np.arange(90.0 * 1300).reshape(90, 1300)
+    image = Image(values, even_edges(0.0, 1.0), (-0.5, 1299.5), (-0.5, 89.5))
+    some, x, y = image.shown(346.0)
+    np.testing.assert_array_equal(some, values[::3, ::3])
+    assert x == pytest.approx((-0.5, 3 * 434 - 0.5))
+    assert y == pytest.approx((-0.5, 89.5))
+    assert image.shown(1300.0)[0].shape == values.shape
+
+
+def test_a_png_is_what_was_put_into_it() -> None:
+    rng = np.random.default_rng(8)
+    index, colours = rng.integers(0, 256, (37, 53)).astype(np.uint8), rng.integers(0, 256, (256, 3))
+    with PngImage.open(io.BytesIO(png_of(index, colours.astype(np.uint8)))) as image:
+        np.testing.assert_array_equal(np.asarray(image.convert("RGB")), colours[index])
+
+
+@pytest.mark.parametrize("name", ["viridis", "viridis_r", "RdBu", "RdBu_r"])
+def test_scales_of_colours_are_those_of_matplotlib(name: str) -> None:
+    expected = 255.0 * mpl.colormaps[name](np.arange(256))[:, :3]
+    assert np.abs(shades(name) - expected).max() < 2.6
 
 
 def test_a_gap_is_a_gap() -> None:

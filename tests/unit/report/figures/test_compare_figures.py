@@ -10,7 +10,7 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.checks.run_differences import MapDifference, compare_maps
 from pchem_pipeline.report.charts.on_paper import draw_chart
 from pchem_pipeline.report.comparison import HistoryRow, RunFacts
-from pchem_pipeline.report.figures.compare import draw_difference, ensemble_tables, ensembles_chart
+from pchem_pipeline.report.figures.compare import difference_chart, ensemble_tables, ensembles_chart
 from pchem_pipeline.report.figures.history import history_figures
 from pchem_pipeline.report.style.style import Drawing, Look
 
@@ -24,17 +24,19 @@ def difference(shape: tuple[int, int], size: float, *, same_data: bool = False):
 
 
 def drawn(found: MapDifference, *, same_data: bool) -> Drawing:
-    return draw_difference(Look(), z=found.z, n_far=found.n_far, title="bias: B − A", same_data=same_data)
+    return draw_chart(Look(), difference_chart(found.z, found.n_far, "bias: B − A", same_data=same_data))
 
 
 @pytest.mark.parametrize("shape", [(12, 16), (1, 9), (40, 4)])
 def test_maps_of_differences_of_all_shapes(shape: tuple[int, int]) -> None:
     found = difference(shape, 1.4)
     figure = drawn(found, same_data=False)
-    top, bottom = figure.axes[:2]
+    top, bottom = figure.axes[0], figure.axes[-1]
     if min(shape) > 1:
-        np.testing.assert_allclose(np.asarray(top.images[0].get_array(), dtype=float), found.z)
-        assert top.images[0].get_clim() == (-4.0, 4.0)
+        level = np.asarray(top.images[0].get_array(), dtype=float)
+        known = np.abs(found.z) < 4.0
+        np.testing.assert_allclose(8.0 * level[known] - 4.0, found.z[known], atol=4.01 / 255)
+        assert figure.axes[1].get_yticklabels()[0].get_text() == "−4"
     assert sum(bottom.patches[0].get_data().values) == found.n_both
     assert len(bottom.lines) == 1  # what chance gives
 
@@ -42,11 +44,12 @@ def test_maps_of_differences_of_all_shapes(shape: tuple[int, int]) -> None:
 def test_tiny_differences_of_the_same_frames_are_seen() -> None:
     found = difference((12, 16), 3e-9, same_data=True)
     figure = drawn(found, same_data=True)
-    assert figure.axes[1].get_xlabel() == "difference (10⁻⁹ standard errors)"
-    assert 1.0 <= figure.axes[0].images[0].get_clim()[1] < 10.0
-    assert not figure.axes[1].lines
+    assert figure.axes[-1].get_xlabel() == "difference (10⁻⁹ standard errors)"
+    ends = [abs(float(text.get_text().replace("−", "-"))) for text in figure.axes[1].get_yticklabels()]
+    assert 0.5 <= max(ends) < 10.0
+    assert not figure.axes[-1].lines
     nothing = difference((12, 16), 0.0, same_data=True)
-    assert drawn(nothing, same_data=True).axes[0].images[0].get_clim() == (-1.0, 1.0)
+    assert drawn(nothing, same_data=True).axes[1].get_yticklabels()[-1].get_text() == "1.0"
 
 
 def run_facts(label: str, mean: float) -> RunFacts:

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.style.ranges import histogram_edges, robust_range
-from pchem_pipeline.report.style.stretch import stretch_map
+from pchem_pipeline.report.style.stretch import even_bar, map_colours
 
 
 def test_hot_pixels_do_not_stretch_the_axis_and_are_counted() -> None:
@@ -51,41 +52,51 @@ def test_edges_cover_the_range_with_a_bounded_number_of_bins() -> None:
     np.testing.assert_allclose([edges[0], edges[-1]], [shown.low, shown.high])
 
 
+def colours(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """The colour of each value, 0 to 1, NaN where there is none."""
+    found = np.searchsorted(edges, values, side="right") / edges.size
+    return np.where(np.isfinite(values), found, np.nan)
+
+
 def test_the_colour_bar_of_the_stretch_tells_the_physical_value() -> None:
     """At a labelled level the colour of a pixel is that level: Appendix C, F_beta(level) is its rank."""
     values = np.random.default_rng(4).gamma(2.0, size=(200, 200))
-    drawn = stretch_map(values, "beta")
-    for level, share in zip(drawn.levels, (0.0, 0.15625, 0.5, 0.84375, 1.0), strict=True):
+    edges, bar = map_colours(Ordered.of(values))
+    for (level, _), share in zip(bar, (0.0, 0.15625, 0.5, 0.84375, 1.0), strict=True):
         at = np.quantile(values, share)
         nearest = np.unravel_index(np.argmin(np.abs(values - at)), values.shape)
-        assert drawn.colour[nearest] == pytest.approx(level, abs=0.005)
-    assert float(drawn.labels[2]) == pytest.approx(float(np.median(values)), rel=0.01)
+        assert colours(values, edges)[nearest] == pytest.approx(level, abs=0.005)
+    assert float(bar[2][1]) == pytest.approx(float(np.median(values)), rel=0.01)
 
 
 def test_the_stretch_keeps_order_and_gaps() -> None:
     values = np.array([[3.0, 1.0, np.nan], [2.0, 1000.0, 2.0]])
-    drawn = stretch_map(values)
-    assert np.isnan(drawn.colour[0, 2])
-    assert drawn.colour[1, 0] == drawn.colour[1, 2]
-    order = [drawn.colour[0, 1], drawn.colour[1, 0], drawn.colour[0, 0], drawn.colour[1, 1]]
-    assert order == sorted(order)
+    colour = colours(values, map_colours(Ordered.of(values))[0])
+    assert np.isnan(colour[0, 2])
+    assert colour[1, 0] == colour[1, 2]
+    assert colour[0, 1] < colour[1, 0] < colour[0, 0] < colour[1, 1]
 
 
 def test_the_linear_stretch_is_linear_and_clipped() -> None:
-    values = np.linspace(0.0, 100.0, 1001).reshape(7, 143)
-    drawn = stretch_map(values, "linear")
-    assert drawn.colour.ravel()[500] == pytest.approx(0.5)
-    assert drawn.colour.ravel()[0] == 0.0
-    assert drawn.labels[0].startswith("≤")
-    assert drawn.labels[-1].startswith("≥")
+    values = np.linspace(0.0, 100.0, 1001)
+    edges, bar = map_colours(Ordered.of(values), "linear")
+    assert colours(values, edges)[500] == pytest.approx(0.5, abs=0.003)
+    assert (colours(values, edges)[[0, -1]] == [0.0, 1.0]).all()
+    assert bar[0][1].startswith("≤")
+    assert bar[-1][1].startswith("≥")
 
 
-def test_nothing_to_stretch() -> None:
-    drawn = stretch_map(np.full((3, 3), np.nan))
-    assert np.isnan(drawn.colour).all()
-    assert drawn.levels == ()
+def test_nothing_to_stretch_and_one_value() -> None:
+    assert map_colours(Ordered.of(np.full((3, 3), np.nan)))[1] == ()
+    edges, bar = map_colours(Ordered.of(np.full(4, 7.0)))
+    assert colours(np.array([7.0]), edges) == pytest.approx(0.5, abs=0.003)
+    assert bar == ((0.5, "7.00"),)
 
 
 def test_labels_tell_close_values_apart() -> None:
-    drawn = stretch_map(np.linspace(100.001, 100.009, 99).reshape(9, 11))
-    assert len(set(drawn.labels)) == 5
+    _, bar = map_colours(Ordered.of(np.linspace(100.001, 100.009, 99)))
+    assert len({text for _, text in bar}) == 5
+
+
+def test_a_bar_in_equal_steps_has_round_numbers() -> None:
+    assert even_bar(-4.0, 4.0, whole=True) == ((0.0, "−4"), (0.25, "−2"), (0.5, "0"), (0.75, "2"), (1.0, "4"))
