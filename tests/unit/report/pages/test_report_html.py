@@ -16,11 +16,12 @@ from helpers.report_material import pixel_fit, report_data, true_maps
 
 from pchem_pipeline import __version__
 from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.report.charts.chart import Image
 from pchem_pipeline.report.data import MAP_NAMES, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import REPORT_FIGURES, report_figures
 from pchem_pipeline.report.figures.figure import DataTable, Figure, csv_text
 from pchem_pipeline.report.figures.stability import stability_figures
-from pchem_pipeline.report.figures.trust import draw_left_out
+from pchem_pipeline.report.figures.trust import left_out_chart
 from pchem_pipeline.report.inspector.inspector import script
 from pchem_pipeline.report.pages import report as report_module
 from pchem_pipeline.report.pages.cite import citation
@@ -31,7 +32,6 @@ from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.report.pages.summary import flags, key_numbers, sentence
 from pchem_pipeline.report.pages.tables import result_tables
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.style import Look
 
 #: Of one exposure, with nothing compared or planned.
 NOT_HERE = {
@@ -387,10 +387,11 @@ def test_moments_have_the_digits_of_the_data_that_they_are_compared_with() -> No
 def test_no_sample_left_out_is_white_and_samples_are_whole_numbers() -> None:
     share = np.zeros((8, 8))
     share[2, 3] = 1e-3
-    left, right = draw_left_out(Look(), share=share, n_frames=1000).axes[:2]
-    assert all(float(place).is_integer() for place in left.get_xticks())
-    (image,) = right.images
-    assert image.get_cmap().get_bad()[:3].tolist() == [1.0, 1.0, 1.0]
+    left, right = left_out_chart(share=share, n_frames=1000).stacks
+    assert left.x.whole
+    (image,) = (mark for mark in right.panels[0].marks if isinstance(mark, Image))
+    assert image.none == "paper"
+    assert np.isfinite(image.values).sum() == 1
 
 
 @pytest.mark.parametrize(
