@@ -361,6 +361,76 @@ def _damping_after(risen: float, expected: float, rise: float, share: float) -> 
     return share
 
 
+@kernel(borrows=True)
+def _ascend(
+    pixel: Pixel,
+    evaluate: Any,
+    limits: Limits,
+    goal: Goal,
+    known: FloatArray,
+    theta: FloatArray,
+    scratch: Scratch,
+) -> tuple[int, float, int, int]:
+    """Climb, see `climb`; return also where the evaluation at the last theta is, `AT` or `AHEAD`."""
+    trial, step = scratch.small[TRIAL], scratch.small[STEPS]
+    rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
+    flags, place = scratch.flags, AT
+    keep_inside(theta, limits)
+    if not sensible(theta, pixel.longest_step, limits.cells):
+        return DEGENERATE, -math.inf, 0, place
+    loglik = evaluate(pixel, theta, DERIVATIVES, scratch, scratch.evaluations[place])
+    warm_up = limits.warm_up if goal.first else 0
+    only_em = goal.first and limits.only_em
+    used, damping, fresh = 1, 0.0, limits.most > 0
+    least = _INDEFINITE_CELLS if limits.cells else _LEAST_SHARE
+    while used < limits.most:
+        at, ahead = scratch.evaluations[place], scratch.evaluations[AT + AHEAD - place]
+        find_held(theta, at, flags[FIXED], limits, flags[HELD])
+        tied = _tie_of(theta, goal, flags, limits, rounding)
+        if tied >= 0.0 and fresh:
+            tie_noise(theta, at, tied)
+        fresh = False
+        rise, share = newton_step(at, damping, least, scratch, step)
+        if not rise >= 0.0:
+            return NOT_CONVERGED, loglik, used, place
+        if damping > 0.0 and rise < limits.tolerance:
+            damping = 0.0  # only Newton's own step says that it has arrived
+            continue
+        end = _end_of(theta, known, loglik, rise, limits, goal) if share == 0.0 else _GOING
+        if end == CONVERGED and not only_em:
+            copy(theta, trial)
+            _take_step(trial, step, tied, limits, theta)
+            loglik += rise
+        if end != _GOING:
+            reached = goal.known if end == _AT_KNOWN else loglik + rise if end == FAR_BELOW else loglik
+            return (CONVERGED if end == _AT_KNOWN else end), reached, used, place
+        newton = limits.cells or goal.tied or (not only_em and used > warm_up and share <= _LARGEST_SHARE)
+        factor = 1.0
+        if newton:
+            factor = _take_step(theta, step, tied, limits, trial)
+        elif not em_step(pixel, theta, at, limits, trial):
+            return NOT_CONVERGED, loglik, used, place
+        risen = -math.inf
+        # a step out of bounds counts, too: damped and not damped in turn it may be refused for ever
+        used += 1
+        if sensible(trial, pixel.longest_step, limits.cells):
+            risen = evaluate(pixel, trial, DERIVATIVES, scratch, ahead)
+        elif not limits.cells:
+            return DEGENERATE, loglik, used - 1, place
+        if newton and not risen >= loglik - 1e-11 * abs(loglik):
+            damping = max(4.0 * share, _REFUSED_CELLS if limits.cells else _REFUSED)
+            if damping > _MOST_SHARE:
+                return NOT_CONVERGED, loglik, used, place
+            continue
+        if not math.isfinite(risen):
+            return NOT_CONVERGED, loglik, used, place
+        damping = _damping_after(risen - loglik, (2.0 * factor - factor * factor) * rise, rise, share)
+        copy(trial, theta)
+        place = AT + AHEAD - place
+        loglik, fresh = risen, True
+    return NOT_CONVERGED, loglik, used, place
+
+
 def climb(
     pixel: Pixel,
     evaluate: Any,
@@ -387,59 +457,7 @@ def climb(
         Outcome, log-likelihood at the last theta (the rise expected from one more Newton step included, once
         that is trusted), number of evaluations.
     """
-    trial, step = scratch.small[TRIAL], scratch.small[STEPS]
-    rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
-    at, ahead, flags = scratch.evaluations[AT], scratch.evaluations[AHEAD], scratch.flags
-    keep_inside(theta, limits)
-    if not sensible(theta, pixel.longest_step, limits.cells):
-        return DEGENERATE, -math.inf, 0
-    loglik = evaluate(pixel, theta, DERIVATIVES, scratch, at)
-    warm_up = limits.warm_up if goal.first else 0
-    only_em = goal.first and limits.only_em
-    used, damping, fresh = 1, 0.0, limits.most > 0
-    least = _INDEFINITE_CELLS if limits.cells else _LEAST_SHARE
-    while used < limits.most:
-        find_held(theta, at, flags[FIXED], limits, flags[HELD])
-        tied = _tie_of(theta, goal, flags, limits, rounding)
-        if tied >= 0.0 and fresh:
-            tie_noise(theta, at, tied)
-        fresh = False
-        rise, share = newton_step(at, damping, least, scratch, step)
-        if not rise >= 0.0:
-            return NOT_CONVERGED, loglik, used
-        if damping > 0.0 and rise < limits.tolerance:
-            damping = 0.0  # only Newton's own step says that it has arrived
-            continue
-        end = _end_of(theta, known, loglik, rise, limits, goal) if share == 0.0 else _GOING
-        if end == CONVERGED and not only_em:
-            copy(theta, trial)
-            _take_step(trial, step, tied, limits, theta)
-            loglik += rise
-        if end != _GOING:
-            reached = goal.known if end == _AT_KNOWN else loglik + rise if end == FAR_BELOW else loglik
-            return (CONVERGED if end == _AT_KNOWN else end), reached, used
-        newton = limits.cells or goal.tied or (not only_em and used > warm_up and share <= _LARGEST_SHARE)
-        factor = 1.0
-        if newton:
-            factor = _take_step(theta, step, tied, limits, trial)
-        elif not em_step(pixel, theta, at, limits, trial):
-            return NOT_CONVERGED, loglik, used
-        risen = -math.inf
-        # a step out of bounds counts, too: damped and not damped in turn it may be refused for ever
-        used += 1
-        if sensible(trial, pixel.longest_step, limits.cells):
-            risen = evaluate(pixel, trial, DERIVATIVES, scratch, ahead)
-        elif not limits.cells:
-            return DEGENERATE, loglik, used - 1
-        if newton and not risen >= loglik - 1e-11 * abs(loglik):
-            damping = max(4.0 * share, _REFUSED_CELLS if limits.cells else _REFUSED)
-            if damping > _MOST_SHARE:
-                return NOT_CONVERGED, loglik, used
-            continue
-        if not math.isfinite(risen):
-            return NOT_CONVERGED, loglik, used
-        damping = _damping_after(risen - loglik, (2.0 * factor - factor * factor) * rise, rise, share)
-        copy(trial, theta)
-        copy_evaluation(ahead, at)
-        loglik, fresh = risen, True
-    return NOT_CONVERGED, loglik, used
+    outcome, loglik, used, place = _ascend(pixel, evaluate, limits, goal, known, theta, scratch)
+    if place != AT:
+        copy_evaluation(scratch.evaluations[place], scratch.evaluations[AT])
+    return outcome, loglik, used
