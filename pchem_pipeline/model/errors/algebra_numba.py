@@ -85,6 +85,69 @@ def back_substitute(lower: FloatArray, start: int, end: int, vector: FloatArray)
     return squared
 
 
+@kernel(inline=True)
+def _solve_without_satellites(at: FloatArray, share: float, scratch: Scratch, step: FloatArray) -> float:
+    """Do as :func:`solve_arrow` where there are no satellites: by L D L', number by number, five times faster.
+
+    The shared parameters are 1/g, mu and v.
+    """
+    n, held = at.shape[0], scratch.flags[HELD]
+    squared = right1 = right2 = right3 = 0.0
+    a11 = a21 = a22 = a31 = a32 = a33 = 0.0
+    for j in range(n):
+        block = at[j]
+        inverse = 0.0
+        if not held[j]:
+            own = block[INFORMATION, 0] + share * block[DAMPING, 0]
+            if not own > _SMALLEST * block[DAMPING, 0]:
+                return math.nan
+            inverse = 1.0 / own
+        score = block[SCORE, 0]
+        squared += score * score * inverse
+        across1 = block[INFORMATION + 1, 0] + share * block[DAMPING + 1, 0]
+        across2 = block[INFORMATION + 2, 0] + share * block[DAMPING + 2, 0]
+        across3 = block[INFORMATION + 3, 0] + share * block[DAMPING + 3, 0]
+        factor1, factor2, factor3 = across1 * inverse, across2 * inverse, across3 * inverse
+        right1 += block[SCORE, 1] - factor1 * score
+        right2 += block[SCORE, 2] - factor2 * score
+        right3 += block[SCORE, 3] - factor3 * score
+        a11 += block[INFORMATION + 1, 1] + share * block[DAMPING + 1, 1] - factor1 * across1
+        a21 += block[INFORMATION + 2, 1] + share * block[DAMPING + 2, 1] - factor2 * across1
+        a22 += block[INFORMATION + 2, 2] + share * block[DAMPING + 2, 2] - factor2 * across2
+        a31 += block[INFORMATION + 3, 1] + share * block[DAMPING + 3, 1] - factor3 * across1
+        a32 += block[INFORMATION + 3, 2] + share * block[DAMPING + 3, 2] - factor3 * across2
+        a33 += block[INFORMATION + 3, 3] + share * block[DAMPING + 3, 3] - factor3 * across3
+    if held[n]:
+        a11, a21, a31, right1 = 1.0, 0.0, 0.0, 0.0
+    if held[n + 1]:
+        a22, a21, a32, right2 = 1.0, 0.0, 0.0, 0.0
+    if held[n + 2]:
+        a33, a31, a32, right3 = 1.0, 0.0, 0.0, 0.0
+    l21, l31 = a21 / a11, a31 / a11
+    d2, d3 = a22 - l21 * a21, a33 - l31 * a31
+    rest = a32 - l31 * a21
+    l32 = rest / d2
+    d3 -= l32 * rest
+    regular = a11 > 0.0 and d2 > _SINGULAR * abs(a22) and d3 > _SINGULAR * abs(a33)
+    if not regular:
+        return math.nan
+    right2 -= l21 * right1
+    right3 -= l31 * right1 + l32 * right2
+    step3 = right3 / d3
+    step2 = right2 / d2 - l32 * step3
+    step1 = right1 / a11 - l21 * step2 - l31 * step3
+    step[n], step[n + 1], step[n + 2], step[n + SATELLITE] = step1, step2, step3, 0.0
+    for j in range(n):
+        block = at[j]
+        step[j] = 0.0
+        if not held[j]:
+            value = block[SCORE, 0] - (block[INFORMATION + 1, 0] + share * block[DAMPING + 1, 0]) * step1
+            value -= (block[INFORMATION + 2, 0] + share * block[DAMPING + 2, 0]) * step2
+            value -= (block[INFORMATION + 3, 0] + share * block[DAMPING + 3, 0]) * step3
+            step[j] = value / (block[INFORMATION, 0] + share * block[DAMPING, 0])
+    return squared + right1 * right1 / a11 + right2 * right2 / d2 + right3 * step3
+
+
 @kernel(borrows=True)
 def solve_arrow(at: FloatArray, share: float, scratch: Scratch, step: FloatArray) -> float:
     """Solve for the step with the information and a share of the damping matrix.
@@ -99,7 +162,9 @@ def solve_arrow(at: FloatArray, share: float, scratch: Scratch, step: FloatArray
         The squared decrement, NaN unless the matrix is positive definite.
     """
     n, held, small = at.shape[0], scratch.flags[HELD], scratch.small
-    size = np.int64(N_BLOCK - 1 if held[n + SATELLITE] else N_BLOCK)
+    if held[n + SATELLITE]:
+        return float(_solve_without_satellites(at, share, scratch, step))
+    size = np.int64(N_BLOCK)
     right, schur, lower = small[RIGHT], small[SCHUR:LOWER], small[LOWER:HERE]
     for row in range(1, size):
         right[row] = 0.0
@@ -132,7 +197,6 @@ def solve_arrow(at: FloatArray, share: float, scratch: Scratch, step: FloatArray
     if not cholesky(schur, np.int64(1), size, _SINGULAR, held[n:], lower):
         return math.nan
     squared += float(back_substitute(lower, np.int64(1), size, right))
-    step[n + SATELLITE] = 0.0
     for row in range(1, size):
         step[n + row - 1] = 0.0 if held[n + row - 1] else right[row]
     for j in range(n):

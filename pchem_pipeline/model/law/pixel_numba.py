@@ -88,9 +88,9 @@ HELD, FIXED = range(2)
 # places in `Scratch.evaluations`: of the last climb, of its trials, at the best maximum
 AT, AHEAD, AT_BEST = range(3)
 N_DENSITY_ROWS = 9
-CAPACITY = 256  # columns of the table of an evaluation; a longer histogram goes through in pieces
 MAX_COMPONENTS = 201  # of which a value may be a mixture
-_MIN_COLUMNS = 384  # the frequencies of the starting points, a value's components, a table's columns
+N_NEGATIVE, _NO_FACTORIAL = 128, 1e5  # numbers below 0 of which a factorial is asked, and its logarithm
+_MIN_COLUMNS = 384  # the frequencies of the starting points, a value's components
 # rows of `Scratch.cells` of a sample: mass, its inverse, counts over mass, slopes in theta
 MASS, PER_MASS, RATIO, SLOPES = range(4)
 N_CELL_ROWS = 3 + N_BLOCK
@@ -148,8 +148,8 @@ class Scratch(NamedTuple):
 
     Attributes:
         rows: of the density and of the starts, shape (N_DENSITY_ROWS, enough).
-        table: a column for each DN, of the density.
-        chains: its coefficients by component, of some cells, shape (enough, SIMD_WIDTH).
+        coefficients: of the density, a row for each component that bins are next to.
+        log_factorials: of -N_NEGATIVE, ... -1, where they are very large, 0, 1, ..., shape (1, enough).
         numbers: electron numbers in use with P(k) and its two derivatives, shape (enough, 4).
         cells: of each sample, shape (J, N_CELL_ROWS, bins + 1 + SIMD_WIDTH).
         edges: of all components of a sample, one after another, as far as there is room; and then of one,
@@ -160,8 +160,8 @@ class Scratch(NamedTuple):
     """
 
     rows: FloatArray
-    table: FloatArray
-    chains: FloatArray
+    coefficients: FloatArray
+    log_factorials: FloatArray
     numbers: FloatArray
     cells: NDArray[np.float64]
     edges: NDArray[np.float64]
@@ -171,13 +171,23 @@ class Scratch(NamedTuple):
 
 
 @kernel
+def _log_factorials(n: int) -> FloatArray:
+    """Return log k! of -N_NEGATIVE <= k < n."""
+    found = np.empty((1, N_NEGATIVE + n))
+    for place in range(N_NEGATIVE + n):
+        k = place - N_NEGATIVE
+        found[0, place] = math.lgamma(k + 1.0) if k >= 0 else _NO_FACTORIAL
+    return found
+
+
+@kernel
 def make_scratch(n_samples: int, n_bins: int, cells: bool) -> Scratch:
     """Return room for so many samples of at most so many bins; ``cells``: also to integrate them."""
     width = n_bins + 1 + SIMD_WIDTH if cells else 0
     return Scratch(
-        np.empty((N_DENSITY_ROWS, n_bins + _MIN_COLUMNS)),
-        np.empty((MAX_COMPONENTS + 5, CAPACITY + SIMD_WIDTH)),
-        np.empty((MAX_COMPONENTS // 2 + MAX_COMPONENTS, SIMD_WIDTH)),
+        np.empty((N_DENSITY_ROWS, 2 * n_bins + _MIN_COLUMNS)),
+        np.empty((2 * n_bins + 2, MAX_COMPONENTS + SIMD_WIDTH)),
+        _log_factorials(2 * n_bins + 512),
         np.empty((n_bins + 512 if cells else 0, 4)),
         np.zeros((n_samples, N_CELL_ROWS, width)),
         np.zeros((3, EDGES_KEPT + width + SIMD_WIDTH if cells else 0)),

@@ -179,6 +179,20 @@ def _counting(_typing: Any) -> Any:
     return signature(_SIMD), emit
 
 
+@intrinsic
+def _spliced(_typing: Any, _n: Any, _x: Any, _y: Any) -> Any:
+    def emit(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        word = ir.IntType(32)
+        kind = ir.VectorType(word, _WIDTH)
+        lanes = ir.Constant(kind, [ir.Constant(word, i) for i in range(_WIDTH)])
+        number = builder.trunc(arguments[0], word)
+        filled = builder.insert_element(ir.Constant(kind, ir.Undefined), number, ir.Constant(word, 0))
+        filled = builder.shuffle_vector(filled, filled, ir.Constant(kind, None))
+        return builder.select(builder.icmp_signed("<", lanes, filled), arguments[1], arguments[2])
+
+    return signature(_SIMD, types.intp, _SIMD, _SIMD), emit
+
+
 def _place(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
     """Return the address of eight successive elements of a row."""
     kind = sig.args[0]
@@ -264,6 +278,11 @@ def counting() -> Simd:
     return np.arange(float(SIMD_WIDTH))
 
 
+def spliced(n: int, x: Value, y: Value) -> Simd:
+    """Return x in the first n lanes, y in the others."""
+    return np.where(np.arange(SIMD_WIDTH) < n, x, y)
+
+
 def simd_load(table: NDArray[np.float64], row: int, column: int) -> Simd:
     """Return eight successive elements of a row of a table."""
     return table[row, column : column + SIMD_WIDTH].copy()
@@ -294,6 +313,7 @@ _VECTOR: dict[Callable[..., Any], _Choice] = {
     fraction_of: lambda x: lambda x: _fraction_of(x),
     scaled: lambda x, power: lambda x, power: _scaled(x, power),
     counting: lambda: lambda: _counting(),
+    spliced: lambda n, x, y: lambda n, x, y: _spliced(n, x, y),
     simd_load: lambda table, row, column: lambda table, row, column: _load(table, row, column),
     simd_store: lambda table, row, column, x: lambda table, row, column, x: _store(table, row, column, x),
     simd_sum: lambda x: lambda x: _sum(x),
@@ -309,6 +329,7 @@ _SCALAR: dict[Callable[..., Any], _Choice] = {
     fraction_of: lambda x: lambda x: 2.0 * math.frexp(x)[0],
     scaled: lambda x, power: lambda x, power: math.ldexp(x, int(power)),
     counting: lambda: lambda: 0.0,
+    spliced: lambda n, x, y: lambda n, x, y: float(x) if n > 0 else float(y),
     simd_load: lambda table, row, column: lambda table, row, column: table[row, column],
     simd_store: lambda table, row, column, x: (
         lambda table, row, column, x: operator.setitem(table, (row, column), x)

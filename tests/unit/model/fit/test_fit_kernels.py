@@ -12,6 +12,8 @@ from helpers.drawn_pixels import draw, samples
 from helpers.em_trace import LIMITS, em_trace, evaluated, one_sample
 from helpers.reference_pchem import Theta, e_step, em, log_likelihood
 from numpy.typing import NDArray
+from scipy.special import logsumexp
+from scipy.stats import norm, poisson
 
 from pchem_pipeline.model.errors import algebra_numba, rounding_numba
 from pchem_pipeline.model.fit import api as fit_api
@@ -193,46 +195,64 @@ def take_plain_simd(monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.setattr(module, name, plain)
 
 
-def test_compiled_table_equals_plain_at_every_width(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(8)
+def test_compiled_sums_equal_plain_at_every_width(monkeypatch: pytest.MonkeyPatch) -> None:
     kernels = {
-        3: density_numba.table_sums_3,
-        5: density_numba.table_sums_5,
-        7: density_numba.table_sums_7,
-        9: density_numba.table_sums_9,
-        12: density_numba.table_sums_any,
+        1: density_numba.sums_of_3,
+        2: density_numba.sums_of_5,
+        3: density_numba.sums_of_7,
+        4: density_numba.sums_of_9,
+        9: density_numba.sums_of_any,
     }
-    a, inverse, columns = 1.3, 0.9, 24
-    for width, kernel in kernels.items():
-        half = width // 2
-        table = rng.uniform(0.01, 2, (4 + width, columns))
-        table[1] = rng.uniform(-a / 2, a / 2, columns)
-        table[2] = rng.integers(0, 9, columns)
-        table[4:] *= 10.0 ** rng.integers(-30, 30, columns)  # the logarithm over many powers of two
-        answers = []
-        for function in (kernel, density_numba.table_sums_any, kernel.py_func):
-            totals = np.zeros(18)
-            if function is kernel.py_func:
-                take_plain_simd(monkeypatch)
-            function(table, columns, width, a, inverse, totals)
-            answers.append(totals)
-        monkeypatch.undo()
-        np.testing.assert_allclose(answers[0], answers[1], rtol=1e-11)
-        np.testing.assert_allclose(answers[0], answers[2], rtol=1e-11)
-        c, offset, place, level = table[:4]
-        low = np.maximum(place - half, 0)
-        d = offset + (place - low) * a
-        i = np.arange(width)[:, None]
-        terms = table[4:] * np.exp(i * offset * a * inverse)
-        density = terms.sum(axis=0)
-        loglik = level - (d - offset / 2) * offset * inverse + np.log(density)
-        first, second = ((terms * i**power).sum(axis=0) / density for power in (1, 2))
-        fourth = (terms * (i**2 - second) ** 2).sum(axis=0) / density
-        assert answers[0][0] == pytest.approx(c @ loglik, rel=1e-13)
-        expected = [c @ first, c @ second, c @ (low * first), c @ (d * first), c @ (low * d)]
-        np.testing.assert_allclose(answers[0][3:8], expected, rtol=1e-11)
-        assert answers[0][10] == pytest.approx(c @ ((second - first**2) * d), rel=1e-9)
-        assert answers[0][17] == pytest.approx(c @ fourth, rel=1e-9)
+    for half, noise in zip(kernels, (0.2, 0.3, 0.42, 0.53, 1.1), strict=True):
+        for step in (11.0, 4.0, 1.7):  # eight bins at a time, four, and two
+            sample, centre, _, theta = prepare((3.0, step, noise))
+            point = internal(theta, centre)
+            facts, bins, rows = sample.pixel.facts[0], sample.pixel.bins[0], sample.scratch.rows
+            run(sample, point)  # lays out the blocks
+            a, zero, n_bins = point[1], point[2] - facts[pixel_numba.FIRST], int(facts[pixel_numba.N_BINS])
+            first, last = (max(0, int(np.floor((x - zero) / a + 0.5))) for x in (0, n_bins - 1))
+            electron_noise, stride = np.exp(0.5 * point[3]) / a, min(8, int(np.ceil(a)))
+            wide = density_numba._half_width(electron_noise, theta.exposure, first, last, 22.0)
+            assert wide == half or wide >= half == 9
+            comb = density_numba._Comb(a, np.exp(-point[3]), zero, first, last, wide, n_bins, stride)
+            blocks, answers = -(-n_bins // stride), []
+            for function in (kernels[half], density_numba.sums_of_any, kernels[half].py_func):
+                if function is kernels[half].py_func:
+                    take_plain_simd(monkeypatch)
+                    monkeypatch.setattr(density_numba, "_lanes", density_numba._lanes.py_func)
+                rows[0] = 0.0
+                function(bins, comb, blocks, rows, sample.scratch.coefficients)
+                answers.append(rows[0, :10].copy())
+            monkeypatch.undo()
+            np.testing.assert_allclose(answers[0], answers[1], rtol=1e-11, atol=1e-9)
+            np.testing.assert_allclose(answers[0], answers[2], rtol=1e-11, atol=1e-9)
+
+
+def test_large_electron_numbers_and_a_comb_finer_than_any() -> None:
+    pixel, scratch, centre = one_sample(np.array([0, 3, 40, 180, 300, 180, 40, 3, 0], np.uint32))
+    x = np.repeat(np.arange(-centre, 9.0 - centre), [0, 3, 40, 180, 300, 180, 40, 3, 0])
+    for h in (40.0, 5000.0):  # with a table of factorials, and beyond it
+        theta = Theta(h, 1 / 0.6, -0.6 * h, 0.7)
+        loglik = evaluated(pixel, internal(theta, 0.0), DERIVATIVES, density_likelihood(), scratch)
+        k = np.arange(int(h) - 60, int(h) + 60)
+        log_weight = poisson.logpmf(k, h)
+        terms = log_weight + norm.logpdf(x[:, None], theta.bias + 0.6 * k, theta.sigma)
+        assert loglik == pytest.approx(logsumexp(terms, axis=1).sum(), rel=1e-10)
+    finest = Theta(2.0, 1 / 0.01, 0.0, 0.3)
+    assert evaluated(pixel, internal(finest, 0.0), DERIVATIVES, density_likelihood(), scratch) == -np.inf
+
+
+def test_far_values_have_the_density_of_the_nearest_component() -> None:
+    counts = np.zeros(400, np.uint32)
+    counts[[0, 200, 211, 222, 399]] = 1, 300, 400, 200, 1
+    pixel, scratch, centre = one_sample(counts)
+    x = np.repeat(np.arange(400.0) - centre, counts)
+    for sigma in (0.6, 3.0):  # e-: 0.055 and 0.27
+        theta = Theta(1.0, 1 / 11.0, 200.3 - centre, sigma)
+        loglik = evaluated(pixel, internal(theta, 0.0), DERIVATIVES, density_likelihood(), scratch)
+        k = np.arange(60)
+        terms = poisson.logpmf(k, 1.0) + norm.logpdf(x[:, None], theta.bias + 11.0 * k, sigma)
+        assert loglik == pytest.approx(logsumexp(terms, axis=1).sum(), rel=1e-10)
 
 
 def test_simd_are_the_functions_that_they_are_named_after(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,7 @@ hooks.register_model = register
 from pchem_pipeline.model.law import simd_math_numba as functions, simd_numba as simd
 from pchem_pipeline.model.law.simd_numba import (
     counting, exponent_of, fraction_of, fused, least, simd_load, most, nearest, scaled, simd_store,
-    simd_sum
+    simd_sum, spliced
 )
 SIMD_WIDTH = simd.SIMD_WIDTH
 exp, log = functions.simd_exp, functions.simd_log
@@ -47,9 +47,10 @@ def fill(table):
         simd_store(table, 8, i, tail)
         simd_store(table, 9, i, density)
         simd_store(table, 10, i, by_z)
+        simd_store(table, 11, i, spliced(3, x, -1.0))
         total = total + x
     return simd_sum(total)
-table = np.zeros((11, 1600))
+table = np.zeros((12, 1600))
 table[0] = np.random.default_rng(1).uniform(-100, 100, 1600)
 table[7] = np.linspace(-37, 37, 1600)
 table[7, :8] = -np.inf, np.inf, 0.0, -1e-250, 1e-250, -300.0, 300.0, 8.5
@@ -70,7 +71,7 @@ def test_the_operations_are_what_they_are_named_after(tmp_path: Path, kind: str,
     assert done.returncode == 0, done.stderr
     assert ("cannot be taught vectors (no such hook)" in done.stderr) == (kind == "scalar")
     with np.load(tmp_path / "found.npz") as found:
-        x, exponential, logarithm, clipped, left, zero, place, z, tail, density, by_z = found["table"]
+        x, exponential, logarithm, clipped, left, zero, place, z, tail, density, by_z, first = found["table"]
         assert found["lanes"] == lanes
         assert found["total"] == pytest.approx(x.sum(), abs=1e-9)
     np.testing.assert_allclose(exponential, np.exp(x), rtol=3e-15)
@@ -79,6 +80,7 @@ def test_the_operations_are_what_they_are_named_after(tmp_path: Path, kind: str,
     np.testing.assert_allclose(left, x + 0.5 - np.rint(x), atol=1e-13)
     np.testing.assert_array_equal(zero, 0.0)
     np.testing.assert_array_equal(place, np.arange(1600))
+    np.testing.assert_array_equal(first, np.where(np.arange(1600) % lanes < 3, x, -1.0))
     np.testing.assert_array_equal(np.sign(tail), np.where(z <= 0.0, 1.0, -1.0))
     near = np.abs(z) < 8.0
     np.testing.assert_allclose(np.abs(tail[near]), ndtr(-np.abs(z[near])), rtol=2e-14)
