@@ -59,8 +59,8 @@ _NOT_SHOWN = ("quality", "goodness_q")
 _FEW_CHANNELS = 12
 #: Pixels in full that have the mass of a model with effects.
 _SOME_MASSES = 300
-#: Memory that a pixel takes: the maps are held as a whole. Measured at 4096 x 2304, 3,820 MiB in all.
-_PIXEL_BYTES = 405
+#: Memory that a pixel takes: the maps are held as a whole. Measured at 2048 x 1152, 980 MiB in all.
+_PIXEL_BYTES = 370
 
 
 def report_tile(data: ReportData, settings: ReportSettings, draw: DrawAll | None = None) -> RenderedReport:
