@@ -62,7 +62,9 @@ def sensor_maps(sums: StackSums) -> dict[str, FloatArray]:
             deviations = block_deviations(sums)
             chi2 = (sums.lengths[:, None, None] * deviations**2).sum(axis=0) / v
             found["spread"] = chi_square(chi2, sums.lengths.size - 1.0)
-    return {name: np.where(np.isfinite(values), values, np.nan) for name, values in found.items()}
+    for values in found.values():
+        values[~np.isfinite(values)] = np.nan
+    return found
 
 
 def block_deviations(sums: StackSums) -> FloatArray:

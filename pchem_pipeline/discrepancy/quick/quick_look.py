@@ -251,7 +251,7 @@ def _frame_covariance(sums: StackSums) -> tuple[_Estimate, _Estimate]:
     m, nx = int(quiet.sum()), sums.shape[1]
     if m < _FEWEST_LINES or nx < _FEWEST_LINES:
         return _NOTHING, columns
-    rows, variance = sums.rows.values[:, quiet], sums.rows.variance[quiet]
+    rows, variance = sums.rows.centred()[:, quiet], sums.rows.variance[quiet]
     total = rows.sum(axis=1)
     products = total**2 - np.einsum("ty,ty->t", rows, rows)
     scale = float(variance.sum())
@@ -390,7 +390,7 @@ def _lag_check(sums: StackSums, common: _Common) -> list[Check]:
     variance = sums.variance[some]
     mean, error = _mean_correlation(sums.lag[some] / variance * math.sqrt(sums.freedom_of_all), common)
     quiet = _quiet(sums)
-    total = sums.rows.values[:, quiet].sum(axis=1)
+    total = sums.rows.centred()[:, quiet].sum(axis=1)
     inside = np.ones(total.size, np.bool_)
     inside[sums.starts] = False
     at = np.flatnonzero(inside)

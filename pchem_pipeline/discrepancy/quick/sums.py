@@ -13,13 +13,17 @@ from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+#: Lines whose sums are looked at together.
+_LINES_AT_ONCE = 1 << 12
+
 
 @dataclass(frozen=True)
 class Lines:
     """Sums over lines (rows, or columns within a group of rows) of some frames, with what they are made of.
 
     Attributes:
-        values: sums, less their mean over each block of frames, (frame, line), DN.
+        sums: of the lines in each frame, (frame, line), DN.
+        starts: first frame of each block of frames, (b,).
         freedom: frames less blocks.
         variance: sum of the variances of a line's pixels, (line,), DN^2.
         pairs: sum over ordered pairs of pixels of the line, neighbours left out, of the product of their
@@ -28,7 +32,8 @@ class Lines:
         length: pixels of each line.
     """
 
-    values: FloatArray
+    sums: NDArray[np.signedinteger]
+    starts: IntArray
     freedom: float
     variance: FloatArray
     pairs: FloatArray
@@ -41,13 +46,33 @@ class Lines:
         return np.maximum((self.length - 1.0) * (self.length - 2.0), 0.0)
 
     @cached_property
+    def _means(self) -> FloatArray:
+        """Mean of each line over each block, (b, line), DN."""
+        blocks = np.split(self.sums, self.starts[1:])
+        return np.stack([each.sum(axis=0, dtype=np.int64) / len(each) for each in blocks])
+
+    def centred(self, frames: slice = slice(None), lines: slice = slice(None)) -> FloatArray:
+        """Return sums less their mean over each block, (frame, line), DN; of some frames, or lines.
+
+        The sums of columns are many: as numbers of 64 bits they would take more than several maps.
+        """
+        values = self.sums[frames, lines].astype(np.float64)
+        first = frames.indices(self.sums.shape[0])[0]
+        block = np.searchsorted(self.starts, np.arange(first, first + len(values)), side="right") - 1
+        for each in np.unique(block):
+            values[block == each] -= self._means[each, lines]
+        return values
+
+    @cached_property
     def covariance(self) -> tuple[FloatArray, FloatArray]:
         """Mean covariance of such pairs in each line, and its standard error by chance, DN^2, (line,).
 
         Given the samples of each pixel, in random order and independent of those of others, the sum of the
         products of all pairs has the expectation 0 and exactly this variance, whatever the pixels' law.
         """
-        square = np.einsum("tl,tl->l", self.values, self.values) / self.freedom
+        parts = [slice(i, i + _LINES_AT_ONCE) for i in range(0, self.variance.size, _LINES_AT_ONCE)]
+        centred = (self.centred(lines=part) for part in parts)
+        square = np.concatenate([np.einsum("tl,tl->l", each, each) for each in centred]) / self.freedom
         rest = square - self.variance - 2.0 * self.neighbours
         with np.errstate(divide="ignore", invalid="ignore"):
             error = np.sqrt(2.0 * self.pairs / self.freedom) / self.n_pairs
@@ -136,7 +161,8 @@ class StackSums:
         v = self.variance
         pairs = v.sum(axis=1) ** 2 - (v**2).sum(axis=1) - 2.0 * (v[:, :-1] * v[:, 1:]).sum(axis=1)
         return Lines(
-            _centred(self.row_sum.astype(np.float64), self.starts),
+            self.row_sum,
+            self.starts,
             self.freedom,
             v.sum(axis=1),
             pairs,
@@ -161,21 +187,12 @@ class StackSums:
         product[ROW_GROUP - 1 :: ROW_GROUP] = 0.0  # no product crosses the border of a group
         along, covariance = (np.add.reduceat(values, tops, axis=0) for values in (product, inside))
         heights = np.diff(np.append(tops, ny))
-        values = self.column_sum.reshape(self.column_sum.shape[0], -1).astype(np.float64)
         return Lines(
-            _centred(values, starts),
+            self.column_sum.reshape(self.column_sum.shape[0], -1),
+            starts,
             freedom,
             total.ravel(),
             (total**2 - square - 2.0 * along).ravel(),
             covariance.ravel(),
             np.repeat(heights, nx),
         )
-
-
-def _centred(values: FloatArray, starts: IntArray) -> FloatArray:
-    """Take the mean over each block of frames off values (frame, line), in place, and return them."""
-    lengths = np.diff(np.append(starts, values.shape[0]))
-    means = np.add.reduceat(values, starts, axis=0) / lengths[:, None]
-    for start, length, mean in zip(starts, lengths, means, strict=True):
-        values[start : start + length] -= mean
-    return values

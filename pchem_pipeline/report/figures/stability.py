@@ -182,12 +182,13 @@ def line_spectra(sums: StackSums) -> tuple[DataTable, ...]:
 
 def _line_power(lines: Lines, length: int) -> FloatArray:
     """Return the mean power of the sums of lines along the sensor, over that of independent pixels."""
-    values = lines.values.reshape(-1, length)
     power, step = np.zeros(length // 2 + 1), max(1, _AT_ONCE // length)
-    for start in range(0, values.shape[0], step):
-        power += (np.abs(np.fft.rfft(values[start : start + step], axis=1)) ** 2).sum(axis=0)
-    power = power[1:] / length
     groups = lines.variance.size // length
+    for start in range(0, lines.sums.shape[0] * groups, step):
+        frames = slice(start // groups, -(-(start + step) // groups))
+        values = lines.centred(frames).reshape(-1, length)[start - groups * frames.start :][:step]
+        power += (np.abs(np.fft.rfft(values, axis=1)) ** 2).sum(axis=0)
+    power = power[1:] / length
     return np.asarray(power / max(lines.freedom * groups * float(lines.variance.mean()), 1e-300))
 
 

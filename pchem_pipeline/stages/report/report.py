@@ -45,6 +45,7 @@ from pchem_pipeline.stages.table import pipeline
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
+    from pchem_pipeline.discrepancy.quick.sums import StackSums
     from pchem_pipeline.report.pages.pictures import DrawAll
     from pchem_pipeline.report.settings import ReportSettings
     from pchem_pipeline.run.sensor import SensorInfo
@@ -59,8 +60,8 @@ _NOT_SHOWN = ("quality", "goodness_q")
 _FEW_CHANNELS = 12
 #: Pixels in full that have the mass of a model with effects.
 _SOME_MASSES = 300
-#: Memory that a pixel takes: the maps are held as a whole. Measured at 4096 x 2304, 3,820 MiB in all.
-_PIXEL_BYTES = 405
+#: Memory that a pixel takes: the maps are held as a whole. Measured at 2048 x 1152, 980 MiB in all.
+_PIXEL_BYTES = 370
 
 
 def report_tile(data: ReportData, settings: ReportSettings, draw: DrawAll | None = None) -> RenderedReport:
@@ -156,9 +157,8 @@ def gather(
     full = choose_inspected(run.maps, run.fit, [(y, x) for _, y, x in shown], _suspects(run))
     index = np.concatenate([pixel_index(shown, shape), full.index])
     histograms = read_histograms(store, index, shape, run.model)
-    loaded = {f"maps/{name}": values for name, values in run.maps.items()}
-    maps, exact = read_maps(store, shape, full.index, loaded)
     sums = read_sums(store)
+    maps, exact = read_maps(store, shape, full.index, _at_hand(run, sums))
     # from here on little is read
     columns = [run.maps[name].reshape(-1)[index] for name in PARAMETERS]
     drawn = slice(0, len(shown))
@@ -178,6 +178,17 @@ def gather(
         # what a single command was given is no setting of the run
         config_yaml=store.config_text() or dump_config(config),
     )
+
+
+def _at_hand(run: StoredRun, sums: StackSums | None) -> dict[str, NDArray[Any]]:
+    """Return the maps that were read, as they are stored, by path."""
+    found = {f"maps/{name}": values for name, values in run.maps.items()}
+    found |= {f"fit/{name}": run.fit[name] for name in ("fit_status", "outlier_share") if name in run.fit}
+    if sums is not None:
+        names = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")
+        covariances = (sums.lag, sums.next_x, sums.next_y)
+        found |= {f"summary/{name}": values for name, values in zip(names, covariances, strict=True)}
+    return found
 
 
 def _shown(run: StoredRun, config: RunConfig) -> list[Chosen]:
