@@ -383,8 +383,8 @@ def _end_of(
         known: a maximum known already.
         loglik: log-likelihood there.
         rise: expected of the next step.
-        following: rise expected of the step after it; negative where the next one is damped, and both are less
-            than what is left.
+        following: rise expected of the step after it; negative where the next one is damped, and both are
+            less than what is left.
         used: evaluations.
         limits: bounds and limits.
         goal: what the climb is for.
