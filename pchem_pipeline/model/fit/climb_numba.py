@@ -156,14 +156,6 @@ def min_log_variance(a: float, cells: bool) -> float:
 
 
 @kernel(inline=True)
-def _near_floor(v: float, a: float, cells: bool) -> bool:
-    """Tell whether v may be at its lower bound: ``log x <= x - 1`` spares the logarithm where it is not."""
-    if cells:
-        return v < 2.0 * max(LEAST_NOISE_DN, LEAST_NOISE_E * a) - 1.9
-    return v < max(MIN_LOG_VARIANCE, 2.0 * MIN_ELECTRON_NOISE * a - 2.0) + 0.1
-
-
-@kernel(inline=True)
 def floor_in_electrons(a: float, cells: bool) -> bool:
     """Tell whether the lower bound of v is that in e-, which moves with the step a."""
     if cells:
@@ -177,9 +169,7 @@ def keep_inside(theta: FloatArray, limits: Limits) -> None:
     n = theta.size - N_BLOCK + 1
     for j in range(n):
         theta[j] = max(limits.bound, theta[j])
-    v, a = theta[n + LOG_VARIANCE], theta[n + STEP]
-    if _near_floor(v, a, limits.cells):
-        theta[n + LOG_VARIANCE] = max(v, min_log_variance(a, limits.cells))
+    theta[n + LOG_VARIANCE] = max(theta[n + LOG_VARIANCE], min_log_variance(theta[n + STEP], limits.cells))
     theta[n + SATELLITE] = min(max(theta[n + SATELLITE], 0.0), MOST_SATELLITE)
 
 
@@ -236,9 +226,8 @@ def find_held(
         noise += at[j, SCORE, 1 + LOG_VARIANCE]
         satellite += at[j, SCORE, 1 + SATELLITE]
     held[n + STEP], held[n + BIAS] = fixed[n + STEP], fixed[n + BIAS]
-    v, a, at_floor = theta[n + LOG_VARIANCE], theta[n + STEP], False
-    if noise <= 0.0 and _near_floor(v, a, limits.cells):
-        at_floor = v <= min_log_variance(a, limits.cells) + 1e-12
+    floor = min_log_variance(theta[n + STEP], limits.cells)
+    at_floor = theta[n + LOG_VARIANCE] <= floor + 1e-12 and noise <= 0.0
     held[n + LOG_VARIANCE] = fixed[n + LOG_VARIANCE] or at_floor
     weight = theta[n + SATELLITE]
     at_end = (weight <= 0.0 and satellite <= 0.0) or (weight >= MOST_SATELLITE and satellite >= 0.0)
@@ -280,7 +269,7 @@ def em_step(pixel: Pixel, theta: FloatArray, at: FloatArray, limits: Limits, out
     return True
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def newton_step(
     at: FloatArray, share: float, least: float, scratch: Scratch, step: FloatArray
 ) -> tuple[float, float]:

@@ -36,7 +36,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     LOG_VARIANCE,
     LOGLIK_ALONE,
     MEAN,
-    N_DENSITY_ROWS,
     N_FRAMES,
     N_KEPT,
     OCCUPIED,
@@ -65,8 +64,6 @@ _SIDE_BY_SIDE = 3  # vectors of frequencies at a time
 _HIGHEST_FREQUENCY = 0.5  # cycles/DN: whole numbers cannot tell f from 1 - f
 
 _TWO_PI = 2.0 * math.pi
-# rows of the room in which the ECF is summed; the first is the result
-_TURN, _EVEN, _ODD, _STEP = 1, 2, 3, 4
 
 #  Attempts at one sample: its first start, and those of a suspicious pixel: side lobe, cumulants, scan, and
 # the
@@ -97,16 +94,27 @@ def regression_basis() -> NDArray[np.float64]:
 
 
 @kernel(borrows=True)
-def _sum_ecf(histogram: Histogram, n_frequencies: int, work: NDArray[np.float64]) -> None:
-    """Leave b_0 and b_1 in the rows `_EVEN` and `_ODD`, from twice the cosines of the angles in `_TURN`.
+def ecf_power(
+    histogram: Histogram,
+    step: float,
+    n_frequencies: int,
+    work: NDArray[np.float64],
+) -> None:
+    """Leave the squared modulus of the ECF at ``step * (1 ... n)`` in ``work[0]``.
 
     By Clenshaw's recurrence ``b_i = c_i + 2 cos(angle) b_{i+1} - b_{i+2}``, two DN at a time and all
-    frequencies side by side: ``sum c_i exp(i angle) = b_0 - b_1 exp(-angle)``.
+    frequencies side by side; ``|sum c_i exp(i angle)|^2 = b_0^2 + b_1^2 - 2 cos(angle) b_0 b_1``.
     """
     weights, n_bins = histogram.weights, histogram.n_bins
+    base = 2.0 * math.cos(_TWO_PI * step)
+    before, present = 2.0, base
+    for m in range(n_frequencies + _SIDE_BY_SIDE * SIMD_WIDTH):
+        work[1, m] = present
+        before, present = present, base * present - before
+    share = 1.0 / (histogram.n * histogram.n)
     for m in range(0, n_frequencies, _SIDE_BY_SIDE * SIMD_WIDTH):
-        turn1, turn2 = simd_load(work, _TURN, m), simd_load(work, _TURN, m + SIMD_WIDTH)
-        turn3 = simd_load(work, _TURN, m + 2 * SIMD_WIDTH)
+        turn1, turn2 = simd_load(work, 1, m), simd_load(work, 1, m + SIMD_WIDTH)
+        turn3 = simd_load(work, 1, m + 2 * SIMD_WIDTH)
         odd1 = odd2 = odd3 = counting() * 0.0
         even1 = even2 = even3 = odd1 + (weights[n_bins - 1] if n_bins % 2 == 1 else 0.0)
         for i in range(n_bins // 2 * 2 - 1, 0, -2):
@@ -117,35 +125,9 @@ def _sum_ecf(histogram: Histogram, n_frequencies: int, work: NDArray[np.float64]
             even1 = fused(turn1, odd1, left - even1)
             even2 = fused(turn2, odd2, left - even2)
             even3 = fused(turn3, odd3, left - even3)
-        simd_store(work, _EVEN, m, even1)
-        simd_store(work, _EVEN, m + SIMD_WIDTH, even2)
-        simd_store(work, _EVEN, m + 2 * SIMD_WIDTH, even3)
-        simd_store(work, _ODD, m, odd1)
-        simd_store(work, _ODD, m + SIMD_WIDTH, odd2)
-        simd_store(work, _ODD, m + 2 * SIMD_WIDTH, odd3)
-
-
-@kernel(borrows=True)
-def ecf_power(
-    histogram: Histogram,
-    step: float,
-    n_frequencies: int,
-    work: NDArray[np.float64],
-) -> None:
-    """Leave the squared modulus of the ECF at ``step * (1 ... n)`` in ``work[0]``.
-
-    It is ``b_0^2 + b_1^2 - 2 cos(angle) b_0 b_1``.
-    """
-    base = 2.0 * math.cos(_TWO_PI * step)
-    before, present = 2.0, base
-    for m in range(n_frequencies + _SIDE_BY_SIDE * SIMD_WIDTH):
-        work[_TURN, m] = present
-        before, present = present, base * present - before
-    _sum_ecf(histogram, n_frequencies, work)
-    share = 1.0 / (histogram.n * histogram.n)
-    for m in range(0, n_frequencies, SIMD_WIDTH):
-        even, odd = simd_load(work, _EVEN, m), simd_load(work, _ODD, m)
-        simd_store(work, 0, m, share * (even * even + odd * odd - simd_load(work, _TURN, m) * even * odd))
+        simd_store(work, 0, m, share * (even1 * even1 + odd1 * odd1 - turn1 * even1 * odd1))
+        simd_store(work, 0, m + SIMD_WIDTH, share * (even2 * even2 + odd2 * odd2 - turn2 * even2 * odd2))
+        simd_store(work, 0, m + 2 * SIMD_WIDTH, share * (even3 * even3 + odd3 * odd3 - turn3 * even3 * odd3))
 
 
 @kernel(borrows=True)
@@ -255,21 +237,8 @@ def assemble(
     """
     if not (a > 0.0 and math.isfinite(a) and exposure > 0.0 and math.isfinite(exposure)):
         return False, False
+    _, _, _, _, n, mean, variance = histogram
     modulus, phase = ecf_at(histogram, 1.0 / a)
-    return True, _from_satellite(histogram, a, exposure, modulus, phase, theta)
-
-
-@kernel(inline=True)
-def _from_satellite(
-    histogram: Histogram,
-    a: float,
-    exposure: float,
-    modulus: float,
-    phase: float,
-    theta: NDArray[np.float64],
-) -> bool:
-    """Fill a start from the ECF at the satellite, unnormalised; tell whether it stands clear of the noise."""
-    n, mean, variance = histogram.n, histogram.mean, histogram.variance
     modulus /= n
     s2 = max(variance - exposure * a * a, 0.16 * a * a)
     bias = mean - exposure * a
@@ -293,7 +262,7 @@ def _from_satellite(
     theta[3] = math.log(
         min(max(s2, QUANTISATION_VARIANCE, 0.0025 * a * a), max(variance, QUANTISATION_VARIANCE))
     )
-    return clear
+    return True, clear
 
 
 @kernel(borrows=True)
@@ -432,22 +401,14 @@ def _first_start(
 @kernel(inline=True)
 def _scan_gains(pixel: Pixel, evaluate: Any, scratch: Scratch, theta: NDArray[np.float64]) -> bool:
     """Fill ``theta`` with the likeliest of a row of gains, the read noise taken as 0.35 e-."""
-    trial, work = scratch.small[HERE], scratch.rows[N_DENSITY_ROWS:]
+    trial = scratch.small[HERE]
     histogram = histogram_of(pixel, np.int64(0))
-    smallest, ratio = math.sqrt(histogram.variance) * 0.2, 12.5 ** (1.0 / (_N_GAINS - 1.0))
-    for m in range(_N_GAINS + _SIDE_BY_SIDE * SIMD_WIDTH):
-        work[_STEP, m] = smallest * ratio**m
-        work[_TURN, m] = 2.0 * math.cos(_TWO_PI / work[_STEP, m])
-    _sum_ecf(histogram, np.int64(_N_GAINS), work)
     best = -math.inf
-    for m in range(_N_GAINS):
-        a = work[_STEP, m]
+    for place in range(_N_GAINS):
+        a = math.sqrt(histogram.variance) * 0.2 * 12.5 ** (place / (_N_GAINS - 1.0))
         exposure = histogram.variance / (a * a) - _GAIN_NOISE
         if exposure > 0.0 and a > MIN_STEP:
-            angle, even, odd = _TWO_PI / a, work[_EVEN, m], work[_ODD, m]
-            real, imag = even - 0.5 * work[_TURN, m] * odd, odd * math.sin(angle)
-            phase = math.atan2(imag, real) + angle * histogram.first
-            _from_satellite(histogram, a, exposure, math.hypot(real, imag), phase, trial)
+            assemble(histogram, a, exposure, trial)
             trial[3] = math.log(max(_GAIN_NOISE * a * a, QUANTISATION_VARIANCE))
             best = _likeliest(pixel, evaluate, scratch, best, theta)
     return best > -math.inf

@@ -80,7 +80,6 @@ FloatArray = NDArray[np.float64]
 _DROPPED, _DROPPED_ALONE = 22.0, 14.0
 _SMALLEST = -700.0  # logarithm of what counts as 0 beside 1
 _LONGEST = 340.0  # logarithm of r, its largest and smallest, times half the components: needles
-_MOST_RATIO = np.exp(_LONGEST / np.maximum(np.arange(MAX_COMPONENTS), 1.0))  # by half the components
 _ALL_BINS = 1e9
 
 # columns of the row `_TOTALS`: the log-likelihood; with y = x - mu the sums of E[e], E[e]^2 and y E[e]; over
@@ -220,7 +219,7 @@ def _sums_kernel(width: int) -> Callable[..., Any]:
         terms = width if width > 0 else 2 * comb.half + 1
         a, half = comb.a, terms // 2
         square, spread = a * a, -0.5 * comb.inverse
-        most_ratio, ratios = _MOST_RATIO[half], simd_exp(counting() * (a * comb.inverse))
+        most_ratio, ratios = math.exp(_LONGEST / half), simd_exp(counting() * (a * comb.inverse))
         zero = counting() * 0.0
         loglik = sum_e = sum_ee = sum_ye = v11 = v11y = v11yy = v12 = v12y = v22 = zero
         for block in range(n_blocks):
@@ -294,7 +293,7 @@ def _loglik_alone(
 ) -> float:
     """Return the log-likelihood; with ``frames``, leave instead the counts expected of all bins."""
     half, spread = comb.half, -0.5 * comb.inverse
-    most_ratio, ratios = _MOST_RATIO[half], simd_exp(counting() * (comb.a * comb.inverse))
+    most_ratio, ratios = math.exp(_LONGEST / half), simd_exp(counting() * (comb.a * comb.inverse))
     loglik = counting() * 0.0
     for block in range(n_blocks):
         start = block * comb.stride
@@ -320,7 +319,7 @@ def _loglik_alone(
 @kernel(inline=True)
 def _finish(
     facts: FloatArray,
-    exposure: float,
+    log_exposure: float,
     a: float,
     bias: float,
     inverse: float,
@@ -334,6 +333,7 @@ def _finish(
     """
     n = facts[N_FRAMES]
     score, sums = out[SCORE], out[SUMS]
+    exposure = math.exp(log_exposure)
     t = a * inverse
     mean = facts[MEAN] - bias
     sum_e, sum_ee, sum_ye = totals[_E], totals[_EE] + a * a * totals[_V11], totals[_YE]
@@ -419,7 +419,7 @@ def _evaluate_sample(
         sums_of_any(bins, comb, n_blocks, rows, coefficients)
     if what == EXPECTATIONS:
         _loglik_alone(bins, comb, n_blocks, rows, coefficients, facts[N_FRAMES])
-    _finish(facts, exposure, a, origin, inverse, rows[_TOTALS], out)
+    _finish(facts, log_exposure, a, origin, inverse, rows[_TOTALS], out)
     return float(rows[_TOTALS, _LOGLIK])
 
 

@@ -87,7 +87,7 @@ N_SMALL = HEIGHTS + 1
 HELD, FIXED = range(2)
 # places in `Scratch.evaluations`: of the last climb, of its trials, at the best maximum
 AT, AHEAD, AT_BEST = range(3)
-N_DENSITY_ROWS, N_SCAN_ROWS = 9, 5  # of `Scratch.rows`: of the density; of a scan that evaluates it
+N_DENSITY_ROWS = 9
 MAX_COMPONENTS = 201  # of which a value may be a mixture
 N_NEGATIVE, _NO_FACTORIAL = 128, 1e5  # numbers below 0 of which a factorial is asked, and its logarithm
 _MIN_COLUMNS = 384  # the frequencies of the starting points, a value's components
@@ -147,7 +147,7 @@ class Scratch(NamedTuple):
     """Room to work in, and the evaluations of a pixel.
 
     Attributes:
-        rows: of the density, of the starts, and of a scan, shape (N_DENSITY_ROWS + N_SCAN_ROWS, enough).
+        rows: of the density and of the starts, shape (N_DENSITY_ROWS, enough).
         coefficients: of the density, a row for each component that bins are next to.
         log_factorials: of -N_NEGATIVE, ... -1, where they are very large, 0, 1, ..., shape (1, enough).
         numbers: electron numbers in use with P(k) and its two derivatives, shape (enough, 4).
@@ -185,7 +185,7 @@ def make_scratch(n_samples: int, n_bins: int, cells: bool) -> Scratch:
     """Return room for so many samples of at most so many bins; ``cells``: also to integrate them."""
     width = n_bins + 1 + SIMD_WIDTH if cells else 0
     return Scratch(
-        np.empty((N_DENSITY_ROWS + N_SCAN_ROWS, 2 * n_bins + _MIN_COLUMNS)),
+        np.empty((N_DENSITY_ROWS, 2 * n_bins + _MIN_COLUMNS)),
         np.empty((2 * n_bins + 2, MAX_COMPONENTS + SIMD_WIDTH)),
         _log_factorials(2 * n_bins + 512),
         np.empty((n_bins + 512 if cells else 0, 4)),
