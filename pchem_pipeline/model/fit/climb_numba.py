@@ -69,17 +69,9 @@ _REFUSED, _REFUSED_CELLS = 3e-5, 1e-2  # after a step that was refused
 _INDEFINITE_CELLS = (
     1.0  # where the information is not positive definite: most of the step is the damping matrix's
 )
-# Newton's steps converge quadratically: the rise after the next one follows from the last two. Of climbs that
-# end where it is below the second of these, nats, 0.1 % would have risen by more than 0.01 nats in the end
-_NEARLY, _SURELY_LOWER = 1e-3, 1e-6
-_MODEST = 0.1  # nats still to rise, for it to follow
-# damped steps say less of what is still to gain: of the climbs given up 0.1 % would have passed, and where a
-# point is so near one that is known, with less below it, nats, the climb goes there
-_DAMPED_FACTOR, _DAMPED_MARGIN = 5.0, 5.0
-_VERY_NEAR, _LITTLE_BELOW = 0.15, 1.0
+_SURELY_LOWER = 1e-4  # nats still to rise, where that much cannot reach the likelihood that is known
 _LARGEST_SHARE = 3.0  # beyond it an EM step is taken, where there is one
 _MOST_SHARE = 1e9
-_SAME = 0.3  # e-: two points of one maximum
 _BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains apart
 
 
@@ -133,9 +125,6 @@ class Goal(NamedTuple):
         known: log-likelihood of a maximum known already: the climb ends where it heads for that one, or
             has all but reached a lower one; infinite without one.
         tied: 1/g moves sigma with it, so that ``sigma g`` stays: the profile of the read noise in e-.
-        patience: give up once the log-likelihood is farther below both than this over the number of
-            evaluations.
-        exact: what is evaluated last is used, so that it must be at the maximum.
     """
 
     first: bool | np.bool_
@@ -143,8 +132,6 @@ class Goal(NamedTuple):
     to_pass: float
     known: float
     tied: bool | np.bool_
-    patience: float
-    exact: bool | np.bool_
 
 
 @kernel(borrows=True)
@@ -200,18 +187,12 @@ def same_place(left: FloatArray, right: FloatArray, cells: bool) -> bool:
     The bias is the same within 0.3 e-, and so is the mean of the brightest sample; with the density of one
     sample the step within 10 %.
     """
-    return bool(_distance(left, right, cells) < _SAME)
-
-
-@kernel(inline=True)
-def _distance(left: FloatArray, right: FloatArray, cells: bool) -> float:
-    """Return by how many e- the bias of two points differs, or the mean of the brightest sample."""
     n = left.size - N_BLOCK + 1
-    a, bright = left[n + STEP], _BRIGHT
+    a, most = left[n + STEP], _BRIGHT
     if n > 1 or cells:
-        bright = max(math.exp(brightest(left)), _BRIGHT)
-    apart = max(abs(left[n + BIAS] - right[n + BIAS]), abs(a - right[n + STEP]) * bright)
-    return float(apart / a)
+        most = max(math.exp(brightest(left)), _BRIGHT)
+    near = abs(left[n + BIAS] - right[n + BIAS]) < 0.3 * a
+    return bool(near and abs(a - right[n + STEP]) * most < 0.3 * a)
 
 
 @kernel(borrows=True)
@@ -356,45 +337,16 @@ def _tie_of(
 
 @kernel(inline=True)
 def _end_of(
-    theta: FloatArray,
-    known: FloatArray,
-    loglik: float,
-    rise: float,
-    following: float,
-    used: int,
-    limits: Limits,
-    goal: Goal,
+    theta: FloatArray, known: FloatArray, loglik: float, rise: float, limits: Limits, goal: Goal
 ) -> int:
-    """Tell how a climb ends, or that it goes on.
-
-    Args:
-        theta: where it is.
-        known: a maximum known already.
-        loglik: log-likelihood there.
-        rise: expected of the next step.
-        following: rise expected of the step after it; negative where the next one is damped, and both are
-            less than what is left.
-        used: evaluations.
-        limits: bounds and limits.
-        goal: what the climb is for.
-    """
-    newton = following >= 0.0
-    if newton and rise < limits.tolerance:
+    """Tell how a climb ends whose next step is Newton's own, or that it goes on."""
+    if rise < limits.tolerance:
         return CONVERGED
-    if newton and rise < _NEARLY and following < 0.1 * limits.tolerance and not goal.exact:
+    if rise < _SURELY_LOWER and loglik + 2.0 * _SURELY_LOWER < goal.known < math.inf:
         return CONVERGED
-    below, pass_at = goal.known - loglik, max(goal.to_beat, goal.to_pass)
-    if newton and rise < _MODEST and following < _SURELY_LOWER and rise + _NEARLY < below < math.inf:
-        return CONVERGED
-    if (pass_at - loglik) * used > goal.patience:
+    if loglik + 2.0 * rise + 1.0 < goal.to_beat or loglik + 4.0 * rise + 3.0 < goal.to_pass:
         return FAR_BELOW
-    if newton and (loglik + 2.0 * rise + 1.0 < goal.to_beat or loglik + 4.0 * rise + 3.0 < goal.to_pass):
-        return FAR_BELOW
-    if not newton and not limits.cells and loglik + _DAMPED_FACTOR * rise + _DAMPED_MARGIN < pass_at:
-        return FAR_BELOW
-    if newton and below < rise + 1.0 and same_place(known, theta, limits.cells):
-        return _AT_KNOWN
-    if below < _LITTLE_BELOW and not limits.cells and _distance(known, theta, limits.cells) < _VERY_NEAR:
+    if loglik + rise > goal.known - 1.0 and same_place(known, theta, limits.cells):
         return _AT_KNOWN
     return _GOING
 
@@ -430,7 +382,6 @@ def _ascend(
     warm_up = limits.warm_up if goal.first else 0
     only_em = goal.first and limits.only_em
     used, damping, fresh = 1, 0.0, limits.most > 0
-    before = 0.0  # rise of the step before, if it was Newton's own
     least = _INDEFINITE_CELLS if limits.cells else _LEAST_SHARE
     while used < limits.most:
         at, ahead = scratch.evaluations[place], scratch.evaluations[AT + AHEAD - place]
@@ -445,18 +396,14 @@ def _ascend(
         if damping > 0.0 and rise < limits.tolerance:
             damping = 0.0  # only Newton's own step says that it has arrived
             continue
-        following = rise * (rise / before) ** 2 if share == 0.0 else -1.0
-        end = _end_of(theta, known, loglik, rise, following, used, limits, goal)
+        end = _end_of(theta, known, loglik, rise, limits, goal) if share == 0.0 else _GOING
         if end == CONVERGED and not only_em:
             copy(theta, trial)
             _take_step(trial, step, tied, limits, theta)
             loglik += rise
         if end != _GOING:
-            if end == _AT_KNOWN:
-                return CONVERGED, goal.known, used, place
-            if end == FAR_BELOW:
-                loglik = min(loglik + rise, max(goal.to_beat, goal.to_pass))
-            return end, loglik, used, place
+            reached = goal.known if end == _AT_KNOWN else loglik + rise if end == FAR_BELOW else loglik
+            return (CONVERGED if end == _AT_KNOWN else end), reached, used, place
         newton = limits.cells or goal.tied or (not only_em and used > warm_up and share <= _LARGEST_SHARE)
         factor = 1.0
         if newton:
@@ -477,7 +424,6 @@ def _ascend(
             continue
         if not math.isfinite(risen):
             return NOT_CONVERGED, loglik, used, place
-        before = rise if share == 0.0 and factor == 1.0 else 0.0
         damping = _damping_after(risen - loglik, (2.0 * factor - factor * factor) * rise, rise, share)
         copy(trial, theta)
         place = AT + AHEAD - place

@@ -30,7 +30,7 @@ _VECTOR = np.zeros(1)
 _OUTCOME = numba.types.Tuple((numba.types.int64, numba.types.float64, numba.types.int64))
 _FOUND = numba.types.UniTuple(numba.types.int64, 3)
 _LIMITS = Limits(0.0, 0.0, 0, 0, False, False, 0.0, 0.0, 0.0, 0.0, 0.0, False, False, False, False, False)
-_GOAL = Goal(False, 0.0, 0.0, 0.0, False, 0.0, False)
+_GOAL = Goal(False, 0.0, 0.0, 0.0, False)
 
 
 def _address(result: Any, arguments: tuple[Any, ...]) -> Any:

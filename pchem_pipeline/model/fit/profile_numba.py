@@ -68,7 +68,7 @@ def _set(
 @kernel(inline=True)
 def _of_profile(tied: bool) -> Goal:
     """Return the goal of a climb with a parameter fixed; tied: the read noise in e-."""
-    return Goal(np.bool_(False), -math.inf, -math.inf, math.inf, tied, math.inf, np.bool_(True))
+    return Goal(np.bool_(False), -math.inf, -math.inf, math.inf, tied)
 
 
 @kernel

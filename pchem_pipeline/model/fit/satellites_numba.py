@@ -80,7 +80,7 @@ def fill_core(pixel: Pixel, theta: FloatArray, scratch: Scratch) -> None:
 @kernel(borrows=True)
 def _climb(pixel: Pixel, tools: Tools, to_beat: float, theta: FloatArray) -> tuple[float, int]:
     """Climb with the weight of the satellites free; return log-likelihood, or -inf, and evaluations."""
-    goal = Goal(np.bool_(True), to_beat, -math.inf, math.inf, np.bool_(False), math.inf, np.bool_(True))
+    goal = Goal(np.bool_(True), to_beat, -math.inf, math.inf, np.bool_(False))
     outcome, loglik, used = climb_on(pixel, tools, goal, theta, theta)
     return (loglik if outcome == CONVERGED else -math.inf), used
 

@@ -17,7 +17,7 @@ from pchem_pipeline.model.fit.climb_numba import (
     Limits,
     same_place,
 )
-from pchem_pipeline.model.fit.starts_numba import fill_starts, n_attempts, side_of
+from pchem_pipeline.model.fit.starts_numba import fill_starts, n_attempts
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.density_numba import LOG_2PI
@@ -63,9 +63,6 @@ _FINE_STEP = 5.0  # DN per electron: below it climbs from a neighbour also meet 
 _CLEAR_LOBE = 3.0  # standard errors: a side lobe of the characteristic function that settles the gain
 _SURE_LOBE = 5.0  # the same where the model does not fit: other starts have only helped below 3
 _MOST_MOVES = 40
-# nats times evaluations: of the climbs from the best with its gain scaled that got higher than what is known,
-# 1 % were this much below it at the first evaluation, half of that at the second, and so on
-_PATIENCE = 100.0
 _LEAST_BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains apart
 _COARSE_NOISE = 0.6  # DN: below it, or below so many DN per electron, rounding is more than additive noise
 _COARSE_STEP = 2.5
@@ -140,15 +137,13 @@ def climb_on(
 @kernel(inline=True)
 def from_start() -> Goal:
     """Return the goal of a climb from a start."""
-    no = np.bool_(False)
-    return Goal(np.bool_(True), -math.inf, -math.inf, math.inf, no, math.inf, no)
+    return Goal(np.bool_(True), -math.inf, -math.inf, math.inf, np.bool_(False))
 
 
 @kernel(inline=True)
-def goal_beside(first: bool, loglik: float, runner_up: float, patience: float) -> Goal:
+def goal_beside(first: bool, loglik: float, runner_up: float) -> Goal:
     """Return the goal of a climb from a start, or from a neighbour, the best and the next known."""
-    no = np.bool_(False)
-    return Goal(np.bool_(first), loglik - CLEAR_GAP, runner_up, loglik, no, patience, no)
+    return Goal(np.bool_(first), loglik - CLEAR_GAP, runner_up, loglik, np.bool_(False))
 
 
 @kernel(inline=True)
@@ -204,7 +199,7 @@ def climb_neighbours(
         if which == came_from or not _neighbour(which, pixel, best, trial):
             which += 1
             continue
-        goal = goal_beside(False, best_loglik, runner_up, math.inf)
+        goal = goal_beside(False, best_loglik, runner_up)
         outcome, loglik, count = climb_on(pixel, tools, goal, best, trial)
         used += count
         higher = outcome == CONVERGED and loglik > best_loglik
@@ -252,12 +247,6 @@ def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
 
 
 @kernel(inline=True)
-def misfit_of(out: FloatArray) -> float:
-    """Return chi-square over its degrees of freedom in a row of results, 1 where there are none."""
-    return float(out[CHI2] / out[DEGREES]) if out[DEGREES] > 0.0 else 1.0
-
-
-@kernel(inline=True)
 def _settled(pixel: Pixel, theta: FloatArray, clear: bool, out: FloatArray) -> tuple[bool, bool]:
     """Tell whether a maximum fits well, its gain settled, and whether other starts have a chance at all.
 
@@ -272,7 +261,8 @@ def _settled(pixel: Pixel, theta: FloatArray, clear: bool, out: FloatArray) -> t
     """
     n, lobe = pixel.facts.shape[0], side_lobe(pixel, theta)
     good = score_of(out) < SUSPICIOUS and ((n > 1 and not clear) or lobe > _CLEAR_LOBE)
-    of_the_model = n == 1 and out[DEGREES] > 0.0 and lobe > _SURE_LOBE * math.sqrt(misfit_of(out))
+    misfit = math.sqrt(out[CHI2] / max(out[DEGREES], 1.0))
+    of_the_model = n == 1 and out[DEGREES] > 0.0 and lobe > _SURE_LOBE * misfit
     return good, not (good or of_the_model)
 
 
@@ -460,34 +450,29 @@ def _climb_start(
     pixel: Pixel,
     tools: Tools,
     clear: bool,
-    patience: float,
     found: Found,
     trial: FloatArray,
     best: FloatArray,
     out: FloatArray,
-) -> tuple[Found, bool]:
-    """Climb from ``trial``; a higher maximum takes the place of ``best``.
-
-    Returns:
-        How far the search has come, and whether the climb came back to the best maximum known.
-    """
+) -> Found:
+    """Climb from ``trial``; a higher maximum takes the place of ``best``."""
     n, cells = pixel.facts.shape[0], tools.limits.cells
     known, goal = best[n + STEP] > 0.0, from_start()
     if known and n == 1:  # of several samples, one comb may have two maxima
-        goal = goal_beside(True, found.loglik, found.runner_up, patience)
+        goal = goal_beside(True, found.loglik, found.runner_up)
     outcome, loglik, count = climb_on(pixel, tools, goal, best, trial)
     used = found.used + count
     if outcome == DEGENERATE:
-        return Found(found.loglik, found.runner_up, used, np.bool_(True)), False
+        return Found(found.loglik, found.runner_up, used, np.bool_(True))
     same = known and same_place(best, trial, cells)
     least = found.loglik + _SAME_COMB if same else found.loglik
     if outcome != CONVERGED or loglik <= least:
         runner_up = found.runner_up if same else max(found.runner_up, loglik)
-        return Found(found.loglik, runner_up, used, found.degenerate), same and outcome == CONVERGED
+        return Found(found.loglik, runner_up, used, found.degenerate)
     runner_up = found.runner_up if same else max(found.runner_up, found.loglik)
     copy(trial, best)
     weighed: Found = _weigh(pixel, tools, clear, Found(loglik, runner_up, used, found.degenerate), best, out)
-    return weighed, False
+    return weighed
 
 
 @kernel(inline=True)
@@ -532,24 +517,16 @@ def search_density(
             out[LOG_LIKELIHOOD], out[GAP] = loglik, min(task.gap, loglik - null)
             return judge(pixel, limits, best, loglik - null, math.inf), used + 1, int(out[DEGREES])
     found = Found(-math.inf, -math.inf, used, np.bool_(False))
-    back = 0  # sides, as bits, on which a start farther out came back to the best maximum
     for attempt in range(n_attempts(n)):
-        side = side_of(attempt, n)
-        if side & back:
-            continue
         clear, count = fill_starts(attempt, pixel, tools.basis, tools.evaluate, best, tools.scratch)
         before = found.loglik
         found = Found(found.loglik, found.runner_up, found.used + count, found.degenerate)
-        patience = _PATIENCE * max(misfit_of(out), 1.0) if side > 0 else math.inf
         for _ in range(1 if n == 1 or (clear and attempt == 0) else N_KEPT):
             if not _next_start(tools.scratch, trial):
                 break
-            found, returned = _climb_start(pixel, tools, clear, patience, found, trial, best, out)
-            back |= side if returned else 0
-        if found.loglik > before:
-            back = 0
-            if not _settled(pixel, best, clear, out)[1]:
-                break
+            found = _climb_start(pixel, tools, clear, found, trial, best, out)
+        if found.loglik > before and not _settled(pixel, best, clear, out)[1]:
+            break
         if limits.quick and found.loglik - null > limits.gap:
             break
     if not best[n + STEP] > 0.0:

@@ -353,15 +353,6 @@ def n_attempts(n_samples: int) -> int:
     return _N_ATTEMPTS_SINGLE if n_samples == 1 else _N_ATTEMPTS_JOINT
 
 
-@kernel(inline=True)
-def side_of(attempt: int, n_samples: int) -> int:
-    """Return 1 or 2 where an attempt is the best of a sample with 1/g scaled up or down, else 0."""
-    which = attempt - (_N_ATTEMPTS_SINGLE - len(_GAIN_SCALES))
-    if n_samples > 1 or which < 0:
-        return 0
-    return 1 if _GAIN_SCALES[which] > 1.0 else 2
-
-
 @kernel(borrows=True)
 def _likeliest(
     pixel: Pixel, evaluate: Any, scratch: Scratch, height: float, theta: NDArray[np.float64]
