@@ -87,7 +87,7 @@ def back_substitute(lower: FloatArray, start: int, end: int, vector: FloatArray)
 
 @kernel(inline=True)
 def _solve_without_satellites(at: FloatArray, share: float, scratch: Scratch, step: FloatArray) -> float:
-    """Do as :func:`solve_arrow` where there are no satellites: by L D L', number by number, five times faster.
+    """Do as :func:`solve_arrow` where there are no satellites: by L D L', five times faster.
 
     The shared parameters are 1/g, mu and v.
     """
