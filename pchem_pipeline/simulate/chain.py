@@ -41,6 +41,8 @@ _SAMPLE_PURPOSE = "sample"
 # bytes per sample of a block: digital and electron numbers
 _BYTES_PER_SAMPLE = 8
 _SAMPLES_AT_ONCE = 1 << 19
+# as long as so many histories are the frames for which one is simulated
+_REPEATED = 8
 _MAPS = ("quanta_exposure", "conversion_gain", "bias", "analog_read_noise_e")
 
 
@@ -121,18 +123,24 @@ def _simulate_planes(
 ) -> tuple[NDArray[Any], NDArray[np.uint32]]:
     halo = sum(effect.halo() for effect in settings.effects)
     history = sum(effect.history() for effect in settings.effects)
-    first, last = max(0, rows[0] - halo), min(settings.shape[0], rows[1] + halo)
-    band = truth.band(first, last)
     size = (frames[1] - frames[0], rows[1] - rows[0], settings.shape[1])
     dn, electrons = np.empty(size, dn_dtype(settings.bit_depth)), np.empty(size, np.uint32)
-    keep = (slice(history, None), slice(rows[0] - first, rows[1] - first))
-    # planes that stay in the cache are three times as fast; history must not be repeated too often
-    step = max(1, _SAMPLES_AT_ONCE // (band.shape[0] * band.shape[1]), 8 * history)
-    for start in range(frames[0], frames[1], step):
-        numbers = np.arange(start - history, min(start + step, frames[1]))
-        part = slice(start - frames[0], start - frames[0] + step)
-        dn_part, charge = _Block(settings, band, numbers, np.arange(first, last)).run()
-        dn[part], electrons[part] = dn_part[keep], charge[keep]
+    # with a long history few rows fit into the cache, and no more are held at once
+    at_once = _SAMPLES_AT_ONCE // ((_REPEATED + 1) * max(history, 1) * settings.shape[1])
+    n_rows = max(at_once, _REPEATED // 2 * halo, 1) if history else size[1]
+    for begin in range(rows[0], rows[1], n_rows):
+        end = min(begin + n_rows, rows[1])
+        first, last = max(0, begin - halo), min(settings.shape[0], end + halo)
+        band = truth.band(first, last)
+        inside = slice(begin - rows[0], end - rows[0])
+        keep = (slice(history, None), slice(begin - first, end - first))
+        # planes that stay in the cache are three times as fast; history must not be repeated too often
+        step = max(1, _SAMPLES_AT_ONCE // (band.shape[0] * band.shape[1]), _REPEATED * history)
+        for start in range(frames[0], frames[1], step):
+            numbers = np.arange(start - history, min(start + step, frames[1]))
+            part = slice(start - frames[0], start - frames[0] + step), inside
+            dn_part, charge = _Block(settings, band, numbers, np.arange(first, last)).run()
+            dn[part], electrons[part] = dn_part[keep], charge[keep]
     return dn, electrons
 
 

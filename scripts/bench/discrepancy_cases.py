@@ -21,10 +21,10 @@ EFFECTS = (
     "exposure_flicker", "overdispersed_counts", "branching_counts", "optical_crosstalk", "cosmic_rays",
     "repeated_frames", "pixel_correction", "bit_errors",
     "binary_offset", "repeated_lines", "gain_stitch", "black_clamp", "glow", "read_order_noise",
-    "misplaced_lines",
+    "misplaced_lines", "trapping",
 )  # fmt: skip
 UNTESTABLE = ("charge_lag", "charge_diffusion", "spurious_charge")
-OUTSIDE = ("trap_limited_lag", "self_trigger_cut", "output_crosstalk", "checkerboard_offset")
+OUTSIDE = ("self_trigger_cut", "output_crosstalk", "checkerboard_offset")
 #: left out of the library on purpose; those of ``SEALED`` are for the last look, when nothing changes
 TRIED = (
     "temporal_filter", "row_gain", "row_droop", "distant_crosstalk", "settling_rows", "tap_gain",

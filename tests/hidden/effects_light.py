@@ -223,3 +223,29 @@ class Glow(Hidden):
 
     def exposure(self, t, h):
         return h + self.strength * self.shape * self.size[max(t, 0)]
+
+
+class Trapping(Hidden):
+    """A trap that holds one electron at most; strength: chance that an empty one catches one of a sample.
+
+    Of traps in some pixels only, each catches the oftener.
+    """
+
+    tag: ClassVar[str] = "trapping"
+    s95: ClassVar[float] = 0.005
+    most: ClassVar[float] = 0.9
+    warmup: ClassVar[int] = 60
+
+    def draw(self):
+        self.release = self.between("release", 0.1, 0.6)
+        self.full = np.zeros(self.sensor.shape, bool)
+        if self.pick("pixels", "all", "some", p=(0.7, 0.3)) == "some":
+            share = self.between("share", 0.1, 0.5)
+            self.some_pixels(share)
+            self.strength = min(self.strength / share, self.most)
+
+    def electrons(self, t, k):
+        freed = self.full & (self.rng.random(k.shape) < self.release)
+        caught = self.affected & ~self.full & (k > 0) & (self.rng.random(k.shape) < self.strength)
+        self.full = (self.full & ~freed) | caught
+        return k + freed - caught

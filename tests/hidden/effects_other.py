@@ -62,25 +62,6 @@ class SpuriousCharge(Hidden):
         return k + self.rng.poisson(self.strength, k.shape)
 
 
-class TrapLimitedLag(Hidden):
-    """One trap per pixel holds at most one electron; strength: chance that an empty one catches one."""
-
-    tag: ClassVar[str] = "trap_limited_lag"
-    s95: ClassVar[float] = 0.005
-    most: ClassVar[float] = 0.9
-    warmup: ClassVar[int] = 60
-
-    def draw(self):
-        self.release = self.between("release", 0.1, 0.6)
-        self.full = np.zeros(self.sensor.shape, bool)
-
-    def electrons(self, t, k):
-        freed = self.full & (self.rng.random(k.shape) < self.release)
-        caught = ~self.full & (k > 0) & (self.rng.random(k.shape) < self.strength)
-        self.full = (self.full & ~freed) | caught
-        return k + freed - caught
-
-
 class SelfTriggerCut(Hidden):
     """Samples without an electron are partly not taken, but awaited anew; strength: that part."""
 

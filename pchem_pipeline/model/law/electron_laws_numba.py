@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.kernel import kernel
 
 # laws of the electron number
-POISSON, NEGATIVE_BINOMIAL, BOREL = 0, 1, 2
+POISSON, NEGATIVE_BINOMIAL, BOREL, TRAPPED = 0, 1, 2, 3
 
 
 @kernel(borrows=True)
@@ -24,6 +24,21 @@ def _log_rising(dispersion: float, k: float) -> float:
         for j in range(1, int(k)):
             total += math.log1p(j * dispersion)
     return total
+
+
+@kernel(borrows=True)
+def _trapped(chance: float, k: float, exposure: float) -> tuple[float, float, float]:
+    """Return P(k) over that of Poisson electrons, and its first two derivatives in log exposure.
+
+    A trap takes one electron from a sample that has any, and gives one to any sample, as often.
+    """
+    some, none = -math.expm1(-exposure), exposure * math.exp(-exposure)
+    given, left = k / exposure, exposure / (k + 1.0)
+    taken = 1.0 if k > 0.0 else 0.0
+    factor = 1.0 + chance * (some * (given - 1.0) + left - taken)
+    rise = chance * (none * (given - 1.0) - some * given + left)
+    bend = chance * (none * (1.0 - exposure) * (given - 1.0) + (some - 2.0 * none) * given + left)
+    return factor, rise, bend
 
 
 @kernel(borrows=True)
@@ -46,7 +61,12 @@ def _one_law(law: int, dispersion: float, k: float, exposure: float) -> tuple[fl
         first = 1.0 + (k - 1.0) * share - primary
         second = (k - 1.0) * share * (1.0 - share) - primary
         return log_mass, first, second
-    return k * math.log(exposure) - exposure - log_factorial, k - exposure, -exposure
+    poisson = k * math.log(exposure) - exposure - log_factorial
+    if law == TRAPPED and dispersion > 0.0:
+        factor, rise, bend = _trapped(dispersion, k, exposure)
+        share = rise / factor
+        return poisson + math.log(factor), k - exposure + share, bend / factor - share * share - exposure
+    return poisson, k - exposure, -exposure
 
 
 @kernel(borrows=True)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
-CountLaw = Literal["poisson", "negative_binomial", "borel"]
+CountLaw = Literal["poisson", "negative_binomial", "borel", "trapped"]
 #: A number of all pixels, or one of each, shape (n,).
 Number = float | FloatArray
 
@@ -48,7 +48,8 @@ class SampleLaw:
     Attributes:
         law: law of the electron number; its mean is H whatever the law.
         dispersion: negative binomial: a in Var K = H + a H^2; borel (generalised Poisson): l in Var K =
-            H / (1 - l)^2 at mean H; no unit.
+            H / (1 - l)^2 at mean H; trapped: chance m that a sample with electrons loses one to a trap, which
+            gives as many back to other samples, Var K = H + 2 m P(K >= 2; H); no unit.
         exposure_weights, exposure_factors: discrete mixture of exposures H f_b, shape (m,) each; weights sum
             to 1 and the mean factor is 1.
         added_exposure, added_weights: discrete mixture of exposures d_j beside H, e-, >= 0, and its weights
@@ -143,7 +144,7 @@ class SampleLaw:
         found: dict[str, Any] = {}
         for name in (*_PER_PIXEL[:-1], *_NUMBERS, *_TABLES):  # of satellites below
             values = [np.asarray(_plain(name, getattr(law, name))) for law in laws]
-            of_all = name not in _PER_PIXEL or all(v.shape[0] == 1 for v in values)
+            of_all = all(v.ndim == 0 or name in _TABLES or v.shape[0] == 1 for v in values)
             if of_all and all(_same(v, values[0]) for v in values):
                 found[name] = getattr(laws[0], name)
                 continue
@@ -191,7 +192,7 @@ class SampleLaw:
         names = ("free_satellites", "free_satellite_pattern", "free_satellite_alarm", "may_have_satellites")
         return replace(self, **found, **{name: getattr(free, name) for name in names})
 
-    def with_counts(self, law: CountLaw, dispersion: float) -> SampleLaw:
+    def with_counts(self, law: CountLaw, dispersion: Number) -> SampleLaw:
         """Return a copy with another law of the electron number."""
         return replace(self, law=law, dispersion=dispersion)
 

@@ -401,10 +401,6 @@ def test_the_untestable_leave_the_electrons_poisson_and_independent(tag):
 
 
 def test_those_outside_the_library_do_something():
-    trapped = hide(("trap_limited_lag",), 20.0, SEED, SHAPE, FRAMES)
-    v = View(trapped)
-    value, error = lagged(v, v.h.sum())
-    assert value < -5 * error
     (effect,) = made("self_trigger_cut").effects
     k = np.random.default_rng(2).poisson(effect.sensor.exposure, (400, *SHAPE))
     cut = np.array([effect.electrons(0, one) for one in k])
@@ -421,7 +417,7 @@ def test_every_effect_is_there_and_checked():
         "exposure_drift persistence dark_current_rts exposure_flicker overdispersed_counts",
         "branching_counts optical_crosstalk cosmic_rays repeated_frames",
         "pixel_correction bit_errors binary_offset repeated_lines gain_stitch black_clamp glow",
-        "read_order_noise misplaced_lines",
+        "read_order_noise misplaced_lines trapping",
     }
     assert set(LIBRARY) == set(" ".join(named).split())
     assert len(OUTSIDE) >= 3

@@ -19,6 +19,7 @@ from pchem_pipeline.effects.charge.cosmic_rays import CosmicRays
 from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
 from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
 from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
+from pchem_pipeline.effects.charge.trapping import Trapping
 from pchem_pipeline.effects.estimators.charge_sums import exposure_nodes
 from pchem_pipeline.effects.estimators.electrons import binomial_upper, further_uniform, regrouped
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
@@ -37,6 +38,7 @@ CLASSES = (
     BranchingCounts,
     OpticalCrosstalk,
     CosmicRays,
+    Trapping,
     ChargeLag,
     ChargeDiffusion,
     SpuriousCharge,

@@ -92,7 +92,7 @@ def test_outliers_are_spread_evenly_and_weigh_nothing_else() -> None:
     np.testing.assert_allclose(with_some, 0.999 * plain + 1e-6, rtol=1e-13)
 
 
-@pytest.mark.parametrize("law", ["poisson", "negative_binomial", "borel"])
+@pytest.mark.parametrize("law", ["poisson", "negative_binomial", "borel", "trapped"])
 @pytest.mark.parametrize("satellite", [0.0, 1.3])
 @pytest.mark.parametrize("aside", [False, True])
 def test_score_and_information_are_the_derivatives(law: str, satellite: float, aside: bool) -> None:
@@ -130,7 +130,9 @@ def test_score_and_information_are_the_derivatives(law: str, satellite: float, a
         np.testing.assert_allclose(information[i], slope, rtol=1e-6, atol=1e-7 * abs(slope).max())
 
 
-@pytest.mark.parametrize(("law", "dispersion"), [(0, 0.0), (1, 0.3), (1, 1e-4), (1, 0.0), (2, 0.2)])
+@pytest.mark.parametrize(
+    ("law", "dispersion"), [(0, 0.0), (1, 0.3), (1, 1e-4), (1, 0.0), (2, 0.2), (3, 0.2), (3, 0.0)]
+)
 def test_electron_number_law_sums_to_one_with_the_right_mean_and_slopes(law: int, dispersion: float) -> None:
     # 0.6 e- of the mean are added, and do not grow with H
     mixtures = np.array([[0.25, 0.75, 0.0], [1.6, 0.8, 0.0], [0.4, 0.6, 0.0], [0.0, 1.0, 0.0]])
@@ -139,7 +141,10 @@ def test_electron_number_law_sums_to_one_with_the_right_mean_and_slopes(law: int
     assert rows[:, 0].sum() == pytest.approx(1.0, abs=1e-10)
     assert rows[:, 0] @ k == pytest.approx(3.0, rel=1e-8)
     mixed = 2.4**2 * 0.12 + 0.24
-    excess = {0: 3.0, 1: 3.0 + dispersion * (9.0 + mixed), 2: 3.0 / (1 - dispersion) ** 2}[law]
+    exposures = 2.4 * np.array([1.6, 0.8])[:, None] + np.array([0.0, 1.0])
+    several = (1.0 - (1.0 + exposures) * np.exp(-exposures)) * np.outer([0.25, 0.75], [0.4, 0.6])
+    trapped = 3.0 + 2.0 * dispersion * several.sum()
+    excess = {0: 3.0, 1: 3.0 + dispersion * (9.0 + mixed), 2: 3.0 / (1 - dispersion) ** 2, 3: trapped}[law]
     assert rows[:, 0] @ (k - 3.0) ** 2 == pytest.approx(excess + mixed, rel=1e-7)
     h = 1e-4
     above, below = (
