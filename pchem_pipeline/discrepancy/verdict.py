@@ -30,6 +30,7 @@ from pchem_pipeline.effects.framework.region import Region, When
 SCHEMA_VERSION = 3
 #: Share of the samples below which the size of an effect is that of the samples that it changes.
 RARE = 0.5
+_TIMES = 10.0  # the read noise, from which on a size is no longer told in per cent
 #: Share of what an effect closes, from which on an unrelated one that closes as much weakens its name.
 CONVINCING_PLACEBO = 0.25
 #: Statistics whose pulls before and after are told and drawn.
@@ -54,6 +55,11 @@ def _finite(value: float) -> float | None:
 
 def _percent(share: float) -> str:
     return f"{100.0 * share:.2g} %" if share < 1.0 else f"{100.0 * share:.0f} %"
+
+
+def _two_digits(value: float) -> str:
+    """Return a number to two digits, in full: 0.035, 21, 2,000."""
+    return f"{value:.2g}" if abs(value) < 99.5 else f"{float(f'{value:.2g}'):,.0f}"
 
 
 Number = Annotated[float, BeforeValidator(_number), PlainSerializer(_finite, when_used="json")]
@@ -120,8 +126,9 @@ class Size(_Part):
 
     def words(self) -> str:
         """Return it for people."""
-        share = _percent(self.of_read_noise)
-        most = f"{self.dn:.2g} DN rms ({self.electrons:.2g} e-, {share} of the read noise)"
+        part = self.of_read_noise
+        share = f"{_percent(part)} of" if part < _TIMES else f"{_two_digits(part)} times"
+        most = f"{_two_digits(self.dn)} DN rms ({_two_digits(self.electrons)} e-, {share} the read noise)"
         return most if self.samples >= RARE else f"{most} in {_percent(self.samples)} of the samples"
 
 

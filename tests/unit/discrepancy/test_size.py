@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.discrepancy.size import size_of
+from pchem_pipeline.discrepancy.verdict import Size
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_class
@@ -62,3 +63,20 @@ def test_without_usable_pixels_there_is_no_size() -> None:
     nothing = replace(MAPS, usable=np.zeros(SHAPE, bool))
     effect = effect_class("row_noise").model_validate({"tag": "row_noise", "row_noise_dn": 0.5})
     assert size_of(effect, nothing, 1000) is None
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        (
+            Size(electrons=0.039, dn=0.61, of_read_noise=0.11),
+            "0.61 DN rms (0.039 e-, 11 % of the read noise)",
+        ),
+        (
+            Size(electrons=213.0, dn=2028.0, of_read_noise=831.06, samples=0.0081),
+            "2,000 DN rms (210 e-, 830 times the read noise) in 0.81 % of the samples",
+        ),
+    ],
+)
+def test_a_size_is_told_to_two_digits_in_full(size: Size, words: str) -> None:
+    assert size.words() == words
