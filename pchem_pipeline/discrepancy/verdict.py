@@ -126,10 +126,14 @@ class Size(_Part):
 
     def words(self) -> str:
         """Return it for people."""
-        part = self.of_read_noise
-        share = f"{_percent(part)} of" if part < _TIMES else f"{_two_digits(part)} times"
-        most = f"{_two_digits(self.dn)} DN rms ({_two_digits(self.electrons)} e-, {share} the read noise)"
+        most = f"{_two_digits(self.dn)} DN rms ({_two_digits(self.electrons)} e-, {self.beside_noise()})"
         return most if self.samples >= RARE else f"{most} in {_percent(self.samples)} of the samples"
+
+    def beside_noise(self) -> str:
+        """Return it as a share of the read noise, or how many times as large it is."""
+        share = self.of_read_noise
+        times = f"{_percent(share)} of" if share < _TIMES else f"{_two_digits(share)} times"
+        return f"{times} the read noise"
 
 
 class Rival(_Part):
