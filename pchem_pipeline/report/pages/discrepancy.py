@@ -260,9 +260,7 @@ def _size_texts(step: Step, values: Sequence[str]) -> tuple[str, tuple[str, ...]
     if size is None:
         return values[0], tuple(values[1:3])
     part = "" if size.samples >= RARE else f", in {percent(size.samples, 1.0)} of the samples"
-    share = (
-        f"{size.beside_noise()}, {short(size.electrons, 2)} e⁻ rms{part}"
-    )
+    share = f"{size.beside_noise()}, {short(size.electrons, 2)} e⁻ rms{part}"
     return f"{short(size.dn, 2)} DN", (share, values[0])
 
 
