@@ -201,7 +201,8 @@ def test_bit_depth_is_checked(tmp_path: Path) -> None:
 def test_left_justified_values_above_the_bit_depth_say_their_shift(tmp_path: Path, shift: int) -> None:
     np.save(tmp_path / "a.npy", STACK << 4)  # 12 bits in 16
     reader = open_frames(InputSettings(files=("a.npy",), bit_depth=12, bit_shift=shift), tmp_path)
-    with pytest.raises(InputError, match=r"lowest 4 bits are all zero.*; set input\.bit_shift: 4 \(--bit-shift\)$"):
+    words = r"lowest 4 bits are all zero.*; set input\.bit_shift: 4 \(--bit-shift\)$"
+    with pytest.raises(InputError, match=words):
         reader.read()
 
 
