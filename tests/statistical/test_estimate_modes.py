@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import drawn_truth, every_third_block, seen, taken
+from helpers.sensor_of_modes import context_of, drawn_truth, every_third_block, seen, taken
 
 from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
 from pchem_pipeline.effects.adc.adc_inl import AdcInl
@@ -89,6 +89,18 @@ def test_the_phase_of_pickup_predicts_the_frames_between():
         np.sin(2 * np.pi * (p.cycles_per_row * y + p.cycles_per_frame * t) + p.phase) for p in (first, effect)
     ]
     assert (waves[0] * waves[1]).mean() > 0.45
+
+
+def test_a_bend_that_is_no_sine_is_found_as_a_curve():
+    curve = (0.0, 1.0, 0.2, -0.8, 0.1, 0.1, 0.1, 0.1, -0.9, 0.0)
+    effect = AdcInl(inl_lsb=0.5, form="curve", first_dn=95.0, spacing_dn=11.0, curve=curve)
+    first = estimated(effect)[0]
+    assert first.form == "curve"
+    places = np.arange(100.0, 180.0)
+    found, true = (e.apply(places.reshape(-1, 1, 1), context_of((1, 1), 80)).ravel() for e in (first, effect))
+    assert np.corrcoef(found - places, true - places)[0, 1] > 0.9
+    # a sine needs no knots
+    assert {e.form for e in estimated(AdcInl(inl_lsb=0.4, period_dn=60.0, phase=1.0))} == {"sine"}
 
 
 def test_a_drift_of_its_own_shape_is_found_as_a_path():

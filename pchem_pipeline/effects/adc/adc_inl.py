@@ -1,20 +1,22 @@
 """Integral nonlinearity of the ADC: a bent transfer curve.
 
-What the ADC converts is ``x + a sin(2 pi x / P + phi)`` instead of x (IEEE Std 1241: INL is the deviation of
-the transfer curve from the best line). One bend over the codes in use is a half or a whole period; more bends
-come from segmented references and ramps. It is fixed in DN, whatever the bias and the gain of a pixel.
+What the ADC converts is ``x + a d(x)`` instead of x (IEEE Std 1241: INL is the deviation of the transfer
+curve from the best line). The form d is a sine, ``sin(2 pi x / P + phi)``, or a smooth curve through knots:
+one bend over the codes in use is a half or a whole period; segmented references and ramps have more, of any
+form. It is fixed in DN, whatever the bias and the gain of a pixel.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.estimators.bends import best_bend
+from pchem_pipeline.effects.estimators.bends import Curve, best_bend, best_curve, through_knots
 from pchem_pipeline.effects.estimators.codes import code_range
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
@@ -24,6 +26,10 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
+
+_FEWEST_KNOTS = 4
+# places of the table of a curve from one knot to the next
+_FINER = 32
 
 
 @register_effect
@@ -53,24 +59,55 @@ class AdcInl(Effect):
         "adc_dnl": "a ramp over many codes: INL is smooth along DN, DNL new from code to code",
         "signal_dependent_noise": "a shifted bias: INL moves peaks to and fro in DN, noise only widens them",
     }
-    inl_lsb: float = Field(ge=0, le=1e4, description="amplitude of the deviation, LSB")
-    period_dn: float = Field(
-        default=100.0, ge=4, le=1e6, description="period of the deviation, DN; two bends per period"
+    inl_lsb: float = Field(
+        ge=0, le=1e4, description="amplitude of the sine, or scale of `curve` (its largest value is 1), LSB"
     )
-    phase: float = Field(default=0.0, ge=-100, le=100, description="phase at 0 DN, rad")
+    form: Literal["sine", "curve"] = Field(
+        default="sine", description="sine: of one period; curve: smooth through the values of `curve`"
+    )
+    period_dn: float = Field(
+        default=100.0, ge=4, le=1e6, description="sine: period of the deviation, DN; two bends per period"
+    )
+    phase: float = Field(default=0.0, ge=-100, le=100, description="sine: phase at 0 DN, rad")
+    first_dn: float = Field(default=0.0, description="curve: where the first value of `curve` lies, DN")
+    spacing_dn: float = Field(
+        default=10.0, gt=0, le=1e6, description="curve: from one value of `curve` to the next, DN"
+    )
+    curve: tuple[float, ...] = Field(
+        default=(),
+        max_length=1 << 10,
+        description="curve: deviations in units of inl_lsb, through which a natural cubic spline goes; "
+        "beyond the ends as at the ends",
+    )
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Self:
+        if (self.form == "curve") != bool(self.curve):
+            raise ValueError("adc_inl: form curve and the list `curve` belong together; give both or none")
+        if self.curve and len(self.curve) < _FEWEST_KNOTS:
+            raise ValueError(f"adc_inl: curve needs at least {_FEWEST_KNOTS} values, got {len(self.curve)}")
+        return self
 
     @model_validator(mode="after")
     def _monotone(self) -> Self:
-        if 2.0 * math.pi * self.inl_lsb >= self.period_dn:
+        if self.inl_lsb * self._steepest() >= 1.0:
+            form = f"period_dn {self.period_dn}" if self.form == "sine" else f"spacing_dn {self.spacing_dn}"
             raise ValueError(
-                f"adc_inl: inl_lsb {self.inl_lsb} at period_dn {self.period_dn} turns the curve back; "
-                f"keep inl_lsb below period_dn / (2 pi)"
+                f"adc_inl: inl_lsb {self.inl_lsb} at {form} turns the curve back; "
+                f"keep inl_lsb below {1.0 / self._steepest():.4g}"
             )
         return self
 
+    def _steepest(self) -> float:
+        """Return the steepest fall of the form, per DN."""
+        if self.form == "sine":
+            return 2.0 * math.pi / self.period_dn
+        return float(np.max(-np.diff(_table(self.curve)) / self._fine, initial=0.0))
+
     def scaled(self, factor: float) -> Self:
         """Return a copy of ``factor`` times the amplitude, as far as the curve stays monotone."""
-        most = 0.99 * self.period_dn / (2.0 * math.pi)
+        steepest = self._steepest()
+        most = 0.99 / steepest if steepest > 0 else math.inf
         return super().scaled(min(factor, most / self.inl_lsb) if self.inl_lsb > 0 else factor)
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
@@ -79,11 +116,20 @@ class AdcInl(Effect):
         return result
 
     def _deviation(self, values: NDArray[Any]) -> NDArray[np.float64]:
+        if self.form == "curve":
+            table = _table(self.curve)
+            places = (values - self.first_dn) / self._fine
+            return self.inl_lsb * np.interp(places, np.arange(table.size), table)
         turned = values * (2.0 * math.pi / self.period_dn)
         turned += self.phase
         np.sin(turned, out=turned)
         turned *= self.inl_lsb
         return turned
+
+    @property
+    def _fine(self) -> float:
+        """Distance of the places of the table, DN."""
+        return self.spacing_dn / _FINER
 
     @classmethod
     def typical(cls) -> Sequence[Self]:
@@ -96,12 +142,22 @@ class AdcInl(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the sines (period, phase, amplitude) that explain the smooth residuals of the codes best."""
-        return [
+        """Return the curve and the sines that explain the smooth residuals of the codes best."""
+        sines = [
             cls(inl_lsb=bend.amplitude, period_dn=bend.period, phase=bend.phase)
             for bend in best_bend(evidence)
             if 2.0 * math.pi * bend.amplitude < bend.period
         ]
+        curve = best_curve(evidence)
+        return sines if curve is None else [*cls._through(curve), *sines]
+
+    @classmethod
+    def _through(cls, curve: Curve) -> list[Self]:
+        """Return the effect with this curve; none where it turns back."""
+        size = float(np.abs(curve.values).max())
+        listed = tuple(np.round(curve.values / size, 4).tolist())
+        form = cls(inl_lsb=0.0, form="curve", first_dn=curve.first, spacing_dn=curve.spacing, curve=listed)
+        return [form.model_copy(update={"inl_lsb": size})] if size * form._steepest() < 1.0 else []
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the code edges where the bent curve crosses them."""
@@ -112,3 +168,10 @@ class AdcInl(Effect):
         for _ in range(50):
             edges = ideal - self._deviation(edges)
         return model.with_edges(first, edges - ideal)
+
+
+@lru_cache(maxsize=64)
+def _table(curve: tuple[float, ...]) -> NDArray[np.float64]:
+    """Return the curve at many places."""
+    knots = np.arange(float(len(curve)))
+    return through_knots(knots, np.array(curve), np.arange(_FINER * knots[-1] + 1) / _FINER)

@@ -30,6 +30,10 @@ _LEVELS = 80
 _END = 0.002
 # fall of chi2 by two coefficients at one of some 20 independent periods: p about 0.02
 _LEAST_GAIN = 14.0
+# knots of a curve, and the fall of chi2 that each further one must bring
+_KNOTS, _PRICE = (5, 7, 9, 12, 16), 3.0
+# directions of the curve that are left at nothing: relative weight, squared standard errors
+_WEAKEST, _DOUBT = 0.003, 4.0
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,15 @@ class Bend:
     amplitude: float
     period: float
     phase: float
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A smooth deviation by its values at knots: DN of the first, DN from one to the next, LSB."""
+
+    first: float
+    spacing: float
+    values: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -99,11 +112,11 @@ class CurveResponse:
         found = [_fit(self.response @ pair.T, self.residuals) for pair in deviations]
         return np.array([gain for gain, _ in found]), np.array([factors for _, factors in found])
 
-    def worth(self, gains: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def worth(self, gains: NDArray[np.float64], least: float = _LEAST_GAIN) -> NDArray[np.bool_]:
         """Return which gains are more than what chance, and what else is amiss with the codes, brings."""
         total = float((self.residuals**2).sum())
         left = np.maximum(1.0, (total - gains) / max(self.residuals.size - 6, 1))
-        return np.asarray(gains > _LEAST_GAIN * left)
+        return np.asarray(gains > least * left)
 
 
 def best_bend(evidence: Evidence) -> list[Bend]:
@@ -121,6 +134,50 @@ def best_bend(evidence: Evidence) -> list[Bend]:
             a, b = factors[place]
             found.append(Bend(float(np.hypot(a, b)), float(periods[place]), float(np.arctan2(b, a))))
     return found[:2]
+
+
+def best_curve(evidence: Evidence) -> Curve | None:
+    """Return the smooth curve through few knots that explains the residuals of the codes best.
+
+    None where no curve explains more than the best sine does, and than its further knots bring by chance.
+    """
+    response = CurveResponse.of(evidence)
+    if response is None:
+        return None
+    turned = [2.0 * np.pi / bend.period * response.edges for bend in best_bend(evidence)]
+    waves = np.array([[np.sin(each), np.cos(each)] for each in turned]).reshape(-1, 2, response.edges.size)
+    best, most = None, float(response.fits(waves)[0].max(initial=0.0))
+    for number in _KNOTS:
+        knots = np.linspace(response.edges[0], response.edges[-1], number)
+        values, gain = _fit_knots(response, through_knots(knots, np.eye(number), response.edges))
+        # a sine has three numbers
+        least = (_LEAST_GAIN + _PRICE * (number - 3)) if best is None else 2.0 * _PRICE
+        if response.worth(np.array([gain - most]), least)[0]:
+            best, most = Curve(float(knots[0]), float(knots[1] - knots[0]), values), gain
+    return best
+
+
+def _fit_knots(response: CurveResponse, basis: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return values at the knots of a basis (codes + 1, knots), LSB, and by how much they lower chi2.
+
+    What hardly shows (a straight line, which bias and gain take up, above all) is left at nothing.
+    """
+    u, size, directions = np.linalg.svd(response.response @ basis, full_matrices=False)
+    seen = u.T @ response.residuals
+    kept = seen * np.clip(1.0 - _DOUBT / np.maximum(seen**2, 1e-9), 0.0, None)
+    kept[size < _WEAKEST * size[0]] = 0.0
+    values = directions.T @ (kept / np.maximum(size, 1e-300))
+    return values, float((seen**2 - (seen - kept) ** 2).sum())
+
+
+def through_knots(
+    knots: NDArray[np.float64], values: NDArray[np.float64], places: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return natural cubic splines through values (knots, ...) at places; beyond the ends as at the ends."""
+    from scipy.interpolate import CubicSpline
+
+    spline = CubicSpline(knots, values, bc_type="natural")
+    return np.asarray(spline(np.clip(places, knots[0], knots[-1])), np.float64)
 
 
 def best_stitch(evidence: Evidence) -> list[Stitch]:

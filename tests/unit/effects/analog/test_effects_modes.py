@@ -331,6 +331,18 @@ def test_the_bent_curve_moves_edges_against_the_deviation():
     assert (np.diff(bent) > 0).all()
 
 
+def test_a_curve_goes_through_its_values_and_stays_at_its_ends():
+    effect = AdcInl(inl_lsb=2.0, form="curve", first_dn=100.0, spacing_dn=10.0, curve=(0.0, 1.0, -0.5, 0.25))
+    places = np.array([100.0, 110.0, 120.0, 130.0, 80.0, 170.0])
+    bent = effect.apply(places.reshape(-1, 1, 1), context_of((1, 1), 6)).ravel()
+    np.testing.assert_allclose(bent - places, [0.0, 2.0, -1.0, 0.5, 0.0, 0.5], atol=1e-9)
+    # codes begin where the bent value is their lower edge
+    edges = edges_of(effect, 104, 126)[3:]
+    values = effect.apply(edges.reshape(-1, 1, 1), context_of((1, 1), edges.size)).ravel()
+    np.testing.assert_allclose(values, np.arange(108, 127) - 0.5, atol=3e-3)
+    assert effect.scaled(100).inl_lsb < 100 / effect.inl_lsb
+
+
 def test_repeats_are_exact_copies_of_what_was_delivered():
     plain, listed = frames_of(), (1, 2, 5, 9, 10, 11)
     delivered = plain.copy()
@@ -377,6 +389,10 @@ def test_random_repeats_come_as_often_as_they_should():
         (AdcDnl, {"dnl_lsb": 0.1, "edges": [0.1]}, "belong together"),
         (AdcDnl, {"dnl_lsb": 0.1, "pattern": "bit", "per_column": True}, "per_column is for pattern random"),
         (AdcInl, {"inl_lsb": 20, "period_dn": 50}, "turns the curve back"),
+        (AdcInl, {"inl_lsb": 20, "form": "curve", "curve": [0, 1, 0, -1]}, "turns the curve back"),
+        (AdcInl, {"inl_lsb": 1, "form": "curve"}, "belong together"),
+        (AdcInl, {"inl_lsb": 1, "curve": [0, 1, 0, -1]}, "belong together"),
+        (AdcInl, {"inl_lsb": 1, "form": "curve", "curve": [0, 1]}, "at least 4 values, got 2"),
         (RepeatedFrames, {"frames": [0]}, "frame 0 is the first"),
         (RepeatedFrames, {"rows": [3, 3]}, "hold none"),
         (RepeatedFrames, {"probability": 0.9}, "less than or equal to 0.5"),

@@ -91,6 +91,9 @@ def chi2(observed: np.ndarray, mass: np.ndarray) -> tuple[float, int]:
         AdcDnl(dnl_lsb=0.3, pattern="edges", first_code=100, edges=(0.5, -1.0, 0.8, 0.3)),
         AdcDnl(dnl_lsb=1.0, pattern="edges", first_code=108, edges=(1.0, 0.0, 0.5, -0.5)),
         AdcInl(inl_lsb=1.0, period_dn=37.0, phase=1.0),
+        AdcInl(
+            inl_lsb=1.0, form="curve", first_dn=90.0, spacing_dn=9.0, curve=(0.0, 1.0, -0.5, 0.2, 0.8, 0.0)
+        ),
         Clipping(low=98, high=141),
     ],
     ids=lambda e: e.tag,
