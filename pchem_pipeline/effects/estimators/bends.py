@@ -112,11 +112,13 @@ class CurveResponse:
         found = [_fit(self.response @ pair.T, self.residuals) for pair in deviations]
         return np.array([gain for gain, _ in found]), np.array([factors for _, factors in found])
 
-    def worth(self, gains: NDArray[np.float64], least: float = _LEAST_GAIN) -> NDArray[np.bool_]:
-        """Return which gains are more than what chance, and what else is amiss with the codes, brings."""
+    def worth(
+        self, gains: NDArray[np.float64], known: float = 0.0, least: float = _LEAST_GAIN
+    ) -> NDArray[np.bool_]:
+        """Return which gains are more than a known one, and what chance and what else is amiss brings."""
         total = float((self.residuals**2).sum())
         left = np.maximum(1.0, (total - gains) / max(self.residuals.size - 6, 1))
-        return np.asarray(gains > least * left)
+        return np.asarray(gains - known > least * left)
 
 
 def best_bend(evidence: Evidence) -> list[Bend]:
@@ -152,9 +154,17 @@ def best_curve(evidence: Evidence) -> Curve | None:
         values, gain = _fit_knots(response, through_knots(knots, np.eye(number), response.edges))
         # a sine has three numbers
         least = (_LEAST_GAIN + _PRICE * (number - 3)) if best is None else 2.0 * _PRICE
-        if response.worth(np.array([gain - most]), least)[0]:
-            best, most = Curve(float(knots[0]), float(knots[1] - knots[0]), values), gain
+        if response.worth(np.array([gain]), most, least)[0]:
+            level = _straight(response, through_knots(knots, values, response.edges))
+            best = Curve(float(knots[0]), float(knots[1] - knots[0]), values - level(knots))
+            most = gain
     return best
+
+
+def _straight(response: CurveResponse, deviation: NDArray[np.float64]) -> np.polynomial.Polynomial:
+    """Return the straight line through a deviation (codes + 1,): bias and gain of the pixels take it up."""
+    counts = np.append(response.expected, 0.0) + np.append(0.0, response.expected)
+    return np.polynomial.Polynomial.fit(response.edges, deviation, 1, w=np.sqrt(counts))
 
 
 def _fit_knots(response: CurveResponse, basis: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
