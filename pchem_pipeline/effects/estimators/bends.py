@@ -32,6 +32,8 @@ _END = 0.002
 _LEAST_GAIN = 14.0
 # knots of a curve, and the fall of chi2 that each further one must bring
 _KNOTS, _PRICE = (5, 7, 9, 12, 16), 3.0
+# share of the samples below its first knot, and above its last
+_RARE = 0.002
 # directions of the curve that are left at nothing: relative weight, squared standard errors
 _WEAKEST, _DOUBT = 0.003, 4.0
 
@@ -149,8 +151,10 @@ def best_curve(evidence: Evidence) -> Curve | None:
     turned = [2.0 * np.pi / bend.period * response.edges for bend in best_bend(evidence)]
     waves = np.array([[np.sin(each), np.cos(each)] for each in turned]).reshape(-1, 2, response.edges.size)
     best, most = None, float(response.fits(waves)[0].max(initial=0.0))
+    share = np.cumsum(response.expected) / response.expected.sum()
+    first, last = response.edges[np.searchsorted(share, [_RARE, 1.0 - _RARE])]
     for number in _KNOTS:
-        knots = np.linspace(response.edges[0], response.edges[-1], number)
+        knots = np.linspace(first, last, number)
         values, gain = _fit_knots(response, through_knots(knots, np.eye(number), response.edges))
         # a sine has three numbers
         least = (_LEAST_GAIN + _PRICE * (number - 3)) if best is None else 2.0 * _PRICE

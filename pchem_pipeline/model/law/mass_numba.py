@@ -41,6 +41,8 @@ FloatArray = NDArray[np.float64]
 
 _LEAST_VARIANCE = 1e-6  # DN^2
 _FAR = 1e-9  # mass of an occupied code below which the tails are looked at
+# mass of a cell that tells nothing: a difference of two tails that are alike, whose slopes are left over
+_LEAST_TOLD = 1e-15
 _LEAST_SEEN = 1e-60  # mass of an occupied code, at least
 
 
@@ -202,6 +204,8 @@ def parabola_tile(
             for a in range(size):
                 relative = cell[SLOPES + a, i] / mass
                 score[index, a] += weights[i] * relative
+                if cell[MASS, i] < _LEAST_TOLD:
+                    continue
                 for b in range(a + 1):
                     information[index, a, b] += total * relative * cell[SLOPES + b, i]
         for a in range(size):

@@ -166,10 +166,15 @@ def posterior_of(
     some = np.arange(len(counts))
     if some.size > _MOST_LEARNT_FROM:
         some = np.sort(np.random.default_rng(seed).choice(some, _MOST_LEARNT_FROM, replace=False))
-    start, population = _beginning(pixels, parameters, mistaken)
-    starts = np.stack([_shifted(start, each) for each in ((0,) if mistaken <= _HARDLY_ANY else _SHIFTS)])
-    population = _learn(pixels.of(some), starts[:, some], population)
-    return _climb(pixels, starts, population, _LAST_STEPS).posterior(population)
+    shifts = (0,) if mistaken <= _HARDLY_ANY else _SHIFTS
+    best, most = None, -np.inf
+    for start, population in _beginnings(pixels, parameters, mistaken):
+        starts = np.stack([_shifted(start, each) for each in shifts])
+        learnt, evidence = _learn(pixels.of(some), starts[:, some], population)
+        if evidence > most:
+            best, most = (starts, learnt), evidence
+    assert best is not None
+    return _climb(pixels, *best, _LAST_STEPS).posterior(best[1])
 
 
 def lost_variance(posterior: Posterior, totals: NDArray[np.integer], law: SampleLaw | None = None) -> float:
@@ -343,8 +348,11 @@ def _climb(pixels: _Pixels, theta: FloatArray, population: Population, steps: in
     )
 
 
-def _learn(pixels: _Pixels, theta: FloatArray, population: Population) -> Population:
-    """Return the population that makes the histograms likeliest; a centre that has an uncertainty stays."""
+def _learn(pixels: _Pixels, theta: FloatArray, population: Population) -> tuple[Population, float]:
+    """Return the population that makes the histograms likeliest, and how likely a pixel's is, nats.
+
+    A centre that has an uncertainty stays.
+    """
     before = -np.inf
     for _ in range(_ROUNDS):
         maxima = _climb(pixels, theta, population, _NEWTON_STEPS)
@@ -354,7 +362,7 @@ def _learn(pixels: _Pixels, theta: FloatArray, population: Population) -> Popula
         if abs(now - before) < _SETTLED:
             break
         before = now
-    return population
+    return population, now
 
 
 def _expectation_maximisation(maxima: _Maxima, population: Population) -> Population:
@@ -396,11 +404,15 @@ def _inside(theta: FloatArray) -> FloatArray:
     return found
 
 
-def _beginning(pixels: _Pixels, parameters: FloatArray, mistaken: float) -> tuple[FloatArray, Population]:
-    """Return a start of theta (n, 4) and of the population: from the fits, or from all pixels' cumulants.
+def _beginnings(
+    pixels: _Pixels, parameters: FloatArray, mistaken: float
+) -> list[tuple[FloatArray, Population]]:
+    """Return starts of theta (n, 4) and of the population: from the fits, or from all pixels' cumulants.
 
     Where peaks are hardly resolved the fits of single pixels lead far from the truth, all to the same side.
+    Of effects in the law the cumulants know nothing: with them either start may be the better one.
     """
+    known = np.asarray(np.isfinite(parameters).all(axis=1))
     mean, k = _cumulants(pixels)
     rng = np.random.default_rng(k.shape[1])
     drawn = rng.integers(k.shape[1], size=(_AGAIN, k.shape[1]))
@@ -410,16 +422,20 @@ def _beginning(pixels: _Pixels, parameters: FloatArray, mistaken: float) -> tupl
     centre[2] = np.median(mean) - np.exp(centre[0] + centre[1])
     start = np.tile(centre, (mean.size, 1))
     start[:, 2] = mean - np.exp(centre[0] + centre[1])
-    known = np.asarray(np.isfinite(parameters).all(axis=1))
-    if known.any() and mistaken <= _MANY:
+    found: list[tuple[FloatArray, Population]] = []
+    resolved = mistaken <= _MANY
+    if known.any() and (resolved or not pixels.law.neutral):
         fits = np.where(known[:, None], to_theta(np.where(known[:, None], parameters, 1.0)), start)
-        return fits, _first_guess(fits[known])
+        found.append((fits, _first_guess(fits[known])))
+        if resolved:
+            return found
     off = np.insert(centres[1:] - centres[0], 2, 0.0, axis=1)
     off = np.clip(off, -_LARGEST_ERROR, _LARGEST_ERROR)
     # mu follows H and 1/g: their product is known far better than both
     off[:, 2] = np.exp(centre[0] + centre[1]) * -np.expm1(off[:, 0] + off[:, 1])
     scatter = np.diag(np.maximum(_ALIKE, [0, 0, mean.std(), 0]) ** 2)
-    return start, Population(centre, scatter, off.T @ off / len(off))
+    from_all = start, Population(centre, scatter, off.T @ off / len(off))
+    return [from_all, *found]
 
 
 def _centres_of(k: FloatArray) -> FloatArray:

@@ -218,6 +218,19 @@ def test_a_parabola_is_made_of_masses_and_slopes(name: str) -> None:
     np.testing.assert_allclose(information, expected, rtol=1e-6, atol=1e-6)
 
 
+def test_codes_without_a_sample_tell_nothing():
+    """Far from all peaks, where the list of edges begins, a code may be narrower than nothing."""
+    model = SampleLaw().with_edges(53, np.full(500, -1.4))
+    maps = tuple(np.array([value]) for value in (4.98, 0.0659, 90.2, 4.65))
+    codes = np.full(1, 40)
+    counts = np.ones((1, 400), np.uint16)
+    mass, slopes = sample_slopes(model, maps, codes, 400)
+    usual = mass[0] > 1e-12
+    assert (mass[0] < 0).any()
+    expected = 400.0 * (slopes[0, :, usual].T / mass[0, usual]) @ slopes[0, :, usual]
+    np.testing.assert_allclose(sample_parabolas(model, maps, counts, codes)[2][0], expected, rtol=1e-6)
+
+
 def test_the_weights_of_exposures_may_differ_by_pixel_where_the_exposures_do_not():
     weights, factors = np.array([[0.5, 0.5], [0.9, 0.1]]), np.array([0.8, 1.2])
     maps = tuple(np.full(2, value) for value in (2.0, 0.1, 100.0, 3.0))
