@@ -56,17 +56,15 @@ from pchem_pipeline.model.law.pixel_numba import (
     Pixel,
     Scratch,
 )
-from pchem_pipeline.model.law.simd_math_numba import LN2, ROOT2, artanh_series, simd_exp, simd_log
+from pchem_pipeline.model.law.simd_math_numba import simd_exp, simd_log
 from pchem_pipeline.model.law.simd_numba import (
     SIMD_WIDTH,
     Simd,
     counting,
-    exponent_of,
     fused,
     least,
     most,
     nearest,
-    scaled,
     simd_load,
     simd_store,
     simd_sum,
@@ -86,8 +84,9 @@ _ALL_BINS = 1e9
 # a^2 those of var(e) times 1, y and y^2, of cov(e, e^2) times 1 and y, and of var(e^2)
 _LOGLIK, _E, _EE, _YE, _V11, _V11Y, _V11YY, _V12, _V12Y, _V22 = range(10)
 
-# rows of `Scratch.rows`; with two numbers: of the nearest component and of the next
-_TOTALS, _LEVEL, _CELL, _OWN, _DISTANCE, _RATIO, _CUT = 0, 1, 2, 3, 4, 6, 8
+# rows of `Scratch.rows`; with two numbers: of the nearest component and of the next; `_DENSITY`: of each bin,
+# over a factor of its own
+_TOTALS, _LEVEL, _CELL, _OWN, _DISTANCE, _RATIO, _CUT, _DENSITY = 0, 1, 2, 3, 4, 6, 8, 9
 
 LOG_2PI = math.log(2.0 * math.pi)
 
@@ -205,6 +204,57 @@ def _lanes(
     return d, r, level
 
 
+@kernel(inline=True)
+def _weighted_logs(bins: FloatArray, rows: FloatArray, n_bins: int) -> Simd:
+    """Sum up counts times the logarithms of `_DENSITY`.
+
+    In a loop of its own, so short that the processor has several logarithms under way at a time: each is a
+    long chain of operations that wait for each other.
+    """
+    total = counting() * 0.0
+    for i in range(0, n_bins, SIMD_WIDTH):
+        total = fused(simd_load(bins, WEIGHT, i), simd_log(simd_load(rows, _DENSITY, i)), total)
+    return total
+
+
+@kernel(inline=True)
+def _add_moments(
+    a: float,
+    square: float,
+    d: Simd,
+    y: Simd,
+    c: Simd,
+    moments: tuple[Simd, Simd, Simd, Simd, Simd],
+    sums: Any,
+) -> Any:
+    """Add a block to the sums that follow the log-likelihood in `_TOTALS`.
+
+    Args:
+        a: 1/g, DN.
+        square: of it.
+        d: distances of the bins from the lowest component that matters, DN.
+        y: bins less mu, DN.
+        c: counts.
+        moments: density over its Gaussian factor, and its first four moments in components above the lowest.
+        sums: so far.
+    """
+    p0, s1, s2, s3, s4 = moments
+    sum_e, sum_ee, sum_ye, v11, v11y, v11yy, v12, v12y, v22 = sums
+    each = 1.0 / p0
+    m1, m2, share = s1 * each, s2 * each, c * each
+    c11, cm2 = c * fused(-0.0 - m1, m1, m2), c * m2
+    c12 = a * fused(-0.0 - cm2, m1, share * s3)
+    c22 = fused(-0.0 - cm2, m2, share * s4)
+    e, dd = fused(m1, -a, d), d + d
+    ce, cy, w12 = c * e, c11 * y, fused(dd, c11, -0.0 - c12)
+    w22 = fused(dd, w12 - c12, square * c22)
+    return (
+        *(sum_e + ce, fused(ce, e, sum_ee), fused(ce, y, sum_ye)),
+        *(v11 + c11, v11y + cy, fused(cy, y, v11yy)),
+        *(v12 + w12, fused(w12, y, v12y), v22 + w22),
+    )
+
+
 def _sums_kernel(width: int) -> Callable[..., Any]:
     """Make the loop over the blocks for a fixed number of components (0: given by the comb)."""
 
@@ -221,11 +271,12 @@ def _sums_kernel(width: int) -> Callable[..., Any]:
         square, spread = a * a, -0.5 * comb.inverse
         most_ratio, ratios = math.exp(_LONGEST / half), simd_exp(counting() * (a * comb.inverse))
         zero = counting() * 0.0
-        loglik = sum_e = sum_ee = sum_ye = v11 = v11y = v11yy = v12 = v12y = v22 = zero
+        loglik, sums = zero, (zero, zero, zero, zero, zero, zero, zero, zero, zero)
         for block in range(n_blocks):
             start = block * comb.stride
             stop = min(start + comb.stride, comb.n_bins)
             if not bins[CUMULATIVE, stop] > bins[CUMULATIVE, start]:
+                simd_store(rows, _DENSITY, start, zero + 1.0)
                 continue
             cell, own = int(rows[_CELL, block]), int(rows[_OWN, block])
             left, right = coefficients[cell], coefficients[cell + 1]
@@ -253,27 +304,11 @@ def _sums_kernel(width: int) -> Callable[..., Any]:
             else:
                 s1, u2 = r * p1, rr * p2
                 s3, s4 = fused(u2, 6.0, s1), fused(u2, 14.0, s1)
-            s2 = fused(u2, 2.0, s1)
-            # log(p0) as in `simd_log`, its division shared with 1 / p0
-            exponent = exponent_of(p0 * ROOT2)
-            fraction = scaled(p0, -0.0 - exponent)
-            above = fraction + 1.0
-            shared = 1.0 / (p0 * above)
-            each, q = shared * above, (fraction - 1.0) * (shared * p0)
-            logged = fused(q + q, artanh_series(q * q), fused(d * d, spread, level))
-            loglik = fused(c, fused(exponent, LN2, logged), loglik)
-            m1, m2, share = s1 * each, s2 * each, c * each
-            c11, cm2 = c * fused(-0.0 - m1, m1, m2), c * m2
-            c12 = a * fused(-0.0 - cm2, m1, share * s3)
-            c22 = fused(-0.0 - cm2, m2, share * s4)
-            e, dd = fused(m1, -a, d), d + d
-            ce, cy, w12 = c * e, c11 * y, fused(dd, c11, -0.0 - c12)
-            w22 = fused(dd, w12 - c12, square * c22)
-            sum_e, sum_ee, sum_ye = sum_e + ce, fused(ce, e, sum_ee), fused(ce, y, sum_ye)
-            v11, v11y, v11yy = v11 + c11, v11y + cy, fused(cy, y, v11yy)
-            v12, v12y, v22 = v12 + w12, fused(w12, y, v12y), v22 + w22
-        sums = (loglik, sum_e, sum_ee, sum_ye, v11, v11y, v11yy, v12, v12y, v22)
-        for place, value in enumerate(sums):
+            simd_store(rows, _DENSITY, start, p0)
+            loglik = fused(c, fused(d * d, spread, level), loglik)
+            sums = _add_moments(a, square, d, y, c, (p0, s1, fused(u2, 2.0, s1), s3, s4), sums)
+        loglik = loglik + _weighted_logs(bins, rows, comb.n_bins)
+        for place, value in enumerate((loglik, *sums)):
             rows[_TOTALS, place] = simd_sum(value)
 
     compiled: Callable[..., Any] = sums_of
@@ -299,6 +334,7 @@ def _loglik_alone(
         start = block * comb.stride
         stop = min(start + comb.stride, comb.n_bins)
         if frames == 0.0 and not bins[CUMULATIVE, stop] > bins[CUMULATIVE, start]:
+            simd_store(rows, _DENSITY, start, counting() * 0.0 + 1.0)
             continue
         cell, own = int(rows[_CELL, block]), int(rows[_OWN, block])
         left, right = coefficients[cell], coefficients[cell + 1]
@@ -312,7 +348,10 @@ def _loglik_alone(
             simd_store(bins, EXPECTED, start, density * frames * level)
         else:
             c = spliced(stop - start, simd_load(bins, WEIGHT, start), 0.0)
-            loglik = fused(c, simd_log(density) + level, loglik)
+            simd_store(rows, _DENSITY, start, density)
+            loglik = fused(c, level, loglik)
+    if frames == 0.0:
+        loglik = loglik + _weighted_logs(bins, rows, comb.n_bins)
     return float(simd_sum(loglik))
 
 

@@ -87,7 +87,7 @@ N_SMALL = HEIGHTS + 1
 HELD, FIXED = range(2)
 # places in `Scratch.evaluations`: of the last climb, of its trials, at the best maximum
 AT, AHEAD, AT_BEST = range(3)
-N_DENSITY_ROWS = 9
+N_DENSITY_ROWS = 10
 MAX_COMPONENTS = 201  # of which a value may be a mixture
 N_NEGATIVE, _NO_FACTORIAL = 128, 1e5  # numbers below 0 of which a factorial is asked, and its logarithm
 _MIN_COLUMNS = 384  # the frequencies of the starting points, a value's components
