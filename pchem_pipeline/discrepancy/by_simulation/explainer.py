@@ -359,7 +359,7 @@ class FrameExplainer:
         Without the effects that were added, since one that merely mimics has no place beside it, and with
         those of them that account for what they move themselves: what closes the gap, then in the fewest
         forms, and where both do as well with the effects, which have a name. None where it closes less than
-        half of what is left, or of what there was if none of the effects does.
+        half of what is left, or of what there was if none of the effects gets a name.
 
         Raises:
             EffortSpentError: the work is at its limit; nothing was added.
@@ -369,6 +369,7 @@ class FrameExplainer:
         if instead is not None or left.at_floor:
             return instead
         unexplained, sure = self._unexplained(), self.accept.accounted(self.extended.rounds, null)
+        named = any(each.named for each in self.close(before, null, disagrees=True).additions)
         best: tuple[tuple[bool, float], Refitted] | None = None
         for kept in ((), sure) if sure else ((),):
             try:
@@ -380,13 +381,8 @@ class FrameExplainer:
             if found is None:
                 continue
             gap = self.accept.gap_of(found)
-            # effects none of which accounts for what it moves lose their names: then less is better
-            alone = (
-                _DESCRIBED * min(left.value, before.value)
-                if sure
-                else min(left.value, _DESCRIBED * before.value)
-            )
-            most = _DESCRIBED * left.value if kept else alone
+            # beside effects that get no name there is nothing to leave less than
+            most = _DESCRIBED * (left.value if kept or named else before.value)
             forms = sum(e.measured_parts for e in found.effects)
             rank = (not gap.at_floor, float(forms) if gap.at_floor else gap.value)
             if (gap.at_floor or gap.value < most) and (best is None or rank <= best[0]):

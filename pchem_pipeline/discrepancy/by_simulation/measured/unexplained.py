@@ -165,7 +165,7 @@ class Unexplained:
                 if likely.form not in forms:
                     continue
                 try:
-                    one = self._tried(beside, likely)
+                    one = self._tried(beside, likely) if beside else self._first(likely)
                 except EffortSpentError:
                     if found is None:
                         raise
@@ -178,6 +178,11 @@ class Unexplained:
                 break
             del forms[better]
         return found
+
+    def _first(self, likely: _Likely) -> Refitted | None:
+        """Return one of what explains most without any effect, as it was fitted by itself if it was."""
+        number = self._of_all.index(likely)
+        return self.alone[number] if number in self.alone else self._tried((), likely)
 
     def _tried(self, kept: tuple[Hypothesis, ...], likely: _Likely, whole: bool = False) -> Refitted | None:
         """Return effects with a form beside them; None where it fails or is not certain."""
