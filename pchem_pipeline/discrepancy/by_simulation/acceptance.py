@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.additions import Round, left_of, unexplained_of_its_own
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    LARGEST_DECREASE,
     Hypothesis,
     Noise,
-    fit_set,
+    correction,
     tolerance,
 )
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import noise_of_splits
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, lesser
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 
@@ -80,11 +81,14 @@ class Acceptance:
         certain = _certain(added, self.z.both - first.mean, noise_of_splits(first, 2, self.model_error))
         noise = noise_of_splits(first, 1, self.model_error)
         noise = replace(noise, covariance=added.covariance * (1.0 + 1.0 / n))
-        final = replace(fit_set(added.hypotheses, self.z.final - first.mean, noise), certain=certain)
+        # about the set at its best fit: strong effects do not add up to what they do together
+        allowed = noise.of(lesser(added.slopes, added.parts))
+        change, stderr = correction(added.slopes, self.z.final - added.mean, allowed)
         measured = np.array([type(h.effect).measured_only for h in added.hypotheses])
         sure = measured | _overwhelming(added.parts, self.z.both - first.mean, first.std)
         clear = np.exp(added.change) > np.where(sure, _MEASURED, _ESTABLISHED) * added.stderr
-        proven = final.factors > np.where(measured, _MEASURED, _CONFIRMED) * final.stderr
+        proven = 1.0 + change > np.where(measured, _MEASURED, _CONFIRMED) * stderr
+        proven &= change > -LARGEST_DECREASE
         there = (clear & proven) | certain
         return tuple(h for h, is_there in zip(added.hypotheses, there, strict=True) if is_there)
 

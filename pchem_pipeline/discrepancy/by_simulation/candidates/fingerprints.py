@@ -27,7 +27,7 @@ FloatArray = NDArray[np.float64]
 
 _REWEIGHTINGS = 3
 _LEAK = 0.1
-_LARGEST_DECREASE, _LARGEST_INCREASE = 0.75, 3.0
+LARGEST_DECREASE, _LARGEST_INCREASE = 0.75, 3.0
 _PRICE = 3.0  # nats for the first effect of a set: none is there unless something speaks for it
 PRICE_OF_MORE = 6.0  # nats for every further one
 _LARGEST_SET = 3
@@ -155,7 +155,7 @@ def correction(
     stderr = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
     if scatter is not None:
         stderr = np.maximum(stderr, asked(scatter.T).std(axis=1, ddof=1))
-    return np.clip(asked(residual), -_LARGEST_DECREASE, _LARGEST_INCREASE), stderr
+    return np.clip(asked(residual), -LARGEST_DECREASE, _LARGEST_INCREASE), stderr
 
 
 def tolerance(parts: FloatArray, model_error: float, events: FloatArray | float) -> FloatArray:

@@ -226,7 +226,7 @@ class Refitter:
         if slopes is not None:
             noise = self.noise(one.covariance, len(one.vectors))
             kept = self.kept(hypotheses)
-            allowed = noise.among(kept).of(_lesser(slopes, one.parts)[:, kept])
+            allowed = noise.among(kept).of(lesser(slopes, one.parts)[:, kept])
             change, _ = correction(slopes[:, kept], (self.target - one.mean)[kept], allowed)
             hypotheses = _moved(hypotheses, np.log1p(np.maximum(change, -_LARGEST_SHARE))) or hypotheses
         try:
@@ -307,7 +307,7 @@ class Refitter:
         change, stderr = correction(
             slopes[:, kept],
             residual[kept],
-            noise.among(kept).of(_lesser(slopes, parts)[:, kept]),
+            noise.among(kept).of(lesser(slopes, parts)[:, kept]),
             None if scatter is None else scatter[:, kept],
         )
         change = np.where(scaling, np.log1p(np.maximum(change, -_LARGEST_SHARE)), 0.0)
@@ -388,7 +388,7 @@ def _step(before: Sequence[Effect], after: Sequence[Effect]) -> FloatArray:
     return np.array(found)
 
 
-def _lesser(slopes: FloatArray, parts: FloatArray) -> FloatArray:
+def lesser(slopes: FloatArray, parts: FloatArray) -> FloatArray:
     """Return of what effects do, and of how that goes with their strengths, the lesser, shape (e, m).
 
     A share of that is not held against them. An effect near a limit of its strength has slopes far above all

@@ -188,6 +188,24 @@ def test_what_closes_the_gap_in_fewest_forms_describes(
     )
     search = explainer(judge, lambda one: one.name)
     monkeypatch.setattr(search, "_unexplained", lambda: measures)
+    named = SimpleNamespace(additions=[SimpleNamespace(named=True)])
+    monkeypatch.setattr(search, "close", lambda *_, **__: named)
+    nothing: Any = None
+    assert search.describe(wide, nothing) == chosen
+
+
+@pytest.mark.parametrize(("named", "chosen"), [(True, None), (False, "measured")])
+def test_what_is_measured_need_not_do_better_than_effects_that_get_no_name(
+    monkeypatch: pytest.MonkeyPatch, named: bool, chosen: str | None
+) -> None:
+    wide, part = Gap(1.0, 0.01, (0.9, 1.1), {}), Gap(0.2, 0.01, (0.1, 0.3), {})
+    judge = SimpleNamespace(gap=lambda _: part, gap_of=lambda _: part, accounted=lambda *_: ())
+    found = SimpleNamespace(effects=[EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))])
+    measures = SimpleNamespace(measured=lambda _: found, by_itself=lambda: None)
+    search = explainer(judge, lambda _: "measured")
+    monkeypatch.setattr(search, "_unexplained", lambda: measures)
+    additions = [SimpleNamespace(named=named)]
+    monkeypatch.setattr(search, "close", lambda *_, **__: SimpleNamespace(additions=additions))
     nothing: Any = None
     assert search.describe(wide, nothing) == chosen
 

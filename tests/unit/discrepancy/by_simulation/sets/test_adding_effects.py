@@ -817,6 +817,8 @@ def test_what_gets_no_name_needs_fewer_errors_and_more_of_them_in_the_final_fram
         added: Any = SimpleNamespace(
             hypotheses=(Hypothesis(one, part),),
             parts=part[None],
+            slopes=part[None],
+            mean=world.null.mean + part,
             change=np.zeros(1),
             stderr=np.array([error]),
             vectors=np.zeros((400, M)),
@@ -836,18 +838,42 @@ def test_an_effect_beyond_doubt_is_there_though_few_frames_know_its_strength_bad
     """Light that flickers in 97 of 1,000 frames moved statistics by 480 sd; its strength had 4.3 errors."""
     world, unused = World([]), cast("Any", None)
     parts = np.array([np.eye(M)[0] * size, np.eye(M)[0] * other])[: 2 if other else 1]
+    seen = world.null.mean + np.eye(M)[0] * size
     tags = ("row_noise", "frame_noise")
     added: Any = SimpleNamespace(
         hypotheses=tuple(Hypothesis(effect(t, 0.1), p) for t, p in zip(tags, parts, strict=False)),
         parts=parts,
+        slopes=parts,
+        mean=seen,
         change=np.zeros(len(parts)),
         stderr=np.full(len(parts), 0.26),
         vectors=np.zeros((400, M)),
         covariance=np.eye(M),
     )
-    seen = world.null.mean + np.eye(M)[0] * size
     accept = Acceptance(world.null, Measured(seen, seen, seen), unused, 0.0)
     assert ("row_noise" in {h.tag for h in accept.established(added)}) is there
+
+
+def test_strong_effects_need_not_add_up_to_be_there() -> None:
+    """Column noise of 127 sd beside a ghost that alone would move its statistic by more than both do."""
+    world, unused = World([]), cast("Any", None)
+    own, shared = np.eye(M)[0] * 100.0, np.eye(M)[1] * 100.0
+    parts = np.array([own + 0.5 * shared, 3.6 * shared - 1.2 * own])
+    seen = world.null.mean + own + 2.1 * shared
+    added: Any = SimpleNamespace(
+        hypotheses=tuple(
+            Hypothesis(effect(t, 0.1), p) for t, p in zip(("row_noise", "frame_noise"), parts, strict=True)
+        ),
+        parts=parts,
+        slopes=parts,
+        mean=seen,
+        change=np.zeros(2),
+        stderr=np.full(2, 0.02),
+        vectors=np.zeros((400, M)),
+        covariance=np.eye(M),
+    )
+    accept = Acceptance(world.null, Measured(seen, seen, seen), unused, 0.0)
+    assert {h.tag for h in accept.established(added)} == {"row_noise", "frame_noise"}
 
 
 def test_what_the_final_frames_do_not_show_stays_outside(monkeypatch: pytest.MonkeyPatch) -> None:
