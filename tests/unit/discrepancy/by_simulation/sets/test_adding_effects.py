@@ -855,11 +855,11 @@ def test_an_effect_beyond_doubt_is_there_though_few_frames_know_its_strength_bad
 
 
 def test_strong_effects_need_not_add_up_to_be_there() -> None:
-    """Column noise of 127 sd beside a ghost that alone would move its statistic by more than both do."""
+    """Column noise beside a ghost that alone would move the statistics by more than both together do."""
     world, unused = World([]), cast("Any", None)
     own, shared = np.eye(M)[0] * 100.0, np.eye(M)[1] * 100.0
-    parts = np.array([own + 0.5 * shared, 3.6 * shared - 1.2 * own])
-    seen = world.null.mean + own + 2.1 * shared
+    parts = np.array([own + 0.5 * shared, 3.6 * shared + 1.4 * own])
+    seen = world.null.mean + own + 2.6 * shared
     added: Any = SimpleNamespace(
         hypotheses=tuple(
             Hypothesis(effect(t, 0.1), p) for t, p in zip(("row_noise", "frame_noise"), parts, strict=True)
