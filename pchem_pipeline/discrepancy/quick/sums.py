@@ -140,9 +140,15 @@ class StackSums:
     def _variance(self, blocks: IntArray | slice) -> FloatArray:
         """Return the variance of each pixel about its mean over the block, of some blocks, (y, x), DN^2."""
         lengths = self.lengths[blocks]
-        sums = self.block_sum[blocks].astype(np.float64)
-        within = self.block_sum_square[blocks] - sums**2 / lengths[:, None, None]
-        return np.asarray(within.sum(axis=0) / float(lengths.sum() - lengths.size))
+        within = np.zeros(self.shape)
+        parts = (self.block_sum[blocks], self.block_sum_square[blocks], lengths.tolist())
+        for total, square, length in zip(*parts, strict=True):  # block by block: each is as large as a map
+            between = total.astype(np.float64)
+            between *= between
+            between /= length
+            within += np.subtract(square, between, out=between)
+        within /= float(lengths.sum() - lengths.size)
+        return within
 
     @cached_property
     def mean_signal(self) -> FloatArray:

@@ -36,14 +36,16 @@ class Ordered:
         """
         if isinstance(values, Ordered):
             return values
-        values = np.asarray(values)
-        kept = np.isfinite(values)
-        known = int(np.count_nonzero(kept))
+        ordered = np.array(values, np.float64, order="C").ravel()
+        without = 0
         if left_out is not None:
-            kept &= ~left_out
-        ordered = values[kept].astype(np.float64, copy=False)
+            without = int(np.count_nonzero(np.isfinite(values[left_out])))
+            ordered[left_out.ravel()] = np.nan
+        # to sort all, NaN last, takes less than to pick what is finite
         ordered.sort()
-        return cls(ordered, values.size - known, known - ordered.size)
+        first, last = np.searchsorted(ordered, -np.inf, "right"), np.searchsorted(ordered, np.inf, "left")
+        known = ordered[first:last]
+        return cls(known, ordered.size - known.size - without, without)
 
     @property
     def size(self) -> int:

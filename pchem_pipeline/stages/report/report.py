@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
+from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
@@ -28,7 +29,7 @@ from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy.result import verdict_data
 from pchem_pipeline.stages.quick_look import read_sums, run_quick_look
-from pchem_pipeline.stages.report.drawing import draw_by_workers
+from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_workers
 from pchem_pipeline.stages.report.inspector import deciding_parameters, inspector_data, read_maps
 from pchem_pipeline.stages.report.pixels import (
     Chosen,
@@ -45,7 +46,8 @@ from pchem_pipeline.stages.table import pipeline
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.discrepancy.quick.sums import StackSums
+    from pchem_pipeline.discrepancy.quick.checks import QuickLook
+    from pchem_pipeline.report.figures.figure import Figure
     from pchem_pipeline.report.pages.pictures import DrawAll
     from pchem_pipeline.report.settings import ReportSettings
     from pchem_pipeline.run.sensor import SensorInfo
@@ -54,8 +56,6 @@ if TYPE_CHECKING:
 
 #: Where a version of the model comes from, in words.
 _SOURCES = {"config": "from the configuration", "verdict": "from the verdict on what the model is missing"}
-#: Maps that are no parameters.
-_NOT_SHOWN = ("quality", "goodness_q")
 #: All channels of a line of so few are shown.
 _FEW_CHANNELS = 12
 #: Pixels in full that have the mass of a model with effects.
@@ -156,10 +156,13 @@ def gather(
     shape, shown = run.sensor.shape, _shown(run, config)
     full = choose_inspected(run.maps, run.fit, [(y, x) for _, y, x in shown], _suspects(run))
     index = np.concatenate([pixel_index(shown, shape), full.index])
-    histograms = read_histograms(store, index, shape, run.model)
-    sums = read_sums(store)
-    maps, exact = read_maps(store, shape, full.index, _at_hand(run, sums))
-    # from here on little is read
+    threads = drawing_workers(None, config.compute)
+    tasks: list[Callable[[], Any]] = [
+        functools.partial(_of_sums, store, run),
+        functools.partial(read_histograms, store, index, shape, run.model),
+    ]
+    (look, stability), histograms = call_all(tasks, threads)
+    maps, exact = read_maps(store, shape, full.index, _at_hand(run), threads)
     columns = [run.maps[name].reshape(-1)[index] for name in PARAMETERS]
     drawn = slice(0, len(shown))
     held, some = slice(drawn.stop, None), slice(0, drawn.stop + _SOME_MASSES)
@@ -173,22 +176,25 @@ def gather(
         report_data(run, config, integration_time, stages),
         pixels=fits,
         inspector=inspector_data(run.name, shape, maps, sample),
-        quick_look=run_quick_look(store, run, sums),
-        stability=stability_figures(sums),
+        quick_look=look,
+        stability=stability,
         # what a single command was given is no setting of the run
         config_yaml=store.config_text() or dump_config(config),
     )
 
 
-def _at_hand(run: StoredRun, sums: StackSums | None) -> dict[str, NDArray[Any]]:
+def _of_sums(store: RunStore, run: StoredRun) -> tuple[QuickLook | None, list[Figure]]:
+    """Return the quick look and the figures of sums over the frames, which are as large as several maps."""
+    sums = read_sums(store)
+    return run_quick_look(store, run, sums), stability_figures(sums)
+
+
+def _at_hand(run: StoredRun) -> dict[str, NDArray[Any]]:
     """Return the maps that were read, as they are stored, by path."""
     found = {f"maps/{name}": values for name, values in run.maps.items()}
-    found |= {f"fit/{name}": run.fit[name] for name in ("fit_status", "outlier_share") if name in run.fit}
-    if sums is not None:
-        names = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")
-        covariances = (sums.lag, sums.next_x, sums.next_y)
-        found |= {f"summary/{name}": values for name, values in zip(names, covariances, strict=True)}
-    return found
+    return found | {
+        f"fit/{name}": run.fit[name] for name in ("fit_status", "outlier_share") if name in run.fit
+    }
 
 
 def _shown(run: StoredRun, config: RunConfig) -> list[Chosen]:
@@ -222,8 +228,7 @@ def report_data(
     """
     from pchem_pipeline.config.load import dump_config
 
-    maps = {name: values for name, values in run.maps.items() if name not in _NOT_SHOWN}
-    facts, sensor = dict(run.facts["ensemble"]), run.sensor
+    maps, facts, sensor = run.maps, dict(run.facts["ensemble"]), run.sensor
     moments, _ = facts.pop("moments", []), facts.pop("missing", {})
     cases = facts.pop("component_cases", COMPONENT_CASES)
     n_frames = sensor.n_frames if sensor.kind == "frames" else None

@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 
 #: Group to the names of the arrays that the report is made from.
 _ARRAYS: dict[str, tuple[str, ...]] = {
-    **{group: tuple(v.name for v in variables_of(group)) for group in ("maps", "ensemble", "discrepancy")},
+    "maps": tuple(v.name for v in variables_of("maps") if v.name != "quality"),
+    **{group: tuple(v.name for v in variables_of(group)) for group in ("ensemble", "discrepancy")},
     "fit": ("fit_status", "goodness_p", "goodness_chi2", "goodness_dof", "outlier_share"),
     "truth": (*PARAMETERS, "read_noise_e"),
     "samples": ("quanta_exposure", "mean", "variance", "linearity_residual", "linearity_p"),
@@ -92,8 +93,8 @@ class StoredRun:
     Attributes:
         name: of the store.
         sensor: its input.
-        maps: group ``maps`` but the ends of intervals, (y, x).
-        fit: ``fit_status``, and of pixels with a value ``goodness_p``, ... (y, x).
+        maps: parameters, what is derived from them, and standard errors, (y, x).
+        fit: ``fit_status``, and of pixels with a value ``goodness_p``, ``goodness_q``, ... (y, x).
         intervals: by quantity the ends of its profile intervals.
         ensemble: group ``ensemble``.
         truth: true maps of simulated data.
@@ -138,12 +139,12 @@ def read_run(store: RunStore) -> StoredRun:
     facts = {group: store.attributes(group) for group in ("maps", "ensemble")}
     maps, fit = groups.pop("maps"), groups["fit"]
     if "goodness_q" in maps:
-        fit["goodness_q"] = maps["goodness_q"]
+        fit["goodness_q"] = maps.pop("goodness_q")
     if "fit_status" in fit:
         # only what has a value can agree with its model or not
         failed = (fit["fit_status"] & int(FAILED)) != 0
-        if failed.any():
-            fit |= {name: np.where(failed, np.nan, fit[name]) for name in fit if name.startswith("goodness_")}
+        for name in (name for name in fit if name.startswith("goodness_")):
+            fit[name][failed] = np.nan
     ends = {name: interval_names(name) for name in (*INTERVALS, *CHARGE_RATES)}
     found = {name: (maps[low], maps[high]) for name, (low, high) in ends.items() if low in maps}
     shown = {name: values for name, values in maps.items() if not any(name in pair for pair in ends.values())}
