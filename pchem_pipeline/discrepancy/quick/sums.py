@@ -186,12 +186,13 @@ class StackSums:
         everywhere = self.column_blocks.size == self.lengths.size
         v = self.variance if everywhere else self._variance(self.column_blocks)
         tops = np.arange(0, ny, ROW_GROUP)
-        total, square = (np.add.reduceat(values, tops, axis=0) for values in (v, v**2))
-        product, inside = np.zeros_like(v), np.zeros_like(v)
-        product[:-1] = v[:-1] * v[1:]
-        inside[:] = np.nan_to_num(self.next_y)
+        total, square = np.add.reduceat(v, tops, axis=0), np.add.reduceat(v**2, tops, axis=0)
+        product = np.zeros_like(v)
+        np.multiply(v[:-1], v[1:], out=product[:-1])
         product[ROW_GROUP - 1 :: ROW_GROUP] = 0.0  # no product crosses the border of a group
-        along, covariance = (np.add.reduceat(values, tops, axis=0) for values in (product, inside))
+        along = np.add.reduceat(product, tops, axis=0)
+        del product  # as large as a map
+        covariance = np.add.reduceat(np.nan_to_num(self.next_y), tops, axis=0)
         heights = np.diff(np.append(tops, ny))
         return Lines(
             self.column_sum.reshape(self.column_sum.shape[0], -1),

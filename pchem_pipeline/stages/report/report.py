@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +33,7 @@ from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_worker
 from pchem_pipeline.stages.report.inspector import deciding_parameters, inspector_data, read_maps
 from pchem_pipeline.stages.report.pixels import (
     Chosen,
+    ChosenPixels,
     bin_masses,
     choose_inspected,
     choose_pixels,
@@ -40,7 +41,7 @@ from pchem_pipeline.stages.report.pixels import (
     pixel_index,
 )
 from pchem_pipeline.stages.report.plan_section import plan_section
-from pchem_pipeline.stages.report.stored import StoredRun, read_histograms, read_run
+from pchem_pipeline.stages.report.stored import PixelHistograms, StoredRun, read_histograms, read_run
 from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.stages.table import pipeline
 
@@ -154,15 +155,13 @@ def gather(
     """
     run = read_run(store)
     shape, shown = run.sensor.shape, _shown(run, config)
-    full = choose_inspected(run.maps, run.fit, [(y, x) for _, y, x in shown], _suspects(run))
-    index = np.concatenate([pixel_index(shown, shape), full.index])
     threads = drawing_workers(None, config.compute)
     tasks: list[Callable[[], Any]] = [
         functools.partial(_of_sums, store, run),
-        functools.partial(read_histograms, store, index, shape, run.model),
+        functools.partial(_of_pixels, store, run, shown),
     ]
-    (look, stability), histograms = call_all(tasks, threads)
-    maps, exact = read_maps(store, shape, full.index, _at_hand(run), threads)
+    of_sums, (full, index, histograms) = call_all(tasks, threads)
+    maps, exact = read_maps(store, shape, full.index, _at_hand(run) | of_sums.covariances, threads)
     columns = [run.maps[name].reshape(-1)[index] for name in PARAMETERS]
     drawn = slice(0, len(shown))
     held, some = slice(drawn.stop, None), slice(0, drawn.stop + _SOME_MASSES)
@@ -176,17 +175,46 @@ def gather(
         report_data(run, config, integration_time, stages),
         pixels=fits,
         inspector=inspector_data(run.name, shape, maps, sample),
-        quick_look=look,
-        stability=stability,
+        quick_look=of_sums.look,
+        stability=of_sums.stability,
         # what a single command was given is no setting of the run
         config_yaml=store.config_text() or dump_config(config),
     )
 
 
-def _of_sums(store: RunStore, run: StoredRun) -> tuple[QuickLook | None, list[Figure]]:
-    """Return the quick look and the figures of sums over the frames, which are as large as several maps."""
+@dataclass(frozen=True)
+class _OfSums:
+    """What the sums over the frames say; they are as large as several maps, and freed.
+
+    Attributes:
+        look: the quick look.
+        stability: figures of frames, rows and columns.
+        covariances: of samples and of neighbours, by the path of the map, (y, x).
+    """
+
+    look: QuickLook | None
+    stability: list[Figure]
+    covariances: Mapping[str, NDArray[np.float64]]
+
+
+def _of_sums(store: RunStore, run: StoredRun) -> _OfSums:
+    """Read the sums over the frames, and return what they say."""
     sums = read_sums(store)
-    return run_quick_look(store, run, sums), stability_figures(sums)
+    look, stability = run_quick_look(store, run, sums), stability_figures(sums)
+    if sums is None:
+        return _OfSums(look, stability, {})
+    names = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")
+    covariances = zip(names, (sums.lag, sums.next_x, sums.next_y), strict=True)
+    return _OfSums(look, stability, {f"summary/{name}": values for name, values in covariances})
+
+
+def _of_pixels(
+    store: RunStore, run: StoredRun, shown: Sequence[Chosen]
+) -> tuple[ChosenPixels, NDArray[np.int64], PixelHistograms]:
+    """Return the pixels held in full, the places of the shown ones and of these, and their histograms."""
+    full = choose_inspected(run.maps, run.fit, [(y, x) for _, y, x in shown], _suspects(run))
+    index = np.concatenate([pixel_index(shown, run.sensor.shape), full.index])
+    return full, index, read_histograms(store, index, run.sensor.shape, run.model)
 
 
 def _at_hand(run: StoredRun) -> dict[str, NDArray[Any]]:
