@@ -21,7 +21,7 @@ from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
-from pchem_pipeline.model.maps.ordered import Ordered
+from pchem_pipeline.model.maps.ordered import Ordered, median_of
 from pchem_pipeline.report.inspector.inspector_data import InspectorData
 from pchem_pipeline.report.settings import Criteria
 
@@ -342,6 +342,6 @@ class ReportData:
             return None
         key = name, with_flagged or not self.any_flagged
         if key not in self._errors:
-            known = Ordered.of(errors, None if key[1] else self.flagged)
-            self._errors[key] = known.median if known.size else None
+            median = median_of(errors, None if key[1] else self.flagged)
+            self._errors[key] = None if np.isnan(median) else median
         return self._errors[key]

@@ -36,6 +36,7 @@ from pchem_pipeline.discrepancy.quick.places import (
 from pchem_pipeline.discrepancy.quick.series import normal_p, of_many, series_checks
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.maps.ordered import median_of
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
@@ -78,10 +79,7 @@ def quick_look(
     """
     checks: list[Check] = []
     usable = maps.usable
-    gain, noise = (
-        float(np.median(values[usable], overwrite_input=True)) if usable.any() else math.nan
-        for values in (maps.conversion_gain, maps.read_noise_dn)
-    )
+    gain, noise = (median_of(values, ~usable) for values in (maps.conversion_gain, maps.read_noise_dn))
     if sums is not None and sums.freedom > 0:
         checks.append(levels_check(sums.frame_mean, sums.frame_variance, gain))
         checks += _stack_checks(sums, maps)
@@ -365,7 +363,7 @@ class _Common:
         """By how much correlated pixels raise the variance of a mean over them."""
         ny, nx = self.sums.shape
         variance = self.sums.variance
-        typical = float(np.median(variance[variance > 0], overwrite_input=True))
+        typical = median_of(variance, ~(variance > 0))
         frame = self._value(self.frame)
         row, column = self.of_row() - frame, self.of_column() - frame
         return 1.0 + (ny * nx * frame**2 + nx * row**2 + ny * column**2) / typical**2
@@ -444,7 +442,7 @@ def _neighbour_checks(sums: StackSums, common: _Common) -> list[Check]:
         mean, error = _mean_correlation(z, common)
         del z
         which, line = (common.rows, "row") if axis == "x" else (common.columns, "column")
-        ratio = float(np.mean(np.minimum(1.0 / size, 4.0 / np.median(size))))
+        ratio = float(np.mean(np.minimum(1.0 / size, 4.0 / median_of(size))))
         if math.isfinite(which.error):
             mean -= shared * ratio
             error = math.hypot(error, which.error * ratio)

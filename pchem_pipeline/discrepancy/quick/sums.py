@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
+from pchem_pipeline.model.maps.ordered import Ordered
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -154,6 +155,12 @@ class StackSums:
     def mean_signal(self) -> FloatArray:
         """Mean of each pixel over the frames of the blocks at hand, (y, x), DN."""
         return np.asarray(self.block_sum.sum(axis=0) / float(self.lengths.sum()))
+
+    @cached_property
+    def typical_signal(self) -> tuple[float, float]:
+        """Median and robust standard deviation of the mean signal over the pixels, DN."""
+        known = Ordered.of(self.mean_signal)
+        return known.median, known.robust_sd
 
     @cached_property
     def variance(self) -> FloatArray:

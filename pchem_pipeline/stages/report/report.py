@@ -153,9 +153,9 @@ def gather(
     Raises:
         StoreError: maps or histograms are missing.
     """
-    run = read_run(store)
-    shape, shown = run.sensor.shape, _shown(run, config)
     threads = drawing_workers(None, config.compute)
+    run = read_run(store, threads)
+    shape, shown = run.sensor.shape, _shown(run, config)
     tasks: list[Callable[[], Any]] = [
         functools.partial(_of_sums, store, run),
         functools.partial(_of_pixels, store, run, shown),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from pchem_pipeline.base.variables import (
     interval_names,
     variables_of,
 )
+from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.run.model_versions import model_of, read_added_exposure
@@ -123,19 +125,28 @@ class StoredRun:
     record: StageRecord | None = None
 
 
-def read_run(store: RunStore) -> StoredRun:
+def read_run(store: RunStore, threads: int = 1) -> StoredRun:
     """Read all of a run but its histograms.
+
+    Args:
+        store: the run.
+        threads: that read an array each.
 
     Raises:
         StoreError: an array is missing or corrupt.
     """
     verdict, methods, model = read_verdict(store.path), read_methods(store), read_model(store)
     sensor, record = SensorInfo.read(store), store.records.read("report")
-    groups = {
-        group: {name: store.read(f"{group}/{name}") for name in names if store.has(f"{group}/{name}")}
+    there = [
+        (group, name)
         for group, names in _ARRAYS.items()
-        if group != "discrepancy" or verdict is not None
-    }
+        for name in names
+        if (group != "discrepancy" or verdict is not None) and store.has(f"{group}/{name}")
+    ]
+    arrays = call_all([functools.partial(store.read, f"{group}/{name}") for group, name in there], threads)
+    groups: dict[str, dict[str, NDArray[Any]]] = {group: {} for group in _ARRAYS}
+    for (group, name), values in zip(there, arrays, strict=True):
+        groups[group][name] = values
     facts = {group: store.attributes(group) for group in ("maps", "ensemble")}
     maps, fit = groups.pop("maps"), groups["fit"]
     if "goodness_q" in maps:
