@@ -320,15 +320,19 @@ class ReportData:
             name: of the map.
             with_flagged: of all pixels with a value; else flagged ones are left out.
         """
-        key = name, with_flagged or not self.any_flagged
-        if key not in self._summaries:
-            self._summaries[key] = summarise(
-                self.ordered(name) if key[1] else self.maps[name],
-                left_out=None if key[1] else self.flagged,
-                percentiles=tuple(dict.fromkeys((*self.percentiles, 5.0, 95.0))),
-                outlier_sigmas=self.outlier_sigmas,
+        if (name, with_flagged) not in self._summaries:
+            known = self.ordered(name)
+            self._summaries[name, True] = self._summarised(known)
+            self._summaries[name, False] = (
+                self._summarised(known.without(self.maps[name][self.flagged]))
+                if self.any_flagged
+                else self._summaries[name, True]
             )
-        return self._summaries[key]
+        return self._summaries[name, with_flagged]
+
+    def _summarised(self, known: Ordered) -> MapSummary:
+        percentiles = tuple(dict.fromkeys((*self.percentiles, 5.0, 95.0)))
+        return summarise(known, percentiles=percentiles, outlier_sigmas=self.outlier_sigmas)
 
     def pixel_error(self, name: str, *, with_flagged: bool = False) -> float | None:
         """Return the median standard error of a pixel in a map; None where it is not known.

@@ -61,8 +61,8 @@ _SOURCES = {"config": "from the configuration", "verdict": "from the verdict on 
 _FEW_CHANNELS = 12
 #: Pixels in full that have the mass of a model with effects.
 _SOME_MASSES = 300
-#: Memory that a pixel takes: the maps are held as a whole. Measured at 2048 x 1152, 980 MiB in all.
-_PIXEL_BYTES = 370
+#: Memory that a pixel takes: the maps are held as a whole. Measured at 2048 x 1152, 940 MiB in all.
+_PIXEL_BYTES = 300
 
 
 def report_tile(data: ReportData, settings: ReportSettings, draw: DrawAll | None = None) -> RenderedReport:
