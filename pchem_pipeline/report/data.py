@@ -21,7 +21,7 @@ from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
-from pchem_pipeline.model.maps.ordered import Ordered
+from pchem_pipeline.model.maps.ordered import Ordered, median_of
 from pchem_pipeline.report.inspector.inspector_data import InspectorData
 from pchem_pipeline.report.settings import Criteria
 
@@ -320,15 +320,19 @@ class ReportData:
             name: of the map.
             with_flagged: of all pixels with a value; else flagged ones are left out.
         """
-        key = name, with_flagged or not self.any_flagged
-        if key not in self._summaries:
-            self._summaries[key] = summarise(
-                self.ordered(name) if key[1] else self.maps[name],
-                left_out=None if key[1] else self.flagged,
-                percentiles=tuple(dict.fromkeys((*self.percentiles, 5.0, 95.0))),
-                outlier_sigmas=self.outlier_sigmas,
+        if (name, with_flagged) not in self._summaries:
+            known = self.ordered(name)
+            self._summaries[name, True] = self._summarised(known)
+            self._summaries[name, False] = (
+                self._summarised(known.without(self.maps[name][self.flagged]))
+                if self.any_flagged
+                else self._summaries[name, True]
             )
-        return self._summaries[key]
+        return self._summaries[name, with_flagged]
+
+    def _summarised(self, known: Ordered) -> MapSummary:
+        percentiles = tuple(dict.fromkeys((*self.percentiles, 5.0, 95.0)))
+        return summarise(known, percentiles=percentiles, outlier_sigmas=self.outlier_sigmas)
 
     def pixel_error(self, name: str, *, with_flagged: bool = False) -> float | None:
         """Return the median standard error of a pixel in a map; None where it is not known.
@@ -342,6 +346,6 @@ class ReportData:
             return None
         key = name, with_flagged or not self.any_flagged
         if key not in self._errors:
-            known = Ordered.of(errors, None if key[1] else self.flagged)
-            self._errors[key] = known.median if known.size else None
+            median = median_of(errors, None if key[1] else self.flagged)
+            self._errors[key] = None if np.isnan(median) else median
         return self._errors[key]

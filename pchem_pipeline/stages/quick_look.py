@@ -60,10 +60,12 @@ def _maps(run: StoredRun) -> PixelMaps | None:
     status = run.fit.get("fit_status")
     if status is None or not all(name in run.maps for name in PARAMETERS):
         return None
-    values = [np.asarray(run.maps[name], np.float64) for name in PARAMETERS]
-    known = np.logical_and.reduce([np.isfinite(each) for each in values])
-    usable = ((status & int(UNTRUSTWORTHY)) == 0) & known
-    return PixelMaps.known(values, usable) if usable.any() else None
+    exposure, gain, bias, sigma = (np.asarray(run.maps[name], np.float64) for name in PARAMETERS)
+    usable = (status & int(UNTRUSTWORTHY)) == 0
+    for values in (exposure, gain, bias, sigma):
+        usable &= np.isfinite(values)
+    # as they are, without the copies of `PixelMaps.known`: a quick look takes the usable pixels alone
+    return PixelMaps(exposure, gain, bias, sigma, usable) if usable.any() else None
 
 
 def read_sums(store: RunStore) -> StackSums | None:

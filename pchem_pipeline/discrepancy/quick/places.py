@@ -20,6 +20,8 @@ BoolArray = NDArray[np.bool_]
 #: Cells along an edge of the maps that are scanned; of a larger sensor pixels are taken together.
 _CELLS = 128
 _CLIP = 6.0
+#: Pixels that are looked at together.
+_AT_ONCE = 1 << 17
 _FEWEST_BLOCKS = 4
 #: Axis along which the values of a map are of a pixel and the next one.
 _NEXT_ALONG = {"next_x": 1, "next_y": 0}
@@ -44,27 +46,6 @@ class SensorPlace:
     def only_there(self) -> bool:
         """Whether little of it is elsewhere."""
         return abs(self.outside) < 0.25 * abs(self.inside)
-
-
-def sensor_maps(sums: StackSums) -> dict[str, FloatArray]:
-    """Return maps of all pixels from all frames, each N(0, 1) where samples are independent, (y, x).
-
-    ``next_x`` and ``next_y`` (covariance with the next pixel), ``lag`` (with the frame before) and, of four
-    blocks of frames or more, ``spread`` (block means scatter); NaN where a pixel never changes.
-    """
-    v, root = sums.variance, math.sqrt(sums.freedom_of_all)
-    right, down = np.full(v.shape, np.nan), np.full(v.shape, np.nan)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        right[:, :-1] = sums.next_x[:, :-1] / np.sqrt(v[:, :-1] * v[:, 1:]) * root
-        down[:-1] = sums.next_y[:-1] / np.sqrt(v[:-1] * v[1:]) * root
-        found = {"next_x": right, "next_y": down, "lag": sums.lag / v * root}
-        if sums.lengths.size >= _FEWEST_BLOCKS:
-            deviations = block_deviations(sums)
-            chi2 = (sums.lengths[:, None, None] * deviations**2).sum(axis=0) / v
-            found["spread"] = chi_square(chi2, sums.lengths.size - 1.0)
-    for values in found.values():
-        values[~np.isfinite(values)] = np.nan
-    return found
 
 
 def block_deviations(sums: StackSums) -> FloatArray:
@@ -117,11 +98,37 @@ class CellMap:
         return np.repeat(np.repeat(cells, np.diff(self.rows), axis=0), np.diff(self.columns), axis=1)
 
 
+def sensor_cells(sums: StackSums) -> dict[str, CellMap]:
+    """Return maps of all pixels, all frames, each N(0, 1) where samples are independent, summed over cells.
+
+    ``next_x`` and ``next_y`` (covariance with the next pixel), ``lag`` (with the frame before) and, of four
+    blocks of frames or more, ``spread`` (block means scatter); a pixel that never changes does not count.
+    """
+    v, root = sums.variance, math.sqrt(sums.freedom_of_all)
+    names = ("next_x", "next_y", "lag")
+    found = {name: CellMap.empty(sums.shape) for name in names}
+    rows = max(1, _AT_ONCE // v.shape[1])
+    for first in range(0, v.shape[0], rows):
+        band = slice(first, first + rows)
+        right, down = v[band, 1:], v[first + 1 : first + 1 + rows]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            next_x = sums.next_x[band, :-1] / np.sqrt(v[band, :-1] * right) * root
+            next_y = sums.next_y[band][: len(down)] / np.sqrt(v[band][: len(down)] * down) * root
+            found["lag"].add(sums.lag[band] / v[band] * root, first)
+        found["next_x"].add(np.pad(next_x, ((0, 0), (0, 1)), constant_values=np.nan), first)
+        found["next_y"].add(next_y, first)
+    if sums.lengths.size >= _FEWEST_BLOCKS:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            chi2 = (sums.lengths[:, None, None] * block_deviations(sums) ** 2).sum(axis=0) / v
+        found["spread"] = CellMap.of(chi_square(chi2, sums.lengths.size - 1.0))
+    return found
+
+
 def sensor_place(name: str, cells: CellMap, significance: float) -> SensorPlace | None:
     """Return the part of the sensor where a map stands out most; None where it is everywhere alike.
 
     Args:
-        name: of the map, as :func:`sensor_maps` calls it.
+        name: of the map, as :func:`sensor_cells` calls it.
         cells: the map.
         significance: largest probability of a chance.
     """

@@ -28,15 +28,15 @@ from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLo
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.levels import levels_check
 from pchem_pipeline.discrepancy.quick.places import (
-    CellMap,
     SensorPlace,
     block_deviations,
-    sensor_maps,
+    sensor_cells,
     sensor_place,
 )
 from pchem_pipeline.discrepancy.quick.series import normal_p, of_many, series_checks
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.maps.ordered import median_of
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
@@ -79,10 +79,7 @@ def quick_look(
     """
     checks: list[Check] = []
     usable = maps.usable
-    gain, noise = (
-        float(np.median(values[usable])) if usable.any() else math.nan
-        for values in (maps.conversion_gain, maps.read_noise_dn)
-    )
+    gain, noise = (median_of(values, ~usable) for values in (maps.conversion_gain, maps.read_noise_dn))
     if sums is not None and sums.freedom > 0:
         checks.append(levels_check(sums.frame_mean, sums.frame_variance, gain))
         checks += _stack_checks(sums, maps)
@@ -154,16 +151,16 @@ _LOCAL = ("neighbours_x", "neighbours_y", "lag")
 
 def _located(checks: list[Check], sums: StackSums) -> list[Check]:
     """Return checks with the part of the sensor that they are about, and one of parts that drift apart."""
-    maps = sensor_maps(sums)
-    limit = SIGNIFICANCE / len(maps)
-    places = {name: sensor_place(name, CellMap.of(values), limit) for name, values in maps.items()}
+    cells = sensor_cells(sums)
+    limit = SIGNIFICANCE / len(cells)
+    places = {name: sensor_place(name, each, limit) for name, each in cells.items()}
     found = []
     for check in checks:
         place = places.get(_MAP_OF.get(check.name, ""))
         found.append(check if place is None else _placed(check, place, sums))
     for noise, neighbours in (("row_noise", "neighbours_x"), ("column_noise", "neighbours_y")):
         found = _told_once(found, noise, neighbours)
-    if "spread" in maps:
+    if "spread" in cells:
         found.append(_local_drift(sums, places["spread"]))
     return found
 
@@ -332,8 +329,10 @@ def _frame_means(sums: StackSums, maps: PixelMaps) -> tuple[FloatArray, float, f
     mean = sums.row_sum[:, quiet].sum(axis=1) / pixels if sums.whole else sums.frame_mean
     scale = float(sums.rows.variance[quiet].sum())
     with np.errstate(divide="ignore", invalid="ignore"):
-        third = np.where(maps.usable, maps.quanta_exposure / maps.conversion_gain**3, 0.0)[quiet].sum()
-    return mean, math.sqrt(scale) / pixels, float(third / scale**1.5)
+        third = maps.conversion_gain**3
+        np.divide(maps.quanta_exposure, third, out=third)
+    third[~maps.usable] = 0.0
+    return mean, math.sqrt(scale) / pixels, float(third[quiet].sum() / scale**1.5)
 
 
 # -- successive samples and neighbours -----------------------------------------------------------
@@ -364,17 +363,20 @@ class _Common:
         """By how much correlated pixels raise the variance of a mean over them."""
         ny, nx = self.sums.shape
         variance = self.sums.variance
-        typical = float(np.median(variance[variance > 0]))
+        typical = median_of(variance, ~(variance > 0))
         frame = self._value(self.frame)
         row, column = self.of_row() - frame, self.of_column() - frame
         return 1.0 + (ny * nx * frame**2 + nx * row**2 + ny * column**2) / typical**2
 
 
 def _mean_correlation(z: FloatArray, common: _Common) -> tuple[float, float]:
-    """Return the mean of correlations that are z standard errors each, and its error, both over 1."""
+    """Return the mean of correlations that are z standard errors each, and its error, both over 1.
+
+    ``z`` is clipped in place: it is as large as a map.
+    """
     freedom = common.sums.freedom_of_all
-    kept = np.clip(z, -_CLIP, _CLIP)
-    return float(kept.mean()) / math.sqrt(freedom), math.sqrt(common.inflation / freedom / kept.size)
+    np.clip(z, -_CLIP, _CLIP, out=z)
+    return float(z.mean()) / math.sqrt(freedom), math.sqrt(common.inflation / freedom / z.size)
 
 
 def _off(correlation: float) -> str:
@@ -388,7 +390,11 @@ def _lag_check(sums: StackSums, common: _Common) -> list[Check]:
     if not some.any():
         return []
     variance = sums.variance[some]
-    mean, error = _mean_correlation(sums.lag[some] / variance * math.sqrt(sums.freedom_of_all), common)
+    z = sums.lag[some]
+    z /= variance
+    z *= math.sqrt(sums.freedom_of_all)
+    mean, error = _mean_correlation(z, common)
+    del z
     quiet = _quiet(sums)
     total = sums.rows.centred()[:, quiet].sum(axis=1)
     inside = np.ones(total.size, np.bool_)
@@ -420,18 +426,23 @@ def _neighbour_checks(sums: StackSums, common: _Common) -> list[Check]:
     """Return whether neighbours resemble each other, beyond what their line shares."""
     v = sums.variance
     found = []
-    for axis, product, covariance, shared in (
-        ("x", v[:, :-1] * v[:, 1:], sums.next_x[:, :-1], common.of_row()),
-        ("y", v[:-1] * v[1:], sums.next_y[:-1], common.of_column()),
+    for axis, one, other, covariance, shared in (
+        ("x", v[:, :-1], v[:, 1:], sums.next_x[:, :-1], common.of_row()),
+        ("y", v[:-1], v[1:], sums.next_y[:-1], common.of_column()),
     ):
-        some = (product > 0) & np.isfinite(covariance)
+        size = one * other
+        some = (size > 0) & np.isfinite(covariance)
         if not some.any():
             continue
-        size = np.sqrt(product[some])
-        z = covariance[some] / size * math.sqrt(sums.freedom_of_all)
+        size = size[some]
+        np.sqrt(size, out=size)
+        z = covariance[some]
+        z /= size
+        z *= math.sqrt(sums.freedom_of_all)
         mean, error = _mean_correlation(z, common)
+        del z
         which, line = (common.rows, "row") if axis == "x" else (common.columns, "column")
-        ratio = float(np.mean(np.minimum(1.0 / size, 4.0 / np.median(size))))
+        ratio = float(np.mean(np.minimum(1.0 / size, 4.0 / median_of(size))))
         if math.isfinite(which.error):
             mean -= shared * ratio
             error = math.hypot(error, which.error * ratio)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
+from pchem_pipeline.model.maps.ordered import Ordered
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -140,14 +141,26 @@ class StackSums:
     def _variance(self, blocks: IntArray | slice) -> FloatArray:
         """Return the variance of each pixel about its mean over the block, of some blocks, (y, x), DN^2."""
         lengths = self.lengths[blocks]
-        sums = self.block_sum[blocks].astype(np.float64)
-        within = self.block_sum_square[blocks] - sums**2 / lengths[:, None, None]
-        return np.asarray(within.sum(axis=0) / float(lengths.sum() - lengths.size))
+        within = np.zeros(self.shape)
+        parts = (self.block_sum[blocks], self.block_sum_square[blocks], lengths.tolist())
+        for total, square, length in zip(*parts, strict=True):  # block by block: each is as large as a map
+            between = total.astype(np.float64)
+            between *= between
+            between /= length
+            within += np.subtract(square, between, out=between)
+        within /= float(lengths.sum() - lengths.size)
+        return within
 
     @cached_property
     def mean_signal(self) -> FloatArray:
         """Mean of each pixel over the frames of the blocks at hand, (y, x), DN."""
         return np.asarray(self.block_sum.sum(axis=0) / float(self.lengths.sum()))
+
+    @cached_property
+    def typical_signal(self) -> tuple[float, float]:
+        """Median and robust standard deviation of the mean signal over the pixels, DN."""
+        known = Ordered.of(self.mean_signal)
+        return known.median, known.robust_sd
 
     @cached_property
     def variance(self) -> FloatArray:
@@ -180,12 +193,13 @@ class StackSums:
         everywhere = self.column_blocks.size == self.lengths.size
         v = self.variance if everywhere else self._variance(self.column_blocks)
         tops = np.arange(0, ny, ROW_GROUP)
-        total, square = (np.add.reduceat(values, tops, axis=0) for values in (v, v**2))
-        product, inside = np.zeros_like(v), np.zeros_like(v)
-        product[:-1] = v[:-1] * v[1:]
-        inside[:] = np.nan_to_num(self.next_y)
+        total, square = np.add.reduceat(v, tops, axis=0), np.add.reduceat(v**2, tops, axis=0)
+        product = np.zeros_like(v)
+        np.multiply(v[:-1], v[1:], out=product[:-1])
         product[ROW_GROUP - 1 :: ROW_GROUP] = 0.0  # no product crosses the border of a group
-        along, covariance = (np.add.reduceat(values, tops, axis=0) for values in (product, inside))
+        along = np.add.reduceat(product, tops, axis=0)
+        del product  # as large as a map
+        covariance = np.add.reduceat(np.nan_to_num(self.next_y), tops, axis=0)
         heights = np.diff(np.append(tops, ny))
         return Lines(
             self.column_sum.reshape(self.column_sum.shape[0], -1),

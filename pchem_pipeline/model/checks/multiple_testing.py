@@ -50,7 +50,7 @@ def misfit(chi2: NDArray[np.float64], dof: NDArray[np.float64]) -> NDArray[np.fl
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         spread = 2.0 / (9.0 * np.where(dof > 0, dof, np.nan))
-        return np.asarray(((chi2 * 4.5 * spread) ** (1.0 / 3.0) - (1.0 - spread)) / np.sqrt(spread))
+        return np.asarray((np.cbrt(chi2 * 4.5 * spread) - (1.0 - spread)) / np.sqrt(spread))
 
 
 def poorest(chi2: NDArray[np.float64], dof: NDArray[np.float64], n: int) -> list[tuple[int, int]]:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
-from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Level, Line, Panel, Stack
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.style.wording import count, short
@@ -132,18 +131,12 @@ def power_table(sums: StackSums) -> DataTable:
     return DataTable(columns, {"frequency": "1/frame"}, "spectrum")
 
 
-def _robust(values: FloatArray) -> tuple[float, float]:
-    known = Ordered.of(values)
-    return known.median, known.robust_sd
-
-
 def profile_table(sums: StackSums, axis: int) -> DataTable:
     """Return the median of the pixels' means over each row (axis 0) or column (axis 1), and chance.
 
     Chance are two standard errors of the median of that many pixels drawn from the whole sensor.
     """
-    image = sums.mean_signal
-    middle, width = _robust(image)
+    image, (middle, width) = sums.mean_signal, sums.typical_signal
     reach = 2.0 * _WIDTH * width / math.sqrt(image.shape[1 - axis])
     medians = np.median(image, axis=1 - axis)
     columns = {
@@ -157,8 +150,7 @@ def profile_table(sums: StackSums, axis: int) -> DataTable:
 
 def pattern_spectra(sums: StackSums) -> tuple[DataTable, ...]:
     """Return the power of the means of rows and columns by frequency, over that of unrelated pixels."""
-    image = sums.mean_signal
-    middle, width = _robust(image)
+    image, (middle, width) = sums.mean_signal, sums.typical_signal
     image = np.clip(image - middle, -_CLIP * width, _CLIP * width)
     found = []
     for axis, line in enumerate(_LINES):

@@ -136,7 +136,7 @@ def _flagged(data: ReportData) -> Table:
     for name in _ORDER if data.any_flagged else ():
         if not data.has_values(name):
             continue
-        summary = summarise(data.maps[name], left_out=~data.flagged, percentiles=(5.0, 95.0))
+        summary = summarise(data.maps[name][data.flagged], percentiles=(5.0, 95.0))
         _, words, unit = symbol(name)
         numbers = (summary.median, *summary.percentiles.values(), summary.minimum, summary.maximum)
         rows.append((f"{words} ({unit})", *(short(number, 4) for number in numbers), f"{summary.n_valid:,}"))

@@ -25,7 +25,7 @@ from pchem_pipeline.discrepancy.observe.pairs import CHANNELS, Samples, pairs_by
 from pchem_pipeline.discrepancy.observe.tables import pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
-from pchem_pipeline.discrepancy.quick.places import CellMap, SensorPlace, sensor_maps, sensor_place
+from pchem_pipeline.discrepancy.quick.places import CellMap, SensorPlace, sensor_cells, sensor_place
 from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
 from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
 from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
@@ -152,7 +152,7 @@ def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, 
     """
     if sums is None or sums.shape != shape or sums.freedom <= 0:
         return None
-    return _places({name: CellMap.of(v) for name, v in sensor_maps(sums).items()}, _SIGNIFICANCE)
+    return _places(sensor_cells(sums), _SIGNIFICANCE)
 
 
 def _places(maps: Mapping[str, CellMap], significance: float) -> dict[str, SensorPlace]:

@@ -23,7 +23,7 @@ def drawing_executor(workers: int, n_figures: int) -> Executor:
 
 
 def drawing_workers(wanted: int | None, settings: ComputeSettings) -> int:
-    """Return how many processes may draw: as asked for, else as the run's section ``compute`` says."""
+    """Return how many may work on a report at a time: as asked for, else as the section ``compute`` says."""
     if wanted is not None:
         return wanted
     workers = available_workers() if settings.workers == "auto" else settings.workers

@@ -6,6 +6,7 @@ shown, with its words and unit.
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, VARIABLES, Variable
+from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import MEANINGS
@@ -143,6 +145,7 @@ def read_maps(
     shape: tuple[int, int],
     index: NDArray[np.int64],
     loaded: Mapping[str, NDArray[Any]] | None = None,
+    threads: int = 1,
 ) -> tuple[list[MapEntry], dict[str, NDArray[np.float64]]]:
     """Read every stored map: packed as far as they fit into the page, and exact for some pixels.
 
@@ -151,6 +154,7 @@ def read_maps(
         shape: of the sensor.
         index: ``y * nx + x`` of the pixels that are held in full.
         loaded: maps that were read already, by path; None: none.
+        threads: that pack a map each.
 
     Returns:
         The maps, in the order of the list, and by path of those that fit their values, shape (n,).
@@ -158,7 +162,7 @@ def read_maps(
     Raises:
         StoreError: an array is missing or corrupt.
     """
-    return _packed(StoredMaps(store, loaded), listed_maps(store, shape), shape, index)
+    return _packed(StoredMaps(store, loaded), listed_maps(store, shape), shape, index, threads)
 
 
 class StoredMaps:
@@ -185,9 +189,10 @@ class StoredMaps:
         """
         if path in self.loaded:
             return self.loaded[path]
-        if path != self._last[0]:
-            self._last = path, self.store.read(path)
-        return self._last[1]
+        last = self._last  # another thread may put another in its place meanwhile
+        if path != last[0]:
+            last = self._last = path, self.store.read(path)
+        return last[1]
 
 
 def inspector_data(
@@ -200,7 +205,11 @@ def inspector_data(
 
 
 def _packed(
-    maps: StoredMaps, listed: Sequence[Listed], shape: tuple[int, int], index: NDArray[np.int64]
+    maps: StoredMaps,
+    listed: Sequence[Listed],
+    shape: tuple[int, int],
+    index: NDArray[np.int64],
+    threads: int,
 ) -> tuple[list[MapEntry], dict[str, NDArray[np.float64]]]:
     """Pack maps, the important ones first, until the budget is spent; see `read_maps`."""
     n = shape[0] * shape[1]
@@ -208,23 +217,44 @@ def _packed(
     order = sorted(listed, key=lambda each: _importance(each.variable.path))
     found: dict[str, MapEntry] = {}
     exact: dict[str, NDArray[np.float64]] = {}
-    for each in order:
-        entry = map_entry(each)
-        alike = _multiple_of_exposure(maps, each.variable)
-        if alike is not None and alike[0] in found and found[alike[0]].packed is not None:
-            found[entry.path] = replace(entry, same_as=alike)
-        else:
-            # packing many pixels takes long: there the first map that does not fit is the last tried
-            packed = packed_map(maps, each.variable) if budget > 0 else None
-            size = math.inf if packed is None else 4 * len(packed.data) / 3
-            fits = size <= budget
-            budget -= size if fits else math.inf if n > _MANY_PIXELS else 0.0
-            found[entry.path] = replace(entry, packed=packed) if fits else entry
-            if not fits:
-                continue
-        exact[entry.path] = maps.read(entry.path).reshape(-1)[index].astype(np.float64)
+    for start in range(0, len(order), threads):
+        some = order[start : start + threads]
+        tasks = [functools.partial(_coded, maps, each.variable, index, budget > 0) for each in some]
+        for each, coded in zip(some, call_all(tasks, threads), strict=True):
+            entry, alike, packed = map_entry(each), coded.alike, coded.packed
+            if alike is not None and alike[0] in found and found[alike[0]].packed is not None:
+                entry = replace(entry, same_as=alike)
+            else:
+                if alike is not None and budget > 0:
+                    packed = packed_map(maps, each.variable)
+                # packing many pixels takes long: there the first map that does not fit is the last tried
+                size = math.inf if packed is None else 4 * len(packed.data) / 3
+                fits = size <= budget
+                budget -= size if fits else math.inf if n > _MANY_PIXELS else 0.0
+                entry = replace(entry, packed=packed if fits else None)
+            found[entry.path] = entry
+            if entry.packed is not None or entry.same_as is not None:
+                exact[entry.path] = coded.exact
     paths = [each.variable.path for each in listed]
     return [found[path] for path in paths], {path: exact[path] for path in paths if path in exact}
+
+
+@dataclass(frozen=True)
+class _Coded:
+    """A map in few bytes, or as a multiple of another, and its values at some pixels, shape (n,)."""
+
+    alike: tuple[str, float] | None
+    packed: PackedMap | None
+    exact: NDArray[np.float64]
+
+
+def _coded(maps: StoredMaps, variable: Variable, index: NDArray[np.int64], pack: bool) -> _Coded:
+    """Return a map as the page can hold it; it is packed only where asked for, and no multiple."""
+    alike = _multiple_of_exposure(maps, variable)
+    if alike is None and not pack:
+        return _Coded(None, None, np.empty(0))
+    packed = packed_map(maps, variable) if alike is None else None
+    return _Coded(alike, packed, maps.read(variable.path).reshape(-1)[index].astype(np.float64))
 
 
 def _importance(path: str) -> tuple[int, int]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.model.maps.ordered import Ordered
+from pchem_pipeline.model.maps.ordered import median_of
 from pchem_pipeline.planning.frames import contour_data, frames_needed, precision
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import Target, parse_target
@@ -28,7 +28,7 @@ def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict
         n_frames: frames of the run, or None where pixels differ.
     """
     names = ("quanta_exposure", "read_noise_e", "conversion_gain")
-    medians = [Ordered.of(maps[name]).median for name in names if name in maps]
+    medians = [median_of(maps[name]) for name in names if name in maps]
     if len(medians) < len(names) or not np.isfinite(medians).all():
         return None
     exposure, noise, gain = medians

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
+from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
@@ -28,10 +29,11 @@ from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy.result import verdict_data
 from pchem_pipeline.stages.quick_look import read_sums, run_quick_look
-from pchem_pipeline.stages.report.drawing import draw_by_workers
+from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_workers
 from pchem_pipeline.stages.report.inspector import deciding_parameters, inspector_data, read_maps
 from pchem_pipeline.stages.report.pixels import (
     Chosen,
+    ChosenPixels,
     bin_masses,
     choose_inspected,
     choose_pixels,
@@ -39,13 +41,14 @@ from pchem_pipeline.stages.report.pixels import (
     pixel_index,
 )
 from pchem_pipeline.stages.report.plan_section import plan_section
-from pchem_pipeline.stages.report.stored import StoredRun, read_histograms, read_run
+from pchem_pipeline.stages.report.stored import PixelHistograms, StoredRun, read_histograms, read_run
 from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.stages.table import pipeline
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.discrepancy.quick.sums import StackSums
+    from pchem_pipeline.discrepancy.quick.checks import QuickLook
+    from pchem_pipeline.report.figures.figure import Figure
     from pchem_pipeline.report.pages.pictures import DrawAll
     from pchem_pipeline.report.settings import ReportSettings
     from pchem_pipeline.run.sensor import SensorInfo
@@ -54,14 +57,12 @@ if TYPE_CHECKING:
 
 #: Where a version of the model comes from, in words.
 _SOURCES = {"config": "from the configuration", "verdict": "from the verdict on what the model is missing"}
-#: Maps that are no parameters.
-_NOT_SHOWN = ("quality", "goodness_q")
 #: All channels of a line of so few are shown.
 _FEW_CHANNELS = 12
 #: Pixels in full that have the mass of a model with effects.
 _SOME_MASSES = 300
-#: Memory that a pixel takes: the maps are held as a whole. Measured at 2048 x 1152, 980 MiB in all.
-_PIXEL_BYTES = 370
+#: Memory that a pixel takes: the maps are held as a whole. Measured at 2048 x 1152, 940 MiB in all.
+_PIXEL_BYTES = 300
 
 
 def report_tile(data: ReportData, settings: ReportSettings, draw: DrawAll | None = None) -> RenderedReport:
@@ -152,14 +153,15 @@ def gather(
     Raises:
         StoreError: maps or histograms are missing.
     """
-    run = read_run(store)
+    threads = drawing_workers(None, config.compute)
+    run = read_run(store, threads)
     shape, shown = run.sensor.shape, _shown(run, config)
-    full = choose_inspected(run.maps, run.fit, [(y, x) for _, y, x in shown], _suspects(run))
-    index = np.concatenate([pixel_index(shown, shape), full.index])
-    histograms = read_histograms(store, index, shape, run.model)
-    sums = read_sums(store)
-    maps, exact = read_maps(store, shape, full.index, _at_hand(run, sums))
-    # from here on little is read
+    tasks: list[Callable[[], Any]] = [
+        functools.partial(_of_sums, store, run),
+        functools.partial(_of_pixels, store, run, shown),
+    ]
+    of_sums, (full, index, histograms) = call_all(tasks, threads)
+    maps, exact = read_maps(store, shape, full.index, _at_hand(run) | of_sums.covariances, threads)
     columns = [run.maps[name].reshape(-1)[index] for name in PARAMETERS]
     drawn = slice(0, len(shown))
     held, some = slice(drawn.stop, None), slice(0, drawn.stop + _SOME_MASSES)
@@ -173,22 +175,54 @@ def gather(
         report_data(run, config, integration_time, stages),
         pixels=fits,
         inspector=inspector_data(run.name, shape, maps, sample),
-        quick_look=run_quick_look(store, run, sums),
-        stability=stability_figures(sums),
+        quick_look=of_sums.look,
+        stability=of_sums.stability,
         # what a single command was given is no setting of the run
         config_yaml=store.config_text() or dump_config(config),
     )
 
 
-def _at_hand(run: StoredRun, sums: StackSums | None) -> dict[str, NDArray[Any]]:
+@dataclass(frozen=True)
+class _OfSums:
+    """What the sums over the frames say; they are as large as several maps, and freed.
+
+    Attributes:
+        look: the quick look.
+        stability: figures of frames, rows and columns.
+        covariances: of samples and of neighbours, by the path of the map, (y, x).
+    """
+
+    look: QuickLook | None
+    stability: list[Figure]
+    covariances: Mapping[str, NDArray[np.float64]]
+
+
+def _of_sums(store: RunStore, run: StoredRun) -> _OfSums:
+    """Read the sums over the frames, and return what they say."""
+    sums = read_sums(store)
+    look, stability = run_quick_look(store, run, sums), stability_figures(sums)
+    if sums is None:
+        return _OfSums(look, stability, {})
+    names = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")
+    covariances = zip(names, (sums.lag, sums.next_x, sums.next_y), strict=True)
+    return _OfSums(look, stability, {f"summary/{name}": values for name, values in covariances})
+
+
+def _of_pixels(
+    store: RunStore, run: StoredRun, shown: Sequence[Chosen]
+) -> tuple[ChosenPixels, NDArray[np.int64], PixelHistograms]:
+    """Return the pixels held in full, the places of the shown ones and of these, and their histograms."""
+    full = choose_inspected(run.maps, run.fit, [(y, x) for _, y, x in shown], _suspects(run))
+    index = np.concatenate([pixel_index(shown, run.sensor.shape), full.index])
+    return full, index, read_histograms(store, index, run.sensor.shape, run.model)
+
+
+def _at_hand(run: StoredRun) -> dict[str, NDArray[Any]]:
     """Return the maps that were read, as they are stored, by path."""
     found = {f"maps/{name}": values for name, values in run.maps.items()}
-    found |= {f"fit/{name}": run.fit[name] for name in ("fit_status", "outlier_share") if name in run.fit}
-    if sums is not None:
-        names = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")
-        covariances = (sums.lag, sums.next_x, sums.next_y)
-        found |= {f"summary/{name}": values for name, values in zip(names, covariances, strict=True)}
-    return found
+    return found | {
+        f"fit/{name}": run.fit[name] for name in ("fit_status", "outlier_share") if name in run.fit
+    }
 
 
 def _shown(run: StoredRun, config: RunConfig) -> list[Chosen]:
@@ -222,8 +256,7 @@ def report_data(
     """
     from pchem_pipeline.config.load import dump_config
 
-    maps = {name: values for name, values in run.maps.items() if name not in _NOT_SHOWN}
-    facts, sensor = dict(run.facts["ensemble"]), run.sensor
+    maps, facts, sensor = run.maps, dict(run.facts["ensemble"]), run.sensor
     moments, _ = facts.pop("moments", []), facts.pop("missing", {})
     cases = facts.pop("component_cases", COMPONENT_CASES)
     n_frames = sensor.n_frames if sensor.kind == "frames" else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from pchem_pipeline.base.variables import (
     interval_names,
     variables_of,
 )
+from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.run.model_versions import model_of, read_added_exposure
@@ -34,7 +36,8 @@ if TYPE_CHECKING:
 
 #: Group to the names of the arrays that the report is made from.
 _ARRAYS: dict[str, tuple[str, ...]] = {
-    **{group: tuple(v.name for v in variables_of(group)) for group in ("maps", "ensemble", "discrepancy")},
+    "maps": tuple(v.name for v in variables_of("maps") if v.name != "quality"),
+    **{group: tuple(v.name for v in variables_of(group)) for group in ("ensemble", "discrepancy")},
     "fit": ("fit_status", "goodness_p", "goodness_chi2", "goodness_dof", "outlier_share"),
     "truth": (*PARAMETERS, "read_noise_e"),
     "samples": ("quanta_exposure", "mean", "variance", "linearity_residual", "linearity_p"),
@@ -92,8 +95,8 @@ class StoredRun:
     Attributes:
         name: of the store.
         sensor: its input.
-        maps: group ``maps`` but the ends of intervals, (y, x).
-        fit: ``fit_status``, and of pixels with a value ``goodness_p``, ... (y, x).
+        maps: parameters, what is derived from them, and standard errors, (y, x).
+        fit: ``fit_status``, and of pixels with a value ``goodness_p``, ``goodness_q``, ... (y, x).
         intervals: by quantity the ends of its profile intervals.
         ensemble: group ``ensemble``.
         truth: true maps of simulated data.
@@ -122,28 +125,37 @@ class StoredRun:
     record: StageRecord | None = None
 
 
-def read_run(store: RunStore) -> StoredRun:
+def read_run(store: RunStore, threads: int = 1) -> StoredRun:
     """Read all of a run but its histograms.
+
+    Args:
+        store: the run.
+        threads: that read an array each.
 
     Raises:
         StoreError: an array is missing or corrupt.
     """
     verdict, methods, model = read_verdict(store.path), read_methods(store), read_model(store)
     sensor, record = SensorInfo.read(store), store.records.read("report")
-    groups = {
-        group: {name: store.read(f"{group}/{name}") for name in names if store.has(f"{group}/{name}")}
+    there = [
+        (group, name)
         for group, names in _ARRAYS.items()
-        if group != "discrepancy" or verdict is not None
-    }
+        for name in names
+        if (group != "discrepancy" or verdict is not None) and store.has(f"{group}/{name}")
+    ]
+    arrays = call_all([functools.partial(store.read, f"{group}/{name}") for group, name in there], threads)
+    groups: dict[str, dict[str, NDArray[Any]]] = {group: {} for group in _ARRAYS}
+    for (group, name), values in zip(there, arrays, strict=True):
+        groups[group][name] = values
     facts = {group: store.attributes(group) for group in ("maps", "ensemble")}
     maps, fit = groups.pop("maps"), groups["fit"]
     if "goodness_q" in maps:
-        fit["goodness_q"] = maps["goodness_q"]
+        fit["goodness_q"] = maps.pop("goodness_q")
     if "fit_status" in fit:
         # only what has a value can agree with its model or not
         failed = (fit["fit_status"] & int(FAILED)) != 0
-        if failed.any():
-            fit |= {name: np.where(failed, np.nan, fit[name]) for name in fit if name.startswith("goodness_")}
+        for name in (name for name in fit if name.startswith("goodness_")):
+            fit[name][failed] = np.nan
     ends = {name: interval_names(name) for name in (*INTERVALS, *CHARGE_RATES)}
     found = {name: (maps[low], maps[high]) for name, (low, high) in ends.items() if low in maps}
     shown = {name: values for name, values in maps.items() if not any(name in pair for pair in ends.values())}

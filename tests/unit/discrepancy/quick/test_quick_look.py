@@ -11,6 +11,7 @@ from helpers.quick_stacks import EXPOSURE, GAIN, READ_NOISE, codes_of, maps_of, 
 
 from pchem_pipeline import fit_counts
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.quick import places
 from pchem_pipeline.discrepancy.quick.checks import _SIGNS, SIGNIFICANCE, Check, QuickLook
 from pchem_pipeline.discrepancy.quick.levels import levels_check
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
@@ -42,6 +43,22 @@ def looked(frames: np.ndarray[Any, Any], model: tuple[Effect, ...] = ()) -> Quic
 
 def by_name(look: QuickLook) -> dict[str, Check]:
     return {check.name: check for check in look.checks}
+
+
+@pytest.mark.parametrize("rows", [1, 5, 32])
+def test_maps_of_the_sensor_are_the_same_in_bands(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
+    sums = sums_of(stack(np.random.default_rng(6), (200, 32, 24)))
+    monkeypatch.setattr(places, "_AT_ONCE", rows * 24)
+    cells = places.sensor_cells(sums)
+    v, root = sums.variance, np.sqrt(sums.freedom_of_all)
+    right = sums.next_x[:, :-1] / np.sqrt(v[:, :-1] * v[:, 1:]) * root
+    down = sums.next_y[:-1] / np.sqrt(v[:-1] * v[1:]) * root
+    for name, values in (("next_x", right), ("next_y", down), ("lag", sums.lag / v * root)):
+        whole = np.full(v.shape, np.nan)
+        whole[: values.shape[0], : values.shape[1]] = values
+        expected = places.CellMap.of(whole)
+        np.testing.assert_array_equal(cells[name].sums, expected.sums)
+        np.testing.assert_array_equal(cells[name].counts, expected.counts)
 
 
 @pytest.fixture(scope="module")

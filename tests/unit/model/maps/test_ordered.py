@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.model.maps.ordered import Ordered
+from pchem_pipeline.model.maps.ordered import Ordered, median_of
 
 
 def _maps():
@@ -19,7 +19,7 @@ def test_every_number_is_that_of_numpy_to_the_bit(values):
     found = Ordered.of(values)
     shares = np.random.default_rng(values.size).random(9)
     np.testing.assert_array_equal(found.quantiles(shares), np.quantile(values, shares))
-    assert found.median == np.median(values)
+    assert found.median == median_of(values) == np.median(values)
     assert found.robust_sd == 1.4826 * float(np.median(np.abs(values - np.median(values))))
     for rank in (-1.0, 0.3 * values.size, values.size + 1.0):
         assert found.at_rank(rank) == np.interp(rank, np.arange(values.size), np.sort(values))
@@ -44,6 +44,26 @@ def test_what_has_no_value_or_is_left_out_is_counted():
     found = Ordered.of(values, values == 7.0)
     np.testing.assert_array_equal(found.values, [1.0, 2.0, 3.0])
     assert (found.n_missing, found.n_left_out) == (2, 1)
+    assert median_of(values, values == 7.0) == 2.0
     nothing = Ordered.of(np.full(3, np.nan))
+    assert np.isnan(median_of(np.full(3, np.nan)))
     assert np.isnan(nothing.median)
     assert np.isnan(nothing.robust_sd)
+
+
+def test_a_map_is_not_changed():
+    values = np.array([3.0, -np.inf, 1.0, 2.0, np.nan])
+    before = values.copy()
+    assert Ordered.of(values, values == 3.0).median == 1.5
+    assert median_of(values, values == 3.0) == 1.5
+    np.testing.assert_array_equal(values, before)
+
+
+def test_values_that_come_again_are_left_out_as_often_as_they_are_given():
+    rng = np.random.default_rng(8)
+    values = rng.integers(0, 6, 200).astype(np.float64)
+    values[::17] = np.nan
+    out = rng.random(200) < 0.2
+    found, expected = Ordered.of(values).without(values[out]), Ordered.of(values, out)
+    np.testing.assert_array_equal(found.values, expected.values)
+    assert (found.n_missing, found.n_left_out) == (expected.n_missing, expected.n_left_out)

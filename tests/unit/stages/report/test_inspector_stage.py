@@ -14,12 +14,12 @@ from pchem_pipeline.base import variables
 from pchem_pipeline.base.variables import Variable
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.inspector.inspector import embedded
+from pchem_pipeline.report.inspector.inspector import embedded, map_facts
 from pchem_pipeline.report.pages import sections
 from pchem_pipeline.report.pages.sections import Section
 from pchem_pipeline.report.pages.summary import answers
 from pchem_pipeline.stages.report import inspector
-from pchem_pipeline.stages.report.inspector import listed_maps, map_entry
+from pchem_pipeline.stages.report.inspector import listed_maps, map_entry, read_maps
 from pchem_pipeline.stages.report.pixels import choose_inspected
 from pchem_pipeline.store.run_store import RunStore
 
@@ -106,6 +106,22 @@ def test_of_many_pixels_a_page_holds_few_megabytes_and_little_is_tried(
     assert 4 * sum(len(each.packed.data) for each in shown.maps if each.packed) / 3 <= 1500
     assert inspector._coarse(4096 * 2304) == (16.0, "a standard error")
     assert inspector._coarse(512 * 512)[1].startswith("a sixteenth")
+
+
+@pytest.mark.parametrize("budget", [1e9, 1500.0])
+def test_threads_change_nothing(
+    store: RunStore, data: ReportData, monkeypatch: pytest.MonkeyPatch, budget: float
+) -> None:
+    monkeypatch.setattr(inspector, "_MAPS_BUDGET", budget)
+    index = np.array([3, 50, 7])
+    (one, exact), (several, also) = (read_maps(store, SHAPE, index, threads=n) for n in (1, 3))
+    assert [map_facts(each) for each in several] == [map_facts(each) for each in one]
+    assert [each.packed and each.packed.data for each in several] == [
+        each.packed and each.packed.data for each in one
+    ]
+    assert list(also) == list(exact)
+    for path, values in exact.items():
+        np.testing.assert_array_equal(also[path], values)
 
 
 def test_the_charge_rate_costs_nothing(store: RunStore, data: ReportData) -> None:
