@@ -1,9 +1,10 @@
 """Over-dispersed counts: each pixel's exposure differs from frame to frame, independently of its neighbours.
 
 Thermal light and speckle (Mandel 1959; Goodman 1985), dark-current blinking that is too fast to be resolved,
-and a jitter of each pixel's integration time mix Poisson laws. A Gamma-distributed exposure of relative
-variance a gives the negative binomial law, ``Var K = H + a H^2`` (Greenwood and Yule 1920). It is drawn as
-what it also is: Poisson many clusters of logarithmic size (Quenouille 1949).
+and a jitter of each pixel's integration time mix Poisson laws: ``Var K = H + a H^2`` at a relative variance
+a of the exposure. One that is Gamma-distributed gives the negative binomial law (Greenwood and Yule 1920),
+which is drawn as what it also is: Poisson many clusters of logarithmic size (Quenouille 1949). One that is
+log-normal, a product of many small factors, is more skewed, which strong mixing shows.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.count_scores import count_excess
-from pchem_pipeline.effects.estimators.electrons import regrouped
+from pchem_pipeline.effects.estimators.electrons import binomial_upper, regrouped
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
@@ -25,10 +26,15 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
+# standard errors by which two kinds of exposures must differ
+_APART = 3.0
+# nodes of a law of log-normal exposures, from so many times the variance of shot noise on
+_NODES, _BEYOND = (3, 5, 7, 11, 17), (0.05, 0.3, 0.7, 1.3)
+
 
 @register_effect
 class OverdispersedCounts(Effect):
-    """Relative variance of the exposure of a pixel from frame to frame: negative binomial electron numbers.
+    """Relative variance of the exposure of a pixel from frame to frame.
 
     Signature: the score of the second Charlier polynomial is positive in all pixels, and per sample grows
     like H; nothing in time, nothing between neighbours, nothing in the readout channel.
@@ -50,6 +56,10 @@ class OverdispersedCounts(Effect):
     relative_variance: float = Field(
         ge=0, le=1, description="variance of the exposure divided by its squared mean (a), no unit"
     )
+    exposures: Literal["gamma", "lognormal"] = Field(
+        default="gamma",
+        description="how the exposures are distributed; gamma: electron numbers are negative binomial",
+    )
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return electron numbers (frame, y, x), e-, made of Poisson ones of mean ``context.exposure``."""
@@ -57,6 +67,8 @@ class OverdispersedCounts(Effect):
         a, exposure = self.relative_variance, context.exposure
         if a == 0:
             return values.copy()
+        if self.exposures == "lognormal":
+            return self._thinned_or_added(values, exposure, context)
         u = context.random.uniform(("frame", "y", "x"))
         flat = exposure.reshape(-1)
 
@@ -71,6 +83,22 @@ class OverdispersedCounts(Effect):
         # both probabilities are below a H / 2
         return regrouped(values, u, (0.5 * a) * exposure, law, extra)
 
+    def _thinned_or_added(
+        self, values: NDArray[Any], exposure: NDArray[np.float64], context: EffectContext
+    ) -> NDArray[Any]:
+        """Return Poisson numbers of the mean of each sample, made of those of the mean of all."""
+        width = _width(self.relative_variance)
+        normal = context.random.normal(("frame", "y", "x"))
+        factor = np.exp(width * normal - 0.5 * width**2)
+        u = context.random.uniform(("frame", "y", "x"), draw=1)
+        lost = binomial_upper(
+            u.ravel(), values.ravel().astype(np.int64), np.maximum(1.0 - factor, 0.0).ravel()
+        )
+        added = context.random.poisson(
+            np.broadcast_to(exposure, values.shape) * np.maximum(factor - 1.0, 0.0), 2
+        )
+        return np.asarray(values - lost.reshape(values.shape) + added, values.dtype)
+
     @classmethod
     def typical(cls) -> Sequence[Self]:
         """Return it at a = 0.0064, an exposure that jitters by 8 %."""
@@ -78,13 +106,36 @@ class OverdispersedCounts(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return a from the scores of the second Charlier polynomial, where they exceed 2.5 sigma."""
+        """Return a from the scores of the second Charlier polynomial, where they exceed 2.5 sigma.
+
+        Both kinds of exposures where the third polynomial, in which they differ by ``a^2 H^3`` in all, would
+        tell them apart.
+        """
         a, stderr = count_excess(evidence, power=0.0)
-        return (cls(relative_variance=min(a, 1.0)),) if a > 2.5 * stderr else ()
+        if not a > 2.5 * stderr:
+            return ()
+        a = min(a, 1.0)
+        exposure = evidence.maps.quanta_exposure[evidence.maps.usable]
+        apart = a**2 * np.sqrt(evidence.n_frames * np.nansum(exposure**3.0) / 6.0)
+        kinds: tuple[Literal["gamma", "lognormal"], ...] = ("gamma", "lognormal")
+        return tuple(cls(relative_variance=a, exposures=kind) for kind in kinds[: 2 if apart > _APART else 1])
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law with negative binomial electron numbers."""
-        return model.with_counts("negative_binomial", self.relative_variance)
+        """Return the law with negative binomial electron numbers, or mixed over log-normal exposures."""
+        if self.exposures == "gamma":
+            return model.with_counts("negative_binomial", self.relative_variance)
+        # Gauss-Hermite in the logarithm, more nodes where exposures differ by more than shot noise does
+        beyond = self.relative_variance * float(np.nanmax(maps.quanta_exposure, initial=0.0))
+        number = _NODES[int(np.searchsorted(_BEYOND, beyond))]
+        nodes, weights = np.polynomial.hermite_e.hermegauss(number)
+        factors = np.exp(_width(self.relative_variance) * nodes)
+        weights = weights / weights.sum()
+        return model.with_exposures(weights, factors / (weights @ factors))
+
+
+def _width(relative_variance: float) -> float:
+    """Return the standard deviation of the logarithm of log-normal exposures."""
+    return float(np.sqrt(np.log1p(relative_variance)))
 
 
 def _logarithmic_beyond_one(v: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.int64]:

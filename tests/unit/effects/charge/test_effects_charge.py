@@ -26,6 +26,7 @@ from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
 from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
 from pchem_pipeline.effects.exposure.persistence import Persistence
+from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -51,6 +52,7 @@ KINDS = [
     CosmicRays(tracks_per_frame=0.7),
     CosmicRays(tracks_per_frame=0.7, cloud_share=0.5, cloud_range=0.4),
     OverdispersedCounts(relative_variance=0.3),
+    OverdispersedCounts(relative_variance=0.3, exposures="lognormal"),
     BranchingCounts(branching=0.3),
 ]
 
@@ -125,6 +127,36 @@ def test_overdispersed_counts_are_negative_binomial(h, strength):
     if strength * h > 1:
         # nor is it the other law of the same variance
         assert goodness(k, borel_mass(h, 1 - (1 + strength * h) ** -0.5)) > 20
+
+
+def lognormal_mass(h, variance, n=60, nodes=60):
+    """Return the masses of Poisson numbers of log-normal exposures, by many nodes."""
+    z, w = np.polynomial.hermite_e.hermegauss(nodes)
+    width = np.sqrt(np.log1p(variance))
+    means = h * np.exp(width * z - 0.5 * width**2)
+    return (w / w.sum()) @ stats.poisson.pmf(np.arange(n), means[:, None])
+
+
+@pytest.mark.parametrize("h", [0.4, 3.0])
+@pytest.mark.parametrize("strength", [0.02, 0.4])
+def test_counts_of_lognormal_exposures(h, strength):
+    k = electrons(h, (40, 40), 500, OverdispersedCounts(relative_variance=strength, exposures="lognormal"))
+    assert abs(goodness(k, lognormal_mass(h, strength))) < 5
+    if strength * h > 1:
+        # more skewed than those of Gamma-distributed exposures of the same variance
+        assert goodness(k, stats.nbinom.pmf(np.arange(60), 1 / strength, 1 / (1 + strength * h))) > 20
+
+
+@pytest.mark.parametrize("h", [0.4, 3.0, 12.0])
+@pytest.mark.parametrize("strength", [0.005, 0.05, 0.2])
+def test_the_law_of_lognormal_exposures_has_nodes_enough(h, strength):
+    maps = PixelMaps.known([np.full(2, value) for value in (h, 0.1, 100.0, 3.0)], np.ones(2, np.bool_))
+    law = OverdispersedCounts(relative_variance=strength, exposures="lognormal").sample_law(SampleLaw(), maps)
+    means = h * law.exposure_factors
+    mass = law.exposure_weights @ stats.poisson.pmf(np.arange(60), means[:, None])
+    true = lognormal_mass(h, strength)
+    # what two million samples do not tell from the truth
+    assert 2e6 * np.sum((mass - true) ** 2 / np.maximum(true, 1e-9)) < 20
 
 
 @pytest.mark.parametrize("h", [0.4, 3.0])
