@@ -44,7 +44,7 @@ class OverdispersedCounts(Effect):
         default="overdispersed_counts", description="name of the effect"
     )
     plane: ClassVar[Plane] = Plane.CHARGE
-    title: ClassVar[str] = "over-dispersed (negative binomial) counts"
+    title: ClassVar[str] = "over-dispersed counts"
     source: ClassVar[str] = "Mandel 1959, Proc. Phys. Soc. 74, 233; Goodman 1985, Statistical Optics, ch. 9"
     signature: ClassVar[tuple[str, ...]] = ("shape.C2.mean", "shape.C2.slope", "code.smooth", "shape.C3.mean")
     strength: ClassVar[str] = "relative_variance"

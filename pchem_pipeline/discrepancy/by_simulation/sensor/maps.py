@@ -42,6 +42,8 @@ _MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
 _SEARCHED = FitSettings(max_iterations=60, tolerance=1e-5)
 # pixels that are fitted before all others, and the share of them that a law must fit
 _PROBED, _LEAST_FITTED = 24, 0.25
+# share of them that another start must fit clearly better for all pixels to be fitted from it
+_OFTEN_BETTER = 0.05
 # nats by which a bias an electron off must be likelier under a law that the plain fit did not know
 _CLEARLY = 4.0
 
@@ -113,10 +115,9 @@ def refit_maps(
         mean = (added.flat().exposure_e * added.flat().weight).sum(axis=0)
         near[:, 0] = np.maximum(near[:, 0] - mean, _LEAST_LEFT * near[:, 0])
 
-    def fitted(some: NDArray[np.intp], electrons: float = 0.0) -> FitResult:
-        start = _off_by(near[some], electrons)
+    def fitted(some: NDArray[np.intp], start: FloatArray = near) -> FitResult:
         origin = histograms.origin.ravel()[some]
-        return fit_histograms(counts[some], origin, law=law.of(some), start=start, settings=_SEARCHED)
+        return fit_histograms(counts[some], origin, law=law.of(some), start=start[some], settings=_SEARCHED)
 
     known, every = np.flatnonzero(maps.usable.ravel()), np.arange(len(near))
     probed = known[:: max(1, known.size // _PROBED)]
@@ -124,9 +125,9 @@ def refit_maps(
     if np.mean(np.isfinite(probe.bias)) < _LEAST_FITTED:
         raise NotFittedError("hardly a pixel can be fitted with it")
     fit = fitted(every)
-    for electrons in (-1.0, 1.0):
-        if np.mean(_likelier(fitted(probed, electrons), probe)) > _LEAST_FITTED:
-            other = fitted(every, electrons)
+    for start in (_off_by(near, -1.0), _off_by(near, 1.0), _of_usual_noise(near, fit.columns)):
+        if np.mean(_likelier(fitted(probed, start), probe)) > _OFTEN_BETTER:
+            other = fitted(every, start)
             better = np.flatnonzero(_likelier(other, fit))
             fit = fit.with_pixels(better, other.of(better))
     new = fit.maps
@@ -159,6 +160,17 @@ def _off_by(start: FloatArray, electrons: float) -> FloatArray:
     off[:, 0] = np.maximum(start[:, 0] + electrons, _LEAST_LEFT * start[:, 0])
     off[:, 2] -= electrons / start[:, 1]
     return off
+
+
+def _of_usual_noise(near: FloatArray, fitted: FloatArray) -> FloatArray:
+    """Return parameters (n, 4) with the gain and the read noise of most pixels, bias and mean of each.
+
+    Under strong effects plain fits have both too large in bright pixels, and those climb no way back.
+    """
+    found = np.where(np.isfinite(fitted), fitted, near)
+    found[:, 0] *= np.nanmedian(fitted[:, 1]) / found[:, 1]
+    found[:, [1, 3]] = np.nanmedian(fitted[:, [1, 3]], axis=0)
+    return found
 
 
 def _likelier(one: FitResult, other: FitResult) -> NDArray[np.bool_]:

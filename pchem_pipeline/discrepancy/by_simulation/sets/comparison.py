@@ -57,6 +57,7 @@ _UNTOUCHED = 0.5  # of that, the most by which the others may move it
 _NO_WORSE = 10.0  # nats by which fewer replicates may make a set look worse
 _PLACEBO_STEPS = 2  # corrections of its strength
 _NEARLY_AS_GOOD = 40.0  # nats between sets that a second witness is asked about
+_MOST_ALIKE = 3  # look-alikes of a single effect that are refitted before anything beside it
 _SILENT = Witness()
 
 
@@ -136,6 +137,9 @@ def compare(
     for hypothesis in _dear_last(singles[:first]):
         trials.refit((hypothesis,))
     if trials.nearly:
+        # a strong effect that is not quite this one leaves as little: what stands out beside it is in vain
+        for hypothesis in _look_alikes(choice):
+            trials.refit((hypothesis,))
         # fingerprints on top of pixels that were fitted without it show its details, not what is beside it
         trials.tune()
         if not held and not trials.complete and _within(unlisted):
@@ -301,6 +305,16 @@ def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesi
         if same < most and len(chosen) < _MOST_SINGLES and all(hypothesis is not h for h in chosen):
             chosen.append(hypothesis)
     return chosen
+
+
+def _look_alikes(choice: Choice) -> list[Hypothesis]:
+    """Return the likeliest effects that are known to be confused with the best set, if that is one effect."""
+    best = choice.best.hypotheses
+    if len(best) > 1:
+        return []
+    singles = [one.hypotheses[0] for one in choice.tried if len(one.hypotheses) == 1]
+    others = (h for h in singles if h.tag != best[0].tag and not unrelated(h.effect, best[0].effect))
+    return [h for h in others if not is_dear([h.effect])][:_MOST_ALIKE]
 
 
 def _asked_once(beside: Callable[[Refitted], Choice | None]) -> Callable[[Refitted], Choice | None]:
