@@ -170,9 +170,6 @@ def posterior_of(
     best, most = None, -np.inf
     for start, population in _beginnings(pixels, parameters, mistaken):
         starts = np.stack([_shifted(start, each) for each in shifts])
-        if len(starts) > 1 and not population.uncertainty.any() and not pixels.law.neutral:
-            # fits under effects are right far more often than plain ones, which tell how many are mistaken
-            population = _learn(pixels.of(some), starts[:1, some], population)[0]
         learnt, evidence = _learn(pixels.of(some), starts[:, some], population)
         if evidence > most:
             best, most = (starts, learnt), evidence
