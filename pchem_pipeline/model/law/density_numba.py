@@ -189,6 +189,8 @@ def _fill_blocks(rows: FloatArray, comb: _Comb, n_blocks: int) -> None:
         simd_store(rows, _RATIO, block, simd_exp(least(kept, longest)))
         simd_store(rows, _RATIO + 1, block, simd_exp(least(most(logarithm - scale * a, -longest), longest)))
         simd_store(rows, _CUT, block, (logarithm - kept) * float(half))
+    # the last logarithms that are taken reach beyond the bins, and the last block may not
+    simd_store(rows, _DENSITY, (comb.n_bins - 1) // SIMD_WIDTH * SIMD_WIDTH, counting() * 0.0 + 1.0)
 
 
 @kernel(inline=True)

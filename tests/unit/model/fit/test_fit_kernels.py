@@ -208,6 +208,7 @@ def test_compiled_sums_equal_plain_at_every_width(monkeypatch: pytest.MonkeyPatc
             sample, centre, _, theta = prepare((3.0, step, noise))
             point = internal(theta, centre)
             facts, bins, rows = sample.pixel.facts[0], sample.pixel.bins[0], sample.scratch.rows
+            sample.scratch.rows[:] = np.nan  # what was in memory before must not matter
             run(sample, point)  # lays out the blocks
             a, zero, n_bins = point[1], point[2] - facts[pixel_numba.FIRST], int(facts[pixel_numba.N_BINS])
             first, last = (max(0, int(np.floor((x - zero) / a + 0.5))) for x in (0, n_bins - 1))
