@@ -118,6 +118,23 @@ def test_flicker_from_frame_to_frame(seed):
     assert found.correlation_frames == 0
 
 
+@pytest.mark.parametrize(("levels", "shares"), [((-1.0, 1.0), (0.5, 0.5)), ((0.0, 1.0), (0.95, 0.05))])
+def test_flicker_of_two_levels(levels, shares):
+    truth = ExposureFlicker(rms=0.06, levels=levels, shares=shares)
+    evidence = seen(truth)
+    found, plain = ExposureFlicker.estimate(evidence)
+    assert not plain.levels
+    n, noise = evidence.n_frames, shot_variance(evidence)
+    p = found.shares[1]
+    assert len(found.levels) == 2
+    assert abs(p - shares[1]) < 5 * np.sqrt(shares[0] * shares[1] / n)
+    # given the shares, the distance of two levels is known to the noise of the rarer one
+    step, wanted = (0.06 / np.sqrt(a * (1 - a)) for a in (p, shares[1]))
+    step *= found.rms / 0.06
+    assert abs(step - wanted) < 5 * np.sqrt(noise / (n * min(shares)))
+    assert wanted > 4 * np.sqrt(noise)
+
+
 def test_flicker_with_a_memory():
     evidence = seen(ExposureFlicker(rms=0.05, correlation_frames=4.0))
     found = ExposureFlicker.estimate(evidence)[0]

@@ -366,10 +366,11 @@ class FrameExplainer:
         """
         self.work.effort.release()
         instead, left = self.replaced(null), self.gap(null)
-        if instead is not None or left.at_floor:
+        additions = self.close(before, null, disagrees=True).additions
+        if instead is not None or (left.at_floor and any(each.fits for each in additions)):
             return instead
         unexplained, sure = self._unexplained(), self.accept.accounted(self.extended.rounds, null)
-        named = any(each.named for each in self.close(before, null, disagrees=True).additions)
+        named = any(each.named for each in additions)
         best: tuple[tuple[bool, float], Refitted] | None = None
         for kept in ((), sure) if sure else ((),):
             try:

@@ -3,7 +3,8 @@
 The intensity noise of a lamp or laser, a shutter that jitters, or a temperature that jumps multiplies the
 exposure of all pixels of frame t by ``a_t`` of mean 1 and standard deviation s (EMVA Standard 1288, release
 4.0, requires the source to be stable for this reason). Successive frames may be alike
-(``correlation_frames``), or the flicker may be a sine: a lamp on the mains, aliased by the frame rate.
+(``correlation_frames``), or the flicker may be a sine: a lamp on the mains, aliased by the frame rate. A lamp
+that misses a cycle or a laser that hops between modes takes a few values only (``levels``).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
 from pchem_pipeline.effects.estimators.common_modes import successive
+from pchem_pipeline.effects.estimators.level_mixtures import Levels, few_levels
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
@@ -77,12 +79,38 @@ class ExposureFlicker(Effect):
         le=1,
         description="phase of the sine at frame 0, cycles (0: rising through the mean)",
     )
+    levels: tuple[float, ...] = Field(
+        default=(),
+        max_length=64,
+        description="values that the exposure takes, in any unit (rms gives their size); "
+        "empty: log-normal fluctuations",
+    )
+    shares: tuple[float, ...] = Field(
+        default=(), max_length=64, description="share of the frames at each of the levels; empty: equal"
+    )
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
-        if self.period_frames is not None and self.correlation_frames > 0:
-            raise ValueError("exposure_flicker: a sine has no correlation_frames; leave one of them out")
+        if self.period_frames is not None and (self.correlation_frames > 0 or self.levels):
+            other = "levels" if self.levels else "correlation_frames"
+            raise ValueError(f"exposure_flicker: a sine has no {other}; leave one of them out")
+        if self.shares and len(self.shares) != len(self.levels):
+            raise ValueError(
+                f"exposure_flicker: {len(self.shares)} shares for {len(self.levels)} levels; give one for each"
+            )
+        if self.shares and not (min(self.shares) > 0 and abs(sum(self.shares) - 1.0) < 1e-3):
+            raise ValueError("exposure_flicker: shares are above 0 and sum to 1")
+        if self.levels and not len(set(self.levels)) > 1:
+            raise ValueError("exposure_flicker: levels needs at least two different values")
         return self
+
+    def _law(self) -> Levels:
+        """Return the relative exposures of the levels, of mean 1, and their shares."""
+        values = np.array(self.levels)
+        shares = np.array(self.shares or [1.0] * values.size)
+        law = Levels(values, shares / shares.sum())
+        centred = (values - law.shares @ values) / law.rms
+        return Levels(np.maximum(1.0 + self.rms * centred, 0.0), law.shares)
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the flickering exposure (frame, y, x), e-."""
@@ -91,6 +119,14 @@ class ExposureFlicker(Effect):
         if self.period_frames is not None:
             phase = context.frames / self.period_frames + self.phase_cycles
             factor = np.maximum(1.0 + self.rms * np.sqrt(2.0) * np.sin(2.0 * np.pi * phase), 0.0)
+        elif self.levels:
+            from scipy.special import ndtr
+
+            # the levels in their order, by the share of the normal law below the fluctuation
+            law = self._law()
+            order = np.argsort(law.values)
+            below = np.cumsum(law.shares[order])[:-1]
+            factor = law.values[order][np.searchsorted(below, ndtr(self._fluctuation(context)))]
         else:
             # log-normal: never negative, mean exactly 1
             width = np.sqrt(np.log1p(self.rms**2))
@@ -99,6 +135,7 @@ class ExposureFlicker(Effect):
         return result
 
     def _fluctuation(self, context: EffectContext) -> NDArray[np.float64]:
+        """Return a normal number of mean 0 and variance 1 for each frame, shape (n,)."""
         if self.correlation_frames == 0:
             return context.random.normal(("frame",))[:, 0, 0]
         from scipy.signal import lfilter
@@ -122,14 +159,16 @@ class ExposureFlicker(Effect):
         profile = exposure_profile(evidence)
         if profile is None or evidence.time is None:
             return ()
-        found = [*_sine(cls, profile), *_random(cls, profile)]
-        return found[:3]
+        return [*_sine(cls, profile), *_random(cls, profile)][:4]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law mixed over the exposures of the frames."""
         if self.period_frames is not None:
             factors = 1.0 + self.rms * np.sqrt(2.0) * np.sin(2.0 * np.pi * (np.arange(400) + 0.5) / 400)
             return model.with_exposures(*exposure_nodes(factors))
+        if self.levels:
+            law = self._law()
+            return model.with_exposures(law.shares, law.values / (law.shares @ law.values))
         # Gauss-Hermite in the logarithm
         nodes, weights = np.polynomial.hermite_e.hermegauss(3)
         width = np.sqrt(np.log1p(self.rms**2))
@@ -153,6 +192,7 @@ def _random(cls: type[_T], profile: ExposureProfile) -> list[_T]:
     if max(fast / fast_error, whole / whole_error) < 3.0:
         return []
     found: list[_T] = []
+    levels = few_levels(profile.deviation, profile.variance)
     if fast > 2.5 * fast_error:
         found.append(cls(rms=min(float(np.sqrt(fast)), 1.0)))
     # fast = s^2 (1 - rho): the lag-1 correlation of an exponential memory
@@ -161,7 +201,13 @@ def _random(cls: type[_T], profile: ExposureProfile) -> list[_T]:
         memory = float(-1.0 / np.log(rho))
         if memory < n / _SLOWEST:
             found.insert(0, cls(rms=min(float(np.sqrt(whole)), 1.0), correlation_frames=memory))
-    return found
+    if levels is None:
+        return found
+    rounded = {
+        "levels": tuple(np.round((levels.values - levels.values.mean()) / levels.rms, 4).tolist()),
+        "shares": tuple(levels.shares.tolist()),
+    }
+    return [*(cls(**{**one.model_dump(), "rms": levels.rms, **rounded}) for one in found), *found]
 
 
 def _sine(cls: type[_T], profile: ExposureProfile) -> list[_T]:

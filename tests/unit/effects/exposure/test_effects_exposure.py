@@ -47,6 +47,37 @@ def test_flicker_has_its_rms_and_memory(correlation):
     assert abs(lag - rho) < 0.01 * (correlation > 0) + 5 / np.sqrt(n)
 
 
+@pytest.mark.parametrize("correlation", [0.0, 4.0])
+@pytest.mark.parametrize(("levels", "shares"), [((3.0, 1.0), (0.1, 0.9)), ((0.9, 1.0, 1.1), ())])
+def test_a_flicker_of_levels_takes_these_and_has_its_rms(levels, shares, correlation):
+    n = 40_000
+    effect = ExposureFlicker(rms=0.2, levels=levels, shares=shares, correlation_frames=correlation)
+    a = exposures(effect, np.ones((1, 1)), n)[:, 0, 0]
+    values, counts = np.unique(a, return_counts=True)
+    wanted = np.array(shares or [1 / 3] * 3)[np.argsort(levels)]
+    # neighbours that are alike count less
+    independent = n / (1.0 + 2.0 * correlation)
+    assert values.size == len(levels)
+    assert np.all(abs(counts / n - wanted) < 5 * np.sqrt(wanted * (1 - wanted) / independent))
+    assert values @ wanted == pytest.approx(1.0)
+    assert np.sqrt(wanted @ (values - 1.0) ** 2) == pytest.approx(0.2)
+    assert np.diff(values) == pytest.approx(np.full(values.size - 1, values[1] - values[0]))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"levels": (1.0, 2.0), "period_frames": 3.0}, "a sine has no levels"),
+        ({"levels": (1.0, 1.0)}, "two different"),
+        ({"levels": (1.0, 2.0), "shares": (0.5,)}, "1 shares for 2 levels"),
+        ({"levels": (1.0, 2.0), "shares": (0.5, 0.6)}, "sum to 1"),
+    ],
+)
+def test_levels_that_make_no_sense_are_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        ExposureFlicker(rms=0.1, **given)
+
+
 def test_a_sine_has_its_rms_period_and_phase():
     effect = ExposureFlicker(rms=0.1, period_frames=8.0, phase_cycles=0.25)
     a = exposures(effect, np.ones((1, 1)), 800)[:, 0, 0] - 1.0
