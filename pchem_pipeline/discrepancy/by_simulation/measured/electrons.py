@@ -152,7 +152,13 @@ def measured_electrons(data: Electrons, model: Electrons) -> Measurement | None:
         data: chances of the frames.
         model: of frames simulated with it.
     """
-    more, of_pairs = _beyond(data.excess, model.excess)
+    following = {
+        place: _beyond(chances, model.together.get(place, _NOTHING))
+        for place, chances in data.together.items()
+    }
+    each, _ = following.get(_NEXT, _NOTHING)
+    chain = each.value if each.clear > _CLEAR else 0.0
+    more, of_pairs = _without_chain(*_beyond(data.excess, model.excess), chain)
     found: list[tuple[Fate, Place, float]] = []
     # what makes electrons come in company: others that follow them, or samples without any
     ways: list[tuple[float, tuple[Fate, Place, float]]] = []
@@ -164,9 +170,8 @@ def measured_electrons(data: Electrons, model: Electrons) -> Measurement | None:
         ways.append((of_pairs.clear, ("emptied", _OWN, emptied)))
     fate: Fate = "lost"
     where, lost = _OWN, -of_pairs.value if of_pairs.clear < -_CLEAR else 0.0
-    gain, chain = (0.5 * max(abs(more.clear), abs(of_pairs.clear)) ** 2 if ways or lost else 0.0), 0.0
-    for place, chances in data.together.items():
-        each, arriving = _beyond(chances, model.together.get(place, _NOTHING))
+    gain = 0.5 * max(abs(more.clear), abs(of_pairs.clear)) ** 2 if ways or lost else 0.0
+    for place, (each, arriving) in following.items():
         # those that came to the next frame have brought others themselves
         each = each._replace(value=each.value - (chain ** place[0] if place[0] > 1 else 0.0))
         if each.clear < _CLEAR:
@@ -176,12 +181,21 @@ def measured_electrons(data: Electrons, model: Electrons) -> Measurement | None:
             fate, where = "moved", place
         else:
             found.append(("followed", place, each.value))
-            chain = each.value if place == _NEXT else chain
     if lost:
         found.append((fate, where, lost))
     likeliest_first = [way for _, way in sorted(ways, key=lambda way: -way[0])]
     effects = [_effect([way, *found]) for way in likeliest_first] or ([_effect(found)] if found else [])
     return Measurement(effects[0], gain, tuple(effects[1:])) if effects else None
+
+
+def _without_chain(more: Chance, of_pairs: Chance, chain: float) -> Chances:
+    """Return the excess of the variance without what electrons make that bring ``chain`` to the next frame.
+
+    ``K' = N + Poisson(c K)`` has the variance ``E[K] / (1 - c^2)`` in the long run.
+    """
+    made = 0.5 * chain**2 / (1.0 - chain**2)
+    left = 1.0 - min(made / more.value, 1.0) if more.value > 0.0 else 1.0
+    return more._replace(value=more.value - made), of_pairs._replace(value=of_pairs.value * left)
 
 
 def _effect(events: Sequence[tuple[Fate, Place, float]]) -> EmpiricalElectrons:

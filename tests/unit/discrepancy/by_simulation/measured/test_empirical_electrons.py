@@ -30,11 +30,15 @@ def nothing(k: np.ndarray, _: np.random.Generator) -> np.ndarray:
     return k
 
 
-def followed(k: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return electrons each of which brings 0.05 others to the next frame."""
-    for t in range(1, len(k)):
-        k[t] += rng.poisson(0.05 * k[t - 1])
-    return k
+def followed_by(number: float) -> Fate:
+    """Return what makes each electron bring so many others to the next frame, on average."""
+
+    def fate(k: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        for t in range(1, len(k)):
+            k[t] += rng.poisson(number * k[t - 1])
+        return k
+
+    return fate
 
 
 def lost(k: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -82,7 +86,9 @@ def plain() -> Any:
 @pytest.mark.parametrize(
     ("fate", "told", "place", "chance"),
     [
-        (followed, "followed", (1, 0, 0), 0.05),
+        (followed_by(0.05), "followed", (1, 0, 0), 0.05),
+        # those that come bring others in turn: more than Poisson in a frame, and nothing of its own
+        (followed_by(0.2), "followed", (1, 0, 0), 0.2),
         (lost, "lost", (0, 0, 0), 0.03),
         (moved, "moved", (0, 0, 1), 0.04),
         (emptied, "emptied", (0, 0, 0), 0.06),
