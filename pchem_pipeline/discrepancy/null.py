@@ -116,6 +116,11 @@ class NullModel:
         return np.array([EXACT.get(name.partition("@")[0], 0.0) for name in self.names])
 
     @property
+    def counts(self) -> NDArray[np.bool_]:
+        """Which statistics are normal quantiles of a count, shape (m,)."""
+        return _are_counts(self.names)
+
+    @property
     def freedom(self) -> float:
         """Degrees of freedom of the standard deviations."""
         return self.n_replicates - 1 + _PRIOR_WEIGHT
@@ -213,6 +218,10 @@ def _kind(name: str) -> str:
     return name.partition("@")[0].rpartition(".")[2]
 
 
+def _are_counts(names: Sequence[str]) -> NDArray[np.bool_]:
+    return np.isin([_kind(name) for name in names], _COUNTS)
+
+
 def _skewness(names: Sequence[str], vectors: FloatArray) -> FloatArray:
     """Return the skewness of statistics, shape (m,).
 
@@ -238,8 +247,7 @@ def _straight(names: Sequence[str], pulls: FloatArray, std: FloatArray, skewness
 
     Not on their short side: a skewness by rare samples does not say that it ends.
     """
-    counts = np.isin([_kind(name) for name in names], _COUNTS)
-    scaled = pulls * np.where(counts, np.minimum(std, 1.0), 1.0)
+    scaled = pulls * np.where(_are_counts(names), np.minimum(std, 1.0), 1.0)
     straight = without_skew(scaled, skewness)
     return np.where(np.abs(straight) < np.abs(scaled), straight, scaled)
 

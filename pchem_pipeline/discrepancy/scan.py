@@ -36,6 +36,7 @@ _RIDGE = 1e-3  # of a covariance of series that may all but coincide
 _FEWEST = 3  # pixels of a place
 _LEAST = -690.0  # logarithm of the smallest probability that is written
 _SURE = 0.05
+_LITTLE = 0.25  # of the mean inside a place, that outside
 #: Nats by which a place of a further family must be less probable than a simpler one.
 _BETTER = 3.0
 
@@ -69,7 +70,7 @@ class Suspect:
     @property
     def only_there(self) -> bool:
         """Whether little of it is elsewhere."""
-        return abs(self.outside) < 0.25 * abs(self.inside)
+        return abs(self.outside) < _LITTLE * abs(self.inside)
 
 
 @dataclass(frozen=True)
@@ -88,9 +89,14 @@ class Stretch:
         """Probability of such a deviation by chance, at least 1e-300."""
         return math.exp(max(self.log_p, _LEAST))
 
+    @property
+    def only_there(self) -> bool:
+        """Whether little of it is elsewhere."""
+        return abs(self.outside) < _LITTLE * abs(self.inside)
+
 
 @dataclass(frozen=True)
-class _Found:
+class Found:
     """The best place of a family, its deviation, and the logarithm of its probability."""
 
     family: str
@@ -149,7 +155,7 @@ def _reaching(mask: BoolArray, axis: int | None) -> BoolArray:
     return grown
 
 
-def _checked(found: _Found, values: FloatArray, some: BoolArray) -> _Found:
+def _checked(found: Found, values: FloatArray, some: BoolArray) -> Found:
     """Return a place with its deviation in terms of the scatter inside and outside (Welch).
 
     Where values scatter more, a mean that is off says less.
@@ -162,15 +168,24 @@ def _checked(found: _Found, values: FloatArray, some: BoolArray) -> _Found:
     if abs(z) >= abs(found.z):
         return found
     places = found.log_p - float(special.log_ndtr(-abs(found.z)))
-    return _Found(found.family, found.mask, z, min(0.0, float(special.log_ndtr(-abs(z))) + places))
+    return Found(found.family, found.mask, z, min(0.0, float(special.log_ndtr(-abs(z))) + places))
 
 
-def _best(values: FloatArray, some: BoolArray, single: bool) -> _Found | None:
+def _best(values: FloatArray, some: BoolArray, single: bool) -> Found | None:
     """Return the place of the smallest probability, a simpler one where that is nearly as small."""
     kept = np.clip(np.where(some, values, 0.0), -_CLIP, _CLIP)
-    contrast = _Contrast.of(kept, some)
-    if contrast is None:
-        return None
+    contrast = Contrast.of(kept, some)
+    return None if contrast is None else best_place(contrast, some, _single(values, some) if single else None)
+
+
+def best_place(contrast: Contrast, some: BoolArray, *others: Found | None) -> Found | None:
+    """Return the place of the smallest probability of all families; None where none divides the pixels.
+
+    Args:
+        contrast: of a map, (y, x).
+        some: pixels that count, (y, x).
+        others: the best places of further families.
+    """
     families = [
         _bands(contrast, 0),
         _bands(contrast, 1),
@@ -178,7 +193,7 @@ def _best(values: FloatArray, some: BoolArray, single: bool) -> _Found | None:
         _periodic(contrast, 1),
         _rectangle(contrast),
         _disc(contrast),
-        _single(values, some) if single else None,
+        *others,
     ]
     there = [each for each in families if each is not None and _parts(each.mask, some)]
     if not there:
@@ -187,7 +202,7 @@ def _best(values: FloatArray, some: BoolArray, single: bool) -> _Found | None:
     for each in there[1:]:
         if each.log_p < best.log_p - _BETTER:
             best = each
-    return _Found(best.family, best.mask, best.z, best.log_p + math.log(len(families)))
+    return Found(best.family, best.mask, best.z, best.log_p + math.log(len(families)))
 
 
 def _parts(mask: BoolArray, some: BoolArray) -> bool:
@@ -195,17 +210,24 @@ def _parts(mask: BoolArray, some: BoolArray) -> bool:
     return bool((some & mask).any() and (some & ~mask).any())
 
 
-def _odd_side(found: _Found, values: FloatArray, some: BoolArray) -> _Found:
+def _odd_side(found: Found, values: FloatArray, some: BoolArray) -> Found:
     """Return the place, or all outside of it where that is what deviates from 0."""
     inside, outside = values[some & found.mask].mean(), values[some & ~found.mask].mean()
     if abs(inside) >= abs(outside):
         return found
-    return _Found(found.family, ~found.mask, -found.z, found.log_p)
+    return Found(found.family, ~found.mask, -found.z, found.log_p)
 
 
 @dataclass(frozen=True)
-class _Contrast:
-    """Values about the mean of all, 0 where they do not count, with what a mean over places needs."""
+class Contrast:
+    """Values about the mean of all, 0 where they do not count, with what a mean over places needs.
+
+    Attributes:
+        values: of the map or series.
+        some: 1 where they count, else 0.
+        spread: standard deviation of a value.
+        fewest: values of a place.
+    """
 
     values: FloatArray
     some: FloatArray
@@ -213,7 +235,7 @@ class _Contrast:
     fewest: int = _FEWEST
 
     @classmethod
-    def of(cls, values: FloatArray, some: BoolArray, fewest: int = _FEWEST) -> _Contrast | None:
+    def of(cls, values: FloatArray, some: BoolArray, fewest: int = _FEWEST) -> Contrast | None:
         """Centre a map, to look for places of so many values or more; None where it has too few."""
         inside = values[some]
         if inside.size <= 2 * _FEWEST:
@@ -231,7 +253,8 @@ class _Contrast:
         """Return the deviation of mean inside from mean outside, for places of such sums and counts."""
         with np.errstate(divide="ignore", invalid="ignore"):
             z = sums / (self.spread * np.sqrt(counts * (1.0 - counts / self.n)))
-        return np.where((counts >= self.fewest) & (counts <= self.n - self.fewest), z, 0.0)
+        # sums over discs are whole numbers but for rounding
+        return np.where((counts > self.fewest - 0.5) & (counts < self.n - self.fewest + 0.5), z, 0.0)
 
 
 def _log_p(z: float, places: float) -> float:
@@ -258,7 +281,7 @@ def _log_p_range(z: float, n: int, shortest: int) -> float:
     return min(union, 3.0 * math.log(b) - b**2 / 2.0 - 0.5 * math.log(8.0 * math.pi) + math.log(total))
 
 
-def _intervals(contrast: _Contrast, sums: FloatArray, counts: FloatArray) -> tuple[float, int, int]:
+def _intervals(contrast: Contrast, sums: FloatArray, counts: FloatArray) -> tuple[float, int, int]:
     """Return the deviation and the ends of the best range of lines."""
     total, number = (np.concatenate([[0.0], np.cumsum(values)]) for values in (sums, counts))
     z = contrast.z(total[None, :] - total[:, None], number[None, :] - number[:, None])
@@ -267,23 +290,21 @@ def _intervals(contrast: _Contrast, sums: FloatArray, counts: FloatArray) -> tup
     return float(z[a, b]), int(a), int(b)
 
 
-def _bands(contrast: _Contrast, axis: int) -> _Found:
+def _bands(contrast: Contrast, axis: int) -> Found:
     """Return the best band of rows (axis 0) or columns (axis 1)."""
     across = 1 - axis
     sums, counts = contrast.values.sum(axis=across), contrast.some.sum(axis=across)
     z, a, b = _intervals(contrast, sums, counts)
     lines = np.zeros(sums.size, np.bool_)
     lines[a:b] = True
-    return _Found(
-        "columns" if axis else "rows", _lines(lines, axis, contrast), z, _log_p(z, sums.size**2 / 2)
-    )
+    return Found("columns" if axis else "rows", _lines(lines, axis, contrast), z, _log_p(z, sums.size**2 / 2))
 
 
-def _lines(lines: BoolArray, axis: int, contrast: _Contrast) -> BoolArray:
+def _lines(lines: BoolArray, axis: int, contrast: Contrast) -> BoolArray:
     return np.broadcast_to(lines if axis else lines[:, None], contrast.values.shape).copy()
 
 
-def _periodic(contrast: _Contrast, axis: int) -> _Found:
+def _periodic(contrast: Contrast, axis: int) -> Found:
     """Return the best set of every n-th row or column."""
     across = 1 - axis
     sums, counts = contrast.values.sum(axis=across), contrast.some.sum(axis=across)
@@ -296,10 +317,10 @@ def _periodic(contrast: _Contrast, axis: int) -> _Found:
         at = int(np.argmax(np.abs(z)))
         if abs(z[at]) > abs(best):
             best, lines = float(z[at]), phase == at
-    return _Found("period", _lines(lines, axis, contrast), best, _log_p(best, max(tried, 1)))
+    return Found("period", _lines(lines, axis, contrast), best, _log_p(best, max(tried, 1)))
 
 
-def _rectangle(contrast: _Contrast) -> _Found:
+def _rectangle(contrast: Contrast) -> Found:
     """Return the best rectangle: of all made of coarse cells, its edges moved to where they fit best."""
     ny, nx = contrast.values.shape
     tops, lefts = (np.unique(np.linspace(0, size, min(_CELLS, size) + 1).astype(int)) for size in (ny, nx))
@@ -323,14 +344,14 @@ def _rectangle(contrast: _Contrast) -> _Found:
         rows = (ends[0], ends[1])
     mask = np.zeros((ny, nx), np.bool_)
     mask[slice(*rows), slice(*columns)] = True
-    return _Found("rectangle", mask, z_best, _log_p(z_best, (ny * nx) ** 2 / 4.0))
+    return Found("rectangle", mask, z_best, _log_p(z_best, (ny * nx) ** 2 / 4.0))
 
 
 def _integral(values: FloatArray) -> FloatArray:
     return np.pad(np.cumsum(np.cumsum(values, axis=0), axis=1), ((1, 0), (1, 0)))
 
 
-def _disc(contrast: _Contrast) -> _Found | None:
+def _disc(contrast: Contrast) -> Found | None:
     """Return the best disc, its middle anywhere; one that an edge of the sensor cuts counts as well."""
     ny, nx = contrast.values.shape
     radii = [radius for radius in _RADII if radius <= max(ny, nx) / 2]
@@ -342,16 +363,16 @@ def _disc(contrast: _Contrast) -> _Found | None:
     z, (row, column), radius = max(tried, key=lambda each: abs(each[0]))
     y, x = np.ogrid[:ny, :nx]
     mask = np.asarray((y - row) ** 2 + (x - column) ** 2 <= radius**2)
-    return _Found("disc", mask, z, _log_p(z, float(ny * nx * len(tried))))
+    return Found("disc", mask, z, _log_p(z, float(ny * nx * len(tried))))
 
 
-def _disc_of(contrast: _Contrast, radius: float) -> tuple[float, tuple[int, int], float]:
+def _disc_of(contrast: Contrast, radius: float) -> tuple[float, tuple[int, int], float]:
     """Return deviation and middle of the best disc of a radius."""
     reach = int(radius)
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     disc = (y * y + x * x <= radius * radius).astype(np.float64)
     sums, counts = (_around(values, disc) for values in (contrast.values, contrast.some))
-    z = contrast.z(sums, np.rint(counts))
+    z = contrast.z(sums, counts)
     row, column = np.unravel_index(int(np.argmax(np.abs(z))), z.shape)
     return float(z[row, column]), (int(row), int(column)), radius
 
@@ -364,7 +385,7 @@ def _around(values: NDArray[Any], disc: FloatArray) -> FloatArray:
     return np.asarray(np.fft.irfft2(product, shape)[reach : reach + ny, reach : reach + nx])
 
 
-def _single(values: FloatArray, some: BoolArray) -> _Found | None:
+def _single(values: FloatArray, some: BoolArray) -> Found | None:
     """Return the pixels that stand out each by itself (with the sign of the largest)."""
     magnitude = np.where(some, np.abs(values), 0.0)
     at = np.unravel_index(int(np.argmax(magnitude)), values.shape)
@@ -376,7 +397,7 @@ def _single(values: FloatArray, some: BoolArray) -> _Found | None:
     if mask.sum() > 0.02 * n:
         return None
     mask[at] = True
-    return _Found("pixels", mask, float(values[at]), log_p)
+    return Found("pixels", mask, float(values[at]), log_p)
 
 
 def affected_share(z: FloatArray, inside: BoolArray, level: float = 0.05) -> float:
@@ -445,6 +466,9 @@ def sharpest_range(series: FloatArray, first: int, last: int, shortest: int) -> 
     Inside and outside, all series are normal with a mean and a covariance of their own (a change point of
     either, Hinkley 1970; its error goes as the inverse of what a frame tells, and not with the root of their
     number); of each only the inverse hyperbolic sine counts, so that single frames far off decide nothing.
+    Where the series are not more probable with a range than without by as many nats as it has parameters
+    (Akaike 1974) and as choosing one of all ranges gains, they do not tell its ends: those that are given
+    stay.
 
     Args:
         series: N(0, 1) where nothing is wrong, (s, n), finite.
@@ -465,11 +489,14 @@ def sharpest_range(series: FloatArray, first: int, last: int, shortest: int) -> 
         likely = _normal(b - a, *inside) + _normal(n - b + a, *outside)
         return np.where(np.minimum(b - a, n - b + a) >= shortest, likely, -np.inf)
 
-    every = np.arange(n + 1)
+    every, given = np.arange(n + 1), (first, last)
     for _ in range(_SWEEPS):
         first = int(np.argmax(nats(every[:last], np.full(last, last))))
         last = first + 1 + int(np.argmax(nats(np.full(n - first, first), every[first + 1 :])))
-    return first, last
+    with_range = nats(np.array([first]), np.array([last]))
+    gain = float((with_range - _normal(np.array([n]), total[-1:], square[-1:]))[0])
+    price = len(series) * (len(series) + 3) / 2 + math.log(n**2 / 2)
+    return (first, last) if gain > price else given
 
 
 def _normal(count: NDArray[np.int64], sums: FloatArray, squares: FloatArray) -> FloatArray:
@@ -483,9 +510,9 @@ def _normal(count: NDArray[np.int64], sums: FloatArray, squares: FloatArray) -> 
 
 def _best_frames(
     values: FloatArray, numbers: NDArray[np.int64], some: BoolArray, shortest: int
-) -> tuple[When, _Found] | None:
+) -> tuple[When, Found] | None:
     kept = np.clip(np.where(some, values, 0.0), -_CLIP, _CLIP)
-    contrast = _Contrast.of(kept, some, shortest)
+    contrast = Contrast.of(kept, some, shortest)
     if contrast is None:
         return None
     families = [_frame_range(contrast), _frame_period(contrast, numbers), _single(values, some)]
@@ -502,10 +529,10 @@ def _best_frames(
         when = When(every=period, phase=int(numbers[at[0]]) % period)
     else:
         when = When(single=tuple(int(i) for i in numbers[at][:1000]))
-    return when, _Found(best.family, best.mask, best.z, log_p)
+    return when, Found(best.family, best.mask, best.z, log_p)
 
 
-def _frame_range(contrast: _Contrast) -> _Found | None:
+def _frame_range(contrast: Contrast) -> Found | None:
     """Return the best range of frames: of whole cells, then its ends moved by frames; None: all too short."""
     n = contrast.values.size
     total, number = (np.concatenate([[0.0], np.cumsum(v)]) for v in (contrast.values, contrast.some))
@@ -525,10 +552,10 @@ def _frame_range(contrast: _Contrast) -> _Found | None:
         z = float(scores[np.argmax(np.abs(scores))])
     mask = np.zeros(n, np.bool_)
     mask[first:last] = True
-    return _Found("range", mask, z, _log_p_range(z, n, contrast.fewest))
+    return Found("range", mask, z, _log_p_range(z, n, contrast.fewest))
 
 
-def _frame_period(contrast: _Contrast, numbers: NDArray[np.int64]) -> _Found | None:
+def _frame_period(contrast: Contrast, numbers: NDArray[np.int64]) -> Found | None:
     """Return the best phase of a period of frames."""
     best, mask, tried = 0.0, np.zeros(numbers.size, np.bool_), 0
     for period in (p for p in _FRAME_PERIODS if 4 * p <= numbers.size):
@@ -539,4 +566,4 @@ def _frame_period(contrast: _Contrast, numbers: NDArray[np.int64]) -> _Found | N
         at = int(np.argmax(np.abs(z)))
         if abs(z[at]) > abs(best) * 1.02:  # a multiple of a period is no better than it
             best, mask = float(z[at]), np.asarray(phase == at)
-    return _Found("period", mask, best, _log_p(best, max(tried, 1))) if tried else None
+    return Found("period", mask, best, _log_p(best, max(tried, 1))) if tried else None

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from pchem_pipeline.discrepancy.by_simulation.additions import Round, left_of, unexplained_of_its_own
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
@@ -32,6 +33,7 @@ _MEASURED = 3.0
 # standard deviations of the plain model beyond the others' part from which on an effect is there, though its
 # strength be known badly: so few errors of that do then
 _OVERWHELMING = 30.0
+_LEFT_OF_COUNT = 3.0  # standard errors of what an effect leaves of a count that it accounts for
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,8 @@ class Acceptance:
         Those had no part in finding them: a true effect of 4.5 standard errors in two thirds of the frames
         misses them once in seventy times; a chance passes once in six. What is measured without a name needs
         3 standard errors in either. The variance of a noise of n frames is known to sqrt(2 / n) of itself,
-        however strong it is: where that is beyond doubt 3 of these are enough.
+        however strong it is: where that is beyond doubt 3 of these are enough. Likewise a strength by a dozen
+        events, where chance makes one, is known to a third: there it counts how far from chance they are.
         """
         first, n = self.first, len(added.vectors)
         certain = _certain(added, self.z.both - first.mean, noise_of_splits(first, 2, self.model_error))
@@ -89,8 +92,22 @@ class Acceptance:
         clear = np.exp(added.change) > np.where(sure, _MEASURED, _ESTABLISHED) * added.stderr
         proven = 1.0 + change > np.where(measured, _MEASURED, _CONFIRMED) * stderr
         proven &= change > -LARGEST_DECREASE
-        there = (clear & proven) | certain
+        there = (clear & proven) | certain | (self._counted(added) & (change > -LARGEST_DECREASE))
         return tuple(h for h, is_there in zip(added.hypotheses, there, strict=True) if is_there)
+
+    def _counted(self, added: Refitted) -> NDArray[np.bool_]:
+        """Tell which effects account for a count beyond chance, which the final frames have, too."""
+        first, z = self.first, self.z
+        size = np.abs(added.parts)
+        others = size.sum(axis=0) - size
+        # of the same probability as so many standard errors of a strength, but of no effect, not of some
+        seen, final = (
+            np.array([first.p_values(each - rest, splits) for rest in others]) < 2.0 * special.ndtr(-limit)
+            for each, splits, limit in ((z.both, 2, _ESTABLISHED), (z.final, 1, _CONFIRMED))
+        )
+        more = np.minimum(z.both, z.final) > first.mean + others
+        made = (added.parts > 0.0) & first.moved_by(added.vectors) & (np.abs(added.rest) < _LEFT_OF_COUNT)
+        return np.asarray((seen & final & more & made & first.counts).any(axis=1))
 
     def accounted(self, rounds: list[Round], null: NullModel) -> tuple[Hypothesis, ...]:
         """Return the effects that rounds added of which the model accounts for what they move."""

@@ -233,6 +233,7 @@ def _compared(
         code=residuals,
         time=None,
         z=in_order(sample_statistics(laws, parameters[:, 0], residuals)),
+        tail_expected=np.stack([mapped(moments[:, c]) for c in (column.EXPECTED_LOW, column.EXPECTED_HIGH)]),
     )
     return evidence, laws
 
@@ -362,5 +363,11 @@ def _time_series(view: FrameView, lags: FloatArray, n_run: int) -> TimeSeries:
         repeated=view.numbers[sums.repeated],
         repeated_rows=sums.repeated_rows,
         frame_noise=view.frame_noise,
-        hits=np.column_stack([view.numbers[sums.hits[:, 0]], sums.hits[:, 1:]]).astype(np.int64),
+        hits=_numbered(sums.hits, view.numbers),
+        low_hits=_numbered(sums.low_hits, view.numbers),
     )
+
+
+def _numbered(hits: IntArray, numbers: IntArray) -> IntArray:
+    """Return samples (position, y, x, DN) with the number of their frame in the run."""
+    return np.column_stack([numbers[hits[:, 0]], hits[:, 1:]]).astype(np.int64)

@@ -22,6 +22,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MOST_HITS = 20_000
+_NO_CODE = np.iinfo(np.int64).max  # above all
 _CHUNK_SAMPLES = 1 << 16
 _LEAST_NOISE = 0.5  # of the variance of r^2: residuals of hardly two values tell nothing of their size
 
@@ -77,7 +78,8 @@ class FrameSums:
         repeated: positions of frames equal to the one before.
         repeated_rows: number of rows (of other frames) equal to those before.
         consecutive: number of frames that directly follow another.
-        hits: frame position, y, x, DN, (n_hits, 4).
+        hits: samples above the support of their pixel: frame position, y, x, DN, (n_hits, 4).
+        low_hits: the same below it.
     """
 
     rows: FloatArray
@@ -94,6 +96,7 @@ class FrameSums:
     repeated_rows: int
     consecutive: int
     hits: IntArray
+    low_hits: IntArray
 
 
 def blocks_of(numbers: IntArray, block_frames: int) -> IntArray:
@@ -171,7 +174,8 @@ def sum_frames(
         rows, columns.transpose(1, 0, 2), gain, blocks, lags,
         row_noise - row_noise.mean(axis=0), column_noise - column_noise.mean(axis=0, dtype=np.float64),
         (pairs[0], pairs[1], pairs[2]), next_column / n, next_row / n, np.flatnonzero(repeated),
-        int(repeated_rows), int(consecutive.sum()), _hits(frames, laws, pixels.usable),
+        int(repeated_rows), int(consecutive.sum()),
+        _hits(frames, laws, pixels.usable, above=True), _hits(frames, laws, pixels.usable, above=False),
     )  # fmt: skip
 
 
@@ -182,10 +186,15 @@ def _packed_support(laws: PixelLaws, usable: NDArray[np.bool_]) -> NDArray[np.in
     return np.ascontiguousarray(packed.transpose(1, 0, 2), np.int32)
 
 
-def _hits(frames: NDArray[Any], laws: PixelLaws, usable: NDArray[np.bool_]) -> IntArray:
-    seen = (laws.moments[:, columns_of.SEEN_HIGH] > 0).reshape(usable.shape) & usable
-    last = (laws.support[:, 0] + laws.support[:, 1] - 1).reshape(usable.shape)
+def _hits(frames: NDArray[Any], laws: PixelLaws, usable: NDArray[np.bool_], *, above: bool) -> IntArray:
+    """Return the samples above or below the support of their pixel, by frame: position, y, x, DN."""
+    column = columns_of.SEEN_HIGH if above else columns_of.SEEN_LOW
+    seen = (laws.moments[:, column] > 0).reshape(usable.shape) & usable
+    first, length = laws.support[seen.ravel(), 0], laws.support[seen.ravel(), 1]
+    ends = np.stack(
+        [np.full_like(first, -1), first + length - 1] if above else [first, np.full_like(first, _NO_CODE)], 1
+    )
     hits = np.zeros((MOST_HITS, 4), np.int64)
-    found = kernel.find_hits(frames, np.ascontiguousarray(np.argwhere(seen)), last[seen], hits)
+    found = kernel.find_hits(frames, np.ascontiguousarray(np.argwhere(seen)), ends, hits)
     hits = hits[: min(found, MOST_HITS)]
     return hits[np.lexsort((hits[:, 2], hits[:, 1], hits[:, 0]))]

@@ -291,15 +291,16 @@ def count_repeats(frames: NDArray[Any], consecutive: NDArray[np.bool_], repeated
 
 
 @kernel
-def find_hits(frames: NDArray[Any], pixels: IntArray, last: IntArray, hits: IntArray) -> int:
-    """Fill ``hits`` (frame, y, x, DN) with samples of pixels (m, 2) above ``last``; return how many."""
+def find_hits(frames: NDArray[Any], pixels: IntArray, ends: IntArray, hits: IntArray) -> int:
+    """Fill ``hits`` (frame, y, x, DN) with samples of m pixels beyond ``ends``, (m, 2); return how many."""
     found = 0
     for i in range(pixels.shape[0]):
         y, x = pixels[i]
         for t in range(frames.shape[0]):
-            if np.int64(frames[t, y, x]) > last[i]:
+            code = np.int64(frames[t, y, x])
+            if code < ends[i, 0] or code > ends[i, 1]:
                 if found < hits.shape[0]:
                     hits[found, 0], hits[found, 1], hits[found, 2] = t, y, x
-                    hits[found, 3] = np.int64(frames[t, y, x])
+                    hits[found, 3] = code
                 found += 1
     return found

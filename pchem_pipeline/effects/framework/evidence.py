@@ -162,6 +162,7 @@ class TimeSeries:
             deviation by chance, shape (n,); None: not known.
         hits: samples above a pixel's support: columns frame, y, x, DN; int64, shape (n_hits, 4), at most
             20,000.
+        low_hits: the same below it.
     """
 
     frames: NDArray[np.int64]
@@ -195,6 +196,7 @@ class TimeSeries:
     previous_bits: PreviousBits | None = None
     repeated_lines: Mapping[str, int] = field(default_factory=dict)
     misplaced_lines: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    low_hits: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 4), np.int64))
 
 
 @dataclass(frozen=True)
@@ -220,6 +222,8 @@ class Evidence:
             give is absent.
         covariance: of the pixels' (H, g, mu, sigma) in ``maps``, shape (y, x, 4, 4); None: not known.
         ambiguous: share of the usable pixels whose bias may be off by an electron.
+        tail_expected: samples of each pixel expected below and above the support, shape (2, y, x); None: not
+            known.
     """
 
     maps: PixelMaps
@@ -236,6 +240,7 @@ class Evidence:
     z: Mapping[str, float] = field(default_factory=dict)
     covariance: NDArray[np.float64] | None = None
     ambiguous: float = 0.0
+    tail_expected: NDArray[np.float32] | None = None
 
     def strongest(self, *names: str) -> float:
         """Return the largest |z| among the named statistics (0 where these data give none of them)."""

@@ -127,8 +127,9 @@ def test_the_ends_of_a_range_are_those_of_its_scatter_or_mean(moved: float, fact
     # a frame tells 0.9 nats in two series; the end is off by a few
     assert np.mean(off) < 4.0
     assert np.max(off) < 25
-    first, last = sharpest_range(rng.standard_normal((3, 300)), 100, 180, 64)
-    assert last - first >= 64
+    # by chance a range gains half a nat for each of nine parameters and a few by its choice: nothing is told
+    for _ in range(20):
+        assert sharpest_range(rng.standard_normal((3, 300)), 100, 180, 64) == (100, 180)
 
 
 def test_a_series_too_short_for_two_stretches_is_looked_at_all_the_same() -> None:

@@ -2,8 +2,10 @@
 
 What the scans of :mod:`pchem_pipeline.discrepancy.where` find in maps of pixels and series of frames, and
 what :mod:`pchem_pipeline.discrepancy.scan_pairs` finds in the pairs of pixels that share a row, a column or a
-frame: a common mode of a part is far larger in those than in any map. A part was chosen by the samples that
-it is then judged by, so none may be a chance: the probabilities count all places that were looked at.
+frame: a common mode of a part is far larger in those than in any map. Samples that chance hardly makes, which
+no mean shows, are events with a scan of their own (:mod:`pchem_pipeline.discrepancy.scan_events`). A part was
+chosen by the samples that it is then judged by, so none may be a chance: the probabilities count all places
+that were looked at.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ from scipy.ndimage import binary_dilation
 
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
 from pchem_pipeline.discrepancy.observe.places import FEWEST_FRAMES, FEWEST_PIXELS, Part
+from pchem_pipeline.discrepancy.observe.rare import N_SETS, rare_samples
 from pchem_pipeline.discrepancy.scan import scan_series, sharpest_range
+from pchem_pipeline.discrepancy.scan_events import scan_event_frames, scan_event_map
 from pchem_pipeline.discrepancy.scan_pairs import Limits, Shared, scan_pairs
 from pchem_pipeline.discrepancy.where import frame_series, suspected_regions
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
@@ -28,7 +32,8 @@ FloatArray = NDArray[np.float64]
 
 #: Of a place among all places of all maps; maps rest on fits, whose errors are not quite normal.
 _SIGNIFICANCE_OF_MAPS = 1e-6
-#: Of a place among all pairs, and of frames among all series: these follow from the order of the frames.
+#: Of a place among all pairs, of frames among all series, and of either among rare samples: these follow from
+#: the order of the frames, and from the number of the samples.
 _SIGNIFICANCE = 1e-3
 _LARGEST = 0.6  # of sensor or run
 _MOST = 2  # regions, and ranges of frames
@@ -59,10 +64,12 @@ def suspected_parts(evidence: Evidence, frames: NDArray[np.unsignedinteger[Any]]
     )
     regions = [
         *_regions(evidence, usable),
+        *_regions_of_rare(evidence),
         *(_Found(each.place.z, Part(each.place.region)) for each in shared),
     ]
     places = _apart(regions, usable.shape)
-    ranges = [with_ends(part, evidence) for part in _told_apart(_stretches(evidence, time), time.frames)]
+    stretches = [*_stretches(evidence, time), *_stretches_of_rare(evidence, time)]
+    ranges = [with_ends(part, evidence) for part in _told_apart(stretches, time.frames)]
     crossings = [*_frames_of_places(shared, samples, time), *_places_of_frames(ranges, samples, frames, time)]
     if places and ranges and not crossings:
         crossings = [_Found(0.0, Part(places[0].region, ranges[0].when))]
@@ -153,6 +160,33 @@ def _regions(evidence: Evidence, usable: NDArray[np.bool_]) -> Iterator[_Found]:
             placed = one.only_there and one.family != "pixels"
             if placed and FEWEST_PIXELS <= inside <= _LARGEST * usable.sum():
                 yield _Found(abs(one.z), Part(one.region))
+
+
+def _regions_of_rare(evidence: Evidence) -> Iterator[_Found]:
+    """Yield the places of samples that chance hardly makes, while few of them are elsewhere."""
+    usable = evidence.maps.usable
+    for rare in rare_samples(evidence):
+        for one in scan_event_map(rare.seen, rare.expected, usable, significance=_SIGNIFICANCE / N_SETS):
+            inside = int((usable & one.region.mask((usable.shape[0], usable.shape[1]))).sum())
+            if one.only_there and FEWEST_PIXELS <= inside <= _LARGEST * usable.sum():
+                yield _Found(one.z, Part(one.region))
+
+
+def _stretches_of_rare(evidence: Evidence, time: TimeSeries) -> Iterator[_Found]:
+    """Yield the frames of samples that chance hardly makes."""
+    for rare in rare_samples(evidence):
+        at = np.searchsorted(time.frames, rare.hits[:, 0])
+        one = scan_event_frames(
+            at,
+            time.frames,
+            expected=float(rare.expected.sum()),
+            significance=_SIGNIFICANCE / N_SETS,
+            shortest=FEWEST_FRAMES,
+        )
+        if one is not None:
+            inside = int(one.when.frames(time.frames).sum())
+            if one.only_there and FEWEST_FRAMES <= inside <= _LARGEST * time.frames.size:
+                yield _Found(one.z, Part(None, _with_unseen(one.when, time.frames)))
 
 
 def _stretches(evidence: Evidence, time: TimeSeries) -> list[_Found]:

@@ -58,6 +58,23 @@ def rows_of_frames(rng, shape):
     return offsets
 
 
+def tails(rng, shape, where):
+    """Return noise four times as wide in a few of some samples, DN."""
+    return np.where(where & (rng.random(shape) < 0.008), rng.normal(0.0, 12.0, shape), 0.0)
+
+
+def tails_of_columns(rng, shape):
+    return tails(rng, shape, (np.arange(shape[2]) >= 20) & (np.arange(shape[2]) < 24))
+
+
+def tails_of_frames(rng, shape):
+    return tails(rng, shape, ((np.arange(shape[0]) // 160) == 4)[:, None, None])
+
+
+def tails_everywhere(rng, shape):
+    return tails(rng, shape, np.True_)
+
+
 def everywhere(rng, shape):
     return rng.normal(0.0, 0.6, (*shape[:2], 1)) + 0.3 * np.linspace(-1, 1, shape[0])[:, None, None]
 
@@ -91,7 +108,18 @@ def test_frames_that_differ_are_suspected():
     assert part.when.overlap(When(range=((600, 760),)), FRAMES) >= 0.8
 
 
-@pytest.mark.parametrize("add", [nothing, everywhere])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_part_of_sensor_or_run_with_heavy_tails_is_suspected(seed):
+    """What no map and no series of means shows."""
+    [part] = parts_of(camera(seed, tails_of_columns))
+    assert part.when is None
+    assert part.region.overlap(Region(columns=((20, 24),)), SHAPE) >= 0.7
+    [part] = parts_of(camera(seed, tails_of_frames))
+    assert part.region is None
+    assert part.when.overlap(When(range=((640, 800),)), FRAMES) >= 0.6
+
+
+@pytest.mark.parametrize("add", [nothing, everywhere, tails_everywhere])
 @pytest.mark.parametrize("seed", [4, 5, 6])
 def test_no_part_is_suspected_where_none_differs(add, seed):
     assert parts_of(camera(seed, add)) == ()

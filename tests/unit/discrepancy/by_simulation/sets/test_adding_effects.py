@@ -823,6 +823,7 @@ def test_what_gets_no_name_needs_fewer_errors_and_more_of_them_in_the_final_fram
             stderr=np.array([error]),
             vectors=np.zeros((400, M)),
             covariance=np.eye(M),
+            rest=np.zeros(M),
         )
         final = world.null.mean + np.eye(M)[0] * in_final
         accept = Acceptance(world.null, Measured(final, final, final), unused, 0.0)
@@ -849,9 +850,47 @@ def test_an_effect_beyond_doubt_is_there_though_few_frames_know_its_strength_bad
         stderr=np.full(len(parts), 0.26),
         vectors=np.zeros((400, M)),
         covariance=np.eye(M),
+        rest=np.zeros(M),
     )
     accept = Acceptance(world.null, Measured(seen, seen, seen), unused, 0.0)
     assert ("row_noise" in {h.tag for h in accept.established(added)}) is there
+
+
+@pytest.mark.parametrize(
+    ("name", "seen", "final", "made", "there"),
+    [
+        ("tail.low.count", 6.0, 4.0, 4.0, True),
+        ("shape.He4.mean", 6.0, 4.0, 4.0, False),  # no count: what matters is how well its strength is known
+        ("tail.low.count", 3.0, 4.0, 2.0, False),  # 4.1 standard deviations of the mean of two splits
+        ("tail.low.count", 6.0, 0.5, 4.0, False),  # chance in the final frames
+        ("tail.low.count", 6.0, 4.0, 0.5, False),  # the effect makes far less than is seen
+    ],
+)
+def test_a_few_events_are_an_effect_though_they_hardly_tell_its_strength(
+    name: str, seen: float, final: float, made: float, there: bool
+) -> None:
+    """A dozen events where chance makes one: their number is known to a third, but there they are."""
+    rng, unused = np.random.default_rng(3), cast("Any", None)
+    names = (name, *NAMES[:8])
+    null = NullModel.from_replicates(names, rng.standard_normal((40, 9)))
+    first = np.eye(9)[0]
+    scatter = 1.3 * rng.standard_normal((16, 9))
+    vectors = null.mean + made * first + scatter - scatter.mean(axis=0)
+    error = np.sqrt(1.3**2 * (1 / 2 + 1 / 16))
+    added: Any = SimpleNamespace(
+        hypotheses=(Hypothesis(effect("row_noise", 0.1), made * first),),
+        parts=made * first[None],
+        slopes=made * first[None],
+        mean=null.mean + made * first,
+        change=np.zeros(1),
+        stderr=np.array([0.36]),
+        vectors=vectors,
+        covariance=1.3**2 * np.eye(9),
+        rest=(seen - made) * first / error,
+    )
+    z = null.mean + seen * first
+    accept = Acceptance(null, Measured(z, z, null.mean + final * first), unused, 0.0)
+    assert bool(accept.established(added)) is there
 
 
 def test_strong_effects_need_not_add_up_to_be_there() -> None:
@@ -871,6 +910,7 @@ def test_strong_effects_need_not_add_up_to_be_there() -> None:
         stderr=np.full(2, 0.02),
         vectors=np.zeros((400, M)),
         covariance=np.eye(M),
+        rest=np.zeros(M),
     )
     accept = Acceptance(world.null, Measured(seen, seen, seen), unused, 0.0)
     assert {h.tag for h in accept.established(added)} == {"row_noise", "frame_noise"}
