@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.gap import Gap
-from pchem_pipeline.discrepancy.null import Measured, NullModel
+from pchem_pipeline.discrepancy.null import Measured, NullModel, look_elsewhere
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS, VERSION
 from pchem_pipeline.discrepancy.size import size_of
 from pchem_pipeline.discrepancy.verdict import (
@@ -47,6 +47,7 @@ _MOST_UNEXPLAINED = 8
 _MOST_RESIDUALS = 3
 _DECIDED = 3.0  # standard errors of a difference of scores that tells two effects apart
 _MOST_LONGER = 30.0  # times the samples that anyone will take
+_NO_CHANCE = 0.05  # of any statistic as far from the model, below which one is told beside the farthest
 _RARE = 0.02  # a chance that is worth telling though it is no disagreement
 # nats per sample from which on a plain fit may be far off: six of seven hidden effects that left so much had
 # moved the gain of 19 to 100 % of the pixels by a fifth or more
@@ -269,8 +270,6 @@ def build_verdict(
     }
     both = found.z.both
     pulls = found.first.pulls(both, splits=2), found.last.pulls(both, splits=2)
-    rest = sorted(zip(found.last.names, pulls[1].tolist(), strict=True), key=lambda item: -abs(item[1]))
-    left = tuple(Place.of(name, z=z) for name, z in rest[:_MOST_UNEXPLAINED]) if found.still else ()
     return Discrepancy(
         verdict=Verdict(
             verdict=found.state,
@@ -283,7 +282,7 @@ def build_verdict(
             steps=tuple(each.step(sizes[each.effect.tag]) for each in found.added.additions),
             gap=_gap_change(found.before, found.added),
             where=tuple(found.places),
-            unexplained=(*found.added.residuals, *left),
+            unexplained=(*found.added.residuals, *_still(found, pulls[1])),
             set_aside=found.added.set_aside if found.named else (),
             untestable=dict(untestable),
             defects=dict(defects),
@@ -299,6 +298,17 @@ def build_verdict(
         code_extended=fitted.code_extended,
         added=fitted.added,
     )
+
+
+def _still(found: Findings, pulls: FloatArray) -> list[Place]:
+    """Return what disagrees with the final model: the farthest statistic, and others beyond chance."""
+    if not found.still:
+        return []
+    tests = found.last.effective_tests
+    chance = [look_elsewhere(p, tests) for p in found.last.p_of(pulls, 2).tolist()]
+    order = np.argsort(-np.abs(pulls))[:_MOST_UNEXPLAINED].tolist()
+    kept = [i for n, i in enumerate(order) if n == 0 or chance[i] < _NO_CHANCE]
+    return [Place.of(found.last.names[i], z=float(pulls[i])) for i in kept]
 
 
 def largest_pulls(
@@ -364,7 +374,7 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
     if state == "cannot_tell":
         return (
             f"Nothing in the order of the {data}, between pixels or in the codes disagrees with the model; "
-            f"of what shows in the shape of the histograms this sensor cannot tell: {found.doubt}."
+            f"of what shows only in the shape of the histograms nothing can be told: {found.doubt}."
         )
     if state == "unexplained":
         first = found.places[0] if found.places else None
@@ -407,21 +417,25 @@ def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size 
 
 
 def _sized(effect: Effect, sizes: Mapping[str, Size | None]) -> str:
-    """Return what an effect is called, with its size."""
+    """Return what an effect is called, with its size, and then its place."""
     size = sizes.get(effect.tag)
-    return title_words(effect) if size is None else f"{title_words(effect)} of {size.words()}"
+    if size is None:
+        return title_words(effect)
+    place = "" if effect.everywhere else f", in {place_words(effect)}"
+    return f"{_title(effect.tag)} of {size.words()}{place}"
 
 
 def _described(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size | None]) -> str:
     """Return what is known of a disagreement that was measured and is not understood."""
     measured = [each.effect for each in found.added.additions if each.described]
     known = [(effect.words(), sizes.get(effect.tag)) for effect in measured]
-    words = _and([text if size is None else f"{text}, {size.words()} in all" for text, size in known])
+    told = [text if size is None else f"{text}, in all {size.words()}" for text, size in known]
+    words, them = "; and ".join(told), "it" if len(told) == 1 else "them"
     besides = f" besides {_and(titles)}" if titles else ""
     none = "No known effect explains" if not found.limit else "No effect that was tried explains"
     return (
         f"{none} the {found.samples}{besides}, but what they hold is measured: {words}; "
-        f"with it {_closed(found)}; {_alike(found)}{_broken(found)}."
+        f"with {them} {_closed(found)}; {_alike(found)}{_broken(found)}."
     )
 
 

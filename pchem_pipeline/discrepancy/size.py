@@ -43,6 +43,9 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
     """
     if not maps.usable.any():
         return None
+    scatter = effect.added_scatter_e(maps.quanta_exposure[maps.usable])
+    if scatter is not None:
+        return _of_scatter(scatter, maps)
     if _is_measured_noise(effect):
         return _of_noise(float(getattr(effect, effect.strength)), maps)
     blocks, noise = _BLOCKS, float(np.median(maps.read_noise_dn[maps.usable]))
@@ -81,6 +84,13 @@ def _is_measured_noise(effect: Effect) -> bool:
     if not effect.measured_only or effect.power != 2.0:
         return False
     return parameters_of(effect, math.nan)[effect.strength].unit == "DN"
+
+
+def _of_scatter(electrons: NDArray[np.float64], maps: PixelMaps) -> Size:
+    """Return the size of a scatter of so many e- of each usable pixel."""
+    in_dn = electrons / maps.conversion_gain[maps.usable]
+    dn, noise = float(np.sqrt(np.mean(in_dn**2))), float(np.median(maps.read_noise_dn[maps.usable]))
+    return Size(electrons=float(np.sqrt(np.mean(electrons**2))), dn=dn, of_read_noise=dn / noise)
 
 
 def _of_noise(dn: float, maps: PixelMaps) -> Size:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from html import escape
@@ -30,7 +31,7 @@ from pchem_pipeline.effects.framework.region import Region, When
 SCHEMA_VERSION = 3
 #: Share of the samples below which the size of an effect is that of the samples that it changes.
 RARE = 0.5
-_TIMES = 10.0  # the read noise, from which on a size is no longer told in per cent
+_TIMES = 2.0  # the read noise, from which on a size is no longer told in per cent
 #: Share of what an effect closes, from which on an unrelated one that closes as much weakens its name.
 CONVINCING_PLACEBO = 0.25
 #: Statistics whose pulls before and after are told and drawn.
@@ -219,7 +220,9 @@ class Place(_Part):
 
     def spot(self) -> str:
         """Return region and frames in words; empty where it is everywhere and always alike."""
-        parts = [] if self.region is None else [Region.model_validate(self.region).words()]
+        # pixels that are listed one by one are told by :attr:`pixels`
+        listed = self.region is None or ("pixels" in self.region and self.pixels)
+        parts = [] if listed else [Region.model_validate(self.region).words()]
         parts += [] if self.when is None else [When.model_validate(self.when).words()]
         # a statistic of a part has only that; another one may be there elsewhere, too, and weaker
         most = "most in " if parts and "@" not in self.statistic else ""
@@ -253,6 +256,11 @@ class GapChange(_Part):
     closed_fraction: Number
     interval_before: Interval = (_NAN, _NAN)
     interval_after: Interval = (_NAN, _NAN)
+
+    @property
+    def within_chance(self) -> bool:
+        """Whether chance alone makes as much before anything is added: no share of that is closed."""
+        return self.before <= self.floor
 
 
 class Change(_Part):
@@ -348,6 +356,11 @@ class Step(_Part):
     moved: dict[str, Moved] = {}
     separate: dict[str, str] = {}
     pulls: tuple[Pull, ...] = ()
+
+    @property
+    def within_chance(self) -> bool:
+        """Whether chance alone makes as much of a gap without it: no share of that is closed."""
+        return self.gap_before <= self.gap_floor
 
     @property
     def runner_up(self) -> Rival | None:
@@ -573,10 +586,13 @@ def parameters_of(effect: Effect, stderr: float) -> dict[str, Measured]:
 
 
 def _unit(effect: type[Effect], name: str) -> str:
-    """Return the unit that the description of a field ends with, or nothing."""
-    text = effect.model_fields[name].description or ""
-    last = text.rpartition(",")[2].strip() if "," in text else ""
-    return last if len(last) <= 20 and last != "no unit" else ""
+    """Return the unit that the description of a field has behind its first part, or nothing."""
+    found = _UNIT.search(effect.model_fields[name].description or "")
+    return found[1] if found else ""
+
+
+#: Behind a comma, before a semicolon, a bracket or the end: one word ("no unit" is none).
+_UNIT = re.compile(r", ([^\s,;]+(?: per frame)?)(?=;| \(|$)")
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,8 @@ def judgement(found: Verdict, hidden: Effect) -> str:
     for step in found.steps:
         rivals = list(dict.fromkeys(candidate.effect for candidate in step.candidates))
         if not step.effect and found.verdict == "ambiguous" and hidden.tag in rivals:
+            if len(rivals) == 1:
+                return f"the only candidate, which these frames do not confirm{besides}"
             return f"among the {len(rivals)} that these frames leave open{besides}"
     return f"not named{besides}"
 
@@ -92,11 +94,13 @@ def _parameters(found: Verdict, hidden: Effect) -> list[str]:
     true: dict[str, Any] = hidden.model_dump(exclude={"tag"})
     estimated: dict[str, tuple[str, str]] = {}
     for step in found.steps:
-        if step.effect == hidden.tag:
-            estimated = {n: (_number(p.value), _number(p.stderr)) for n, p in step.parameters.items()}
-        elif not step.effect and not estimated:
-            mine = [c for c in step.candidates if c.effect == hidden.tag]
-            estimated = {name: (value, "") for c in mine[:1] for name, value in parameter_texts(c)}
+        if step.effect not in (None, hidden.tag):
+            continue
+        mine = [c for c in step.candidates if c.effect == hidden.tag]
+        texts = {name: (text, "") for c in mine[:1] for name, text in parameter_texts(c)}
+        estimated = texts | estimated
+        if step.likeliest == hidden.tag and (step.effect or found.verdict == "ambiguous"):
+            estimated |= {n: (_number(p.value), _number(p.stderr)) for n, p in step.parameters.items()}
     head = f"{'parameter':<26}{'true':>14}{'estimated':>14}{'stderr':>12}"
     lines = ["", head, "-" * len(head)]
     for name, value in true.items():

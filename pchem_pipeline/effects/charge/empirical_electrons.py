@@ -147,7 +147,7 @@ class EmpiricalElectrons(Effect):
         place = f" in {place_words(self)}" if place_words(self) else ""
         largest = max(mode.weight for mode in self.modes)
         told = [mode.words(self.chance * mode.weight / largest) for mode in self.modes]
-        return f"electrons{place} that do not come by themselves ({'; '.join(told)})"
+        return f"electrons{place} that do not come independently ({'; '.join(told)})"
 
 
 def _gone(electrons: NDArray[np.int64], u: NDArray[np.float64], chance: float) -> NDArray[np.int64]:

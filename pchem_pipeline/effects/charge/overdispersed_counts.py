@@ -83,6 +83,10 @@ class OverdispersedCounts(Effect):
         # both probabilities are below a H / 2
         return regrouped(values, u, (0.5 * a) * exposure, law, extra)
 
+    def added_scatter_e(self, exposure: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the scatter of the exposure, e- rms: which electrons it moves differs from draw to draw."""
+        return np.asarray(np.sqrt(self.relative_variance) * exposure)
+
     def _thinned_or_added(
         self, values: NDArray[Any], exposure: NDArray[np.float64], context: EffectContext
     ) -> NDArray[Any]:

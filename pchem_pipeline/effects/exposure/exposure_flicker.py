@@ -68,7 +68,7 @@ class ExposureFlicker(Effect):
     correlation_frames: float = Field(
         default=0.0,
         ge=0,
-        description="number of frames in which the memory of a fluctuation falls to 1/e; 0: every frame anew",
+        description="time in which the memory of a fluctuation falls to 1/e, frames; 0: every frame anew",
     )
     period_frames: float | None = Field(
         default=None, gt=1, description="period of a sine, frames; null: random fluctuations"

@@ -281,6 +281,17 @@ class Effect(Section):
         """
         return {}
 
+    def added_scatter_e(self, exposure: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return the scatter that it adds to electron numbers, e- rms, where that is its size.
+
+        Args:
+            exposure: mean number of electrons of each pixel, e-.
+
+        Returns:
+            One for each pixel; None where samples with and without it tell its size.
+        """
+        return None
+
     def halo(self) -> int:
         """Return how many rows on either side a row depends on, px."""
         return 0

@@ -209,14 +209,19 @@ class Empirical(Effect):
         if self.squares:
             rows, columns = (("even", "odd")[parity] for parity in self.squares)
             return (
-                f"a share of {self.share:.2g} of the squares of 2 x 2 pixels{place}, from {rows} rows and "
-                f"{columns} columns on, comes as the mean of their samples"
+                f"{_percent(self.share)} of the squares of 2 x 2 pixels{place}, from {rows} rows and "
+                f"{columns} columns on, come as the mean of their samples"
             )
         shares = self.shares()
-        told = [f"{shares[i]:.2g} {self.moves[i].words()}" for i in np.argsort(-shares)[:_MOST_TOLD]]
-        free = "" if any(move.towards for move in self.moves) else ", whatever was read before or beside it"
-        how = f"comes out moved after the converter ({', '.join(told)}){free}"
-        return f"a share of {self.share:.2g} of the {what}{place} {how}"
+        order = np.argsort(-shares)[:_MOST_TOLD]
+        told = [f"{_percent(shares[i])} {self.moves[i].words()}" for i in order]
+        how = f" {self.moves[0].words()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
+        free = "" if any(move.towards for move in self.moves) else ", whatever was read before or beside them"
+        return f"{_percent(self.share)} of the {what}{place} are moved after the converter{how}{free}"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.2g} %"
 
 
 def _averaged(values: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -41,8 +41,9 @@ from pchem_pipeline.report.charts.ticks import scaled, ticks
 from pchem_pipeline.report.style.palette import LIGHT, MAP_COLOURS, shades
 from pchem_pipeline.report.style.wording import without_formulas
 
-#: Dots of a millimetre on paper, size of the letters and their mean width, all px; columns of a curve.
-_MM, _LETTER, _WIDE, _COLUMNS = 4.5, 11, 6.8, 300
+#: Dots of a millimetre on paper, size of the letters, their mean width and that of bold ones, all px; columns
+#: of a curve.
+_MM, _LETTER, _WIDE, _BOLD, _COLUMNS = 4.5, 11, 6.8, 7.6, 300
 #: Room beside and below panels, between them, and of a line of the legend, px.
 _LEFT, _RIGHT, _BELOW, _BETWEEN, _LINE = 68.0, 10.0, 38.0, 8.0, 15.0
 _POINT = 1.35  # px
@@ -135,7 +136,9 @@ def _stack(stack: Stack, left: float, top: float, width: float) -> tuple[list[st
     stack = replace(stack, panels=panels)
     lines = [line for line in without_formulas(stack.title).split("\n") if line]
     start = left + _beside(stack)
-    parts = [_text(start, top + 13.0 + i * 14.0, line, bold=i == 0) for i, line in enumerate(lines)]
+    # a title too long to begin with the panel begins left of it
+    title = max(left + 2.0, min(start, left + width - _BOLD * max(map(len, lines), default=0)))
+    parts = [_text(title, top + 13.0 + i * 14.0, line, bold=i == 0) for i, line in enumerate(lines)]
     at = top + 8.0 + 14.0 * len(lines)
     across = left + width - _RIGHT - start - max(map(_bar_room, stack.panels), default=0.0)
     room = height_of(stack, width / _MM) * _MM - _BELOW - _BETWEEN * len(stack.panels)
@@ -371,7 +374,7 @@ def _mark(mark: Mark, frame: Frame) -> str:
             anchor = "start" if mark.align == "left" else "middle"
             return _text(
                 float(frame.across(mark.x)),
-                frame.height * (1.0 - mark.up),
+                max(frame.height * (1.0 - mark.up), float(_LETTER)),  # not cut at the top of a low panel
                 mark.text,
                 anchor,
                 colour=_named(mark.colour),

@@ -29,7 +29,10 @@ def ticks_between(low: float, high: float, most: int, *, whole: bool = False) ->
     """Return multiples of 1, 2 or 5 times a power of ten."""
     rough = (high - low) / most
     power = math.floor(math.log10(rough))
-    step = next(each for m in (1, 2, 5, 10) if (each := m * 10.0**power) >= rough * (1 - 1e-9))
+    steps = [m * 10.0**power for m in (1, 2, 5, 10)]
+    step = next(each for each in steps if each >= rough * (1 - 1e-9))
+    if not _has_two(low, high, step):  # a single tick tells no scale
+        step = next((each for each in reversed(steps) if _has_two(low, high, each)), step)
     if whole and step < 1.0:
         step, power = 1.0, 0
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
@@ -38,6 +41,11 @@ def ticks_between(low: float, high: float, most: int, *, whole: bool = False) ->
     if decimals > 5 or max(map(abs, places), default=0.0) >= 1e6:
         return [(place, short(place, 2)) for place in places]
     return [(place, f"{place:,.{decimals}f}".replace("-", "−")) for place in places]
+
+
+def _has_two(low: float, high: float, step: float) -> bool:
+    """Tell whether at least two multiples of a step lie between two ends."""
+    return math.floor(high / step + 1e-9) > math.ceil(low / step - 1e-9)
 
 
 def _powers(low: float, high: float, most: int) -> Ticks:

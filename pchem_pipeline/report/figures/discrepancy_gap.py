@@ -127,7 +127,8 @@ _GAP_UNIT = "1e-6 nats/sample"
 def largest_pulls(data: DiscrepancyData) -> list[Pull]:
     """Return the statistics farthest from chance before and after: of the vectors ``z_before``, ``z_after``.
 
-    Where those are not kept, those that the JSON tells.
+    Beside them those of a part of the sensor or the run, which only the JSON tells; of all it tells where no
+    vectors are kept.
     """
     rows: dict[str, Pull] = {}
     if "z_before" in data.arrays:
@@ -137,7 +138,8 @@ def largest_pulls(data: DiscrepancyData) -> list[Pull]:
             if i < before.size and np.isfinite(before[i]):
                 later = float(after_all[i]) if i < after_all.size else math.nan
                 rows[name] = Pull(statistic=name, sentence=sentence, before=float(before[i]), after=later)
-    for pull in () if rows else [pull for step in data.found.steps for pull in step.pulls]:
+    whole = not rows
+    for pull in [pull for step in data.found.steps for pull in step.pulls if whole or "@" in pull.statistic]:
         known = rows.get(pull.statistic, pull)
         after = pull.after if math.isfinite(pull.after) else known.after
         rows[pull.statistic] = known.model_copy(update={"after": after})
@@ -275,7 +277,7 @@ def _gap_rows(bars: Sequence[GapBar], floor: float, ends: tuple[float, float]) -
         marks += [
             Span(left, floor, "x", colour="bars", alpha=0.4),
             Level(floor, "x", colour="ink", width=0.9),
-            Words(floor, 0.93, " floor", "left", colour="ink"),
+            Words(floor, 0.93, "\u00a0floor", "left", colour="ink"),
         ]
     for row, bar in enumerate(bars):
         if math.isfinite(bar.low) and math.isfinite(bar.high):

@@ -40,7 +40,7 @@ _SCALES = {"charge": (100.0, "%"), "readout": (1.0, "DN")}
 
 _CODES_CAPTION = (
     "All usable pixels together. Top: samples at each DN (gray) and those that the fitted PCDs lead to "
-    "expect (black; with what was added: orange). Below: the difference from the plain model in "
+    "expect (black; with what was added: purple). Below: the difference from the plain model in "
     "standard deviations, even and odd DN in two colours; the gray band is two standard deviations. A "
     "single tall line is a pile-up, alternating colours are a comb of the ADC, a slow wave is its "
     "nonlinearity. Yellow: what the verdict points to."
@@ -189,7 +189,7 @@ def codes_chart(table: DataTable, marked: Sequence[Place] = ()) -> Chart:
         Steps(edges, expected, colour="ink", width=0.9, label="expected from the fitted PCDs"),
     ]
     if _NAMED in table:
-        above.append(Steps(edges, table[_NAMED], colour="vermilion", width=0.9, label="with what was added"))
+        above.append(Steps(edges, table[_NAMED], colour="purple", width=0.9, label="with what was added"))
     highest = max(float(observed.max()), 1.0)
     top = Panel(
         Axis("samples per DN", 0.5, 4.0 * highest, log=True), tuple(above), 1.0, legend="upper right",

@@ -24,7 +24,15 @@ from pchem_pipeline.report.pages.discrepancy_tables import (
 from pchem_pipeline.report.pages.pictures import Picture
 from pchem_pipeline.report.pages.summary import Flag, Level
 from pchem_pipeline.report.pages.tables import Table
-from pchem_pipeline.report.style.wording import count, measured, percent, short, typeset, unit_text
+from pchem_pipeline.report.style.wording import (
+    count,
+    fitted_or_chosen,
+    percent,
+    short,
+    signed,
+    typeset,
+    unit_text,
+)
 
 #: File of the verdict's own page in the folder of a run.
 DISCREPANCY_PAGE = "discrepancy.html"
@@ -93,7 +101,7 @@ _EMPTY = {
 
 @dataclass(frozen=True)
 class KeyFact:
-    """One number of the first screen, with up to two lines below it."""
+    """One number of the first screen, with up to three lines below it."""
 
     label: str
     value: str
@@ -203,7 +211,7 @@ def frames_text(found: Verdict) -> str:
     share = f" ({percent(seen.share, 1.0)} of the run's samples)" if math.isfinite(seen.share) else ""
     place = f"rows {seen.rows[0]} to {seen.rows[1] - 1}, columns {seen.columns[0]} to {seen.columns[1] - 1}"
     rest = seen.frames - seen.train - seen.test - seen.final
-    over = f"; a rest of {count(rest, 'frame')}, less than three blocks, is left out" if rest > 0 else ""
+    over = f"; a rest of {count(rest, 'frame')}, too few to be dealt as well, is left out" if rest > 0 else ""
     return f"{count(seen.frames, 'frame')} of {place}{share}: {dealt} that is left{over}."
 
 
@@ -225,10 +233,11 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
         return []
     extended = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
     nats = f"{gap_text(gap.before)} → {gap_text(gap.after)}" if extended else gap_text(gap.before)
-    words, chance = f"{nats} micronats per sample", f"chance alone: up to {gap_text(gap.floor)}"
-    if not extended:
-        return [KeyFact("distance of data and model", words, (chance,))]
-    more = (words, chance + _interval(gap))
+    unit, chance = "micronats per sample", f"chance alone: up to {gap_text(gap.floor)}"
+    if not extended or gap.within_chance:
+        closed = ", so no share counts as closed" if extended else ""
+        return [KeyFact("distance of data and model", nats, (unit, chance + closed))]
+    more = (f"{nats} {unit}", chance + _interval(gap))
     nearest = " by what is most like it, not named" if found.verdict == "unexplained" else ""
     return [KeyFact(f"of the gap closed{nearest}", percent(max(gap.closed_fraction, 0.0), 1.0), more)]
 
@@ -247,15 +256,17 @@ def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
     for step in data.found.steps:
         if (step.effect or step.verdict == "described") and step.parameters:
             values = [
-                f"{name} {measured(p.value, p.stderr, unit_text(p.unit))}"
+                f"{name} {fitted_or_chosen(p.value, p.stderr, unit_text(p.unit))}"
                 for name, p in step.parameters.items()
             ]
-            facts.append(KeyFact(data.title(step.likeliest), *_size_texts(step, values)))
+            value, more = _size_texts(step, values)
+            place = (f"in {step.place}",) if step.place else ()
+            facts.append(KeyFact(data.title(step.likeliest), value, (*more, *place)))
     return facts[:4]
 
 
 def _size_texts(step: Step, values: Sequence[str]) -> tuple[str, tuple[str, ...]]:
-    """Return the size of an effect, and the two lines below it; its parameters where no size is known."""
+    """Return the size of an effect, and the lines below it; its parameters where no size is known."""
     size = step.size
     if size is None:
         return values[0], tuple(values[1:3])
@@ -305,7 +316,7 @@ def remarks(data: DiscrepancyData) -> list[Flag]:
     extended = [step for step in found.steps if step.effect]
     if found.doubt:
         words = "What rests on the parameters of the pixels was not tested, and no size is given in e⁻"
-        flags.append(Flag("caution", f"{words}: {found.doubt}."))
+        flags.append(Flag("caution", f"{words}: {typeset(found.doubt)}."))
     if extended:
         flags += _closing(found)
         flags += [flag for step in extended for flag in _compared(step, data)]
@@ -315,7 +326,7 @@ def remarks(data: DiscrepancyData) -> list[Flag]:
     if found.unexplained:
         most = found.unexplained[0]
         words = most.sentence or most.statistic
-        flags.append(Flag("caution", f"What is left shows most in: {words} ({_signed(most.z)} sd)."))
+        flags.append(Flag("caution", f"What is left shows most in: {words} ({signed(most.z)} sd)."))
     flags += [
         Flag("serious", f"A defect: the candidate {name} failed and was not compared: {why}.")
         for name, why in found.defects.items()
@@ -333,7 +344,12 @@ def _closing(found: Verdict) -> list[Flag]:
     gap, flags = found.gap, []
     level: Level
     if math.isfinite(gap.after) and math.isfinite(gap.floor):
-        if gap.after <= gap.floor:
+        if gap.within_chance:
+            words = (
+                "The gap is at its floor without the effect, too: single statistics show it, not their sum."
+            )
+            flags.append(Flag("note", words))
+        elif gap.after <= gap.floor:
             flags.append(Flag("good", "The gap that is left is at its floor: chance alone makes as much."))
         else:
             left = percent(1.0 - max(gap.closed_fraction, 0.0), 1.0)
@@ -351,9 +367,13 @@ def _short(data: DiscrepancyData, tag: str) -> str:
 def _compared(step: Step, data: DiscrepancyData) -> list[Flag]:
     """Say what the runner-up and the placebo of a step close in the place of the named effect."""
     own, flags = 1.0 - max(step.gap_after, 0.0) / step.gap_before if step.gap_before > 0.0 else math.nan, []
+    name, runner_up, placebo = _short(data, step.effect or ""), step.runner_up, step.placebo
+    if step.within_chance:  # shares of what chance makes tell nothing
+        if runner_up is None or not runner_up.why:
+            return []
+        return [Flag("note", f"Not the runner-up, {_short(data, runner_up.effect)}: {runner_up.why}.")]
     if not own > 0.0:
         return []
-    name, runner_up, placebo = _short(data, step.effect or ""), step.runner_up, step.placebo
     if runner_up is not None:
         share = percent(max(step.closed_by(runner_up), 0.0), 1.0)
         why = f": {runner_up.why}" if runner_up.why else ""

@@ -15,7 +15,16 @@ from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.discrepancy_gap import gap_text
 from pchem_pipeline.report.pages.tables import Table
-from pchem_pipeline.report.style.wording import count, measured, percent, short, signed, symbol, unit_text
+from pchem_pipeline.report.style.wording import (
+    count,
+    fitted_or_chosen,
+    measured,
+    percent,
+    short,
+    signed,
+    symbol,
+    unit_text,
+)
 
 #: Longer lists are in ``discrepancy.json`` only.
 _MOST_PLACES, _MOST_CANDIDATES = 12, 8
@@ -59,6 +68,7 @@ def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
         "where": [_where(data, found.where)],
         "evidence": [
             *[_candidates(data, step, i) for i, step in enumerate(found.steps)],
+            _rivals(data),
             _separate(found.steps),
         ],
         "shown": [_gaps(found)],
@@ -128,7 +138,7 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
                 data.titles.get(candidate.effect, ""),
                 measured(candidate.score, candidate.stderr),
                 short(behind) if math.isfinite(behind) and behind < 0 else "best" if behind == 0 else "",
-                probability_text(candidate.probability),
+                probability_text(candidate.probability) if len(step.candidates) > 1 else "no other one",
                 ", ".join(f"{name} {value}" for name, value in parameter_texts(candidate)),
             )
         )
@@ -150,6 +160,29 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
     )
 
 
+def _rivals(data: DiscrepancyData) -> Table:
+    rows = tuple(
+        (
+            rival.effect,
+            data.titles.get(rival.effect, ""),
+            step.effect,
+            short(-rival.behind) if math.isfinite(rival.behind) else "not scored",
+            rival.why or "its lower score",
+        )
+        for step in data.found.steps
+        if step.effect
+        for rival in step.rivals
+    )
+    return Table(
+        "discrepancy-rivals",
+        "Why not another effect",
+        "The next best effects, each fitted in the place of the named one: nats of held-out log-probability "
+        "that it lies behind, and what speaks against it.",
+        ("effect", "in the literature", "in the place of", "behind", "what speaks against it"),
+        rows,
+    )
+
+
 def _separate(steps: Sequence[Step]) -> Table:
     rows = tuple(dict.fromkeys((rival, text) for step in steps for rival, text in step.separate.items()))
     return Table(
@@ -166,8 +199,9 @@ def _gaps(found: Verdict) -> Table:
     for i, step in enumerate(found.steps):
         low, high = step.gap_interval_after
         interval = f" ({gap_text(low)} to {gap_text(high)})" if math.isfinite(low) else ""
+        none = "none closes any" if step.effect else "not fitted"
         rivals = [
-            f"{gap_text(rival.gap_after)} ({rival.effect})" if rival is not None else ""
+            f"{gap_text(rival.gap_after)} ({rival.effect})" if rival is not None else none
             for rival in (step.runner_up, step.placebo)
         ]
         rows.append(
@@ -205,7 +239,7 @@ def _parameters(data: DiscrepancyData) -> Table:
     rows = tuple(
         (
             f"{tag}: {name}",
-            measured(p.value, p.stderr, unit_text(p.unit)),
+            fitted_or_chosen(p.value, p.stderr, unit_text(p.unit)),
             data.title(tag) + _beside(step),
             data.sources.get(tag, ""),
         )
@@ -217,7 +251,8 @@ def _parameters(data: DiscrepancyData) -> Table:
     return Table(
         "discrepancy-parameters",
         "Parameters of the effects",
-        "Estimates with their standard errors; these are the keys of model.effects in the run's YAML.",
+        "The strength with its standard error, and the numbers that set its form, which were chosen and have "
+        "none. They are the keys of model.effects in the run's YAML.",
         ("parameter", "value", "effect", "source"),
         rows,
     )
@@ -300,11 +335,11 @@ def _examined(data: DiscrepancyData) -> Table:
         ("train", "frames to find and fit with"),
         ("test", "frames to confirm and score with"),
         ("final", "frames kept for the last gap"),
-        ("rows", "rows, first and after the last"),
-        ("columns", "columns, first and after the last"),
+        ("rows", "rows"),
+        ("columns", "columns"),
     ):
         value = getattr(found.examined, key)
-        rows.append((words, " to ".join(map(str, value)) if isinstance(value, tuple) else f"{value:,}"))
+        rows.append((words, f"{value[0]} to {value[1] - 1}" if isinstance(value, tuple) else f"{value:,}"))
     examined = found.examined
     if math.isfinite(examined.share):
         rows.append(("share of the run's samples", percent(examined.share, 1.0)))

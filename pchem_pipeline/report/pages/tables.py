@@ -80,7 +80,7 @@ def _quick_look(data: ReportData) -> Table:
 
 def _limit_text(check: Check) -> str:
     if not math.isfinite(check.limit):
-        return ""
+        return "not known"
     return f"{short(check.limit, 2)}{f' {check.unit}' if check.unit != '1' else ''}"
 
 
@@ -353,7 +353,7 @@ def _misfits(data: ReportData) -> Table:
         (
             f"channel {row['x']}" if data.shape[0] == 1 else f"y = {row['y']}, x = {row['x']}",
             f"{row['chi2']:.1f}",
-            f"{row['dof']:.1f}",
+            f"{row['dof']:.1f}".removesuffix(".0"),
             scientific(float(row["p"])),
             scientific(float(row["q"])),
             "yes" if float(row["q"]) <= float(facts["false_discovery_rate"]) else "no",

@@ -152,6 +152,15 @@ def measured(value: float, error: float, unit: str = "") -> str:
     return f"{value:.{decimals}f} ± {error:.{decimals}f}{tail}".replace("-", "−")
 
 
+def fitted_or_chosen(value: float, error: float, unit: str = "") -> str:
+    """Return a number as :func:`measured`; one without an error was chosen, and has no zeros at its end."""
+    text = measured(value, error, unit)
+    number, space, rest = text.partition(" ")
+    if "." in number and "×" not in number and not (math.isfinite(error) and error > 0):
+        number = number.rstrip("0").rstrip(".")
+    return number + space + rest
+
+
 def count(number: int, noun: str) -> str:
     """Return ``1 pixel``, ``2 pixels``, ``17,750 frames``."""
     plural = "" if number == 1 else "s"

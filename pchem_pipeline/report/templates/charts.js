@@ -176,10 +176,11 @@
       if (mark.axis === "x") context.fillRect(X(mark.low), box.top, X(mark.high) - X(mark.low), box.bottom - box.top);
       else context.fillRect(box.left, Y(mark.high), box.right - box.left, Y(mark.low) - Y(mark.high));
     },
-    words(mark, context, X, Y, box) {
+    words(mark, context, X, Y, box, ratio) {
       context.textAlign = mark.align;
       context.textBaseline = "bottom";
-      context.fillText(mark.text, X(mark.x), box.bottom - mark.up * (box.bottom - box.top));
+      const y = box.bottom - mark.up * (box.bottom - box.top);
+      context.fillText(mark.text, X(mark.x), Math.max(y, box.top + 14 * ratio)); // not cut at the top of a low panel
     },
   };
 

@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Sequence
 
 from pchem_pipeline.discrepancy.verdict import Place, Rival, Step, Verdict, micronats
-from pchem_pipeline.report.style.wording import measured
+from pchem_pipeline.report.style.wording import fitted_or_chosen
 
 _WIDTH = 100
 #: Longer lists end with a count.
@@ -65,7 +65,8 @@ def _places(title: str, places: Sequence[Place], most: int) -> list[str]:
 
 
 def _spots(place: Place) -> str:
-    words = [place.spot()] if place.spot() else []
+    # the sentence of a statistic of a part ends with that part
+    words = [place.spot()] if place.spot() and "@" not in place.statistic else []
     if place.pixels:
         words.append(f"{len(place.pixels)} pixels, first (y, x) = {place.pixels[0]}")
     if place.dn is not None:
@@ -85,16 +86,19 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
     title = f"step {number}" if number else "candidate"
     if step.effect:
         lines += [line for rival in step.rivals for line in _beaten(step.effect, rival)]
-    elif step.candidates and found.verdict == "ambiguous":
+    elif len(step.candidates) > 1 and found.verdict == "ambiguous":
         lines.append(f"{title:<28}{'score':>10}{'stderr':>9}{'probability':>13}")
         for each in step.candidates[:_MOST_CANDIDATES]:
             row = f"  {each.effect:<26}{_number(each.score):>10}{_number(each.stderr):>9}"
             lines.append(f"{row}{_number(each.probability, 3):>13}".translate(_PLAIN)[:_WIDTH])
         more = len(step.candidates) - _MOST_CANDIDATES
         lines += [f"  and {more} more"] if more > 0 else []
-    if step.effect and step.parameters:
-        values = [f"{name} = {measured(p.value, p.stderr, p.unit)}" for name, p in step.parameters.items()]
-        lines += _listed(f"{step.effect} in {step.place}" if step.place else step.effect, values, 0)
+    # of several candidates none has numbers of its own
+    if step.parameters and (step.effect or (len(step.candidates) == 1 and found.verdict == "ambiguous")):
+        values = [
+            f"{name} = {fitted_or_chosen(p.value, p.stderr, p.unit)}" for name, p in step.parameters.items()
+        ]
+        lines += _listed(f"{step.likeliest} in {step.place}" if step.place else step.likeliest, values, 0)
     if not step.effect and found.verdict == "ambiguous":
         lines += [
             line
@@ -126,11 +130,15 @@ def _gap(found: Verdict) -> list[str]:
     if found.steps and math.isfinite(gap.after):
         words += f" -> {micronats(gap.after)}"
     words += f" micronats per sample (floor {micronats(gap.floor)}"
-    if found.steps and math.isfinite(gap.closed_fraction):
+    if found.steps and gap.within_chance:
+        words += ": chance alone makes as much, before and after"
+    elif found.steps and math.isfinite(gap.closed_fraction):
         nearest = " by what is most like it" if found.verdict == "unexplained" else ""
         words += f", {100 * gap.closed_fraction:.1f} % closed{nearest}"
     words += ")"
     for step in found.steps:
+        if step.within_chance:
+            continue  # what anything leaves of it tells nothing
         for role, rival in (("runner-up", step.runner_up), ("placebo", step.placebo)):
             if rival is not None and step.effect:
                 left = f"{rival.effect} leaves {micronats(rival.gap_after)}"

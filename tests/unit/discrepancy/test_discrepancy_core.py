@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings, _sentence
+from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings, _sentence, _sized, _still
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,
@@ -23,8 +24,9 @@ from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, look_elsewhere
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
-from pchem_pipeline.discrepancy.verdict import Candidate, Place
+from pchem_pipeline.discrepancy.verdict import Candidate, Place, Size
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_class
 
 NAMES = tuple(STATISTICS)[:40]
@@ -362,7 +364,7 @@ def test_a_statistic_says_what_its_sign_says() -> None:
     assert "skewed to high DN" in Place.of("shape.He3.mean", z=17.0).sentence
     assert "less than the model makes it" in Place.of("space.follows.line", z=-5.0).sentence
     part = STATISTICS["space.x.rr@columns=24:28"]
-    assert "anticorrelated, along x (in columns 24 to 27)" in part.says(-5.0)
+    assert "anticorrelated, along x, in columns 24 to 27" in part.says(-5.0)
 
 
 @pytest.mark.parametrize(
@@ -413,3 +415,21 @@ def test_the_verdict_says_where_the_fit_itself_breaks_down(left: float) -> None:
     found = Findings("frames", Measured(z, z, z), null, null, gap, [], True, Added((), gap))
     assert found.state == "unexplained"
     assert ("the fit itself breaks down" in _sentence(found, {})) == (left > 0.1)
+
+
+def test_the_place_of_an_effect_stands_behind_its_size() -> None:
+    """Not: columns 10 to 13 of 0.96 DN."""
+    effect = effect_class("row_noise")(row_noise_dn=0.96).at_place(Region.model_validate("columns=10:14"))
+    words = _sized(effect, {"row_noise": Size(electrons=0.089, dn=0.96, of_read_noise=0.29)})
+    assert words.endswith(" of 0.96 DN rms (0.089 e-, 29 % of the read noise), in columns 10 to 13")
+
+
+def test_what_is_left_is_the_farthest_and_what_chance_does_not_make() -> None:
+    pulls, chances = np.array([2.8, -6.5, 6.0]), np.array([0.01, 1e-9, 1e-8])
+    names = ("code.smooth", "code.largest", "code.rough")
+    last = SimpleNamespace(names=names, effective_tests=100.0, p_of=lambda pulls, splits: chances)
+    left = _still(SimpleNamespace(still=True, last=last), pulls)  # type: ignore[arg-type]
+    assert [place.statistic for place in left] == ["code.largest", "code.rough"]
+    last.p_of = lambda pulls, splits: np.ones(3)
+    left = _still(SimpleNamespace(still=True, last=last), pulls)  # type: ignore[arg-type]
+    assert [place.statistic for place in left] == ["code.largest"]

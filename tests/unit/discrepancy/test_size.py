@@ -27,6 +27,8 @@ MAPS = PixelMaps(
         ("row_noise", {"row_noise_dn": 0.5}, 0.5 * GAIN, 12 * 20_000),
         ("frame_noise", {"frame_noise_dn": 0.2}, 0.2 * GAIN, 20_000),
         ("signal_dependent_noise", {"noise_e": 0.1}, 0.1 * np.sqrt(EXPOSURE), 144 * 20_000),
+        # not the electrons that a simulation happens to move: few samples, one each
+        ("overdispersed_counts", {"relative_variance": 0.01}, 0.1 * EXPOSURE, 144 * 20_000),
     ],
 )
 @pytest.mark.parametrize("n_frames", [300, 4000])
@@ -75,6 +77,10 @@ def test_without_usable_pixels_there_is_no_size() -> None:
         (
             Size(electrons=213.0, dn=2028.0, of_read_noise=831.06, samples=0.0081),
             "2,000 DN rms (210 e-, 830 times the read noise) in 0.81 % of the samples",
+        ),
+        (
+            Size(electrons=1.1, dn=12.0, of_read_noise=3.41),
+            "12 DN rms (1.1 e-, 3.4 times the read noise)",
         ),
     ],
 )

@@ -139,6 +139,27 @@ def test_a_place_takes_its_words_from_the_catalogue() -> None:
     assert Place.of("code.smooth", z=1.0, sentence="other").sentence == "other"
 
 
+@pytest.mark.parametrize(
+    ("tag", "name", "unit"),
+    [
+        ("adc_inl", "period_dn", "DN"),
+        ("gain_stitch", "origin_dn", "DN"),
+        ("persistence", "slow_decay_frames", "frames"),
+        ("persistence", "peak_e", "e- per frame"),
+        ("periodic_pickup", "cycles_per_column", "cycles"),
+        ("rts_noise", "fraction", ""),
+        ("rts_noise", "amplitude_e", "e-"),
+        ("read_order_noise", "taps", ""),
+        ("exposure_flicker", "correlation_frames", "frames"),
+    ],
+)
+def test_the_unit_of_a_parameter_is_that_of_its_description(tag: str, name: str, unit: str) -> None:
+    """Remarks behind the unit are none of it."""
+    kind = effect_class(tag)
+    effect = kind.model_construct(**{name: 1 if kind.model_fields[name].annotation is int else 1.0})
+    assert parameters_of(effect, 0.1)[name].unit == unit
+
+
 def test_only_the_strength_has_a_standard_error() -> None:
     effect = effect_class("row_noise").model_validate({"row_noise_dn": 0.35})
     found = parameters_of(effect, 0.004)

@@ -78,8 +78,8 @@ class ObservedFrames:
             else f"only {100 * usable:.0f} % of the pixels have a fit that can be relied upon"
         )
         return (
-            f"{lost} (fitted read noise {noise:.2f} e-, {frames} frames): several exposures fitted together "
-            "(pchem joint) identify them; many more frames or a lower read noise may do so, too"
+            f"{lost} (fitted read noise {noise:.2f} e-, {frames:,} frames); several exposures fitted "
+            "together (pchem joint) identify them, and many more frames or a lower read noise may do so, too"
         )
 
 

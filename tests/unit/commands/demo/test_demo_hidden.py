@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.discrepancy_material import verdict_of
+from helpers.discrepancy_material import step, verdict_of
 from typer.testing import CliRunner
 
 from pchem_pipeline.base.errors import ConfigError
@@ -156,6 +156,18 @@ def test_only_the_sealed_key_knows(tmp_path: Path) -> None:
 def test_the_judgement(verdict: str, tag: str, words: str) -> None:
     hidden = hidden_effect(tag, SETTINGS, draw_truth(SETTINGS))
     assert judgement(verdict_of(verdict), hidden) == words
+
+
+def test_a_candidate_alone_is_not_confirmed_and_has_its_errors() -> None:
+    alone = step(None, "ambiguous", 120.0, 120.0)
+    alone["candidates"] = alone["candidates"][:1]
+    found = verdict_of("ambiguous", steps=[alone])
+    hidden = effect_class("row_noise").model_validate({"row_noise_dn": 0.35})
+    assert judgement(found, hidden) == "the only candidate, which these frames do not confirm"
+    truth = dict.fromkeys(COMPARED, np.full((8, 8), 2.0))
+    text = compare(found, hidden, truth, maps({}), maps({}, 3))
+    assert "0.3512" in text
+    assert "0.0041" in text
 
 
 def test_named_alone_is_said_so() -> None:

@@ -309,6 +309,26 @@ def test_ticks_are_round(axis: Axis, ends: tuple[float, float], expected: list[s
     assert [text for _, text in ticks(axis, *ends)] == expected
 
 
+@pytest.mark.parametrize(("end", "most"), [(9.0, 3), (0.9, 2), (4.9, 1)])
+def test_a_scale_has_more_than_one_tick(end: float, most: int) -> None:
+    assert len(ticks(Axis(""), -end, end, most)) > 1
+
+
+def test_a_title_too_long_for_its_panel_begins_left_of_it_and_is_not_cut() -> None:
+    stacks = [
+        Stack((Panel(Axis(""), (Points(np.arange(3.0), np.arange(3.0)),)),), Axis("x"), title=title)
+        for title in ("a", "charge: skew beyond Poisson (C3)")
+    ]
+    svg = chart_picture(Chart(tuple(stacks), (1.0, 1.0, 1.0)), PAGE_MM)[0].decode()
+    short_one, long_one = (
+        float(re.search(rf'<text x="([0-9.]+)"[^>]*>{re.escape(stack.title)}<', svg)[1])  # type: ignore[index]
+        for stack in stacks
+    )
+    third = PAGE_MM * 4.5 / 3
+    assert 0 < long_one - third < short_one  # in its own column, left of its panel
+    assert long_one + 7.0 * len(stacks[1].title) < 2 * third
+
+
 def test_axes_end_where_they_are_told_or_beyond_the_marks() -> None:
     bars = Bars(np.arange(3.0), np.zeros(3), np.array([1.0, 2.0, 3.0]))
     assert y_window(Panel(Axis("y"), (bars,))) == (0.0, pytest.approx(3.15))

@@ -35,7 +35,7 @@ from pchem_pipeline.report.figures.discrepancy_gap import largest_pulls
 from pchem_pipeline.report.figures.discrepancy_sensor import largest_maps, regions_of
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages import report as report_module
-from pchem_pipeline.report.pages.discrepancy import frames_text, remarks
+from pchem_pipeline.report.pages.discrepancy import frames_text, key_facts, remarks
 from pchem_pipeline.report.pages.discrepancy_tables import discrepancy_tables, place_text
 from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
@@ -198,7 +198,7 @@ def test_the_legend_over_the_scatter_of_lines_covers_no_point() -> None:
 def test_frames_that_no_part_has_are_told() -> None:
     seen = {"frames": 1000, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320,
             "histograms": None}  # fmt: skip
-    words = "; a rest of 40 frames, less than three blocks, is left out."
+    words = "; a rest of 40 frames, too few to be dealt as well, is left out."
     assert frames_text(discrepancy_data("named", examined=seen).found).endswith(words)
     whole = {**seen, "frames": 960}
     assert "rest" not in frames_text(discrepancy_data("named", examined=whole).found)
@@ -426,6 +426,11 @@ def test_pulls_come_from_the_steps_or_from_the_vectors() -> None:
     assert pulls[0].sentence == STATISTICS[pulls[0].statistic].sentence
     largest = max(np.nanmax(np.abs(data.arrays[name])) for name in ("z_before", "z_after"))
     assert max(abs(pulls[0].before), abs(pulls[0].after)) == pytest.approx(largest)
+    # the vectors are of the whole sensor
+    placed = step("row_noise", "named", 477.0, 31.0)
+    part = {"statistic": "space.x.rr@columns=3:9", "sentence": "in a part", "before": 900.0, "after": 1.0}
+    placed["pulls"] = [part, *placed["pulls"]]
+    assert largest_pulls(discrepancy_data("named", steps=[placed]))[0].sentence == "in a part"
 
 
 def test_a_placebo_that_closes_the_gap_is_a_caution() -> None:
@@ -442,6 +447,45 @@ def test_a_placebo_that_closes_the_gap_is_a_caution() -> None:
     closed = replace(data, found=verdict_of("named", gap={**gap, "after": 0.5e-6}))
     at_floor = [f for f in remarks(closed) if "at its floor" in f.text]
     assert [flag.level for flag in at_floor] == ["good"]
+
+
+def test_a_gap_that_chance_makes_is_not_said_to_be_closed() -> None:
+    weak = {**step("row_noise", "named", 0.6, 0.0), "gap_floor": 1e-6}
+    gap = {**result("named")["gap"], "before": 0.6e-6, "after": 0.0, "floor": 1e-6, "closed_fraction": 1.0}
+    data = discrepancy_data("named", steps=[weak], gap=gap)
+    told = [flag.text for flag in remarks(data)]
+    assert not any("would close" in text or "placebo" in text.lower() for text in told)
+    assert any(text.startswith("Not the runner-up, Periodic pickup: with it in the model") for text in told)
+    facts = {fact.label: fact for fact in key_facts(data)}
+    assert "of the gap closed" not in facts
+    assert facts["distance of data and model"].value == "0.6 → 0"
+
+
+def test_a_named_effect_says_why_no_other_one_and_where_it_is() -> None:
+    placed = {**step("row_noise", "named", 477.0, 31.0), "place": "columns 3 to 8"}
+    data = discrepancy_data("named", steps=[placed])
+    tables = {table.id: table for part in discrepancy_tables(data).values() for table in part}
+    rows = tables["discrepancy-rivals"].rows
+    assert [(row[0], row[2], row[3]) for row in rows] == [
+        ("periodic_pickup", "row_noise", "16.8"),
+        ("interpixel_capacitance", "row_noise", "262"),
+    ]
+    assert all(row[4] for row in rows)
+    assert key_facts(data)[0].more[-1] == "in columns 3 to 8"
+    examined = {row[0]: row[1] for row in tables["discrepancy-examined"].rows}
+    first, last = data.found.examined.rows
+    assert examined["rows"] == f"{first} to {last - 1}"  # as in the sentence at the top
+
+
+def test_a_single_candidate_has_no_share_of_the_probability() -> None:
+    alone = step(None, "ambiguous", 120.0, 120.0)
+    alone["candidates"] = alone["candidates"][:1]
+    (table,) = [
+        each
+        for each in discrepancy_tables(discrepancy_data("ambiguous", steps=[alone]))["evidence"]
+        if each.id == "discrepancy-candidates-1"
+    ]
+    assert table.rows[0][4] == "no other one"
 
 
 def test_places_of_a_window_are_places_of_the_sensor() -> None:

@@ -5,6 +5,7 @@ import pytest
 from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.report.style.wording import (
     count,
+    fitted_or_chosen,
     measured,
     percent,
     scientific,
@@ -49,6 +50,13 @@ def test_short(value: float, digits: int, text: str) -> None:
 )
 def test_measured_rounds_to_two_digits_of_the_error(value: float, error: float, text: str) -> None:
     assert measured(value, error, "e⁻") == text
+
+
+def test_a_number_that_was_chosen_claims_no_precision() -> None:
+    assert fitted_or_chosen(30.0, float("nan"), "frames") == "30 frames"
+    assert fitted_or_chosen(0.2, float("nan")) == "0.2"
+    assert fitted_or_chosen(100.0, float("nan"), "DN") == "100 DN"
+    assert fitted_or_chosen(2.0, 0.01, "DN") == "2.000 ± 0.010 DN"
 
 
 @pytest.mark.parametrize(

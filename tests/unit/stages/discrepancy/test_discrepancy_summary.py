@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from helpers.discrepancy_material import VERDICTS, step, verdict_of
 
+from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 
 
@@ -81,3 +82,30 @@ def test_numbers_that_are_not_known_are_said_so() -> None:
 def test_pixels_that_are_not_identified_are_said_beside_a_name() -> None:
     text = verdict_text(verdict_of("named", doubt="the bias of 93 % of the pixels may be off"))
     assert "no size in e-: the bias of 93 %" in " ".join(text.split())
+
+
+def test_a_gap_that_chance_makes_is_not_said_to_be_closed() -> None:
+    weak = {**step("row_noise", "named", 0.6, 0.0), "gap_floor": 1e-6}
+    gap = {**verdict_of("named").gap.model_dump(), "before": 0.6e-6, "after": 0.0, "floor": 1e-6}
+    text = " ".join(verdict_text(verdict_of("named", steps=[weak], gap=gap)).split())
+    assert (
+        "gap: 0.6 -> 0 micronats per sample (floor 1: chance alone makes as much, before and after)" in text
+    )
+    assert "leaves" not in text
+
+
+def test_a_single_candidate_has_its_numbers_and_no_probability() -> None:
+    alone = step(None, "ambiguous", 120.0, 120.0)
+    alone["candidates"] = alone["candidates"][:1]
+    text = verdict_text(verdict_of("ambiguous", steps=[alone]))
+    assert "row_noise: row_noise_dn = 0.3512 +- 0.0041 DN" in text
+    assert "probability" not in text
+
+
+def test_a_place_is_told_once() -> None:
+    part = Place.of("space.x.rr@columns=10:14", z=6.6, region={"columns": [[10, 14]]})
+    pixels = {"pixels": [[2, 9, 10], [8, 0, 1]]}
+    few = Place.of("shape.goodness.cnt", z=7.3, region=pixels, pixels=((2, 9), (8, 0), (1, 5)))
+    text = " ".join(verdict_text(verdict_of("named", where=[part.model_dump(), few.model_dump()])).split())
+    assert "along x, in columns 10 to 13 (+6.6 sd)" in text
+    assert "(+7.3 sd; 3 pixels, first (y, x) = (2, 9))" in text
