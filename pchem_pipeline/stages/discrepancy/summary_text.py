@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Sequence
 
@@ -15,6 +16,9 @@ _MOST_PLACES, _MOST_CANDIDATES, _MOST_LEFT = 3, 5, 4
 _LEAD = "where: "
 _DEFECT = "DEFECT: the candidate {} failed and was not compared: {}"
 _PLAIN = str.maketrans({"−": "-", "→": "->", "⁻": "-", "±": "+-", "…": "...", "\u00a0": " "})
+# a number and its unit stay in one line
+_HELD = "\u00a0"
+_BEFORE_UNIT = re.compile(r"(?<=\d) (?=%|DN|e-|sd\b|nats)")
 
 
 def verdict_text(found: Verdict) -> str:
@@ -41,8 +45,9 @@ def verdict_text(found: Verdict) -> str:
 
 def _wrapped(text: str, indent: str = "  ") -> list[str]:
     # line breaks inside a stranger's message would break the columns
-    words = " ".join(text.translate(_PLAIN).split())
-    return textwrap.wrap(words, _WIDTH - 7, subsequent_indent=indent, break_long_words=True) or [""]
+    words = _BEFORE_UNIT.sub(_HELD, " ".join(text.translate(_PLAIN).split()))
+    lines = textwrap.wrap(words, _WIDTH - 7, subsequent_indent=indent, break_long_words=True) or [""]
+    return [line.replace(_HELD, " ") for line in lines]
 
 
 def _listed(words: str, items: Sequence[str], more: int) -> list[str]:

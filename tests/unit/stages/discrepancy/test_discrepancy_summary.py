@@ -32,6 +32,12 @@ def test_what_a_named_effect_is_told_with() -> None:
     assert "DEFECT: the candidate odd_plugin failed and was not compared: ValueError: boom" in text
 
 
+def test_no_line_ends_between_a_number_and_its_unit() -> None:
+    for length in range(60, 100):
+        found = verdict_of("consistent").model_copy(update={"sentence": "x" * length + " 5.7 % and 2 DN"})
+        assert "5.7 %" in verdict_text(found)
+
+
 def test_an_ambiguous_verdict_says_what_would_decide() -> None:
     text = verdict_text(verdict_of("ambiguous"))
     assert "to tell periodic_pickup apart: a faster or slower row time" in text
