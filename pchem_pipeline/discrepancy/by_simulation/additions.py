@@ -99,6 +99,7 @@ class AddedRounds:
         gap = before
         for index, this in enumerate(self.rounds):
             parts, mean = this.added.parts, this.null.mean
+            of_round: list[Addition] = []
             order = np.argsort([-_weight(part, this.null) for part in parts])
             for place, member in enumerate(order):
                 mean = mean + parts[member]
@@ -116,8 +117,9 @@ class AddedRounds:
                     against = "too much of the gap is left beside it"
                 against = against or self._against(this, int(member), still)
                 later = parts[order[place + 1 :]].sum(axis=0)
-                additions.append(self._addition(this, int(member), (gap, now), against, later))
+                of_round.append(self._addition(this, int(member), (gap, now), against, later))
                 gap = now
+            additions += _without_company(of_round)
         return Added(tuple(additions), after, unfinished)
 
     def _gap(self, null: NullModel) -> Gap:
@@ -241,6 +243,18 @@ class _Other:
     rest: FloatArray
     closes: bool
     error: float | None = None
+
+
+def _without_company(additions: Sequence[Addition]) -> list[Addition]:
+    """Take the names from effects of a round that were fitted beside others which close more and fail."""
+    closed = [each.before.value - each.after.value for each in additions]
+    mimicked = sum(own for own, each in zip(closed, additions, strict=True) if each.against and own > 0.0)
+    return [
+        replace(each, against="it was found beside effects that close more and do not fit")
+        if each.fits and not each.described and own < mimicked
+        else each
+        for own, each in zip(closed, additions, strict=True)
+    ]
 
 
 def left_of(rounds: Sequence[Round], last: NullModel, z: Measured, allowed: float) -> FloatArray:
