@@ -165,9 +165,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
         if extended is None:
             break
         null, rounds = extended, rounds + 1
-        still = disagrees(null, z, significance, by.tolerance())
-        # what strong effects hide of weak ones shows in the gap before any statistic proves it
-        wanted = still or (not by.gap(null).at_floor and by.suspects(null))
+        wanted = still = disagrees(null, z, significance, by.tolerance())
         instead = _replaced(by, null) if still else None
         if instead is not None:
             null, still = instead, disagrees(instead, z, significance, by.tolerance())
