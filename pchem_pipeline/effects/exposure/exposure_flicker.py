@@ -96,7 +96,7 @@ class ExposureFlicker(Effect):
             raise ValueError(f"exposure_flicker: a sine has no {other}; leave one of them out")
         if self.shares and len(self.shares) != len(self.levels):
             raise ValueError(
-                f"exposure_flicker: {len(self.shares)} shares for {len(self.levels)} levels; give one for each"
+                f"exposure_flicker: {len(self.shares)} shares for {len(self.levels)} levels; give as many"
             )
         if self.shares and not (min(self.shares) > 0 and abs(sum(self.shares) - 1.0) < 1e-3):
             raise ValueError("exposure_flicker: shares are above 0 and sum to 1")
