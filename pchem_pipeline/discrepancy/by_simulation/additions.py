@@ -119,7 +119,7 @@ class AddedRounds:
                 later = parts[order[place + 1 :]].sum(axis=0)
                 of_round.append(self._addition(this, int(member), (gap, now), against, later))
                 gap = now
-            additions += _without_company(of_round)
+            additions += without_company(of_round)
         return Added(tuple(additions), after, unfinished)
 
     def _gap(self, null: NullModel) -> Gap:
@@ -245,7 +245,7 @@ class _Other:
     error: float | None = None
 
 
-def _without_company(additions: Sequence[Addition]) -> list[Addition]:
+def without_company(additions: Sequence[Addition]) -> list[Addition]:
     """Take the names from effects of a round that were fitted beside others which close more and fail."""
     closed = [each.before.value - each.after.value for each in additions]
     mimicked = sum(own for own, each in zip(closed, additions, strict=True) if each.against and own > 0.0)

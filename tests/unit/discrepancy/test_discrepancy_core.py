@@ -11,6 +11,7 @@ from scipy import stats
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings, _sentence, _sized, _still
+from pchem_pipeline.discrepancy.by_simulation.additions import without_company
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,
@@ -43,6 +44,21 @@ def _hypothesis(tag: str, fingerprint: np.ndarray) -> Hypothesis:
         "exposure_drift": {"drift": 0.1},
     }[tag]
     return Hypothesis(effect_class(tag).model_validate({"tag": tag, **parameters}), fingerprint)
+
+
+# -- names ------------------------------------------------------------------------------------------
+
+
+def test_beside_effects_that_close_more_and_do_not_fit_there_is_no_name() -> None:
+    def one(tag: str, against: str, before: float, after: float) -> Addition:
+        gaps = (Gap(value, 0.1, (value, value), {}) for value in (before, after))
+        return Addition(_hypothesis(tag, np.zeros(1)).effect, True, against, (), 0.01, *gaps, (), None, ())
+
+    mimic = one("frame_noise", "too much of the gap is left beside it", 9.0, 5.0)
+    weak, strong = one("row_noise", "", 5.0, 4.0), one("exposure_drift", "", 9.0, 1.0)
+    assert [each.fits for each in without_company([mimic, weak])] == [False, False]
+    assert [each.fits for each in without_company([mimic, strong])] == [False, True]
+    assert without_company([weak, strong]) == [weak, strong]
 
 
 # -- splits -----------------------------------------------------------------------------------------
