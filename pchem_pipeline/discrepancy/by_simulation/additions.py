@@ -246,14 +246,18 @@ class _Other:
 
 
 def without_company(additions: Sequence[Addition]) -> list[Addition]:
-    """Take the names from effects of a round that were fitted beside others which close more and fail."""
-    closed = [each.before.value - each.after.value for each in additions]
-    mimicked = sum(own for own, each in zip(closed, additions, strict=True) if each.against and own > 0.0)
+    """Take the names from effects that were fitted beside one which moves more and does not fit.
+
+    Args:
+        additions: of a round, the weightiest first.
+    """
+    mimics = [i for i, each in enumerate(additions) if each.against]
+    first = mimics[0] if mimics else len(additions)
     return [
-        replace(each, against="it was found beside effects that close more and do not fit")
-        if each.fits and not each.described and own < mimicked
+        replace(each, against="it was found beside an effect that moves more and does not fit")
+        if i > first and each.fits and not each.described
         else each
-        for own, each in zip(closed, additions, strict=True)
+        for i, each in enumerate(additions)
     ]
 
 

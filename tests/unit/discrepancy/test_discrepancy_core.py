@@ -49,16 +49,17 @@ def _hypothesis(tag: str, fingerprint: np.ndarray) -> Hypothesis:
 # -- names ------------------------------------------------------------------------------------------
 
 
-def test_beside_effects_that_close_more_and_do_not_fit_there_is_no_name() -> None:
-    def one(tag: str, against: str, before: float, after: float) -> Addition:
-        gaps = (Gap(value, 0.1, (value, value), {}) for value in (before, after))
-        return Addition(_hypothesis(tag, np.zeros(1)).effect, True, against, (), 0.01, *gaps, (), None, ())
+def test_beside_an_effect_that_moves_more_and_does_not_fit_there_is_no_name() -> None:
+    def one(tag: str, against: str) -> Addition:
+        effect, gap = _hypothesis(tag, np.zeros(1)).effect, Gap(1.0, 0.1, (1.0, 1.0), {})
+        return Addition(effect, True, against, (), 0.01, gap, gap, (), None, ())
 
-    mimic = one("frame_noise", "too much of the gap is left beside it", 9.0, 5.0)
-    weak, strong = one("row_noise", "", 5.0, 4.0), one("exposure_drift", "", 9.0, 1.0)
-    assert [each.fits for each in without_company([mimic, weak])] == [False, False]
-    assert [each.fits for each in without_company([mimic, strong])] == [False, True]
-    assert without_company([weak, strong]) == [weak, strong]
+    mimic, good = one("frame_noise", "too much of the gap is left beside it"), one("row_noise", "")
+    assert [each.fits for each in without_company([mimic, good])] == [False, False]
+    assert without_company([good, mimic]) == [good, mimic]
+    assert without_company([good, good]) == [good, good]
+    measured = replace(good, described=True)
+    assert without_company([mimic, measured])[1].verdict == "described"
 
 
 # -- splits -----------------------------------------------------------------------------------------
