@@ -1,6 +1,12 @@
-"""Constants of the units that the package works in."""
+"""Constants of the units that the package works in, and shares in words."""
 
 from __future__ import annotations
 
 #: DN^2: variance of rounding to whole DN, an error uniform over 1 DN
 QUANTISATION_VARIANCE = 1.0 / 12.0
+
+
+def per_cent(share: float) -> str:
+    """Return a share to two digits in per cent, and never as a power of ten."""
+    percent = 100.0 * share
+    return f"{percent:.2g} %" if abs(percent) < 99.5 else f"{percent:.0f} %"

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError
 
 from pchem_pipeline.base.errors import StoreError
+from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
@@ -52,10 +53,6 @@ def _number(value: Any) -> Any:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.2g} %" if share < 1.0 else f"{100.0 * share:.0f} %"
 
 
 def _two_digits(value: float) -> str:
@@ -128,12 +125,12 @@ class Size(_Part):
     def words(self) -> str:
         """Return it for people."""
         most = f"{_two_digits(self.dn)} DN rms ({_two_digits(self.electrons)} e-, {self.beside_noise()})"
-        return most if self.samples >= RARE else f"{most} in {_percent(self.samples)} of the samples"
+        return most if self.samples >= RARE else f"{most} in {per_cent(self.samples)} of the samples"
 
     def beside_noise(self) -> str:
         """Return it as a share of the read noise, or how many times as large it is."""
         share = self.of_read_noise
-        times = f"{_percent(share)} of" if share < _TIMES else f"{_two_digits(share)} times"
+        times = f"{per_cent(share)} of" if share < _TIMES else f"{_two_digits(share)} times"
         return f"{times} the read noise"
 
 

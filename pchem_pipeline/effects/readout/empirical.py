@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
+from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
@@ -209,19 +210,15 @@ class Empirical(Effect):
         if self.squares:
             rows, columns = (("even", "odd")[parity] for parity in self.squares)
             return (
-                f"{_percent(self.share)} of the squares of 2 x 2 pixels{place}, from {rows} rows and "
+                f"{per_cent(self.share)} of the squares of 2 x 2 pixels{place}, from {rows} rows and "
                 f"{columns} columns on, come as the mean of their samples"
             )
         shares = self.shares()
         order = np.argsort(-shares)[:_MOST_TOLD]
-        told = [f"{_percent(shares[i])} {self.moves[i].words()}" for i in order]
+        told = [f"{per_cent(shares[i])} {self.moves[i].words()}" for i in order]
         how = f" {self.moves[0].words()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
         free = "" if any(move.towards for move in self.moves) else ", whatever was read before or beside them"
-        return f"{_percent(self.share)} of the {what}{place} are moved after the converter{how}{free}"
-
-
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.2g} %"
+        return f"{per_cent(self.share)} of the {what}{place} are moved after the converter{how}{free}"
 
 
 def _averaged(values: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
