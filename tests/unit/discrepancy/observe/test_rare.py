@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.small_stacks import small_stack
 from scipy import stats
 
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.rare import expected_beyond, rare_samples, single_samples
 from pchem_pipeline.discrepancy.observe.sums import MOST_HITS
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from tests.helpers.small_stacks import small_stack
 
 
 def observed(frames):
