@@ -269,7 +269,9 @@ def _size_texts(step: Step, values: Sequence[str]) -> tuple[str, tuple[str, ...]
     """Return the size of an effect, and the lines below it; its parameters where no size is known."""
     size = step.size
     if size is None:
-        return values[0], tuple(values[1:3])
+        # the value stands in one line, which a name before it would make too long
+        name, _, value = values[0].partition(" ")
+        return value, (name, *values[1:3])
     part = "" if size.samples >= RARE else f", in {percent(size.samples, 1.0)} of the samples"
     share = f"{size.beside_noise()}, {short(size.electrons, 2)} e⁻ rms{part}"
     return f"{short(size.dn, 2)} DN", (share, values[0])

@@ -472,6 +472,8 @@ def test_a_named_effect_says_why_no_other_one_and_where_it_is() -> None:
     ]
     assert all(row[4] for row in rows)
     assert key_facts(data)[0].more[-1] == "in columns 3 to 8"
+    unsized = key_facts(discrepancy_data("named", steps=[{**placed, "size": None}]))[0]
+    assert (unsized.value, unsized.more[0]) == ("0.3512 ± 0.0041 DN", "row_noise_dn")
     examined = {row[0]: row[1] for row in tables["discrepancy-examined"].rows}
     first, last = data.found.examined.rows
     assert examined["rows"] == f"{first} to {last - 1}"  # as in the sentence at the top
