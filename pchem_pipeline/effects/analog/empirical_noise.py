@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
+from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.shared_offset import add_offset
@@ -122,7 +123,7 @@ class NoiseMode(Section):
             form = ".2g" if abs(share) < 100.0 else ".0f"
             form = form if self.burst is None else f"+{form}"
             what = f"{share:{form}} % of the {of}, {what} {at}of {self.signal_dn:.3g} DN"
-        burst = "" if self.burst is None else f"in {100 * self.burst:.2g} % of the {self.of}s only"
+        burst = "" if self.burst is None else f"in {per_cent(self.burst)} of the {self.of}s only"
         return ", ".join(part for part in (what, whole, burst, shared) if part)
 
     def values(self, number: int, context: EffectContext) -> FloatArray:

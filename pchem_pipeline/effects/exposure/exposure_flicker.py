@@ -207,7 +207,7 @@ def _random(cls: type[_T], profile: ExposureProfile) -> list[_T]:
         "levels": tuple(np.round((levels.values - levels.values.mean()) / levels.rms, 4).tolist()),
         "shares": tuple(levels.shares.tolist()),
     }
-    return [*(cls(**{**one.model_dump(), "rms": levels.rms, **rounded}) for one in found), *found]
+    return [*(cls(**{**one.model_dump(), "rms": min(levels.rms, 1.0), **rounded}) for one in found), *found]
 
 
 def _sine(cls: type[_T], profile: ExposureProfile) -> list[_T]:

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from helpers.charge_material import exposures
 
+from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
-from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
+from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker, _random
 from pchem_pipeline.effects.exposure.persistence import Persistence
 
 
@@ -76,6 +77,15 @@ def test_a_flicker_of_levels_takes_these_and_has_its_rms(levels, shares, correla
 def test_levels_that_make_no_sense_are_refused(given, words):
     with pytest.raises(ValueError, match=words):
         ExposureFlicker(rms=0.1, **given)
+
+
+def test_flashes_are_guessed_within_what_the_effect_takes():
+    """Their rms is 4 times the mean, more than the effect takes: a guess, and no error."""
+    rng = np.random.default_rng(3)
+    deviation = np.where(rng.random(400) < 0.05, 19.0, -1.0) + 0.02 * rng.standard_normal(400)
+    found = _random(ExposureFlicker, ExposureProfile(np.arange(400.0), deviation, 4e-4))
+    assert found[0].levels
+    assert {each.rms for each in found} == {1.0}
 
 
 def test_a_sine_has_its_rms_period_and_phase():
