@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,42 +43,61 @@ def pink_noise_of(evidence: Evidence) -> list[tuple[float, int]]:
     """Return standard deviation, DN, and number of taps of 1/f noise; empty if rows do not show it.
 
     Least squares of its variance to the covariances of row means, and to the correlations of neighbours along
-    both axes, for each number of taps: in place of rows that move each by itself, or beside them.
+    both axes, for each number of taps: in place of rows that move each by itself, or beside them. Neighbours
+    that are coupled besides look like another number of taps: the likeliest beside such a coupling is second.
     """
     time, rows, columns = evidence.time, *evidence.maps.usable.shape
     if time is None or rows < 8 or columns < 8:
         return []
     seen, error = _seen(evidence, time)
-    fits, shapes = [], []
-    for taps in (taps for taps in _TAPS if columns % taps == 0 and columns // taps > 1):
-        shape = _shown(evidence, rows, columns, taps)
-        gain, variance = _fitted(seen, shape, error)
+    shapes = {
+        taps: _shown(evidence, rows, columns, taps)
+        for taps in _TAPS
+        if columns % taps == 0 and columns // taps > 1
+    }
+    in_rows = slice(0, _LAGS + 1)
+    whole = {
+        taps: _fitted(seen, shape, error)
+        for taps, shape in shapes.items()
         # coupled neighbours are alike, too, but not whole rows
-        rows_too = _fitted(seen[: _LAGS + 1], shape[: _LAGS + 1], error[: _LAGS + 1])[0]
-        shapes.append(shape)
-        fits.append((gain if rows_too > _LEAST**2 else 0.0, variance, taps))
-    gain, variance, taps = max(fits)
+        if _fitted(seen[in_rows], shape[in_rows], error[in_rows])[0] > _LEAST**2
+    }
     # rows that move each by itself: their variance, and that of neighbours within them
     alone = np.where(np.isin(np.arange(seen.size), (0, _LAGS + 1)), 1.0, 0.0)
     alone[_LAGS + 1] = float(np.nanmean(evidence.readout_std**-2.0))
-    alone[: _LAGS + 1] -= 1.0 / rows  # the frame's mean is taken from each
+    alone[in_rows] -= 1.0 / rows  # the frame's mean is taken from each
     by_rows = _fitted(seen, alone, error)[0]
-    if gain >= max(_LEAST**2, by_rows + _LEAST_SHAPE):
-        return [(float(np.sqrt(variance)), taps)]
+    if whole and max(whole.values())[0] >= max(_LEAST**2, by_rows + _LEAST_SHAPE):
+        coupled = np.where(np.arange(seen.size) > _LAGS, 1.0, 0.0)
+        beside = {taps: _fitted_beside(seen, coupled, shapes[taps], error) for taps in whole}
+        likely = dict(map(_best, (whole, beside)))
+        return [(float(np.sqrt(variance)), taps) for taps, variance in likely.items()]
+    # both at once, by whole rows: coupled neighbours are alike, too
+    by_rows = _fitted(seen[in_rows], alone[in_rows], error[in_rows])[0]
+    both = {
+        taps: _fitted_beside(seen[in_rows], alone[in_rows], shape[in_rows], error[in_rows])
+        for taps, shape in shapes.items()
+    }
+    taps, variance = _best(both)
+    seen_beside = both[taps][0] - by_rows > _LEAST**2 + _LEAST_BESIDE * by_rows
+    return [(float(np.sqrt(variance)), taps)] if seen_beside else []
+
+
+def _best(fits: Mapping[int, tuple[float, float]]) -> tuple[int, float]:
+    """Return the number of taps that lowers chi2 the most, and the variance with it."""
+    taps = max(fits, key=lambda each: fits[each][0])
+    return taps, fits[taps][1]
+
+
+def _fitted_beside(
+    seen: FloatArray, other: FloatArray, shape: FloatArray, error: FloatArray
+) -> tuple[float, float]:
+    """Return by how much multiples of two shapes, none negative, lower chi2, and the second multiple."""
     from scipy import optimize  # not for every command that knows of effects
 
-    # both at once, by whole rows: coupled neighbours are alike, too
-    in_rows = slice(0, _LAGS + 1)
-    wanted, by_rows = (seen / error)[in_rows], _fitted(seen[in_rows], alone[in_rows], error[in_rows])[0]
-    pairs = [
-        optimize.nnls((np.stack([alone, shape], axis=1) / error[:, None])[in_rows], wanted)
-        for shape in shapes
-    ]
-    left, variance, taps = min(
-        (float(rest), float(pair[1]), fit[2]) for (pair, rest), fit in zip(pairs, fits, strict=True)
-    )
-    more = float((wanted**2).sum()) - left**2 - by_rows
-    return [(float(np.sqrt(variance)), taps)] if more > _LEAST**2 + _LEAST_BESIDE * by_rows else []
+    wanted = seen / error
+    factors, left = optimize.nnls(np.stack([other, shape], axis=1) / error[:, None], wanted)
+    return float(wanted @ wanted) - float(left) ** 2, float(factors[1])
 
 
 def _fitted(seen: FloatArray, shape: FloatArray, error: FloatArray) -> tuple[float, float]:

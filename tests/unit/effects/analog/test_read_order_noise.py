@@ -12,6 +12,7 @@ from hidden.chain import hide
 from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
 from pchem_pipeline.effects.analog.read_order_noise import ReadOrderNoise
 from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
 
 SHAPE = (16, 12)
 
@@ -59,6 +60,17 @@ def test_it_is_seen_beside_rows_that_move_each_by_itself():
     [_] = ReadOrderNoise.estimate(
         seen(hide(("read_order_noise", "row_noise"), 8.0, 180000, (32, 32), 1200).frames)
     )
+
+
+@pytest.mark.parametrize("probability", [0.1, 0.2])
+def test_neighbours_that_are_coupled_besides_are_not_taken_for_taps(probability):
+    # at this read noise the residuals of electrons that came together are alike, too
+    truth = drawn_truth((24, 24), noise_e=(0.35, 0.4))
+    hidden = OpticalCrosstalk(probability=probability), ReadOrderNoise(noise_dn=2.0)
+    alone, beside = ReadOrderNoise.estimate(seen(taken(truth, *hidden, n_frames=1200, seed=53)))
+    assert alone.taps > 1
+    assert beside.taps == 1
+    assert beside.noise_dn == pytest.approx(2.0, rel=0.2)
 
 
 def test_relatives_have_another_order():
