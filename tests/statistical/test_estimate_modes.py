@@ -21,6 +21,7 @@ from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
 from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.estimators.change_points import find_steps, noise_variance
+from pchem_pipeline.effects.estimators.two_levels import between_two_levels
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
@@ -272,3 +273,39 @@ def test_steps_of_pairs_of_series_are_told_from_opposite_steps_of_the_others(noi
         apart = profile - (levels[:, q] - levels[:, q].mean())
         # what the contrasts leave open is a constant: half a jump wrong at every cut if it were taken
         assert np.sqrt(np.mean(apart**2)) < 0.1
+
+
+def _apart(steps, levels):
+    """Return the rms deviation of each series' levels from the true ones, in their own rms."""
+    profile = np.stack([np.repeat(s.levels, np.diff([*s.starts, len(levels)])) for s in steps], axis=1)
+    levels = levels - levels.mean(axis=0)
+    return np.sqrt(np.mean((profile - levels) ** 2, axis=0)) / levels.std(axis=0)
+
+
+def test_short_visits_to_one_of_two_levels_are_found():
+    rng = np.random.default_rng(9)
+    n, gaps = 1200, np.ones(1200)
+    gaps[::60] = 31.0
+    changes = rng.uniform(size=(n, 4)) < 0.5 * (1 - (1 - 2 * 0.006) ** gaps)[:, None]
+    levels = 1.0 * (np.cumsum(changes, axis=0) % 2)
+    common = np.linspace(0.0, 0.5, n)[:, None] + 0.2 * rng.standard_normal((n, 1))
+    series = levels + common + 0.25 * rng.standard_normal(levels.shape)
+    steps = find_steps(series, gaps)
+    found = between_two_levels(series, gaps, steps)
+    # a frame is put to the wrong level where four of its errors are not enough, and at the ends of a visit
+    assert _apart(found, levels).max() < 0.25
+    assert _apart(found, levels).max() < 0.6 * _apart(steps, levels).max()
+    assert [s.starts.size for s in found] == pytest.approx(1 + changes.sum(axis=0), abs=2)
+
+
+def test_a_walk_through_many_levels_stays_as_it_is():
+    rng = np.random.default_rng(10)
+    levels = np.zeros((1000, 4))
+    levels[:, 1] = np.repeat([0.0, 1.0, 2.0, 3.0, 2.0], 200)
+    levels[:, 3] = np.repeat([0.0, -1.0, -2.0, -1.0], 250)
+    series = levels + 0.25 * rng.standard_normal(levels.shape)
+    steps = find_steps(series)
+    assert between_two_levels(series, np.ones(1000), steps) == steps
+    assert between_two_levels(series[:, :1], np.ones(1000), steps[:1]) == steps[:1]
+    none = find_steps(rng.standard_normal((400, 4)))
+    assert between_two_levels(rng.standard_normal((400, 4)), np.ones(400), none) == none

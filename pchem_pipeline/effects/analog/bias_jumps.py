@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.change_points import Steps, find_steps, noise_variance
 from pchem_pipeline.effects.estimators.common_modes import quantile_means, responsivity, with_offsets
+from pchem_pipeline.effects.estimators.two_levels import between_two_levels
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 
@@ -144,7 +145,8 @@ class BiasJumps(Effect):
         """Return the change points of the quadrants' means, and random jumps of like size and rate.
 
         What is common to the quadrants is taken out first, so that neither a drift nor frame noise is
-        taken for jumps. Jumps too many or too small to be told apart still leave a correlation in time.
+        taken for jumps; where each sits on one of two levels, that tells short visits and jumps of several at
+        once. Jumps too many or too small to be told apart still leave a correlation in time.
         """
         if evidence.time is None or evidence.time.frames.size < 16:
             return ()
@@ -153,7 +155,8 @@ class BiasJumps(Effect):
         drawn = [(*_correlated(time.frames, means @ mix.T), name) for name, mix in _PARTS.items()]
         drawn = sorted((d for d in drawn if d[0] > _SIGNIFICANT), reverse=True)
         random = [cls(amplitude_dn=a / alpha, rate=rate, parts=name) for _, a, rate, name in drawn[:2]]
-        found = find_steps(means, np.diff(time.frames, prepend=-1))
+        gaps = np.diff(time.frames, prepend=-1).astype(np.float64)
+        found = between_two_levels(means, gaps, find_steps(means, gaps))
         jumps = np.concatenate([np.diff(steps.levels) for steps in found])
         if not jumps.size:
             return random

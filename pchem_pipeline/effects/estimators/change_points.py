@@ -90,7 +90,7 @@ def find_steps(
         return [Steps(np.zeros(1, np.int64), np.zeros(1)) for _ in range(m)]
     starts, levels = _with_common(series, starts, variance * m / (m - 1.0))
     return [
-        Steps(np.array(begins, np.int64), _centred(level, begins, n))
+        Steps(np.array(begins, np.int64), centred(level, begins, n))
         for level, begins in zip(levels, starts, strict=True)
     ]
 
@@ -154,7 +154,8 @@ def _indicators(begins: list[int], n: int, row: NDArray[np.float64]) -> NDArray[
     return (inside[:, None, :] * row[:, None]).reshape(n * row.size, len(begins))
 
 
-def _centred(levels: NDArray[np.float64], starts: list[int], n: int) -> NDArray[np.float64]:
+def centred(levels: NDArray[np.float64], starts: list[int], n: int) -> NDArray[np.float64]:
+    """Return levels less their mean over n values, each from its start on."""
     lengths = np.diff([*starts, n])
     return np.asarray(levels - (levels * lengths).sum() / n)
 
