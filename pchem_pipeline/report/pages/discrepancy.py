@@ -312,9 +312,9 @@ def _chance_fact(found: Verdict) -> list[KeyFact]:
 
 
 def remarks(data: DiscrepancyData) -> list[Flag]:
-    """Return what speaks for and against the verdict, the gravest first."""
+    """Return what speaks for and against the verdict beside its sentence, the gravest first."""
     found = data.found
-    flags = [Flag("caution", f"{found.limit[0].upper()}{found.limit[1:]}.")] if found.limit else []
+    flags: list[Flag] = []
     extended = [step for step in found.steps if step.effect]
     if found.doubt:
         words = "What rests on the parameters of the pixels was not tested, and no size is given in e⁻"
