@@ -145,7 +145,7 @@ class _Lines:
     Attributes:
         charge: sums of k - H of the row groups, then of the column groups, e-, (n, r + c).
         y, x: mean row and column of the groups, (r,) and (c,).
-        response: sum over the pixels of a cell of dE[k]/dH, (r, c).
+        response: sum over the pixels of a cell of dE[k] by an electron of light, (r, c).
         variance: sum of Var(k), e-^2, which is also what a flicker of all pixels adds, (r, c).
     """
 
@@ -191,7 +191,9 @@ def _lines(evidence: Evidence) -> _Lines | None:
     if good.sum() < 16 or min(good.shape) < 2:
         return None
     variance = np.where(good, evidence.charge_std, 0.0) ** 2
-    response = np.where(good, variance / np.where(good, maps.quanta_exposure, 1.0), 0.0)
+    # bright bursts lead the fit of a pixel astray: light counts by its gain against the sensor's usual one
+    gain = maps.conversion_gain / np.median(maps.conversion_gain[good])
+    response = np.where(good, gain * variance / np.where(good, maps.quanta_exposure, 1.0), 0.0)
     groups = [np.arange(n) * min(n, _CELLS) // n for n in good.shape]
     first = [np.flatnonzero(np.diff(group, prepend=-1)) for group in groups]
 
