@@ -86,11 +86,22 @@ def test_drift(drift, settling):
     truth = ExposureDrift(drift=drift, settling_fraction=settling)
     evidence = seen(truth)
     first, *others = ExposureDrift.estimate(evidence)
-    shape = truth.profile(np.linspace(0, 1, 1001))
+    t = np.linspace(0, 1, 1001)
+    shape = truth.profile(t)
     stderr = np.sqrt(shot_variance(evidence) / evidence.n_frames / shape.var())
-    assert (first.settling_fraction, first.path) == (settling, ())
-    assert abs(first.drift - drift) < 5 * stderr
     assert abs(drift) > 20 * stderr
+    assert first.path == ()
+    assert (first.settling_fraction is None) == (settling is None)
+    if settling is not None:
+        # how the profile goes with the logarithm of the time constant, all of it and beside its size
+        longer = truth.model_copy(update={"settling_fraction": 1.02 * settling})
+        slope = (longer.profile(t) - truth.profile(t)) / np.log(1.02)
+        beside = slope - shape * (slope @ shape) / (shape @ shape)
+        error = stderr * shape.std() / beside.std() / abs(drift)
+        assert 5 * error < np.log(2.0)  # the next one of a list would be seen
+        assert abs(np.log(first.settling_fraction / settling)) < 5 * error
+        stderr *= slope.std() / beside.std()
+    assert abs(first.drift - drift) < 5 * stderr
     assert len(others) <= 2
 
 

@@ -22,7 +22,12 @@ from pchem_pipeline.effects.estimators.common_modes import (
     successive,
     with_offsets,
 )
-from pchem_pipeline.effects.estimators.time_profiles import SETTLING, along_path, check_path, settling
+from pchem_pipeline.effects.estimators.time_profiles import (
+    along_path,
+    check_path,
+    settling,
+    settling_time,
+)
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
 
@@ -192,10 +197,13 @@ class _Curve(NamedTuple):
 def _settled(position: NDArray[np.float64], means: NDArray[np.float64]) -> _Curve | None:
     """Return mean and size of the best exponential approach to the end; None if a line does as well."""
     one = np.ones_like(position)
-    curves = [
-        _Curve(*_criterion(means, np.stack([one, settling(position, s)], 1)), fraction=s) for s in SETTLING
-    ]
-    return _better_than_line(min(curves, key=lambda curve: curve.criterion), position, means)
+
+    def curve(fraction: float) -> _Curve:
+        basis = np.stack([one, settling(position, fraction)], axis=1)
+        return _Curve(*_criterion(means, basis), fraction=fraction)
+
+    best = curve(settling_time(lambda fraction: curve(fraction).criterion))
+    return _better_than_line(best, position, means)
 
 
 def _best_path(position: NDArray[np.float64], means: NDArray[np.float64]) -> _Curve | None:

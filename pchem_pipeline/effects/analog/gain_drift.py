@@ -15,7 +15,12 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.common_modes import run_position
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
-from pchem_pipeline.effects.estimators.time_profiles import SETTLING, along_path, check_path, settling
+from pchem_pipeline.effects.estimators.time_profiles import (
+    along_path,
+    check_path,
+    settling,
+    settling_time,
+)
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
@@ -109,7 +114,8 @@ class GainDrift(Effect):
         price = float(np.log(gain.size))
         flat = _chi_square(gain, error, np.ones((gain.size, 1)))[0]
         line, slope = _along(gain, error, position - 0.5)
-        curve, size, fraction = min((*_along(gain, error, settling(position, s)), s) for s in SETTLING)
+        fraction = settling_time(lambda s: _along(gain, error, settling(position, s))[0])
+        curve, size = _along(gain, error, settling(position, fraction))
         straight = line + 2.0 * price
         found: list[tuple[float, Self]] = []
         if flat - line > _SIGMAS**2:

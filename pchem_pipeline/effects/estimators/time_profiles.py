@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-#: time constants that estimators try, in lengths of the run
-SETTLING = (0.05, 0.1, 0.2, 0.4)
+# time constants in lengths of the run: shorter ones are hardly a drift, longer ones are straight lines
+_SETTLING = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
 
 
 def settling(position: NDArray[np.float64], fraction: float) -> NDArray[np.float64]:
@@ -22,6 +22,22 @@ def settling(position: NDArray[np.float64], fraction: float) -> NDArray[np.float
     mean = (1.0 - fraction * whole) / whole
     profile: NDArray[np.float64] = -np.expm1(-position / fraction) / whole - mean
     return profile
+
+
+def settling_time(left: Callable[[float], float]) -> float:
+    """Return the time constant of an exponential approach that leaves least, in lengths of the run.
+
+    Args:
+        left: what an approach with a time constant leaves.
+    """
+    from scipy.optimize import minimize_scalar  # not for every command that knows of effects
+
+    losses = [left(fraction) for fraction in _SETTLING]
+    best = int(np.argmin(losses))
+    ends = _SETTLING[max(best - 1, 0)], _SETTLING[min(best + 1, len(_SETTLING) - 1)]
+    options = {"xatol": 0.01}
+    found = minimize_scalar(lambda log: left(float(np.exp(log))), bounds=np.log(ends), options=options)
+    return float(np.exp(found.x)) if found.fun < losses[best] else _SETTLING[best]
 
 
 def along_path(position: NDArray[np.float64], path: Sequence[float]) -> NDArray[np.float64]:

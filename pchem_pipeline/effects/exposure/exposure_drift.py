@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
-from pchem_pipeline.effects.estimators.time_profiles import SETTLING, along_path, settling
+from pchem_pipeline.effects.estimators.time_profiles import along_path, settling, settling_time
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:
@@ -130,9 +130,12 @@ class ExposureDrift(Effect):
         position = profile.frames / max(evidence.time.n_run - 1, 1)
         # what flickers from frame to frame is noise to a drift
         noise = max(profile.variance, 0.5 * float(np.mean(np.diff(profile.deviation) ** 2)))
-        curves = [_fit(cls(drift=1.0, settling_fraction=s), profile, position, noise) for s in SETTLING]
+
+        def settled(fraction: float) -> tuple[float, Self]:
+            return _fit(cls(drift=1.0, settling_fraction=fraction), profile, position, noise)
+
+        curve: tuple[float, Self] = settled(settling_time(lambda fraction: -settled(fraction)[0]))
         line = _fit(cls(drift=1.0), profile, position, noise)
-        curve = max(curves, key=lambda pair: pair[0])
         path = _fit_path(cls, profile, position, noise)
         net = [line, (curve[0] - _PRICE_OF_SETTLING, curve[1]), path]
         best = max(chi2 for chi2, _ in net)
