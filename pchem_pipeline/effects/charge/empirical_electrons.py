@@ -24,12 +24,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.model.law.sample_law import SampleLaw
 
 #: What happens to electrons: some that have others in their sample are lost or moved, or each brings others,
 #: or all of a sample are lost together.
 Fate = Literal["lost", "moved", "followed", "emptied"]
 _DEPTH = 4  # frames through which electrons that follow others are followed themselves
+_MOST_LATER = 0.9  # others that an electron brings to later frames, beyond which there is no steady number
+_EMPTY = 1e-9  # of its exposure, what a sample has that loses all of its electrons
 
 
 class ElectronMode(Section):
@@ -112,9 +115,7 @@ class EmpiricalElectrons(Effect):
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return electron numbers (frame, y, x), e-, without those that go and with those that come."""
-        own = values.astype(np.int64)
-        largest = max(mode.weight for mode in self.modes)
-        chance = {number: self.chance * mode.weight / largest for number, mode in enumerate(self.modes)}
+        own, chance = values.astype(np.int64), self._chances()
         for number, mode in enumerate(self.modes):
             if mode.fate != "followed":
                 u = context.random.uniform(("frame", "y", "x"), number)
@@ -132,6 +133,29 @@ class EmpiricalElectrons(Effect):
                 found = np.asarray(found + context.random.poisson(mean, number))
         return found.astype(values.dtype)
 
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
+        """Return the law of what is left, and of as many more as come; H is the exposure without all that.
+
+        Those that come are taken for as independent as those that are there, and those that were moved for
+        as many as those that come in their place.
+        """
+        here = later = 0.0
+        for mode, chance in zip(self.modes, self._chances(), strict=True):
+            if mode.fate == "lost":
+                model = model.with_counts("lost", chance)
+            elif mode.fate == "emptied":
+                model = model.with_exposures((chance, 1.0 - chance), (_EMPTY, 1.0))
+            elif mode.fate == "followed" and mode.place[0]:
+                later += chance
+            elif mode.fate == "followed":
+                here += chance
+        return model.with_exposures((1.0,), ((1.0 + here) / max(1.0 - later, 1.0 - _MOST_LATER),))
+
+    def _chances(self) -> list[float]:
+        """Return the chance, or mean number, of each mode."""
+        largest = max(mode.weight for mode in self.modes)
+        return [self.chance * mode.weight / largest for mode in self.modes]
+
     @classmethod
     def typical(cls) -> Sequence[Self]:
         """Return electrons of which each hundredth brings another one to the next frame."""
@@ -145,8 +169,7 @@ class EmpiricalElectrons(Effect):
     def words(self) -> str:
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
-        largest = max(mode.weight for mode in self.modes)
-        told = [mode.words(self.chance * mode.weight / largest) for mode in self.modes]
+        told = [mode.words(chance) for mode, chance in zip(self.modes, self._chances(), strict=True)]
         return f"electrons{place} that do not come independently ({'; '.join(told)})"
 
 

@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.kernel import kernel
 
 # laws of the electron number
-POISSON, NEGATIVE_BINOMIAL, BOREL, TRAPPED = 0, 1, 2, 3
+POISSON, NEGATIVE_BINOMIAL, BOREL, TRAPPED, LOST = 0, 1, 2, 3, 4
+
+_MOST_LOST, _SURELY_LOST = 400, 0.99
+_NEGLIGIBLE = 1e-18  # of a mass
 
 
 @kernel(borrows=True)
@@ -42,6 +45,35 @@ def _trapped(chance: float, k: float, exposure: float) -> tuple[float, float, fl
 
 
 @kernel(borrows=True)
+def _lost(chance: float, k: float, exposure: float) -> tuple[float, float, float]:
+    """Return log P(k) where each electron is lost with a chance for every other one, and its derivatives.
+
+    Of n electrons so many are left that the others are a binomial number: a sum over n.
+    """
+    log_exposure, largest = math.log(exposure), 0.0
+    mass = slope = bend = 0.0
+    outer = -exposure - math.lgamma(k + 1.0)
+    for gone in range(_MOST_LOST):
+        n = k + gone
+        each = min(chance * (n - 1.0), _SURELY_LOST) if n > 1.0 else 0.0
+        if gone > 0 and each == 0.0:
+            continue
+        log_term = outer + n * log_exposure - math.lgamma(gone + 1.0) + k * math.log1p(-each)
+        if gone > 0:
+            log_term += gone * math.log(each)
+        if gone == 0:
+            largest = log_term
+        term = math.exp(log_term - largest)
+        mass += term
+        slope += term * (n - exposure)
+        bend += term * ((n - exposure) * (n - exposure) - exposure)
+        if n > exposure and term < _NEGLIGIBLE * mass:
+            break
+    first = slope / mass
+    return largest + math.log(mass), first, bend / mass - first * first
+
+
+@kernel(borrows=True)
 def _one_law(law: int, dispersion: float, k: float, exposure: float) -> tuple[float, float, float]:
     """Return log P(k) at mean ``exposure`` and its first two derivatives in log exposure."""
     log_factorial = math.lgamma(k + 1.0)
@@ -66,6 +98,9 @@ def _one_law(law: int, dispersion: float, k: float, exposure: float) -> tuple[fl
         factor, rise, bend = _trapped(dispersion, k, exposure)
         share = rise / factor
         return poisson + math.log(factor), k - exposure + share, bend / factor - share * share - exposure
+    if law == LOST and dispersion > 0.0:
+        log_mass, first, second = _lost(dispersion, k, exposure)
+        return log_mass, first, second
     return poisson, k - exposure, -exposure
 
 

@@ -20,6 +20,7 @@ _LAWS: dict[CountLaw, int] = {
     "negative_binomial": electron_laws_numba.NEGATIVE_BINOMIAL,
     "borel": electron_laws_numba.BOREL,
     "trapped": electron_laws_numba.TRAPPED,
+    "lost": electron_laws_numba.LOST,
 }
 _NO_LIMIT = 2**40  # DN
 _PEAK_FIELDS = ("weights", "shift_e", "shift_dn", "shift_sigma", "width")

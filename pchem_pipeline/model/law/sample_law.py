@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
-CountLaw = Literal["poisson", "negative_binomial", "borel", "trapped"]
+CountLaw = Literal["poisson", "negative_binomial", "borel", "trapped", "lost"]
 #: A number of all pixels, or one of each, shape (n,).
 Number = float | FloatArray
 
@@ -46,12 +46,13 @@ class SampleLaw:
     laws of groups: then there is a row for each.
 
     Attributes:
-        law: law of the electron number; its mean is H whatever the law.
+        law: law of the electron number; its mean is H, but where electrons are lost.
         dispersion: negative binomial: a in Var K = H + a H^2; borel (generalised Poisson): l in Var K =
             H / (1 - l)^2 at mean H; trapped: chance m that a sample with electrons loses one to a trap, which
-            gives as many back to other samples, Var K = H + 2 m P(K >= 2; H); no unit.
+            gives as many back to other samples, Var K = H + 2 m P(K >= 2; H); lost: chance c of each electron
+            for every other one in its sample, of H electrons on average before, E K = H - c H^2; no unit.
         exposure_weights, exposure_factors: discrete mixture of exposures H f_b, shape (m,) each; weights sum
-            to 1 and the mean factor is 1.
+            to 1, and the mean factor is 1 where H is the exposure of all that the samples hold.
         added_exposure, added_weights: discrete mixture of exposures d_j beside H, e-, >= 0, and its weights
             u_j, shape (n or 1, j) each; weights sum to 1 along j.
         level_scale: DN per electron of the comb relative to 1/g, shape (n,) or (1,).

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from helpers.em_trace import evaluated
 from helpers.extended_reference import EVERYTHING, LAWS, reference_mass
-from scipy.stats import norm
+from scipy.stats import binom, norm, poisson
 
 from pchem_pipeline.model.fit.api import satellite_threshold
 from pchem_pipeline.model.law import cells_numba, pixel_numba
-from pchem_pipeline.model.law.electron_laws_numba import _one_law, electron_number
+from pchem_pipeline.model.law.electron_laws_numba import LOST, _one_law, electron_number
 from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood
 from pchem_pipeline.model.law.mass import log_likelihood, sample_mass, sample_parabolas, sample_slopes
@@ -92,7 +92,7 @@ def test_outliers_are_spread_evenly_and_weigh_nothing_else() -> None:
     np.testing.assert_allclose(with_some, 0.999 * plain + 1e-6, rtol=1e-13)
 
 
-@pytest.mark.parametrize("law", ["poisson", "negative_binomial", "borel", "trapped"])
+@pytest.mark.parametrize("law", ["poisson", "negative_binomial", "borel", "trapped", "lost"])
 @pytest.mark.parametrize("satellite", [0.0, 1.3])
 @pytest.mark.parametrize("aside", [False, True])
 def test_score_and_information_are_the_derivatives(law: str, satellite: float, aside: bool) -> None:
@@ -156,6 +156,30 @@ def test_electron_number_law_sums_to_one_with_the_right_mean_and_slopes(law: int
     for i in (0, 1, 7):
         compiled, plain = (f(law, dispersion, float(i), 2.5) for f in (_one_law, _one_law.py_func))
         np.testing.assert_allclose(plain, compiled, rtol=1e-13)
+
+
+def test_what_is_lost_of_electrons_is_what_chance_takes() -> None:
+    chance, exposure = 0.08, 2.4
+    n = np.arange(80)
+    before, gone = poisson.pmf(n, exposure), np.minimum(chance * np.maximum(n - 1, 0), 0.99)
+    wanted = [before @ binom.pmf(n - k, n, gone) for k in range(30)]
+    one = np.array([[1.0], [1.0], [1.0], [0.0]])
+    rows = np.array([electron_number(LOST, chance, k, exposure, one) for k in range(30)])
+    np.testing.assert_allclose(rows[:, 0], wanted, rtol=1e-11)
+    # to first order in the chance, as long as no sample loses nearly all
+    weak = np.array([electron_number(LOST, 1e-4, k, exposure, one)[0] for k in range(40)])
+    assert weak @ np.arange(40) == pytest.approx(exposure - 1e-4 * exposure**2, rel=1e-9)
+    h = 1e-4
+    above, below = (
+        np.array([electron_number(LOST, chance, k, exposure * np.exp(s), one)[0] for k in range(30)])
+        for s in (h, -h)
+    )
+    np.testing.assert_allclose(rows[:, 1], (above - below) / (2 * h), atol=1e-8)
+    np.testing.assert_allclose(rows[:, 2], (above - 2 * rows[:, 0] + below) / h**2, atol=1e-6)
+    for k in (0, 1, 7):
+        compiled, plain = (f(LOST, chance, float(k), exposure) for f in (_one_law, _one_law.py_func))
+        np.testing.assert_allclose(plain, compiled, rtol=1e-13)
+    assert _one_law(LOST, 0.0, 3.0, exposure) == _one_law(0, 0.0, 3.0, exposure)
 
 
 def test_log_likelihood_is_that_of_the_masses() -> None:

@@ -14,6 +14,8 @@ from pchem_pipeline.discrepancy.by_simulation.measured.electrons import electron
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons
+from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
@@ -145,6 +147,40 @@ def test_simulated_samples_are_emptied_as_often_as_told() -> None:
     none = 0.1 + 0.9 * np.exp(-2.0)
     assert abs((k < 0.5).mean() - none) < 5 * np.sqrt(none / k.size)
     assert abs(k.mean() - 1.8) < 5 * np.sqrt(k.var() / k.size)
+
+
+def law_of(*modes: ElectronMode, chance: float) -> np.ndarray:
+    """Return the probabilities of the numbers of electrons under the law, at H = 2."""
+    columns = [np.array([v]) for v in (2.0, 1 / STEP, 100.0, np.sqrt(0.02**2 + 1 / 12))]
+    law = EmpiricalElectrons(chance=chance, modes=modes).sample_law(SampleLaw(), None)
+    return sample_mass(law, columns, 93 + np.arange(16 * int(STEP))).reshape(16, -1).sum(axis=1)
+
+
+@pytest.mark.parametrize("fate", ["lost", "emptied"])
+def test_the_law_is_that_of_the_simulated_samples(fate: Any) -> None:
+    k = np.round(simulated(ElectronMode(fate=fate), chance=0.1)).astype(int).ravel()
+    seen = np.bincount(k, minlength=16)[:16]
+
+    def misfit(mass: np.ndarray) -> float:
+        expected = k.size * mass
+        good = expected > 20
+        chi2 = float(((seen - expected)[good] ** 2 / expected[good]).sum())
+        return (chi2 - good.sum()) / np.sqrt(2.0 * good.sum())
+
+    assert abs(misfit(law_of(ElectronMode(fate=fate), chance=0.1))) < 5
+    assert misfit(law_of(ElectronMode(fate=fate), chance=0.08)) > 20  # another chance would be seen
+
+
+@pytest.mark.parametrize("place", [(1, 0, 0), (0, 0, 1), (0, 0, 0)])
+def test_the_law_has_the_mean_of_electrons_with_those_that_follow(place: tuple[int, int, int]) -> None:
+    mode = ElectronMode(fate="followed", place=place)
+    k = simulated(mode, chance=0.1)
+    # none come from beyond the edge
+    k = k[4:, :, 1:]
+    mean = law_of(mode, chance=0.1) @ np.arange(16)
+    error = np.sqrt(1.5 * k.var() / k.size)
+    assert abs(k.mean() - mean) < 5 * error
+    assert abs(mean - 2.0) > 20 * error
 
 
 def test_simulated_frames_do_not_depend_on_how_they_are_cut() -> None:
