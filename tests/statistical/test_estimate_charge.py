@@ -9,6 +9,8 @@ import dataclasses
 import numpy as np
 import pytest
 from helpers.charge_material import a_sensor, evidence_of
+from helpers.sensor_of_modes import drawn_truth, taken
+from helpers.sensor_of_modes import seen as seen_modes
 
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
@@ -225,6 +227,16 @@ def test_what_would_begin_brighter_than_any_scene_is_no_afterglow(monkeypatch):
     truth = Persistence(peak_e=0.5, decay_frames=600.0, centre_y=0.3, centre_x=0.6, radius=0.13)
     monkeypatch.setattr(persistence, "fading_of", lambda *_: Fading(600.0, None, 0.5, scale=1e9))
     assert not Persistence.estimate(seen(truth))
+
+
+def test_persistence_so_bright_that_it_misleads_the_fits():
+    sensor = drawn_truth((32, 32), noise_e=(0.36, 0.42), step=(11.5, 12.5))
+    truth = Persistence(peak_e=6.0, decay_frames=200.0, centre_y=0.3, centre_x=0.6, radius=0.05)
+    image, spot = Persistence.estimate(seen_modes(taken(sensor, truth, n_frames=1200, seed=5)))
+    wanted = truth.peak_e * truth.pattern(np.arange(32), (32, 32))
+    for found, share in ((image, 0.05), (spot, 0.005)):
+        left = found.peak_e * found.pattern(np.arange(32), (32, 32)) - wanted
+        assert np.sum(left**2) < share * np.sum(wanted**2)
 
 
 def test_persistence():

@@ -13,9 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
 
 FloatArray = NDArray[np.float64]
+
+
+_FAR = 7.5  # median deviations of the logarithm of a gain: five standard deviations
 
 
 class ExposureProfile(NamedTuple):
@@ -82,23 +85,35 @@ def block_charge(evidence: Evidence) -> BlockCharge | None:
     charge = np.asarray(time.block_charge, np.float64)[:, good]
     charge -= np.average(charge, axis=0, weights=length)
     common = charge.sum(axis=1) / variance.sum()
-    slope = variance / exposure
+    slope = variance / exposure * against_usual_gain(evidence.maps)[good]
     deviation = (charge - common[:, None] * variance) / slope
     y, x = np.nonzero(good)
-    return BlockCharge(time.block_start.astype(np.float64), length, deviation, exposure**2 / variance, y, x)
+    return BlockCharge(time.block_start.astype(np.float64), length, deviation, variance / slope**2, y, x)
+
+
+def against_usual_gain(maps: PixelMaps) -> FloatArray:
+    """Return the gain of each pixel over the sensor's usual one where it is far from that, else 1, (y, x).
+
+    Where the light of a pixel changes much its fit is led astray: so much of an electron counts as one.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_gain = np.log(maps.conversion_gain)
+    apart = log_gain - np.median(log_gain[maps.usable])
+    usual = float(np.median(np.abs(apart[maps.usable])))
+    return np.asarray(np.where(np.abs(apart) > _FAR * usual, np.exp(apart), 1.0))
 
 
 def block_signal(evidence: Evidence) -> BlockCharge | None:
     """Return the same of the samples themselves, at the sensor's usual gain; None as there.
 
-    Where the light of a pixel changes much its fit is led astray, and with it what is taken for charge.
+    Where its fit is led astray so is what is taken for charge; the samples are what they are.
     """
     charge, time = block_charge(evidence), evidence.time
     if charge is None or time is None:
         return None
     at = charge.y, charge.x
     gain, exposure = evidence.maps.conversion_gain[at], evidence.maps.quanta_exposure[at]
-    usual = float(np.median(gain)) / gain
+    usual = 1.0 / against_usual_gain(evidence.maps)[at]
     signal = (time.block_charge[:, *at] + gain * time.block_readout[:, *at]).astype(np.float64) * usual
     signal -= np.average(signal, axis=0, weights=charge.length)
     signal -= np.median(signal / exposure, axis=1)[:, None] * exposure

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pchem_pipeline.effects.estimators.charge_sums import against_usual_gain
 from pchem_pipeline.effects.framework.spot import Falloff, spot_image
 
 if TYPE_CHECKING:
@@ -191,8 +192,7 @@ def _lines(evidence: Evidence) -> _Lines | None:
     if good.sum() < 16 or min(good.shape) < 2:
         return None
     variance = np.where(good, evidence.charge_std, 0.0) ** 2
-    # bright bursts lead the fit of a pixel astray: light counts by its gain against the sensor's usual one
-    gain = maps.conversion_gain / np.median(maps.conversion_gain[good])
+    gain = against_usual_gain(maps)
     response = np.where(good, gain * variance / np.where(good, maps.quanta_exposure, 1.0), 0.0)
     groups = [np.arange(n) * min(n, _CELLS) // n for n in good.shape]
     first = [np.flatnonzero(np.diff(group, prepend=-1)) for group in groups]

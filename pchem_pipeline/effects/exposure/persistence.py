@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
 # rows and columns of the grids: to find something, and to describe it
-_GRIDS = (8, 16)
+_GRIDS = (8, 32)
 #: cells along a side of an image that was found in a part of the sensor: it stands in the YAML
 _MOST_CELLS = 48
 # by how many times as clearly the samples must show it as the charge

@@ -94,7 +94,7 @@ def test_an_independent_camera_s_glow_is_found(seed):
 @pytest.mark.parametrize("seed", [5, 7])
 def test_bursts_so_bright_that_they_mislead_the_fits_keep_their_form(seed):
     # without single peaks a fit takes bright bursts for electrons, at a tenth of the gain
-    truth = drawn_truth((24, 24), noise_e=(0.36, 0.42))
+    truth = drawn_truth((24, 24), noise_e=(0.36, 0.42), step=(11.5, 12.5))
     hidden = Glow(peak_e=10.0, burst_share=0.015, centre_y=0.3, centre_x=0.0, radius=0.2)
     found = Glow.estimate(seen(taken(truth, hidden, n_frames=1200, seed=seed)))[0]
     assert found.falloff == "exponential"
