@@ -12,7 +12,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hyp
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, lesser
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
@@ -81,9 +81,10 @@ class ExtendedModel:
             corrected = self._take(added, change)
         self.last = added
         extended = NullModel.from_replicates(self.first.names, added.vectors, self.first)
-        extended = extended.shifted(np.sum(added.slopes * change[:, None], axis=0))
+        slopes = lesser(added.slopes, added.parts)
+        extended = extended.shifted(np.sum(slopes * change[:, None], axis=0))
         fitted = np.array([bool(h.effect.strength) for h in added.hypotheses])
-        extended = replace(extended, strengths=added.slopes * (added.stderr * fitted)[:, None])
+        extended = replace(extended, strengths=slopes * (added.stderr * fitted)[:, None])
         errors = dict(zip((h.tag for h in corrected), added.stderr, strict=True))
         now = {h.tag: h for h in corrected}
         self.rounds = [this.updated(now, errors) for this in self.rounds]

@@ -751,6 +751,22 @@ def test_what_was_chosen_enters_the_model_though_the_limit_is_reached(
     assert [e.tag for e in search.model] == ["row_noise"]
 
 
+def test_slopes_beyond_all_that_an_effect_does_do_not_lift_the_floor() -> None:
+    # near the limit of a strength a small step may spoil all fits: nothing is at the floor by that
+    world = World([effect("row_noise", 0.5)])
+    work: Any = SimpleNamespace(mapped=lambda _: UNMOVED)
+    one = world.refitter().simulated((hypothesis("row_noise", 0.5),), None, 12)
+    gaps = StatisticsGap(world.null, 100_000)
+
+    def floor(slopes: np.ndarray) -> float:
+        model = ExtendedModel(work, world.null, (), ())
+        steep = replace(one, slopes=slopes)
+        null = model.put(Comparison(steep, (steep,)), steep, (), world.null)
+        return gaps.gap(world.z.final, null.mean, null.replicates, null.strengths).floor
+
+    assert floor(1e5 * one.slopes) == pytest.approx(floor(one.slopes), rel=0.5)
+
+
 def test_what_is_found_enters_the_model_at_its_best_strength(monkeypatch: pytest.MonkeyPatch) -> None:
     search, extended = add(World([effect("row_noise", 0.5)]), monkeypatch, hypothesis("row_noise"))
     assert [e.tag for e in search.model] == ["row_noise"]
