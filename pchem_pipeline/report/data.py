@@ -321,13 +321,10 @@ class ReportData:
             with_flagged: of all pixels with a value; else flagged ones are left out.
         """
         if (name, with_flagged) not in self._summaries:
-            known = self.ordered(name)
-            self._summaries[name, True] = self._summarised(known)
-            self._summaries[name, False] = (
-                self._summarised(known.without(self.maps[name][self.flagged]))
-                if self.any_flagged
-                else self._summaries[name, True]
-            )
+            self._summaries[name, True] = self._summaries[name, False] = self._summarised(self.ordered(name))
+            if self.any_flagged:
+                known = Ordered.of(self.maps[name], self.flagged)
+                self._summaries[name, False] = self._summarised(known)
         return self._summaries[name, with_flagged]
 
     def _summarised(self, known: Ordered) -> MapSummary:
