@@ -7,7 +7,7 @@ import pytest
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
 from pchem_pipeline.compute.environment import available_workers, peak_rss_bytes
-from pchem_pipeline.compute.executor import Stop, make_executor
+from pchem_pipeline.compute.executor import Stop, beside, make_executor
 from pchem_pipeline.compute.memory import BASE_BYTES, affordable, keep_to_limit, resident_bytes
 from pchem_pipeline.compute.settings import ComputeSettings
 
@@ -125,3 +125,26 @@ def test_too_little_memory_for_the_program_is_refused():
     keep_to_limit(None)
     with pytest.raises(ConfigError, match="64 MiB are less than the"):
         keep_to_limit(64)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_task_beside_is_done_once_and_before_those_behind_it(threads):
+    done = []
+
+    def task(number):
+        done.append((number, threading.current_thread() is threading.main_thread()))
+        return reciprocal(number)
+
+    with beside(threads) as hand:
+        half, none = hand(lambda: task(2)), hand(lambda: task(0))
+        double = hand(lambda: half() * task(4))  # may ask for what was handed on before
+        assert (double(), half(), double()) == (0.125, 0.5, 0.125)
+        with pytest.raises(ZeroDivisionError):
+            none()
+    here = threads == 1
+    assert sorted(done) == [(0, here), (2, here), (4, here)]
+
+
+def test_a_single_thread_does_nothing_that_nobody_asks_for():
+    with beside(1) as hand:
+        hand(lambda: reciprocal(0))
