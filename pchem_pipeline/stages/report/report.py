@@ -47,8 +47,6 @@ from pchem_pipeline.stages.table import pipeline
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.discrepancy.quick.checks import QuickLook
-    from pchem_pipeline.report.figures.figure import Figure
     from pchem_pipeline.report.pages.pictures import DrawAll
     from pchem_pipeline.report.settings import ReportSettings
     from pchem_pipeline.run.sensor import SensorInfo
@@ -161,25 +159,21 @@ def gather(
     """
     threads = drawing_workers(None, config.compute)
     run = read_run(store, threads)
-    # two ways of about the same length: the sums, then figures and tables; the pixels, then the inspector
+    # two ways of about the same length: single pixels and packed maps, the quick look and figures and tables
     pixels = hand(functools.partial(_of_pixels, store, run, config))
+    sums = read_sums(store)
+    stability = hand(functools.partial(stability_figures, sums))
     inspector = hand(lambda: _inspector(store, run, pixels(), max(1, threads - 1)))
-    look, stability = _of_sums(store, run)
+    look = run_quick_look(store, run, sums)
     return replace(
         report_data(run, config, integration_time, stages),
         pixels=pixels().fits,
         inspector=inspector,
         quick_look=look,
-        stability=stability,
+        stability=stability(),
         # what a single command was given is no setting of the run
         config_yaml=store.config_text() or dump_config(config),
     )
-
-
-def _of_sums(store: RunStore, run: StoredRun) -> tuple[QuickLook | None, list[Figure]]:
-    """Return what the sums over the frames say; they are as large as several maps, and freed."""
-    sums = read_sums(store)
-    return run_quick_look(store, run, sums), stability_figures(sums)
 
 
 @dataclass(frozen=True)
