@@ -108,15 +108,19 @@ class Beside(Protocol):
 
 @contextlib.contextmanager
 def beside(threads: int) -> Iterator[Beside]:
-    """Have tasks that share the memory done by another thread, one after the other; wait for all at the end.
+    """Have tasks that share the memory done by another thread, one after the other.
 
-    Of a single thread each is done when its result is first asked for.
+    Of a single thread each is done when its result is first asked for. What is not begun at the end, which
+    may be an error, is not done.
     """
     if threads <= 1:
         yield functools.cache
         return
-    with ThreadPoolExecutor(1, thread_name_prefix="beside") as pool:
+    pool = ThreadPoolExecutor(1, thread_name_prefix="beside")
+    try:
         yield lambda task: pool.submit(task).result
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 class SerialExecutor:

@@ -2,6 +2,7 @@ import contextlib
 import os
 import socket
 import threading
+import time
 
 import pytest
 
@@ -143,6 +144,24 @@ def test_a_task_beside_is_done_once_and_before_those_behind_it(threads):
             none()
     here = threads == 1
     assert sorted(done) == [(0, here), (2, here), (4, here)]
+
+
+def test_after_an_error_nothing_more_is_begun_beside():
+    done, ready, ended = [], threading.Event(), threading.Event()
+
+    def first():
+        deadline = time.monotonic() + 30
+        while not second.__self__.cancelled() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        ended.set()
+
+    with contextlib.suppress(ZeroDivisionError), beside(2) as hand:
+        hand(lambda: ready.wait(30) and first())
+        second = hand(lambda: done.append(1))
+        ready.set()
+        reciprocal(0)
+    assert ended.is_set()  # what was begun is waited for
+    assert done == []
 
 
 def test_a_single_thread_does_nothing_that_nobody_asks_for():
