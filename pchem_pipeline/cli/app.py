@@ -19,7 +19,17 @@ from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import ExitCode, PchEmError
 from pchem_pipeline.cli.apply import apply
 from pchem_pipeline.cli.methods import methods
-from pchem_pipeline.cli.options import Progress, Quiet, Strict, Target, Workers, region_of, takes_command
+from pchem_pipeline.cli.options import (
+    Output,
+    Progress,
+    Quiet,
+    Strict,
+    Target,
+    Workers,
+    on_this_machine,
+    region_of,
+    takes_command,
+)
 from pchem_pipeline.cli.plan import plan
 from pchem_pipeline.cli.twin import twin
 from pchem_pipeline.stages.table import STAGES, pipeline, pipeline_of
@@ -53,7 +63,9 @@ def _stage_command(name: str, summary: str) -> None:
 
 @app.command()
 def init(
-    path: Annotated[Path, typer.Argument(help="YAML file to write")] = Path("config.yaml"),
+    path: Annotated[Path, typer.Argument(help="YAML file to write", callback=on_this_machine)] = Path(
+        "config.yaml"
+    ),
     files: Annotated[list[str] | None, typer.Argument(help="camera files, globs or folders")] = None,
     simulated: Annotated[bool, typer.Option("--simulated", help="include a simulated camera")] = False,
     schema: Annotated[
@@ -270,7 +282,7 @@ def model(
 @app.command()
 def export(
     target: Target,
-    output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("export"),
+    output: Output = Path("export"),
     formats: Annotated[
         str,
         typer.Option(
@@ -288,7 +300,7 @@ def export(
 @app.command()
 def figures(
     target: Target,
-    output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("figures"),
+    output: Output = Path("figures"),
     formats: Annotated[str, typer.Option("--format", help="pdf, svg and png, separated by commas")] = "pdf",
     width: Annotated[
         str | None, typer.Option(help="width such as 88mm, 18cm or 3.5in [default: each figure's own]")
@@ -338,7 +350,7 @@ def view(
 @app.command()
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="two runs or more; the first is the reference")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("compare"),
+    output: Output = Path("compare"),
     tolerance: Annotated[
         float, typer.Option(help="same frames: relative difference that counts as rounding")
     ] = 1e-12,
@@ -382,7 +394,7 @@ def compare(
 
 @app.command()
 def demo(
-    output: Annotated[Path, typer.Option("--output", "-o", help="folder to write to")] = Path("pchem-demo"),
+    output: Output = Path("pchem-demo"),
     size: Annotated[int, typer.Option(min=8, help="rows and columns of the simulated sensor")] = 64,
     frames: Annotated[int, typer.Option(min=16, help="number of frames")] = 4000,
     seed: Annotated[

@@ -16,11 +16,20 @@ from pchem_pipeline.base.errors import ConfigError
 if TYPE_CHECKING:
     from pchem_pipeline.runner.session import Command
 
+
+def on_this_machine(path: Path | None) -> Path | None:
+    """Return a path that a command writes to, as typer's callback; a URL is refused."""
+    from pchem_pipeline.store.remote_path import local_path
+
+    return None if path is None else local_path(path)
+
+
 Target = Annotated[Path, typer.Argument(help="a config.yaml, or the store of a run (run.zarr)")]
 Workers = Annotated[int | None, typer.Option(min=1, help="number of workers [default: compute.workers]")]
 Progress = Annotated[
     Literal["auto", "on", "off"], typer.Option(help="progress bars; auto: only on a terminal")
 ]
+Output = Annotated[Path, typer.Option("--output", "-o", help="folder to write to", callback=on_this_machine)]
 Strict = Annotated[
     bool, typer.Option("--strict", help="exit code 3 where the report says not to believe its results")
 ]
@@ -68,7 +77,10 @@ _COMMON: tuple[tuple[str, Any, Any], ...] = (
     ),
     (
         "log_json",
-        Annotated[Path | None, typer.Option(help="append JSON lines about the run to this file")],
+        Annotated[
+            Path | None,
+            typer.Option(help="append JSON lines about the run to this file", callback=on_this_machine),
+        ],
         None,
     ),
     ("progress", Progress, "auto"),

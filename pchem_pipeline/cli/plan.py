@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from pchem_pipeline.cli.options import on_this_machine
+
 
 def plan(
     run: Annotated[
@@ -33,9 +35,14 @@ def plan(
     pixels: Annotated[int, typer.Option(min=10, help="simulated pixels of --verify")] = 1000,
     seed: Annotated[int, typer.Option(min=0, help="root of the random numbers of --verify")] = 1,
     figure: Annotated[
-        Path | None, typer.Option(help="draw frames over exposure and read noise: .svg, .png or .pdf")
+        Path | None,
+        typer.Option(
+            help="draw frames over exposure and read noise: .svg, .png or .pdf", callback=on_this_machine
+        ),
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="write the numbers to this file")] = None,
+    json: Annotated[
+        Path | None, typer.Option(help="write the numbers to this file", callback=on_this_machine)
+    ] = None,
 ) -> None:
     """Tell how many frames are enough.
 

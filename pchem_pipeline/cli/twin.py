@@ -9,12 +9,15 @@ from typing import Annotated
 import typer
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.cli.options import Target
+from pchem_pipeline.cli.options import Target, on_this_machine
 
 
 def twin(
     target: Target,
-    output: Annotated[Path, typer.Option("--output", "-o", help="YAML to write; maps go beside it")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="YAML to write; maps go beside it", callback=on_this_machine),
+    ],
     scene: Annotated[
         str | None,
         typer.Option(

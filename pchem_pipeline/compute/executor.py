@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import multiprocessing
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor as Pool
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -94,6 +96,31 @@ def call_all(tasks: Sequence[Callable[[], T]], threads: int) -> list[T]:
     with ThreadPoolExecutor(min(threads, len(tasks)), thread_name_prefix="share") as pool:
         futures = [pool.submit(task) for task in tasks]
     return [future.result() for future in futures]
+
+
+class Beside(Protocol):
+    """Takes a task; what it returns gives the task's result, however often it is asked."""
+
+    def __call__(self, task: Callable[[], T], /) -> Callable[[], T]:
+        """See above."""
+        ...
+
+
+@contextlib.contextmanager
+def beside(threads: int) -> Iterator[Beside]:
+    """Have tasks that share the memory done by another thread, one after the other.
+
+    Of a single thread each is done when its result is first asked for. What is not begun at the end, which
+    may be an error, is not done.
+    """
+    if threads <= 1:
+        yield functools.cache
+        return
+    pool = ThreadPoolExecutor(1, thread_name_prefix="beside")
+    try:
+        yield lambda task: pool.submit(task).result
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 class SerialExecutor:

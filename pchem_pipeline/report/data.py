@@ -6,7 +6,7 @@ does not have is empty here, and ``missing`` says why in words for the reader.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -22,11 +22,11 @@ from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.model.maps.ordered import Ordered, median_of
-from pchem_pipeline.report.inspector.inspector_data import InspectorData
 from pchem_pipeline.report.settings import Criteria
 
 if TYPE_CHECKING:
     from pchem_pipeline.report.figures.figure import Figure
+    from pchem_pipeline.report.inspector.inspector_data import InspectorData
 
 FloatArray = NDArray[np.float64]
 
@@ -188,7 +188,7 @@ class ReportData:
         discrepancy: what the model is missing, or None where nobody looked.
         quick_look: checks of rows, columns, frames, neighbours, lags and codes; None without a fit.
         stability: figures of frames, rows and columns, made of sums as large as several maps; may be empty.
-        inspector: maps and pixels to look at in the browser, or None.
+        inspector: returns maps and pixels to look at in the browser, which are asked for last; or None.
         methods: content of ``methods.json``, or None where nobody compared.
         plan: frames that precisions need, or None where no pixel has a value.
         samples: the exposures of a run whose input is several samples, or None.
@@ -227,7 +227,7 @@ class ReportData:
     discrepancy: DiscrepancyData | None = None
     quick_look: QuickLook | None = None
     stability: Sequence[Figure] = ()
-    inspector: InspectorData | None = None
+    inspector: Callable[[], InspectorData] | None = None
     methods: Mapping[str, Any] | None = None
     plan: Mapping[str, Any] | None = None
     samples: Samples | None = None
@@ -321,13 +321,10 @@ class ReportData:
             with_flagged: of all pixels with a value; else flagged ones are left out.
         """
         if (name, with_flagged) not in self._summaries:
-            known = self.ordered(name)
-            self._summaries[name, True] = self._summarised(known)
-            self._summaries[name, False] = (
-                self._summarised(known.without(self.maps[name][self.flagged]))
-                if self.any_flagged
-                else self._summaries[name, True]
-            )
+            self._summaries[name, True] = self._summaries[name, False] = self._summarised(self.ordered(name))
+            if self.any_flagged:
+                known = Ordered.of(self.maps[name], self.flagged)
+                self._summaries[name, False] = self._summarised(known)
         return self._summaries[name, with_flagged]
 
     def _summarised(self, known: Ordered) -> MapSummary:

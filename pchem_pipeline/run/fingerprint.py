@@ -90,6 +90,8 @@ def status(stage: Stage, context: StageContext) -> StageState:
 
 def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) -> tuple[str, str]:
     """Return the state of a stage that was begun, and why."""
+    if stage.upstream and "sensor" not in context.store.attributes("frames"):
+        return "stale", "the run has no input"  # ingest was killed while it was done again
     content = fingerprint_content(stage, context)
     before = present_content(context.store, record.content)
     same = fingerprint_of(content) in (record.fingerprint, fingerprint_of(before))

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.registry import EffectList
 from pchem_pipeline.simulate.distributions import Distribution, LogNormal, Normal
 from pchem_pipeline.simulate.patterns import ColumnPattern
+from pchem_pipeline.store.remote_path import local_path
 
 ParameterName = Literal[
     "quanta_exposure", "dark_current", "conversion_gain", "dn_per_electron", "bias", "analog_read_noise_e"
@@ -181,7 +182,9 @@ class SimulateSettings(Section):
     format: Literal["tiff", "fits", "hdf5", "npy", "raw", "zarr"] = Field(
         default="tiff", description="file format of the frames: tiff, fits, hdf5, npy, raw, zarr"
     )
-    output: Path = Field(default=Path("frames"), description="folder for the frames and truth.npz")
+    output: Annotated[Path, AfterValidator(local_path)] = Field(
+        default=Path("frames"), description="folder for the frames and truth.npz"
+    )
     frames_per_file: int | None = Field(
         default=None, ge=1, description="frames in one file; null: all in one file"
     )

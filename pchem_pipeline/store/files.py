@@ -177,6 +177,21 @@ def sync_folder(path: Path) -> None:
         raise storage_error(error, path) from error
 
 
+def link_out_of(folder: Path) -> Path | None:
+    """Return a link in a folder, or below it, that leads out of it; None where there is none."""
+    home, folders = folder.resolve(), [os.fspath(folder)]
+    while folders:
+        # another process may be removing what is listed
+        with contextlib.suppress(OSError), os.scandir(folders.pop()) as entries:
+            for entry in entries:
+                if entry.is_symlink():
+                    if home not in Path(entry.path).resolve().parents:
+                        return Path(entry.path).relative_to(folder)
+                elif entry.is_dir(follow_symlinks=False):
+                    folders.append(entry.path)
+    return None
+
+
 def canonical_json(value: Any) -> bytes:
     """Return the one JSON text of a value: sorted keys, no spaces, no NaN."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()

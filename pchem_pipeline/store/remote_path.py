@@ -60,6 +60,20 @@ def place_of(path: Path | str, base_dir: Path | None = None) -> Path:
     return Path(path) if base_dir is None else base_dir / path
 
 
+def local_path(path: Path) -> Path:
+    """Return a path to which this machine alone can write: a URL would be one of its folders, called s3:.
+
+    Raises:
+        ConfigError: it is a URL.
+    """
+    place = place_of(path)
+    if isinstance(place, RemotePath):
+        raise ConfigError(
+            f"{place}: only stores can lie in an object storage; give a path of this machine to copy from"
+        )
+    return place
+
+
 def _asked(method: F) -> F:
     """Turn errors of the storage into FileNotFoundError, or into one line with the cure."""
 

@@ -16,6 +16,7 @@ machines, beside one of this machine in the user's cache.
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import shutil
@@ -32,7 +33,14 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import LockedError, PchEmError, StoreError, quoted
 from pchem_pipeline.base.variables import variable_at
 from pchem_pipeline.store import disk
-from pchem_pipeline.store.files import is_blank, remove_file, remove_folder, storage_error, write_atomic
+from pchem_pipeline.store.files import (
+    is_blank,
+    link_out_of,
+    remove_file,
+    remove_folder,
+    storage_error,
+    write_atomic,
+)
 from pchem_pipeline.store.lease import check_lease, leased
 from pchem_pipeline.store.records import Records
 from pchem_pipeline.store.remote_path import RemotePath, lock_folder, place_of, refused
@@ -104,6 +112,7 @@ class RunStore:
             raise StoreError(
                 f"there is no run at {path}; make one with: pchem run FILES --store {quoted(path)}"
             )
+        _refuse_links(path)
         try:
             with _one_line(path, path):
                 root = zarr.open_group(zarr_store(path, writable=writable), mode="r+" if writable else "r")
@@ -394,6 +403,16 @@ class RunStore:
             raise StoreError(
                 f"{where} cannot be read ({error}); redo that stage with --force, or those tiles with --tiles"
             ) from error
+
+
+@functools.lru_cache(maxsize=64)  # once in a process: it takes 20 ms in the largest stores
+def _refuse_links(path: Path) -> None:
+    """Raise StoreError where a link leads out of a store: to files that are to be read, or to be replaced."""
+    if not isinstance(path, RemotePath) and (link := link_out_of(path)) is not None:
+        raise StoreError(
+            f"{path}: {link} is a link out of the store, which this program never makes; put the files that "
+            "it leads to in its place"
+        )
 
 
 def _remove_blank(path: Path) -> None:

@@ -85,7 +85,7 @@ def make_page(size: int) -> str:
         "bench",
         (size, size),
         maps=maps,
-        inspector=InspectorData(tuple(entries), sample, "a quarter", "pchem view"),
+        inspector=lambda: InspectorData(tuple(entries), sample, "a quarter", "pchem view"),
     )
     dot = Drawn(DOT, 9, 9)
     settings = ReportSettings(figure_formats=())

@@ -121,7 +121,9 @@ def fail_once(bench: Bench, work: Work, total: int, rng: random.Random) -> tuple
     return f"{errno.errorcode[number]} at {at} of {total}, code {code}", "" if proper else f"{code}: {words}"
 
 
-def cut_power(bench: Bench, log: list[Any], files: dict[Path, bytes], rng: random.Random) -> tuple[str, str]:
+def cut_power(
+    bench: Bench, log: list[Any], files: dict[Path, bytes], times: dict[Path, int], rng: random.Random
+) -> tuple[str, str]:
     """Leave the disk as a power cut does; return what was done."""
     end = rng.randrange(len(log) + 1)
     forgetful = ForgetfulDisk.__new__(ForgetfulDisk)
@@ -129,6 +131,9 @@ def cut_power(bench: Bench, log: list[Any], files: dict[Path, bytes], rng: rando
     left = forgetful.after_power_cut(end, np.random.default_rng(rng.randrange(1 << 30)), before=files)
     shutil.rmtree(bench.case)
     materialised(left, bench.case, bench.case)
+    for path, time in times.items():  # by which camera files are known
+        if path.exists():
+            os.utime(path, ns=(time, time))
     return f"power cut at {end} of {len(log)}", ""
 
 
@@ -160,13 +165,14 @@ def main() -> int:
         total = failed(bench, work, None, 0)[0]
         bench.begin(work)
         files = {path: path.read_bytes() for path in bench.case.rglob("*") if path.is_file()}
+        times = {path: path.stat().st_mtime_ns for path in files}
         log = logged(bench, work)
         print(f"{work.name}: {total} operations, {len(expected)} results", flush=True)
         for case in range(options.cases * i // len(works), options.cases * (i + 1) // len(works)):
             if case % 2:
                 what, words = fail_once(bench, work, total, rng)
             else:
-                what, words = cut_power(bench, log, files, rng)
+                what, words = cut_power(bench, log, files, times, rng)
             words += gone_on(bench, work, expected)
             outcomes[f"{work.name}, {'write' if case % 2 else 'power'}"] += 1
             if words:

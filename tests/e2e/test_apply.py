@@ -154,6 +154,10 @@ def test_nothing_is_overwritten_without_force(lab):
         given = ["--output", "mine", "--format", kind, "--force"]
         assert lab("apply", "run.zarr", "night.tif", *given).code == 2
     assert (lab.folder / "mine" / "notes.txt").read_text() == "keep"
+    far = lab("apply", "run.zarr", "night.tif", "--output", "s3://lab/far", "--format", "tiff")
+    assert far.code == 2
+    assert "s3://lab/far: only stores can lie in an object storage" in far.last
+    assert not (lab.folder / "s3:").exists()
 
 
 def test_electrons_start_without_compiled_loops(night, tmp_path):

@@ -179,6 +179,7 @@ def test_a_report_in_a_store_on_s3_begun_from_files(cloud, server, frames, finis
     store = fetched(server, tmp_path / "fetched")
     assert_same(store, finished, ("frames", "histogram"))
     assert 'id="figure-ensemble"' in (store / "report.html").read_text()
+    assert not [path for path in store.rglob("*") if path.is_file() and SECRET in path.read_bytes()]
 
 
 def test_a_store_on_s3_is_locked_on_this_machine(cloud, frames, monkeypatch):

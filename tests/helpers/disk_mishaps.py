@@ -44,7 +44,8 @@ class ForgetfulDisk:
             monkeypatch.setattr(disk, name, self._noted(name, getattr(disk, name)))
 
     def _noted(self, name, operation):
-        def call(*arguments):
+        def call(*given):
+            arguments = [each.absolute() if isinstance(each, Path) else each for each in given]
             entry = (name, *arguments)
             if name == "make_folder":
                 above = [arguments[0], *arguments[0].parents]

@@ -62,7 +62,7 @@ def inspector_of(
 def inspected(store: RunStore, data: ReportData) -> ReportData:
     """Return the same report with its inspector."""
     inspector = inspector_of(store, data.maps, data.fit, [(0, 0)])
-    return replace(data, inspector=inspector, pixels=data.pixels[:1])
+    return replace(data, inspector=lambda: inspector, pixels=data.pixels[:1])
 
 
 def page_without_pictures(data: ReportData) -> str:

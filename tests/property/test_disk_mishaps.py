@@ -150,6 +150,17 @@ def test_a_power_cut_at_any_moment(tmp_path, monkeypatch, before, step):
         assert_same(found, expected)
 
 
+def test_a_power_cut_knows_files_by_their_whole_paths(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as patch:
+        forgetful = ForgetfulDisk(patch)
+        disk.put(Path("out.zarr/a"), b"x", sync=True)
+        disk.sync_folder(Path("out.zarr"))
+        disk.sync_folder(tmp_path)
+    left = forgetful.after_power_cut(len(forgetful.log), np.random.default_rng(1))
+    assert left == {tmp_path / "out.zarr" / "a": b"x"}
+
+
 def test_the_power_cut_would_be_seen(tmp_path, monkeypatch):
     """With a disk that does not keep what it was told to keep, the same test fails."""
     old = tmp_path / "run.zarr"

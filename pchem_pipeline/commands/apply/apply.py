@@ -45,7 +45,7 @@ from pchem_pipeline.run.signals import stop_on_signals
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.session import Command, with_overrides
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
-from pchem_pipeline.store.remote_path import place_of
+from pchem_pipeline.store.remote_path import local_path, place_of
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
 from pchem_pipeline.use.common_modes import CommonModes, scene_of
@@ -97,7 +97,7 @@ def apply_to_frames(
         stack.callback(reporter.close)
         stack.enter_context(announced(reporter, STAGE, target.config.compute.max_memory))
         made = _make_job(run, target, files, wanted)
-        output = place_of(output)
+        output = place_of(output) if wanted.format == "zarr" else local_path(output)
         place = output if wanted.format == "zarr" else output.with_name(f".{output.name}.unfinished.zarr")
         if wanted.format != "zarr" and _is_done(output, made.content, command):
             reporter.info(f"apply: {output} is up to date")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -19,7 +18,7 @@ from pchem_pipeline.frames.identity import file_size
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
-from pchem_pipeline.store.files import whole_file
+from pchem_pipeline.store.files import link_out_of, whole_file
 
 
 class ZarrReader(FrameReader):
@@ -50,7 +49,8 @@ class ZarrReader(FrameReader):
 
         from pchem_pipeline.store.zarr_store import foreign_codecs
 
-        _check_links(path)
+        if link := link_out_of(path):
+            raise InputError(f"{path}: {link} is a link out of the store; copy its files into it")
         node = zarr.open(path, mode="r")
         if isinstance(node, zarr.Array):
             array: Any = node
@@ -108,22 +108,6 @@ class ZarrReader(FrameReader):
             self._array = node[self._name] if self._name else node
         except Exception as error:
             raise changed(self.paths[0], "the store vanished or broke") from error
-
-
-def _check_links(path: Path) -> None:
-    """Refuse a store whose files are not in its folder.
-
-    Raises:
-        InputError: a link leads out of it.
-    """
-    home = path.resolve()
-    for folder, folders, names in os.walk(path):
-        for name in (*folders, *names):
-            part = Path(folder) / name
-            if part.is_symlink() and home not in part.resolve().parents:
-                raise InputError(
-                    f"{path}: {part.relative_to(path)} is a link out of the store; copy its files into it"
-                )
 
 
 def _full_resolution(group: Any, settings: InputSettings) -> str | None:

@@ -109,14 +109,6 @@ class Ordered:
         """Return the values from low to high, both included."""
         return Ordered(self.values[self.n_below(low) : self.size - self.n_above(high)])
 
-    def without(self, left_out: NDArray[Any]) -> Ordered:
-        """Return the others than some of these values; those of them that are not finite are passed over."""
-        gone = np.sort(left_out[np.isfinite(left_out)], axis=None)
-        # of equal values, as many as there are
-        again = np.arange(gone.size) - np.searchsorted(gone, gone, "left")
-        kept = np.delete(self.values, np.searchsorted(self.values, gone, "left") + again)
-        return Ordered(kept, self.n_missing, self.n_left_out + gone.size)
-
     def histogram(self, edges: Sequence[float] | FloatArray) -> NDArray[np.int64]:
         """Return the values in each bin; the last edge belongs to the last bin."""
         ends = np.searchsorted(self.values, edges, "left")

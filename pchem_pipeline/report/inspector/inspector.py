@@ -59,8 +59,9 @@ def embedded(data: ReportData) -> Embedded | None:
     """Return the inspector's part of the page; None where the run has nothing to inspect."""
     if data.inspector is None:
         return None
-    parts = [(name, Markup(text)) for name, text in _blobs(data.inspector)]
-    return Embedded(json_for_html(_facts(data, data.inspector)), parts, Markup(script()))
+    shown = data.inspector()
+    parts = [(name, Markup(text)) for name, text in _blobs(shown)]
+    return Embedded(json_for_html(_facts(data, shown)), parts, Markup(script()))
 
 
 def script() -> str:

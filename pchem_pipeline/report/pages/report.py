@@ -55,7 +55,9 @@ def render_report(
     )
     view = None if data.discrepancy is None else discrepancy_view(data.discrepancy, evidence)
     tables = [*result_tables(data), *method_tables(data), *emva_tables(data)]
-    inspector = embedded(data)
+    sections = page_sections(Material(data, settings, pictures, tables, view))
+    pages = {} if view is None else {DISCREPANCY_PAGE: _discrepancy_page(data, view)}
+    numbers, inspector = report_json(data), embedded(data)
     page = render_page(
         "report.html.j2",
         [*shown, *others],
@@ -63,10 +65,9 @@ def render_report(
         title=data.title,
         data=data,
         inspector=inspector,
-        sections=page_sections(Material(data, settings, pictures, tables, view)),
+        sections=sections,
     )
-    pages = {} if view is None else {DISCREPANCY_PAGE: _discrepancy_page(data, view)}
-    return RenderedReport(page, report_json(data), figures, pages)
+    return RenderedReport(page, numbers, figures, pages)
 
 
 def _discrepancy_page(data: ReportData, view: DiscrepancyView) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
-from pchem_pipeline.compute.executor import call_all
+from pchem_pipeline.compute.executor import Beside, beside
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
-from pchem_pipeline.report.data import ReportData, Sample, Samples
+from pchem_pipeline.report.data import PixelFit, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
 from pchem_pipeline.report.figures.ensemble import case_name
 from pchem_pipeline.report.figures.stability import stability_figures
-from pchem_pipeline.report.inspector.inspector_data import PixelSample
+from pchem_pipeline.report.inspector.inspector_data import InspectorData, PixelSample
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
 from pchem_pipeline.report.pages.quick_look import check_sentence
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
@@ -47,8 +47,6 @@ from pchem_pipeline.stages.table import pipeline
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.discrepancy.quick.checks import QuickLook
-    from pchem_pipeline.report.figures.figure import Figure
     from pchem_pipeline.report.pages.pictures import DrawAll
     from pchem_pipeline.report.settings import ReportSettings
     from pchem_pipeline.run.sensor import SensorInfo
@@ -108,8 +106,9 @@ def _write(
 ) -> dict[str, Any]:
     """Gather, draw and write; files of figures that this run does not have any more are removed."""
     store = open_store(path)
-    data = gather(store, config, integration_time, stages)
-    rendered = report_tile(data, config.report, draw)
+    with beside(drawing_workers(None, config.compute)) as hand:
+        data = gather(store, config, integration_time, stages, hand)
+        rendered = report_tile(data, config.report, draw)
     for name, content in rendered.figures.items():
         store.write_file(f"figures/{name}", content)
     for old in (path / "figures").glob("*.*"):
@@ -140,7 +139,11 @@ def _warnings(data: ReportData) -> list[str]:
 
 
 def gather(
-    store: RunStore, config: RunConfig, integration_time: float | None, stages: Sequence[Mapping[str, Any]]
+    store: RunStore,
+    config: RunConfig,
+    integration_time: float | None,
+    stages: Sequence[Mapping[str, Any]],
+    hand: Beside = functools.cache,
 ) -> ReportData:
     """Read all that the report shows.
 
@@ -149,72 +152,72 @@ def gather(
         config: its configuration.
         integration_time: seconds, or None.
         stages: rows of the table of stages.
+        hand: takes what can be done meanwhile: single pixels, and packing maps for the inspector.
 
     Raises:
         StoreError: maps or histograms are missing.
     """
     threads = drawing_workers(None, config.compute)
     run = read_run(store, threads)
-    shape, shown = run.sensor.shape, _shown(run, config)
-    tasks: list[Callable[[], Any]] = [
-        functools.partial(_of_sums, store, run),
-        functools.partial(_of_pixels, store, run, shown),
-    ]
-    of_sums, (full, index, histograms) = call_all(tasks, threads)
-    maps, exact = read_maps(store, shape, full.index, _at_hand(run) | of_sums.covariances, threads)
-    columns = [run.maps[name].reshape(-1)[index] for name in PARAMETERS]
-    drawn = slice(0, len(shown))
-    held, some = slice(drawn.stop, None), slice(0, drawn.stop + _SOME_MASSES)
-    masses = bin_masses([c[some] for c in columns], histograms.of(some), run.model.at(index[some]))
-    channel = run.sensor.kind == "histograms"
-    fits = pixel_fits(shown, run.maps, run.fit, histograms.of(drawn), masses[drawn], channel=channel)
-    deciding = deciding_parameters([c[held] for c in columns], run.model.at(index[held]))
-    kept = histograms.of(held)
-    sample = PixelSample(full.index, exact, kept.origin, kept.counts, deciding, masses[held], full.reasons)
+    # two ways of about the same length: single pixels and packed maps, the quick look and figures and tables
+    pixels = hand(functools.partial(_of_pixels, store, run, config))
+    sums = read_sums(store)
+    stability = hand(functools.partial(stability_figures, sums))
+    inspector = hand(lambda: _inspector(store, run, pixels(), max(1, threads - 1)))
+    look = run_quick_look(store, run, sums)
     return replace(
         report_data(run, config, integration_time, stages),
-        pixels=fits,
-        inspector=inspector_data(run.name, shape, maps, sample),
-        quick_look=of_sums.look,
-        stability=of_sums.stability,
+        pixels=pixels().fits,
+        inspector=inspector,
+        quick_look=look,
+        stability=stability(),
         # what a single command was given is no setting of the run
         config_yaml=store.config_text() or dump_config(config),
     )
 
 
 @dataclass(frozen=True)
-class _OfSums:
-    """What the sums over the frames say; they are as large as several maps, and freed.
+class _Pixels:
+    """Single pixels of the report.
 
     Attributes:
-        look: the quick look.
-        stability: figures of frames, rows and columns.
-        covariances: of samples and of neighbours, by the path of the map, (y, x).
+        fits: of those that are shown.
+        full: those that the inspector holds in full.
+        histograms: of the latter.
+        masses: of as many of the first of them, under a model with effects.
     """
 
-    look: QuickLook | None
-    stability: list[Figure]
-    covariances: Mapping[str, NDArray[np.float64]]
+    fits: list[PixelFit]
+    full: ChosenPixels
+    histograms: PixelHistograms
+    masses: list[NDArray[np.float64]]
 
 
-def _of_sums(store: RunStore, run: StoredRun) -> _OfSums:
-    """Read the sums over the frames, and return what they say."""
-    sums = read_sums(store)
-    look, stability = run_quick_look(store, run, sums), stability_figures(sums)
-    if sums is None:
-        return _OfSums(look, stability, {})
-    names = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")
-    covariances = zip(names, (sums.lag, sums.next_x, sums.next_y), strict=True)
-    return _OfSums(look, stability, {f"summary/{name}": values for name, values in covariances})
-
-
-def _of_pixels(
-    store: RunStore, run: StoredRun, shown: Sequence[Chosen]
-) -> tuple[ChosenPixels, NDArray[np.int64], PixelHistograms]:
-    """Return the pixels held in full, the places of the shown ones and of these, and their histograms."""
+def _of_pixels(store: RunStore, run: StoredRun, config: RunConfig) -> _Pixels:
+    """Choose pixels, and read their histograms."""
+    shown = _shown(run, config)
     full = choose_inspected(run.maps, run.fit, [(y, x) for _, y, x in shown], _suspects(run))
     index = np.concatenate([pixel_index(shown, run.sensor.shape), full.index])
-    return full, index, read_histograms(store, index, run.sensor.shape, run.model)
+    histograms = read_histograms(store, index, run.sensor.shape, run.model)
+    drawn, held, some = slice(0, len(shown)), slice(len(shown), None), slice(0, len(shown) + _SOME_MASSES)
+    masses = bin_masses(_parameters(run, index[some]), histograms.of(some), run.model.at(index[some]))
+    channel = run.sensor.kind == "histograms"
+    fits = pixel_fits(shown, run.maps, run.fit, histograms.of(drawn), masses[drawn], channel=channel)
+    return _Pixels(fits, full, histograms.of(held), masses[held])
+
+
+def _inspector(store: RunStore, run: StoredRun, pixels: _Pixels, threads: int) -> InspectorData:
+    """Pack maps, and the pixels that are held in full, for the inspector."""
+    index, held, shape = pixels.full.index, pixels.histograms, run.sensor.shape
+    maps, exact = read_maps(store, shape, index, _at_hand(run), threads)
+    deciding = deciding_parameters(_parameters(run, index), run.model.at(index))
+    sample = PixelSample(index, exact, held.origin, held.counts, deciding, pixels.masses, pixels.full.reasons)
+    return inspector_data(run.name, shape, maps, sample)
+
+
+def _parameters(run: StoredRun, index: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+    """Return (H, g, mu, sigma) of some pixels."""
+    return [run.maps[name].reshape(-1)[index] for name in PARAMETERS]
 
 
 def _at_hand(run: StoredRun) -> dict[str, NDArray[Any]]:

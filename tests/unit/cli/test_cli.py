@@ -193,3 +193,30 @@ def test_a_full_disk_behind_stdout_is_one_line():
     assert (
         found.stderr == "pchem: stdout cannot be written (No space left on device); check where it goes to\n"
     )
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("init", "s3://lab/run.yaml"),
+        ("export", "run.zarr", "--output", "s3://lab/x"),
+        ("figures", "run.zarr", "--output", "s3://lab/x"),
+        ("compare", "a.zarr", "b.zarr", "--output", "s3://lab/x"),
+        ("demo", "--output", "s3://lab/x"),
+        ("twin", "run.zarr", "--output", "s3://lab/twin.yaml"),
+        ("plan", "--read-noise", "0.3", "--json", "s3://lab/plan.json"),
+        ("plan", "--read-noise", "0.3", "--figure", "s3://lab/plan.svg"),
+        ("run", "run.yaml", "--log-json", "s3://lab/log.jsonl"),
+    ],
+)
+def test_what_is_written_beside_a_store_lies_on_this_machine(arguments, tmp_path, monkeypatch):
+    """As a path of this machine a URL would be a folder called s3:."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"^s3://lab/.*: only stores can lie in an object storage; give a"):
+        invoke(*arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_simulated_frames_lie_on_this_machine():
+    with pytest.raises(ConfigError, match=r"^s3://lab/frames: only stores"):
+        parse_config("simulate: {output: 's3://lab/frames'}")

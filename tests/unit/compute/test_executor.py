@@ -2,12 +2,13 @@ import contextlib
 import os
 import socket
 import threading
+import time
 
 import pytest
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
 from pchem_pipeline.compute.environment import available_workers, peak_rss_bytes
-from pchem_pipeline.compute.executor import Stop, make_executor
+from pchem_pipeline.compute.executor import Stop, beside, make_executor
 from pchem_pipeline.compute.memory import BASE_BYTES, affordable, keep_to_limit, resident_bytes
 from pchem_pipeline.compute.settings import ComputeSettings
 
@@ -125,3 +126,44 @@ def test_too_little_memory_for_the_program_is_refused():
     keep_to_limit(None)
     with pytest.raises(ConfigError, match="64 MiB are less than the"):
         keep_to_limit(64)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_task_beside_is_done_once_and_before_those_behind_it(threads):
+    done = []
+
+    def task(number):
+        done.append((number, threading.current_thread() is threading.main_thread()))
+        return reciprocal(number)
+
+    with beside(threads) as hand:
+        half, none = hand(lambda: task(2)), hand(lambda: task(0))
+        double = hand(lambda: half() * task(4))  # may ask for what was handed on before
+        assert (double(), half(), double()) == (0.125, 0.5, 0.125)
+        with pytest.raises(ZeroDivisionError):
+            none()
+    here = threads == 1
+    assert sorted(done) == [(0, here), (2, here), (4, here)]
+
+
+def test_after_an_error_nothing_more_is_begun_beside():
+    done, ready, ended = [], threading.Event(), threading.Event()
+
+    def first():
+        deadline = time.monotonic() + 30
+        while not second.__self__.cancelled() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        ended.set()
+
+    with contextlib.suppress(ZeroDivisionError), beside(2) as hand:
+        hand(lambda: ready.wait(30) and first())
+        second = hand(lambda: done.append(1))
+        ready.set()
+        reciprocal(0)
+    assert ended.is_set()  # what was begun is waited for
+    assert done == []
+
+
+def test_a_single_thread_does_nothing_that_nobody_asks_for():
+    with beside(1) as hand:
+        hand(lambda: reciprocal(0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import struct
 from pathlib import Path
@@ -165,6 +166,36 @@ def test_files_of_two_cameras_are_no_stack(tmp_path: Path) -> None:
 )
 def test_a_temperature_is_one_of_a_sensor_or_none(value: object, unit: str, found: float | None) -> None:
     assert celsius(value, unit) == (None if found is None else pytest.approx(found))
+
+
+def test_names_of_a_megabyte_in_every_format(tmp_path: Path) -> None:
+    text = "日本語 кир עברית \u202e\x1b[31m<script>" * 35_000
+    image = fits.PrimaryHDU(STACK)
+    image.header["INSTRUME"] = "Z" * 100_000
+    for _ in range(10_000):
+        image.header["COMMENT"] = "x" * 70
+    image.writeto(tmp_path / "a.fits")
+    with h5py.File(tmp_path / "a.h5", "w", libver="latest") as file:
+        file["frames"], file["camera"] = STACK, text
+        file["frames"].attrs["exposure_time"] = text
+    named = {"camera": text, "sensor_temperature": text, "exposure_time": [1] * 200_000}
+    zarr.create_array(tmp_path / "a.zarr", data=STACK, attributes=named)
+    maker = [(271, "s", 0, "Z" * 1_000_000, True)]
+    tifffile.imwrite(tmp_path / "a.tif", STACK, photometric="minisblack", extratags=maker, metadata=None)
+    for name in ("a.fits", "a.h5", "a.zarr", "a.tif"):
+        found = facts(tmp_path / name)
+        assert found.temperature is None
+        assert found.name is not None
+        assert 40 < len(found.name) <= 80, name
+        assert found.name.isprintable()
+
+
+def test_xml_that_stands_for_a_billion_letters_is_not_read(tmp_path: Path) -> None:
+    names = "abcdefghij"
+    more = "".join(f'<!ENTITY {b} "{f"&{a};" * 10}">' for a, b in itertools.pairwise(names))
+    xml = f'<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "{"a" * 10}">{more}]><OME><Image Name="&j;"/></OME>'
+    tifffile.imwrite(tmp_path / "a.tif", STACK, description=xml, metadata=None)
+    assert facts(tmp_path / "a.tif") == CameraFacts()
 
 
 def test_hostile_texts_become_one_short_line() -> None:

@@ -16,7 +16,7 @@ from pchem_pipeline.base.errors import ConfigError, InputError, PchEmError, Stor
 from pchem_pipeline.compute.cluster import _cluster_class
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
-from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore, _refuse_links
 
 
 class Trap:
@@ -106,6 +106,30 @@ def test_a_run_with_a_codec_that_is_not_ours(tmp_path: Path) -> None:
     changed(place, codecs=codecs, shape=[8, 8, 8])
     with pytest.raises(StoreError):
         RunStore.open(tmp_path / "run.zarr").read("fit/bias")
+
+
+@pytest.mark.parametrize("link", ["report.json", "fit", "fit/bias/c/0/0"])
+def test_a_run_with_a_link_out_of_it(tmp_path: Path, link: str) -> None:
+    """`pchem view` would show the file, and a stage that is done again would write into the folder."""
+    path = tmp_path / "run.zarr"
+    store = RunStore.create(path)
+    store.write_array("fit/bias", np.ones((8, 8)))
+    store.write_file("report.json", b"{}")
+    moved = tmp_path / "elsewhere"
+    (path / link).rename(moved)
+    (path / link).symlink_to(moved)
+    _refuse_links.cache_clear()  # the links of a store are looked at once in a process
+    for writable in (False, True):
+        with pytest.raises(StoreError, match=f"run.zarr: {link} is a link out of the store"):
+            RunStore.open(path, writable=writable)
+
+
+def test_a_link_to_a_run_and_one_within_it(tmp_path: Path) -> None:
+    store = RunStore.create(tmp_path / "far" / "run.zarr")
+    store.write_array("fit/bias", np.ones((8, 8)))
+    (store.path / "page.html").symlink_to("report.html")
+    (tmp_path / "run.zarr").symlink_to(store.path)
+    assert RunStore.open(tmp_path / "run.zarr").read("fit/bias").sum() == 64.0
 
 
 def test_a_cluster_that_is_none() -> None:

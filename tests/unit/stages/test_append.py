@@ -172,10 +172,22 @@ def test_more_frames_than_sixteen_bits_can_count(tmp_path):
     np.testing.assert_array_equal(counts.sum(axis=2), np.full((2, 3), 70_000))
 
 
+_APPEND = "pchem_pipeline.commands.append"
+
+
 @pytest.mark.parametrize(
-    "moment", ["before the arrays grow", "while frames are counted", "while tiles are marked"]
+    "places",
+    [
+        pytest.param([f"{_APPEND}.extend_arrays"], id="before the arrays grow"),
+        pytest.param([f"{_APPEND}.StackCounter.count"], id="while frames are counted"),
+        pytest.param([f"{_APPEND}.execute"], id="while tiles are marked"),
+        pytest.param(
+            [f"{_APPEND}.StackCounter.count", "pchem_pipeline.run.sensor.SensorInfo.write"],
+            id="and again, when the old frames are gone and all are to be taken",
+        ),
+    ],
 )
-def test_a_stopped_one_goes_on_by_the_same_command(tmp_path, monkeypatch, frames, moment):
+def test_a_stopped_one_goes_on_by_the_same_command(tmp_path, monkeypatch, frames, places):
     write(tmp_path, frames, [600])
     (tmp_path / "f1.npy").rename(tmp_path / "later")
     run = target(tmp_path, "run.zarr")
@@ -185,15 +197,13 @@ def test_a_stopped_one_goes_on_by_the_same_command(tmp_path, monkeypatch, frames
     def killed(*arguments, **named):
         raise KeyboardInterrupt
 
-    place = {
-        "before the arrays grow": "extend_arrays",
-        "while frames are counted": "StackCounter.count",
-        "while tiles are marked": "execute",
-    }[moment]
-    with monkeypatch.context() as patch:
-        patch.setattr(f"pchem_pipeline.commands.append.{place}", killed)
-        with pytest.raises(KeyboardInterrupt):
-            append_frames(run, QUIET)
+    for place in places:
+        with monkeypatch.context() as patch:
+            patch.setattr(place, killed)
+            with pytest.raises(KeyboardInterrupt):
+                append_frames(run, QUIET)
+    if len(places) > 1:
+        assert [state.why for state in run_status(run) if state.stage == "fit"] == ["the run has no input"]
     assert [state.state for state in append_frames(run, QUIET)] == ["complete", "complete"]
     assert append_frames(run, QUIET) == []
     whole = target(tmp_path, "whole.zarr")

@@ -57,13 +57,3 @@ def test_a_map_is_not_changed():
     assert Ordered.of(values, values == 3.0).median == 1.5
     assert median_of(values, values == 3.0) == 1.5
     np.testing.assert_array_equal(values, before)
-
-
-def test_values_that_come_again_are_left_out_as_often_as_they_are_given():
-    rng = np.random.default_rng(8)
-    values = rng.integers(0, 6, 200).astype(np.float64)
-    values[::17] = np.nan
-    out = rng.random(200) < 0.2
-    found, expected = Ordered.of(values).without(values[out]), Ordered.of(values, out)
-    np.testing.assert_array_equal(found.values, expected.values)
-    assert (found.n_missing, found.n_left_out) == (expected.n_missing, expected.n_left_out)

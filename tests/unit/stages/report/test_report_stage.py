@@ -11,13 +11,15 @@ import pytest
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.compute.executor import SerialExecutor
+from pchem_pipeline.compute.executor import SerialExecutor, beside
+from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.report.figures.catalogue import DISCREPANCY_FIGURES, FIGURE_NAMES
+from pchem_pipeline.report.figures.catalogue import DISCREPANCY_FIGURES, FIGURE_NAMES, report_figures
 from pchem_pipeline.report.pages.report import RenderedReport
 from pchem_pipeline.report.pages.report_json import report_numbers
 from pchem_pipeline.report.pages.summary import flags
+from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.signals import StopRequest
@@ -150,6 +152,33 @@ def test_chosen_pixels_are_shown_and_wrong_ones_refused(folder: Path) -> None:
     assert data.pixels[1].counts.sum() == FRAMES
     with pytest.raises(ConfigError, match="y = 16, x = 0 lies outside the sensor of 16 x 24"):
         execute("report", make_context(folder, {"pixels": [[16, 0]]}))
+
+
+def test_a_report_is_the_same_whoever_works_on_it(folder: Path) -> None:
+    context = make_context(folder)
+    context.store.write_config(dump_config(context.config))
+    pages = []
+    for workers in (1, 3):
+        compute = context.config.compute.model_copy(update={"workers": workers})
+        config = context.config.model_copy(update={"compute": compute})
+        with beside(workers) as hand:
+            data = gather(context.store, config, 4.87, [], hand)
+            rendered = report.report_tile(data, config.report)
+        pages.append((rendered.html, rendered.json))
+    assert 'id="inspector-app"' in pages[0][0]
+    assert [len(set(each)) for each in zip(*pages, strict=True)] == [1, 1]  # without pytest's comparison
+
+
+def test_figures_alone_pack_no_maps(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise AssertionError("packed")
+
+    monkeypatch.setattr(report, "read_maps", fail)
+    context = make_context(folder)
+    data = gather(context.store, context.config, None, [])
+    assert report_figures(data, ReportSettings())
+    with pytest.raises(AssertionError, match="packed"):
+        data.inspector()  # type: ignore[misc]
 
 
 def test_a_histogram_is_that_of_its_pixel(folder: Path) -> None:
