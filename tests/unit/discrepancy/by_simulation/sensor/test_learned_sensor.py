@@ -90,8 +90,16 @@ def test_a_poor_sensor_with_a_bent_curve_is_learnt_under_its_law():
     assert abs(np.median(off)) < 0.05
 
 
-@pytest.mark.parametrize(("threshold", "region"), [(32, None), (32, Region(columns=((0, 10),))), (18, None)])
-def test_a_sensor_is_learnt_from_corrected_samples(threshold, region):
+@pytest.mark.parametrize(
+    "effect",
+    [
+        PixelCorrection(threshold_dn=32),
+        PixelCorrection(threshold_dn=32, region=Region(columns=((0, 10),))),
+        PixelCorrection(threshold_dn=28, share=0.6, predictor="mean"),
+        PixelCorrection(threshold_dn=18),
+    ],
+)
+def test_a_sensor_is_learnt_from_corrected_samples(effect):
     """A camera replaces samples by the median of their neighbours: plain fits take that for less light.
 
     From 1.5 electrons above it on most plain fits are ambiguous, and cumulants of all pixels no start.
@@ -100,9 +108,8 @@ def test_a_sensor_is_learnt_from_corrected_samples(threshold, region):
     exposure, step, bias, noise = camera.maps(np.random.default_rng(6))
     truth = np.stack([np.log(exposure), np.log(step), bias, 2 * np.log(noise * step)], axis=-1)
     before, numbers = camera.frames(6), np.arange(1500)
-    effect = PixelCorrection(threshold_dn=threshold, region=region)
     inside = np.zeros((20, 20), bool)
-    inside[1:-1, 1 : -1 if region is None else 10] = True
+    inside[1:-1, 1 : -1 if effect.region is None else 10] = True
     frames = np.where(inside, effect.apply(before, context_of((20, 20), 1500)), before)
     seen = observe(frames, numbers, n_run=1500, block_frames=50)
     fit = Refit(seen.maps, {}, seen.covariance)
