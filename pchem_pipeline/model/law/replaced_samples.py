@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-_APART = 1 << 40  # DN: farther than any two codes
-
 
 @dataclass(frozen=True)
 class ReplacedSamples:
@@ -51,16 +49,11 @@ class ReplacedSamples:
             n_codes: number of codes.
         """
         n_frames, n = values.shape
-        rows = _APART * np.arange(n)[:, None]
-        known = (np.sort(values.T.astype(np.int64), axis=1) + rows).ravel()
-        codes = first.astype(np.int64)[:, None] + np.arange(n_codes)
-
-        def below(limit: NDArray[np.int64]) -> FloatArray:
-            before = np.searchsorted(known, (limit + rows).ravel()).reshape(limit.shape)
-            return np.asarray((before - n_frames * np.arange(n)[:, None]) / n_frames)
-
-        s = share[:, None]
-        stays, comes = 1.0 - s * below(codes - excess[:, None]), s * (below(codes + 1) - below(codes))
+        stays, comes = np.empty((n, n_codes)), np.empty((n, n_codes))
+        for i, (own, t, s) in enumerate(zip(values.T, excess, share, strict=True)):
+            codes = first[i] + np.arange(n_codes)
+            below, to, beyond = np.searchsorted(np.sort(own), [codes - t, codes, codes + 1]) / n_frames
+            stays[i], comes[i] = 1.0 - s * below, s * (beyond - to)
         # no sample lies beyond the codes
         return cls(stays, comes, np.minimum(excess, n_codes))
 
