@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.added_exposure import AddedExposure
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.effects.framework.replacement import Replacement
     from pchem_pipeline.effects.framework.shared_offset import SharedOffset
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -280,6 +281,16 @@ class Effect(Section):
         Of these no pixel's own histogram has a law: the search fits it without lines that are likely such.
         """
         return {}
+
+    def replacement(self, frames: NDArray[np.unsignedinteger]) -> Replacement | None:
+        """Return the rule by which it replaces samples by others of their frame; None where it does not.
+
+        The law of a pixel then depends on others: the search learns the sensor by what stands in for each.
+
+        Args:
+            frames: codes (frame, y, x), DN, before any is replaced.
+        """
+        return None
 
     def added_scatter_e(self, exposure: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return the scatter that it adds to electron numbers, e- rms, where that is its size.

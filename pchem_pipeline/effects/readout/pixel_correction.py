@@ -16,6 +16,7 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.prediction import PREDICTORS, Predictor, predicted
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.replacement import Replacement
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -35,8 +36,9 @@ class PixelCorrection(Effect):
 
     Signature: samples equal what their neighbours predict more often than what those of the next frame do,
     and exceed it less often; the upper tail of a pixel is cut, the more so the darker its neighbours. A
-    pixel's own histogram has no law of its own, since the cut is where the neighbours put it: the pixels keep
-    the parameters of their corrected samples.
+    pixel's own histogram has no law of its own, since the cut is where the neighbours put it: the search
+    learns the sensor by what those predict (:meth:`replacement`), and in a fit the pixels keep the parameters
+    of their corrected samples.
     """
 
     tag: Literal["pixel_correction"] = Field(default="pixel_correction", description="name of the effect")
@@ -69,16 +71,19 @@ class PixelCorrection(Effect):
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the digital numbers (frame, y, x), DN, corrected; those at the border stay as they are."""
-        result: NDArray[Any] = values.copy()
-        if min(values.shape[1:]) < 3:
-            return result
-        inside = result[:, 1:-1, 1:-1]
-        prediction = predicted(values, self.predictor)
-        replaced = inside.astype(np.int64) - prediction > self.threshold_dn
+        rule = self.replacement(values)
+        replaced = (values - rule.value > rule.excess) & rule.inside
         if self.share < 1.0:
-            replaced &= context.random.uniform(("frame", "y", "x"))[:, 1:-1, 1:-1] < self.share
-        inside[replaced] = prediction[replaced]
-        return result
+            replaced &= context.random.uniform(("frame", "y", "x")) < self.share
+        return np.where(replaced, rule.value, values).astype(values.dtype)
+
+    def replacement(self, frames: NDArray[Any]) -> Replacement:
+        """Return the rule: what the neighbours predict, inside the border."""
+        value, inside = frames.astype(np.int32), np.zeros(frames.shape[1:], np.bool_)
+        if min(inside.shape) >= 3:
+            value[:, 1:-1, 1:-1] = predicted(frames, self.predictor)
+            inside[1:-1, 1:-1] = True
+        return Replacement(value, inside, self.threshold_dn, self.share)
 
     @classmethod
     def typical(cls) -> Sequence[Self]:

@@ -9,6 +9,7 @@ from pchem_pipeline.model.law import mass_numba
 from pchem_pipeline.model.law.cells_numba import EXACT, NEAR
 from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
 from pchem_pipeline.model.law.parameters import Parameters, columns_of
+from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
@@ -110,7 +111,11 @@ def sample_slopes(
 
 
 def sample_parabolas(
-    model: SampleLaw, maps: Parameters, counts: NDArray[np.integer], origin: NDArray[np.integer]
+    model: SampleLaw,
+    maps: Parameters,
+    counts: NDArray[np.integer],
+    origin: NDArray[np.integer],
+    replaced: ReplacedSamples | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return log-likelihood, its slopes and Fisher's information of every pixel, NaN without parameters.
 
@@ -119,6 +124,7 @@ def sample_parabolas(
         maps: (H, g, mu, sigma) of n pixels.
         counts: histograms, shape (n, B), any unsigned type.
         origin: DN of bin 0, shape (n,).
+        replaced: what becomes of the samples, at the codes of the histograms; None: nothing.
 
     Returns:
         Nats, shape (n,), samples of less than 1e-50 as of that; slopes in log H, 1/g, mu and log sigma_R^2,
@@ -128,5 +134,7 @@ def sample_parabolas(
     n = counts.shape[0]
     value, score, information = np.full(n, np.nan), np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
     first = np.ascontiguousarray(origin, np.int64)
-    mass_numba.parabola_tile(counts, first, columns, pack([model], n), value, score, information)
+    none = np.empty((0, counts.shape[1]))
+    rule = (none, none, np.empty(0, np.int64)) if replaced is None else replaced.arrays
+    mass_numba.parabola_tile(counts, first, columns, pack([model], n), *rule, value, score, information)
     return value, score, information

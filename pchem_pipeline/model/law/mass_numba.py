@@ -152,12 +152,34 @@ def mass_tile(
                 slopes[index, j, i] = scratch.cells[0, SLOPES + j, i]
 
 
+@kernel(borrows=True)
+def replace_some(stays: FloatArray, comes: FloatArray, excess: int, total: float, values: FloatArray) -> None:
+    """Turn the mass of successive codes, or a slope of it, into that of the codes that come out.
+
+    Args:
+        stays: chance that a sample of each code stays, shape (B,).
+        comes: chance that what replaces others is that code, shape (B,).
+        excess: by how much a sample must exceed that, DN.
+        total: of all codes: 1 of a mass, 0 of a slope.
+        values: in and out, at least B + excess codes.
+    """
+    below = 0.0
+    for i in range(excess):
+        below += values[i]
+    for i in range(stays.size):
+        below += values[i + excess]
+        values[i] = stays[i] * values[i] + comes[i] * (total - below)
+
+
 @kernel
 def parabola_tile(
     counts: NDArray[np.generic],
     first: NDArray[np.int64],
     parameters: FloatArray,
     law: Law,
+    stays: FloatArray,
+    comes: FloatArray,
+    excess: NDArray[np.int64],
     value: FloatArray,
     score: FloatArray,
     information: FloatArray,
@@ -169,14 +191,20 @@ def parabola_tile(
         first: DN of bin 0, shape (n,).
         parameters: (H, g, mu, sigma), shape (n, 4).
         law: of the samples.
+        stays: of :class:`.replaced_samples.ReplacedSamples`, shape (n, B), or (0, B) where none is replaced.
+        comes: likewise.
+        excess: likewise, shape (n,) or (0,).
         value: out, log-likelihood down to masses of 1e-50, nats, shape (n,); comes as NaN.
         score: out, its slopes in log H, 1/g, mu and log sigma_R^2, shape (n, 4); comes as NaN.
         information: out, Fisher's, of as many samples, in the same, shape (n, 4, 4); comes as NaN.
     """
     n_bins, size = counts.shape[1], N_BLOCK - 1
-    room, scratch = pixel_scratch(n_bins, law)
+    more = 0
+    for index in range(excess.size):
+        more = max(more, excess[index])
+    room, scratch = pixel_scratch(n_bins + more, law)
     theta, weights, cell = scratch.small[OWN], room.bins[0, WEIGHT], scratch.cells[0]
-    room.facts[0, N_BINS], room.facts[0, FIRST] = float(n_bins), 0.0
+    room.facts[0, N_BINS], room.facts[0, FIRST] = float(n_bins + more), 0.0
     for index in range(parameters.shape[0]):
         if not known_theta(parameters[index], first[index], 0.0, theta):
             continue
@@ -194,6 +222,10 @@ def parabola_tile(
                 lowest = min(lowest, cell[MASS, i])
         if lowest < _FAR:
             fill_masses(theta, cells, NEAR, np.int64(DERIVATIVES), scratch.numbers, scratch.edges, cell)
+        if excess.size > 0:
+            replace_some(stays[index], comes[index], excess[index], 1.0, cell[MASS])
+            for a in range(size):
+                replace_some(stays[index], comes[index], excess[index], 0.0, cell[SLOPES + a])
         value[index] = 0.0
         score[index] = 0.0
         information[index] = 0.0

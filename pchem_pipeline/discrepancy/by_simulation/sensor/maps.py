@@ -27,6 +27,7 @@ from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
@@ -247,8 +248,8 @@ class Sensor:
     def corrected(self, wanted: PixelMaps, simulated: PixelMaps) -> Sensor:
         """Return sensors of which plain fits come out as wanted, given those of one that was simulated.
 
-        An effect of which the law knows only a part (what a neighbour adds, a sample that is replaced) is in
-        the fitted parameters, mostly the read noise, and simulated on top would be there twice.
+        An effect of which the law knows only a part (what a neighbour adds) is in the fitted parameters,
+        mostly the read noise, and simulated on top would be there twice.
 
         Args:
             wanted: plain fits of the data.
@@ -276,6 +277,7 @@ def learn_sensor(
     effects: Sequence[Effect],
     mistaken: float,
     lost: float | None = None,
+    before: NDArray[np.unsignedinteger] | None = None,
 ) -> Sensor:
     """Learn what the pixels' true parameters may be.
 
@@ -286,6 +288,8 @@ def learn_sensor(
         effects: of the model.
         mistaken: share of pixels whose bias may be off by an electron.
         lost: see :class:`Sensor`; None: not known yet.
+        before: frames like these before effects replaced samples of them, which tell what stands in for
+            each; None: those that were fitted, which differ little.
     """
     maps = fit.maps
     usable = maps.usable.ravel()
@@ -305,11 +309,14 @@ def learn_sensor(
         outside = (histograms.under + histograms.over).ravel()
         drawn = (counts > 0).sum(axis=1) >= _FEWEST_CODES
         drawn &= (outside <= _MOST_OUTSIDE * counts.sum(axis=1)) | usable
+        origin = histograms.origin.ravel()
+        replaced = _replaced(effects, frames if before is None else before, places, origin, counts.shape[1])
         posterior = posterior_of(
             counts[drawn],
-            histograms.origin.ravel()[drawn],
+            origin[drawn],
             parameters[drawn],
             law.of(drawn),
+            None if replaced is None else replaced.of(drawn),
             mistaken=mistaken,
         )
         if lost is None:
@@ -318,6 +325,30 @@ def learn_sensor(
     return Sensor(
         posterior.moved(np.array([0.0, 0.0, 0.0, lost])), drawn.reshape(maps.usable.shape), maps.usable, lost
     )
+
+
+def _replaced(
+    effects: Sequence[Effect],
+    before: NDArray[np.unsignedinteger],
+    places: PixelPlaces,
+    origin: NDArray[np.integer],
+    n_codes: int,
+) -> ReplacedSamples | None:
+    """Return what effects make of the samples of all pixels, at the codes of histograms; None: nothing.
+
+    Of several that replace samples of a pixel the last one counts.
+    """
+    rules = [(effect, effect.replacement(before)) for effect in effects]
+    found = [(effect, rule) for effect, rule in rules if rule is not None]
+    if not found:
+        return None
+    value = before.reshape(len(before), -1).astype(np.int32)
+    excess, share = np.zeros(value.shape[1], np.int64), np.zeros(value.shape[1])
+    for effect, rule in found:
+        inside = rule.inside.ravel() & places.inside(effect)
+        value[:, inside] = rule.value.reshape(value.shape)[:, inside]
+        excess[inside], share[inside] = rule.excess, rule.share * places.share(effect)
+    return ReplacedSamples.by(value, excess, share, origin, n_codes)
 
 
 def _law_of_all(

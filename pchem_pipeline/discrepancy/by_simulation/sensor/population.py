@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.by_simulation.sensor.population_numba import solve_parabolas
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
+from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
@@ -56,6 +57,7 @@ _MOST_NOISE = 12.0  # of 1/g over what it were without read noise
 _ITERATIONS = 30
 _MOST_DRAWN_AGAIN = 500  # pixels behind what is learnt too low
 _REACH = 7.0  # standard deviations of the samples: their histograms reach no further
+_LEAST_ELECTRONS = 0.01  # that a pixel is begun with
 _OUTLYING = 15.0  # median deviations of a cumulant beyond which a pixel is not asked
 
 
@@ -148,6 +150,7 @@ def posterior_of(
     origin: IntArray,
     parameters: FloatArray,
     law: SampleLaw | None = None,
+    replaced: ReplacedSamples | None = None,
     *,
     mistaken: float = 1.0,
     seed: int = 0,
@@ -159,10 +162,11 @@ def posterior_of(
         origin: DN of bin 0, shape (n,).
         parameters: fitted (H, g, mu, sigma), shape (n, 4), NaN where there is none.
         law: of the samples; the PCD if None.
+        replaced: what becomes of them, at the codes of the histograms; None: nothing.
         mistaken: share of pixels whose bias may be off by an electron: says what starts are worth a try.
         seed: of the choice of pixels to learn from.
     """
-    pixels = _Pixels(counts, np.asarray(origin, np.int64), law or SampleLaw())
+    pixels = _Pixels(counts, np.asarray(origin, np.int64), law or SampleLaw(), replaced)
     some = np.arange(len(counts))
     if some.size > _MOST_LEARNT_FROM:
         some = np.sort(np.random.default_rng(seed).choice(some, _MOST_LEARNT_FROM, replace=False))
@@ -170,6 +174,8 @@ def posterior_of(
     best, most = None, -np.inf
     for start, population in _beginnings(pixels, parameters, mistaken):
         starts = np.stack([_shifted(start, each) for each in shifts])
+        if replaced is not None:
+            starts = np.concatenate([starts, _usual(pixels, population)[None]])
         learnt, evidence = _learn(pixels.of(some), starts[:, some], population)
         if evidence > most:
             best, most = (starts, learnt), evidence
@@ -231,21 +237,25 @@ def posterior_of_estimates(parameters: FloatArray, covariance: FloatArray) -> Po
 
 @dataclass(frozen=True)
 class _Pixels:
-    """Histograms (n, B) with the DN of their first bin (n,), and the law of their samples."""
+    """Histograms (n, B), the DN of their first bin (n,), the law of their samples, what becomes of those."""
 
     counts: NDArray[np.integer]
     origin: IntArray
     law: SampleLaw
+    replaced: ReplacedSamples | None
 
     def of(self, some: NDArray[np.intp]) -> _Pixels:
         """Return some of them."""
-        return replace(self, counts=self.counts[some], origin=self.origin[some], law=self.law.of(some))
+        replaced = None if self.replaced is None else self.replaced.of(some)
+        return _Pixels(self.counts[some], self.origin[some], self.law.of(some), replaced)
 
     def parabolas(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return log-likelihood (n,), score (n, 4) and Fisher's information (n, 4, 4) at theta (n, 4)."""
         own = to_parameters(theta)
         columns = [np.ascontiguousarray(column) for column in own.T]
-        value, score, information = sample_parabolas(self.law, columns, self.counts, self.origin)
+        value, score, information = sample_parabolas(
+            self.law, columns, self.counts, self.origin, self.replaced
+        )
         # the second slope is in 1/g
         score[:, 1] /= own[:, 1]
         information[:, 1] /= own[:, 1, None]
@@ -301,10 +311,7 @@ class _Maxima:
 def _climb(pixels: _Pixels, theta: FloatArray, population: Population, steps: int) -> _Maxima:
     """Find the posterior maxima near theta (j, n, 4) by damped scoring steps, each pixel by itself."""
     j, n = theta.shape[:2]
-    flat = replace(
-        pixels, counts=np.tile(pixels.counts, (j, 1)), origin=np.tile(pixels.origin, j),
-        law=pixels.law.of(np.tile(np.arange(n), j)),
-    )  # fmt: skip
+    flat = pixels.of(np.tile(np.arange(n), j))
     x = _inside(theta).reshape(-1, 4)
     prior = np.linalg.inv(population.scatter)
 
@@ -424,7 +431,7 @@ def _beginnings(
     start[:, 2] = mean - np.exp(centre[0] + centre[1])
     found: list[tuple[FloatArray, Population]] = []
     resolved = mistaken <= _MANY
-    if known.any() and (resolved or not pixels.law.neutral):
+    if known.any() and (resolved or not pixels.law.neutral or pixels.replaced is not None):
         fits = np.where(known[:, None], to_theta(np.where(known[:, None], parameters, 1.0)), start)
         found.append((fits, _first_guess(fits[known])))
         if resolved:
@@ -492,6 +499,17 @@ def _first_guess(theta: FloatArray) -> Population:
     centre = np.median(theta, axis=0)
     scatter = _MAD * np.median(np.abs(theta - centre), axis=0)
     return Population(centre, np.diag(np.maximum(scatter, 5.0 * _LEAST_SCATTER) ** 2))
+
+
+def _usual(pixels: _Pixels, population: Population) -> FloatArray:
+    """Return theta (n, 4) of the usual pixel, with the exposure that the mean of each asks for.
+
+    Where many samples were replaced the fit of a pixel by itself may be electrons off.
+    """
+    theta = np.tile(population.centre, (len(pixels.counts), 1))
+    electrons = (_cumulants(pixels)[0] - theta[:, 2]) * np.exp(-theta[:, 1])
+    theta[:, 0] = np.log(np.maximum(electrons, _LEAST_ELECTRONS))
+    return theta
 
 
 def _shifted(theta: FloatArray, electrons: int) -> FloatArray:

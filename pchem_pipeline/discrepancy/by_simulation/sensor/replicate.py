@@ -95,10 +95,13 @@ class Replicate:
         """Simulate, and observe each part."""
         return tuple(evidence for _, _, evidence in self._observed())
 
+    def simulated(self) -> NDArray[np.unsignedinteger]:
+        """Return the frames of the first part, (frame, y, x), DN."""
+        return simulate_frames(self.maps, self.effects, self.seed, self.acquisition)
+
     def fitted(self) -> PixelMaps:
         """Simulate, and fit the frames of the first part, from nothing, without any effect."""
-        frames = simulate_frames(self.maps, self.effects, self.seed, self.acquisition)
-        return fitted_maps(frames, ~self.maps.usable)
+        return fitted_maps(self.simulated(), ~self.maps.usable)
 
     def _observed(self) -> Iterator[tuple[NDArray[np.unsignedinteger], NDArray[np.int64], Evidence]]:
         """Simulate; yield the frames of each part, their numbers and their evidence."""

@@ -5,6 +5,7 @@ Each is counted; a search ends at a limit of that work (:mod:`pchem_pipeline.dis
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -110,13 +111,27 @@ class Simulations:
             NotFittedError: hardly a pixel can be fitted with the model.
         """
         if model not in self.known:
-            own, numbers = self.frames.effects(model), self.frames.seen_numbers
             frames = self.own_samples(model)
             fit = self._refit_of(frames, model)
-            sensor = learn_sensor(frames, numbers, fit, own, self.plain.ambiguous, self.lost)
+            sensor = self._learnt(frames, fit, model)
             self.lost = sensor.lost
             self.known[model] = Mapped(fit, self._corrected(sensor, model) if model else sensor)
         return self.known[model]
+
+    def _learnt(self, frames: NDArray[np.unsignedinteger], fit: Refit, model: tuple[Effect, ...]) -> Sensor:
+        """Return the sensor that frames and their fit under a model tell.
+
+        What stands in for replaced samples is taken from the frames and, once these have told a sensor, from
+        frames drawn of it: in those that are seen it is itself replaced in part.
+        """
+        own, numbers = self.frames.effects(model), self.frames.seen_numbers
+        learnt = functools.partial(learn_sensor, frames, numbers, fit, own, self.plain.ambiguous)
+        sensor = learnt(self.lost)
+        others = tuple(effect for effect in model if effect.replacement(frames[:1]) is None)
+        if others == model:
+            return sensor
+        self.effort.refit(self.plain.maps.usable.size, fit.components, 0.0, ())
+        return learnt(sensor.lost, self._once("before", sensor, others).simulated())
 
     def drawn(self, model: tuple[Effect, ...], count: int) -> tuple[Refit, list[Mapping[str, float]]]:
         """Return the fit of a model and the statistics of so many replicates, drawn where they are new.
@@ -137,12 +152,16 @@ class Simulations:
         """Return sensors that, simulated with effects and fitted without, come out as the data do."""
         if self.plain.ambiguous > MANY_MISTAKEN:
             return sensor
-        seed = self.seed_of("fitted")
+        return sensor.corrected(self.plain.maps, self._once("fitted", sensor, model).fitted())
+
+    def _once(self, purpose: str, sensor: Sensor, model: tuple[Effect, ...]) -> Replicate:
+        """Return a stack of the seen frames to draw from a sensor once for a purpose, and count it."""
+        seed = self.seed_of(purpose)
         taken = replace(self.frames.acquisition(), numbers=self.frames.seen_numbers)
-        one = Replicate("fitted", sensor.draw(seed), model, seed, taken)
+        one = Replicate(purpose, sensor.draw(seed), model, seed, taken)
         self.done += 1
         self.effort.simulate(one.samples, one.maps.usable.size, one.fits)
-        return sensor.corrected(self.plain.maps, one.fitted())
+        return one
 
     def replicates(
         self, model: tuple[Effect, ...], sensor: Sensor, prefix: str, count: int, begin: int = 0

@@ -117,3 +117,16 @@ def test_exchanged_predictions_count_the_same_as_a_loop():
     np.testing.assert_array_equal(found.above, own)
     np.testing.assert_allclose(found.above_chance[0], others[0])
     assert (np.diff(found.above_chance, axis=0) <= 1e-9).all()
+
+
+def test_the_rule_says_what_comes_out_in_the_stead_of_a_sample():
+    frames = np.random.default_rng(4).integers(90, 140, (5, 7, 6)).astype(np.uint16)
+    effect = PixelCorrection(threshold_dn=12)
+    rule = effect.replacement(frames)
+    changed = effect.apply(frames, context_of((7, 6), 5)) != frames
+    assert changed.any()
+    assert not changed[:, ~rule.inside].any()
+    np.testing.assert_array_equal(
+        changed, (frames.astype(int) - rule.value > rule.excess) & rule.inside & (frames != rule.value)
+    )
+    assert not PixelCorrection(threshold_dn=1).replacement(frames[:, :2]).inside.any()

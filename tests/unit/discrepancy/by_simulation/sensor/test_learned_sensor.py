@@ -5,6 +5,7 @@ from typing import ClassVar, Literal
 import numpy as np
 import pytest
 from helpers.plain_camera import PlainCamera
+from helpers.sensor_of_modes import context_of
 
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     MANY_MISTAKEN,
@@ -30,6 +31,7 @@ from pchem_pipeline.effects.framework.added_exposure import added_exposures
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.effects.readout.pixel_correction import PixelCorrection
 
 SPREAD = (0.25, 0.015, 0.06, 3.0)
 
@@ -37,6 +39,14 @@ SPREAD = (0.25, 0.015, 0.06, 3.0)
 def logs(maps, some):
     every = (maps.quanta_exposure, maps.conversion_gain, maps.bias, maps.read_noise_dn)
     return to_theta(np.stack([values[some] for values in every], axis=1))
+
+
+def logs_error(seen, some):
+    """Return the standard errors of the same, of the plain fits, (n, 4)."""
+    maps, error = seen.maps, np.sqrt(np.diagonal(seen.covariance[some], axis1=1, axis2=2))
+    slope = [1 / maps.quanta_exposure, 1 / maps.conversion_gain, np.ones(some.shape), 2 / maps.read_noise_dn]
+    found = error * np.stack([each[some] for each in slope], axis=1)
+    return found[np.isfinite(found).all(axis=1)]
 
 
 def learnt(camera, seed):
@@ -78,6 +88,39 @@ def test_a_poor_sensor_with_a_bent_curve_is_learnt_under_its_law():
     sensor = learn_sensor(frames, numbers, fit, [effect], MANY_MISTAKEN + 0.1)
     off = logs(sensor.draw(1), sensor.drawn)[:, 0] - np.log(exposure[sensor.drawn])
     assert abs(np.median(off)) < 0.05
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        PixelCorrection(threshold_dn=32),
+        PixelCorrection(threshold_dn=32, region=Region(columns=((0, 10),))),
+        PixelCorrection(threshold_dn=28, share=0.6, predictor="mean"),
+        PixelCorrection(threshold_dn=18),
+    ],
+)
+def test_a_sensor_is_learnt_from_corrected_samples(effect):
+    """A camera replaces samples by the median of their neighbours: plain fits take that for less light.
+
+    From 1.5 electrons above it on most plain fits are ambiguous, and cumulants of all pixels no start.
+    """
+    camera = PlainCamera(0.3, 1.5, 12.0, (20, 20), 1500, SPREAD)
+    exposure, step, bias, noise = camera.maps(np.random.default_rng(6))
+    truth = np.stack([np.log(exposure), np.log(step), bias, 2 * np.log(noise * step)], axis=-1)
+    before, numbers = camera.frames(6), np.arange(1500)
+    inside = np.zeros((20, 20), bool)
+    inside[1:-1, 1 : -1 if effect.region is None else 10] = True
+    frames = np.where(inside, effect.apply(before, context_of((20, 20), 1500)), before)
+    seen = observe(frames, numbers, n_run=1500, block_frames=50)
+    fit = Refit(seen.maps, {}, seen.covariance)
+    sensor = learn_sensor(frames, numbers, fit, [effect], seen.ambiguous, before=before)
+    some = sensor.drawn & inside
+    off = (logs(sensor.draw(1), some) - truth[some]) / np.median(logs_error(seen, some), axis=0)
+    plain = logs(seen.maps, some & seen.maps.usable) - truth[some & seen.maps.usable]
+    plain /= np.median(logs_error(seen, some), axis=0)
+    limit = 5 * 1.25 * np.sqrt(2 / some.sum())
+    assert (np.abs(np.median(off, axis=0)) < limit).all()
+    assert (np.abs(np.median(plain, axis=0))[:2] > 2 * limit).all()
 
 
 def test_pixels_of_a_noisy_sensor_scatter_as_the_true_ones():

@@ -1,0 +1,71 @@
+"""The law of samples of which some come out as another number of their frame.
+
+Where a sample x exceeds what stands in for it, y, by more than t, a share s of the time y comes out. Both are
+independent, and so
+
+``P(v) = P(x = v) [1 - s P(y < v - t)] + s P(y = v) P(x > v + t)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ReplacedSamples:
+    """What becomes of the samples of n pixels, by their code.
+
+    Attributes:
+        stays: chance that a sample comes out as it is, at successive codes, shape (n, c).
+        comes: chance that y is that code, times s, shape (n, c).
+        excess: t, DN, or c where that is less, shape (n,).
+    """
+
+    stays: FloatArray
+    comes: FloatArray
+    excess: NDArray[np.integer]
+
+    @classmethod
+    def by(
+        cls,
+        values: NDArray[np.integer],
+        excess: NDArray[np.integer],
+        share: FloatArray,
+        first: NDArray[np.integer],
+        n_codes: int,
+    ) -> ReplacedSamples:
+        """Return it by a sample of what stands in for each pixel.
+
+        Args:
+            values: y, DN, shape (frame, n).
+            excess: t of each pixel, DN, shape (n,).
+            share: s of each pixel, no unit, shape (n,).
+            first: first code of each pixel, DN, shape (n,).
+            n_codes: number of codes.
+        """
+        n_frames, n = values.shape
+        stays, comes = np.empty((n, n_codes)), np.empty((n, n_codes))
+        for i, (own, t, s) in enumerate(zip(values.T, excess, share, strict=True)):
+            codes = first[i] + np.arange(n_codes)
+            below, to, beyond = np.searchsorted(np.sort(own), [codes - t, codes, codes + 1]) / n_frames
+            stays[i], comes[i] = 1.0 - s * below, s * (beyond - to)
+        # no sample lies beyond the codes
+        return cls(stays, comes, np.minimum(excess, n_codes))
+
+    def of(self, pixels: NDArray[np.intp] | NDArray[np.bool_]) -> ReplacedSamples:
+        """Return it for some of the pixels."""
+        return ReplacedSamples(self.stays[pixels], self.comes[pixels], self.excess[pixels])
+
+    @property
+    def arrays(self) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+        """The three as the loops over cells take them."""
+        return (
+            np.ascontiguousarray(self.stays),
+            np.ascontiguousarray(self.comes),
+            np.ascontiguousarray(self.excess, np.int64),
+        )
