@@ -507,18 +507,17 @@ def _shown(found: Findings) -> str:
 
 def _doubts(added: Added) -> str:
     """Return a caution where a placebo closes much of what a named effect does."""
-    doubted = []
+    words = ""
     for each in added.additions:
         closed = each.before.value - each.after.value
         if each.named and each.placebo is not None and closed > 0.0:
             share = (each.before.value - max(each.placebo.gap_after, 0.0)) / closed
             if share > CONVINCING_PLACEBO:
-                doubted.append(_title(each.effect.tag))
-    return (
-        f"; unrelated effects explain it nearly as well: take the name {_and(doubted)} with caution"
-        if doubted
-        else ""
-    )
+                words += (
+                    f"; {_title(each.placebo.effect)}, unrelated to {_title(each.effect.tag)}, would close "
+                    f"{_share(min(share, 1.0))} of what that closes: take the name with caution"
+                )
+    return words
 
 
 def _left(added: Added) -> str:

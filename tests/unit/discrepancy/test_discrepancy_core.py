@@ -25,7 +25,7 @@ from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, look_elsewhere
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
-from pchem_pipeline.discrepancy.verdict import Candidate, Place, Size
+from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival, Size
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_class
@@ -405,6 +405,18 @@ def test_what_the_final_frames_do_not_confirm_has_no_name(before: float, after: 
     words = _sentence(replace(found, added=both), {})
     assert "cannot tell apart" in words
     assert ("do not confirm" in words) == (state == "ambiguous"), words
+
+
+@pytest.mark.parametrize(("left", "words"), [(5e-5, "would close 50 % of what that closes"), (8e-5, "")])
+def test_an_unrelated_effect_that_closes_much_is_told_with_its_share(left: float, words: str) -> None:
+    effect = effect_class("row_noise")(row_noise_dn=1.0)
+    first, last = (Gap(value, 3e-5, (0.0, 0.0), {}) for value in (9e-5, 1e-5))
+    placebo = Rival(effect="adc_inl", gap_after=left)
+    addition = Addition(effect, True, "", (), 0.1, first, last, (), placebo, ())
+    found = Findings("frames", None, None, None, first, [], False, Added((addition,), last))  # type: ignore[arg-type]
+    sentence = _sentence(found, {})
+    assert words in sentence
+    assert ("unrelated to row noise" in sentence) == ("with caution" in sentence) == bool(words)
 
 
 def test_what_one_statistic_shows_still_is_a_part_that_has_no_name() -> None:
