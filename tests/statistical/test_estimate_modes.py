@@ -20,8 +20,8 @@ from pchem_pipeline.effects.analog.frame_noise import FrameNoise
 from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
 from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
 from pchem_pipeline.effects.analog.row_noise import RowNoise
-from pchem_pipeline.effects.estimators.change_points import find_steps, noise_variance
-from pchem_pipeline.effects.estimators.two_levels import between_two_levels
+from pchem_pipeline.effects.estimators.levels.change_points import find_steps, noise_variance
+from pchem_pipeline.effects.estimators.levels.two_levels import between_two_levels
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.law.normal_numba import normal_mass
+from pchem_pipeline.model.arithmetic.normal_numba import normal_mass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.estimators.change_points import Steps, find_steps, noise_variance
 from pchem_pipeline.effects.estimators.common_modes import quantile_means, responsivity, with_offsets
-from pchem_pipeline.effects.estimators.two_levels import between_two_levels
+from pchem_pipeline.effects.estimators.levels.change_points import Steps, find_steps, noise_variance
+from pchem_pipeline.effects.estimators.levels.two_levels import between_two_levels
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 

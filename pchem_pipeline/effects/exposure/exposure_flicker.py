@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
 from pchem_pipeline.effects.estimators.common_modes import successive
-from pchem_pipeline.effects.estimators.level_mixtures import Levels, few_levels
+from pchem_pipeline.effects.estimators.levels.level_mixtures import Levels, few_levels
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
 if TYPE_CHECKING:

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.arithmetic.normal_numba import NARROW, REACH, normal_mass
+from pchem_pipeline.model.arithmetic.simd_math_numba import simd_tail
+from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, simd_load, simd_store
 from pchem_pipeline.model.ensemble.ensemble_numba import (
     capacity,
     log_factorials,
@@ -17,9 +20,6 @@ from pchem_pipeline.model.ensemble.ensemble_numba import (
     poisson_weights,
     reach_of,
 )
-from pchem_pipeline.model.law.normal_numba import NARROW, REACH, normal_mass
-from pchem_pipeline.model.law.simd_math_numba import simd_tail
-from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH, simd_load, simd_store
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

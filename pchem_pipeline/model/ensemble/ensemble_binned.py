@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.arithmetic.normal_numba import NARROW, REACH
 from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, IntArray, NucedAxis, electron_pmf
-from pchem_pipeline.model.law.normal_numba import NARROW, REACH
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
 #: Cells for each pixel up to which a table of all of them is faster than sorting.

@@ -12,9 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.law.normal_numba import NARROW, REACH, add_component, add_mass
-from pchem_pipeline.model.law.simd_math_numba import simd_exp
-from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH, counting, fused, most, simd_load, simd_store
+from pchem_pipeline.model.arithmetic.normal_numba import NARROW, REACH, add_component, add_mass
+from pchem_pipeline.model.arithmetic.simd_math_numba import simd_exp
+from pchem_pipeline.model.arithmetic.simd_numba import (
+    SIMD_WIDTH,
+    counting,
+    fused,
+    most,
+    simd_load,
+    simd_store,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

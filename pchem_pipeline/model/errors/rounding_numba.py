@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.arithmetic.normal_numba import add_mass
 from pchem_pipeline.model.errors.algebra_numba import invert_arrow, solve_arrow
-from pchem_pipeline.model.law.normal_numba import add_mass
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
     CUMULATIVE,

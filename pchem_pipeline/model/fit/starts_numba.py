@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, counting, fused, simd_load, simd_store
 from pchem_pipeline.model.fit.climb_numba import (
     MIN_STEP,
     min_log_variance,
@@ -52,7 +53,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     make_pixel,
     make_scratch,
 )
-from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH, counting, fused, simd_load, simd_store
 
 FREQUENCY_STEP = 0.1  # 1/sd: less than the width of a satellite
 N_FREQUENCIES = 48  # up to 4.8/sd, the satellite of H = 22

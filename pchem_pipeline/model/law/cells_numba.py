@@ -19,8 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.arithmetic.normal_numba import FARTHEST
+from pchem_pipeline.model.arithmetic.simd_math_numba import simd_log, simd_tail
+from pchem_pipeline.model.arithmetic.simd_numba import (
+    SIMD_WIDTH,
+    counting,
+    fused,
+    least,
+    most,
+    simd_load,
+    simd_store,
+    simd_sum,
+)
 from pchem_pipeline.model.law.electron_laws_numba import electron_number
-from pchem_pipeline.model.law.normal_numba import FARTHEST
 from pchem_pipeline.model.law.pixel_numba import (
     ADDED_EXPOSURE,
     ADDED_WEIGHT,
@@ -82,17 +93,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     Z_DENSITY,
     Pixel,
     Scratch,
-)
-from pchem_pipeline.model.law.simd_math_numba import simd_log, simd_tail
-from pchem_pipeline.model.law.simd_numba import (
-    SIMD_WIDTH,
-    counting,
-    fused,
-    least,
-    most,
-    simd_load,
-    simd_store,
-    simd_sum,
 )
 
 # places in a sample's own parameters

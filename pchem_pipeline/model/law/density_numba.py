@@ -9,7 +9,7 @@ derivatives are factorial moments of ``l``; from them come those of the residual
 ``k = (y - m - e) / a`` those of ``k`` and of ``k e``. They give the score and
 ``sum_i c_i {E[I_c | x_i] - Cov(S | x_i)}`` (Louis 1982).
 
-The values go through one loop by the eight, side by side (:mod:`.simd_numba`): blocks of bins, so short that
+The values go through one loop by the eight, side by side (`simd_numba`): blocks of bins, so short that
 all bins of one are nearest to one of two successive components. What such a block needs is laid out before,
 for eight blocks at a time, and blocks without samples are passed over.
 """
@@ -24,6 +24,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.arithmetic.simd_math_numba import simd_exp, simd_log
+from pchem_pipeline.model.arithmetic.simd_numba import (
+    SIMD_WIDTH,
+    Simd,
+    counting,
+    fused,
+    least,
+    most,
+    nearest,
+    simd_load,
+    simd_store,
+    simd_sum,
+    spliced,
+)
 from pchem_pipeline.model.law.pixel_numba import (
     BIAS,
     CENTRE,
@@ -55,20 +69,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     WEIGHT,
     Pixel,
     Scratch,
-)
-from pchem_pipeline.model.law.simd_math_numba import simd_exp, simd_log
-from pchem_pipeline.model.law.simd_numba import (
-    SIMD_WIDTH,
-    Simd,
-    counting,
-    fused,
-    least,
-    most,
-    nearest,
-    simd_load,
-    simd_store,
-    simd_sum,
-    spliced,
 )
 
 FloatArray = NDArray[np.float64]

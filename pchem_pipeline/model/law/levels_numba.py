@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.arithmetic.normal_numba import FARTHEST, REACH, normal_mass
+from pchem_pipeline.model.arithmetic.simd_math_numba import simd_tail
+from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, fused, simd_load, simd_store
 from pchem_pipeline.model.law.cells_numba import Cells, Component, Law, cells_of, component, resolve
 from pchem_pipeline.model.law.electron_laws_numba import electron_number
-from pchem_pipeline.model.law.normal_numba import FARTHEST, REACH, normal_mass
 from pchem_pipeline.model.law.pixel_numba import (
     ADDED_EXPOSURE,
     CLIP_HIGH,
@@ -30,8 +32,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     SHARE_SLOPE,
     Pixel,
 )
-from pchem_pipeline.model.law.simd_math_numba import simd_tail
-from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH, fused, simd_load, simd_store
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

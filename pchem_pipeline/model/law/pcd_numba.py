@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.law.normal_numba import normal_mass
+from pchem_pipeline.model.arithmetic.normal_numba import normal_mass
 
 _NEGLIGIBLE = 41.0  # nats: exp(-41) is below the resolution of a double
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.law.simd_numba import SIMD_WIDTH
+from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH
 
 FloatArray = NDArray[np.float64]
 

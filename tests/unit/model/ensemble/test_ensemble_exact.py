@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, poisson
 
+from pchem_pipeline.model.arithmetic import normal_numba
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.ensemble import (
     DnAxis,
@@ -17,7 +18,6 @@ from pchem_pipeline.model.ensemble.ensemble import (
     nuced_axis,
     tally,
 )
-from pchem_pipeline.model.law import normal_numba
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.parameters import UsablePixels, usable_pixels
 from pchem_pipeline.model.law.sample_law import SampleLaw

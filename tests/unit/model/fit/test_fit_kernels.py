@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 from scipy.stats import norm, poisson
 
+from pchem_pipeline.model.arithmetic import simd_math_numba
+from pchem_pipeline.model.arithmetic.simd_numba import counting, least, most, simd_load, simd_store
 from pchem_pipeline.model.errors import algebra_numba, rounding_numba
 from pchem_pipeline.model.fit import api as fit_api
 from pchem_pipeline.model.fit import (
@@ -26,7 +28,7 @@ from pchem_pipeline.model.fit import (
     tile_numba,
 )
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.law import density_numba, pixel_numba, simd_math_numba
+from pchem_pipeline.model.law import density_numba, pixel_numba
 from pchem_pipeline.model.law.likelihood import density_likelihood
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
@@ -47,7 +49,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     Scratch,
     histogram_of,
 )
-from pchem_pipeline.model.law.simd_numba import counting, least, most, simd_load, simd_store
 
 # (H, 1/g, s_e) from needles to unresolved peaks, and a hot pixel
 CASES = [

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.effects.estimators.change_points import Steps, centred, noise_variance
+from pchem_pipeline.effects.estimators.levels.change_points import Steps, centred, noise_variance
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 IntArray = np.ndarray[Any, np.dtype[np.int64]]

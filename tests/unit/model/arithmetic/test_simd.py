@@ -22,10 +22,10 @@ if sys.argv[1] == "scalar":
     hooks.register_model = refuse
 import numpy as np
 from pchem_pipeline.base.kernel import kernel
-import pchem_pipeline.model.law.simd_numba
+import pchem_pipeline.model.arithmetic.simd_numba
 hooks.register_model = register
-from pchem_pipeline.model.law import simd_math_numba as functions, simd_numba as simd
-from pchem_pipeline.model.law.simd_numba import (
+from pchem_pipeline.model.arithmetic import simd_math_numba as functions, simd_numba as simd
+from pchem_pipeline.model.arithmetic.simd_numba import (
     counting, exponent_of, fraction_of, fused, least, simd_load, most, nearest, scaled, simd_store,
     simd_sum, spliced
 )

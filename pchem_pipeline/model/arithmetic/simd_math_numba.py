@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.law.simd_numba import (
+from pchem_pipeline.model.arithmetic.simd_numba import (
     Simd,
     counting,
     exponent_of,

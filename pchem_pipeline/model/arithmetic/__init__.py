@@ -1,0 +1,1 @@
+"""Arithmetic of the compiled loops: values side by side, and masses of the normal law."""
