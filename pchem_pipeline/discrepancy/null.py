@@ -42,6 +42,7 @@ _REPLICATION = 0.02  # in each split by itself, and in the same direction
 #: Nats on held-out frames that an explanation must be worth where no statistic deviates by itself.
 CONVINCING = 6.0
 _SUSPICION = 0.1  # chance of a deviation for which it is worth to ask the candidates
+_STRAY = 30.0  # robust standard deviations beyond which a value of a replicate is a single pixel's
 _SIGNATURE = 3.0  # standard deviations by which an effect moves the statistics of its signature
 
 
@@ -167,6 +168,18 @@ def two_sided(pulls: FloatArray, freedom: float) -> FloatArray:
 def look_elsewhere(p: float, tests: float) -> float:
     """Return the chance that the smallest of ``tests`` independent p-values is ``p`` or less (Sidak)."""
     return float(-np.expm1(tests * np.log1p(-min(p, 1.0 - 1e-16))))
+
+
+def without_strays(vectors: FloatArray) -> FloatArray:
+    """Return replicates, (b, m), in which no value is farther from the others than any scatter takes it.
+
+    A single pixel that no fit holds makes a sum of squares of one replicate thousands of times as large as in
+    all others; its mean and scatter would be those of that pixel.
+    """
+    middle = np.median(vectors, axis=0)
+    # statistics scatter by about 1 without effects
+    scatter = np.maximum(1.4826 * np.median(np.abs(vectors - middle), axis=0), 1.0)
+    return np.asarray(np.clip(vectors, middle - _STRAY * scatter, middle + _STRAY * scatter))
 
 
 def as_matrix(

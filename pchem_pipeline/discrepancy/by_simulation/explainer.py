@@ -45,6 +45,7 @@ from pchem_pipeline.discrepancy.null import (
     as_matrix,
     free_of_parameters,
     suspicious,
+    without_strays,
 )
 from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
@@ -301,7 +302,7 @@ class FrameExplainer:
 
         def draw(effects: tuple[Effect, ...], count: int) -> tuple[Refit, FloatArray]:
             fit, vectors = self.work.drawn(along_chain(present, effects), count)
-            return fit, as_matrix(first.names, vectors, first.mean)
+            return fit, without_strays(as_matrix(first.names, vectors, first.mean))
 
         def allow(words: str) -> None:
             self.work.effort.check(f"{words} was fitted")

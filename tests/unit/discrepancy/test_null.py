@@ -5,7 +5,7 @@ import pytest
 from scipy import special
 
 from pchem_pipeline.discrepancy.by_simulation.sensor.population import Population, Posterior
-from pchem_pipeline.discrepancy.null import NullModel
+from pchem_pipeline.discrepancy.null import NullModel, without_strays
 from pchem_pipeline.discrepancy.observe import laws
 
 REPLICATES, SETS, DATA = 40, 300, 50
@@ -81,3 +81,14 @@ def test_drawn_pixels_keep_the_mean_of_their_samples_however_little_is_known_of_
     assert exposure.std() > 2.0
     assert (exposure / gain + bias).std() == pytest.approx(0.1, rel=5.0 / np.sqrt(2.0 * n))
     assert (exposure / gain + bias).mean() == pytest.approx(115.0, abs=5 * 0.1 / np.sqrt(n))
+
+
+def test_a_single_pixel_does_not_make_the_scatter_of_replicates() -> None:
+    usual = np.random.default_rng(6).normal(100.0, 5.0, (16, 3))
+    np.testing.assert_array_equal(without_strays(usual), usual)
+    strayed = usual.copy()
+    strayed[7, 1] = 17_000.0  # as seen in a sum of squares of scores
+    found = without_strays(strayed)
+    assert abs(found[:, 1].mean() - 100.0) < 20.0
+    assert np.array_equal(found[:, [0, 2]], usual[:, [0, 2]])
+    assert np.array_equal(np.delete(found, 7, axis=0), np.delete(usual, 7, axis=0))
