@@ -153,7 +153,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
     places = locate(by.evidence, first, z.both, significance)
     null, rounds = first, 0
     doubt = by.doubt()
-    still = disagrees(null, z, significance)
+    still = disagreed = disagrees(null, z, significance)
     wanted = still or (not doubt and by.suspects(null))
     limit, instead = "", None
     while wanted and rounds < by.most_rounds:
@@ -181,6 +181,9 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
             null, still = described, disagrees(described, z, significance, by.tolerance())
     tell("measuring the gap that is left, with effects and with rivals")
     added = by.close(before, null, still)
+    if not disagreed and before.at_floor and not any(each.named for each in added.additions):
+        # data that agree with the model are not made doubtful by what they do not confirm
+        null, still, added = first, False, Added((), before)
     found = Findings(by.samples, z, first, null, before, places, still, added, doubt, limit)
     model = found.model(present, by.model)
     return build_verdict(
