@@ -17,6 +17,7 @@ from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
+from pchem_pipeline.effects.framework.region import Region
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -65,7 +66,7 @@ class ResponseTerm(Section):
             where = neighbour_words(self.place).removeprefix("the sample ").strip()
             what = f"each {'other ' if not any(self.place) else ''}sample of the {self.of}"
             what += f" {where}" if any(self.place) else ""
-        only = f" (in columns {self.columns[0]} to {self.columns[1] - 1})" if self.columns else ""
+        only = f" (in {Region(columns=(self.columns,)).words()})" if self.columns else ""
         return f"{100.0 * response:+.2g} % of {what}{only}"
 
     def seen(self, charge: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -226,6 +226,9 @@ def test_it_is_no_candidate_and_says_what_follows() -> None:
         "samples that follow the charge of others (by +0.4 % of the sample 16 columns to the left, "
         "-0.2 % of each other sample of the row)"
     )
+    one, some = (ResponseTerm(place=(0, 0, 1), columns=each).words(0.01) for each in ((0, 1), (2, 5)))
+    assert one.endswith(" (in column 0)")
+    assert some.endswith(" (in columns 2 to 4)")
     near = EmpiricalResponse(response=0.004, terms=(ResponseTerm(place=(0, 0, -1)),))
     assert not near.unlisted
 
