@@ -2,8 +2,8 @@
 
 A hidden Markov chain (Rabiner 1989, Proc. IEEE 77, 257): what is looked for in one series is told by the
 levels at which it sits for the rest of the run, so that short visits and jumps of several series at once are
-found where change points alone leave them open. Levels by expectation and maximisation over all states of the
-series together, the times by the likeliest path.
+found where change points alone leave them open. By turns: the likeliest path through the states of all series
+together at given levels, and the levels by least squares along it.
 """
 
 from __future__ import annotations
@@ -63,15 +63,14 @@ def between_two_levels(series: FloatArray, gaps: FloatArray, steps: Sequence[Ste
     own = float(np.mean([noise_variance(one) for one in contrast.T])) * m / (m - 1.0)
     noise = _Noise(own, max(float((series - profile).mean(axis=1).var()), own / m))
     known = float(noise.squares(series - profile).sum()) + _price(n, jumps.size, jumps.size + m)
-    levels, rate = _start(profile, float(np.median(jumps))), jumps.size / (m * float(gaps[1:].sum()))
+    levels, number = _start(profile, float(np.median(jumps))), jumps.size
     for _ in range(_ROUNDS):
+        rate = min(max(number, 1) / (m * float(gaps[1:].sum())), _LARGEST_RATE)
         states, path = _likeliest(series, gaps, levels, rate, noise)
         levels = _fitted(series, states[path], levels, noise)
-        rate = max(np.count_nonzero(np.diff(states[path], axis=0)), 1) / (m * float(gaps[1:].sum()))
-        rate = min(rate, _LARGEST_RATE)
+        number = np.count_nonzero(np.diff(states[path], axis=0))
     found = [_steps(states[path, q], levels[q]) for q in range(m)]
     rest = series - np.stack([_profile(each, n) for each in found], axis=1)
-    number = sum(each.levels.size - 1 for each in found)
     two = float(noise.squares(rest - rest.mean(axis=0)).sum()) + _price(n, number, 2 * m)
     return found if two < known else list(steps)
 
