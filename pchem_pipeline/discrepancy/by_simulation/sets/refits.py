@@ -35,6 +35,8 @@ _MOST_STEPS = 5
 _STEPS_OF_DEAR = 2
 _CLOSE = 0.05  # relative change of a factor that is not worth another simulation
 _LARGEST_STEP = np.log(4.0)  # of the logarithm of a factor
+_FURTHER = 2  # steps beyond one that explains less, where the data go on asking for the same
+_SHORTEST = 0.25  # of the step that the data ask for
 _CERTAIN = 3.5  # errors of a difference of means: less is chance
 _SMALLEST_SECANT = 0.05  # of the logarithm of a factor: shorter steps say nothing about the slope
 _TRIAL = 0.3  # step of the logarithm of a factor by which a slope is measured
@@ -162,7 +164,8 @@ class Refitter:
         words = " + ".join(h.tag for h in hypotheses)
         self.allow(words)
         best = now = self.simulated(tuple(hypotheses), None, replicates)
-        shortened, gained = 0, np.inf
+        step = best.change
+        length, gained, further = 1.0, np.inf, 0
         dear = is_dear(h.effect for h in hypotheses)
         for step_number in range(self.steps):
             if best.settled or gained < _LEAST_GAIN or self._hopeless(best, gained, rival):
@@ -171,21 +174,27 @@ class Refitter:
                 return replace(best, short=True)
             if dear and (step_number >= _STEPS_OF_DEAR or (step_number and best.score < rival)):
                 break
-            step = np.clip(best.change, -_LARGEST_STEP, _LARGEST_STEP) * 0.5**shortened
-            moved = _moved(best.hypotheses, step)
+            if 0 < further <= _FURTHER:
+                start, step = now, _as_long(now.change, step)
+            else:
+                start, step = best, best.change * length
+            step = np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
+            moved = _moved(start.hypotheses, step)
             if moved is None:
                 break
             try:
                 self.allow(words)
-                now = self.simulated(moved, best, replicates)
+                now = self.simulated(moved, start, replicates)
             except EffortSpentError:
                 break  # what was simulated is not lost
             except NotFittedError:
                 now = best  # a step too far
             if now.score > best.score:
-                gained, best, shortened = now.score - best.score, now, 0
-            elif shortened < 2:
-                shortened += 1
+                gained, best, length, further = now.score - best.score, now, 1.0, 0
+            elif now is not best and further < _FURTHER and length == 1.0 and float(now.change @ step) > 0.0:
+                further += 1  # on both sides of a dip the data ask for more of the same
+            elif length > _SHORTEST:
+                length, further = length / 2.0, 0
             else:
                 break
         return best
@@ -377,6 +386,11 @@ def _moved(hypotheses: Sequence[Hypothesis], step: FloatArray) -> tuple[Hypothes
     """Return the hypotheses at other strengths, None where their limits do not let them move."""
     new = tuple(h.times(float(np.exp(s))) for h, s in zip(hypotheses, step, strict=True))
     return None if all(a.effect == b.effect for a, b in zip(new, hypotheses, strict=True)) else new
+
+
+def _as_long(change: FloatArray, step: FloatArray) -> FloatArray:
+    """Return a change, made as long as a step."""
+    return np.asarray(change * float(np.linalg.norm(step) / max(np.linalg.norm(change), 1e-12)))
 
 
 def _step(before: Sequence[Effect], after: Sequence[Effect]) -> FloatArray:
