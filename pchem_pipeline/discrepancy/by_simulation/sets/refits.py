@@ -274,7 +274,7 @@ class Refitter:
         error = apart.std(axis=0, ddof=1) / np.sqrt(len(apart))
         # a shift in proportion to the factor has this slope between the two
         middle = np.exp(step / 2.0)
-        foreseen = middle * one.parts[place]
+        foreseen = middle * one.slopes[place]
         slope = foreseen + beyond_chance(apart.mean(axis=0) - foreseen, error)
         return np.asarray(slope / middle)
 
@@ -305,14 +305,16 @@ class Refitter:
         fit, vectors = self.draw(tuple(h.effect for h in hypotheses), replicates)
         mean = vectors.mean(axis=0)
         covariance = self._covariance(vectors)
-        parts = self._parts(hypotheses, before, vectors, covariance)
+        parts = self._shifts(hypotheses, vectors, covariance)
+        if slopes is None:
+            slopes = self._secants(hypotheses, parts, before, vectors, covariance)
         noise = self.noise(covariance, replicates)
         residual = self.target - mean
         scaling = np.array([bool(h.effect.strength) for h in hypotheses])
         scatter = None
         if replicates >= _ENOUGH:
             scatter = (vectors - mean) * np.sqrt(1.0 / self.splits + 1.0 / replicates)
-        slopes, kept = parts if slopes is None else slopes, self.kept(hypotheses)
+        kept = self.kept(hypotheses)
         change, stderr = correction(
             slopes[:, kept],
             residual[kept],
@@ -337,32 +339,42 @@ class Refitter:
             chance=log_density(np.zeros_like(residual), allowed) - residual.size / 2.0,
         )
 
-    def _parts(
+    def _shifts(
+        self, hypotheses: tuple[Hypothesis, ...], vectors: FloatArray, covariance: FloatArray
+    ) -> FloatArray:
+        """Return by how much each effect has moved the statistics, shape (e, m).
+
+        As foreseen where that is within chance of what all together do: the shift of the refitted model is
+        its own, not that of the fingerprints.
+        """
+        parts = np.array([h.fingerprint for h in hypotheses])
+        error = np.sqrt(np.diag(covariance) * (1.0 / len(vectors) + 1.0 / self.null.n_replicates))
+        apart = vectors.mean(axis=0) - self.null.mean - parts.sum(axis=0)
+        return _spread(parts, beyond_chance(apart, error))
+
+    def _secants(
         self,
         hypotheses: tuple[Hypothesis, ...],
+        parts: FloatArray,
         before: Refitted | None,
         vectors: FloatArray,
         covariance: FloatArray,
     ) -> FloatArray:
         """Return how the statistics go with the logarithm of each factor, shape (e, m).
 
-        From nothing to the first strength the refitted model has moved by its own shift, not by the
-        fingerprints'; from one strength to the next, by a secant (Broyden 1965). What is within chance of
-        what was foreseen is taken as foreseen: a slope that holds the scatter of the replicates would be
-        correlated with what they leave, and every strength would come out too low.
+        At first in proportion to the shift; from one strength to the next, by a secant (Broyden 1965). What
+        is within chance of what was foreseen is taken as foreseen: a slope that holds the scatter of the
+        replicates would be correlated with what they leave, and every strength would come out too low.
         """
-        mean, replicates = vectors.mean(axis=0), len(vectors)
-        parts = np.array([h.fingerprint for h in hypotheses])
         if before is None:
-            error = np.sqrt(np.diag(covariance) * (1.0 / replicates + 1.0 / self.null.n_replicates))
-            return _spread(parts, beyond_chance(mean - self.null.mean - parts.sum(axis=0), error))
-        step = _step(before.effects, tuple(h.effect for h in hypotheses))
-        length = float(step @ step)
-        if length < _SMALLEST_SECANT**2:
             return parts
-        old, error = before.parts, np.sqrt(np.diag(covariance) * 2.0 / replicates)
-        unforeseen = beyond_chance(mean - before.mean - step @ old, error)
-        slope = old + np.outer(step, unforeseen / length)
+        step = _step(before.effects, tuple(h.effect for h in hypotheses))
+        length, old = float(step @ step), before.slopes
+        if length < _SMALLEST_SECANT**2:
+            return old
+        apart = vectors.mean(axis=0) - before.mean - step @ old
+        error = _error_of_difference(vectors, before.vectors, np.sqrt(np.diag(covariance)))
+        slope = old + np.outer(step, beyond_chance(apart, error) / length)
         # a secant holds between the two; a shift in proportion to the factor has its end's slope
         return np.asarray(slope * np.exp(step / 2.0)[:, None])
 
@@ -388,9 +400,22 @@ def _moved(hypotheses: Sequence[Hypothesis], step: FloatArray) -> tuple[Hypothes
     return None if all(a.effect == b.effect for a, b in zip(new, hypotheses, strict=True)) else new
 
 
+def _error_of_difference(vectors: FloatArray, before: FloatArray, std: FloatArray) -> FloatArray:
+    """Return standard errors of the difference of the means of replicates at two strengths, shape (m,).
+
+    They share their random numbers, so that a difference is known far better than either; few of them do not
+    know that well for a single statistic: never below that of most, beside the scatter of each by chance.
+    """
+    if len(vectors) != len(before):
+        return std * np.sqrt(1.0 / len(vectors) + 1.0 / len(before))
+    scatter = (vectors - before).std(axis=0, ddof=1)
+    usual = std * np.sqrt(np.mean((scatter / std) ** 2))
+    return np.asarray(np.maximum(scatter, usual) / np.sqrt(len(vectors)))
+
+
 def _as_long(change: FloatArray, step: FloatArray) -> FloatArray:
     """Return a change, made as long as a step."""
-    return np.asarray(change * float(np.linalg.norm(step) / max(np.linalg.norm(change), 1e-12)))
+    return np.asarray(change * (np.linalg.norm(step) / max(float(np.linalg.norm(change)), 1e-12)))
 
 
 def _step(before: Sequence[Effect], after: Sequence[Effect]) -> FloatArray:

@@ -142,7 +142,7 @@ def test_a_strength_is_refined_by_refits_until_it_stops_moving(strength: float) 
 
 
 def test_a_dip_on_the_way_to_the_best_strength_is_crossed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As of row noise of 0.4 e-: what it moves goes slowly with its strength, many others a little to and fro.
+    """As of row noise of 0.4 e-: what it moves goes slowly with its strength, many others to and fro.
 
     So steps are short, the next one explains less, and the data ask for the same on both sides of that.
     """
