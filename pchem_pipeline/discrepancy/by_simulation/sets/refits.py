@@ -407,7 +407,7 @@ def _error_of_difference(vectors: FloatArray, before: FloatArray, std: FloatArra
     know that well for a single statistic: never below that of most, beside the scatter of each by chance.
     """
     if len(vectors) != len(before):
-        return std * np.sqrt(1.0 / len(vectors) + 1.0 / len(before))
+        return np.asarray(std * np.sqrt(1.0 / len(vectors) + 1.0 / len(before)))
     scatter = (vectors - before).std(axis=0, ddof=1)
     usual = std * np.sqrt(np.mean((scatter / std) ** 2))
     return np.asarray(np.maximum(scatter, usual) / np.sqrt(len(vectors)))
