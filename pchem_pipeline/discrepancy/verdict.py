@@ -273,7 +273,8 @@ class Surveyed(_Part):
     Attributes:
         map: next_x or next_y (covariance with the next pixel), lag (with the frame before), spread (means
             over blocks of frames scatter), score.* and goodness (shape of the histograms), pairs.row.readout
-            and so on (pixels that share a row, a column or a frame move together).
+            and so on (pixels that share a row, a column or a frame move together), unfitted (pixels without
+            a fit to be relied upon).
         region: as ``model.effects`` takes a region.
         p: probability of such a place by chance, anywhere.
     """
@@ -296,6 +297,7 @@ class Examined(_Part):
         surveyed_by: share of the run's samples by what was looked at, over the whole sensor: neighbours and
             successive frames, shapes of the histograms, pairs of pixels in rows, columns and frames.
         places: where those stand out.
+        unfitted: pixels that are not compared, since they have no fit to be relied upon.
     """
 
     frames: int
@@ -309,6 +311,7 @@ class Examined(_Part):
     surveyed: Number = _NAN
     surveyed_by: dict[str, Number] = {}
     places: tuple[Surveyed, ...] = ()
+    unfitted: int = 0
 
     @property
     def origin(self) -> tuple[int, int]:

@@ -12,6 +12,7 @@ from scipy import special
 from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere
 from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.scan import Stretch, Suspect, scan_map, scan_series
+from pchem_pipeline.discrepancy.scan_events import scan_event_map
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.effects.framework.evidence import SCORES, Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import parse_place
@@ -71,6 +72,19 @@ def suspected_frames(
         for name, values in series.items()
     }
     return {name: frames for name, frames in found.items() if frames}
+
+
+def unfitted_place(usable: NDArray[np.bool_], significance: float = 1e-3) -> Suspect | None:
+    """Return where pixels without a fit to be relied upon come together; None where chance explains it.
+
+    An effect of single pixels in a part of the sensor may leave only that to be seen.
+
+    Args:
+        usable: pixels with a fit, (y, x).
+        significance: largest probability of a chance, in any place.
+    """
+    alike, every = np.ones(usable.shape), np.ones(usable.shape, np.bool_)
+    return next(iter(scan_event_map(~usable, alike, every, significance=significance, most=1)), None)
 
 
 def pixel_maps(evidence: Evidence) -> dict[str, FloatArray]:

@@ -189,7 +189,7 @@ class FrameExplainer:
     @property
     def examined(self) -> Examined:
         """What was looked at."""
-        return self.observed.frames.splits.examined(self.observed.frames.stack.shape)
+        return self.observed.examined()
 
     @property
     def first(self) -> NullModel:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from pchem_pipeline.discrepancy.verdict import (
     CONVINCING_PLACEBO,
@@ -14,6 +15,7 @@ from pchem_pipeline.discrepancy.verdict import (
     Step,
     Verdict,
 )
+from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.discrepancy_gap import gap_text
 from pchem_pipeline.report.pages.discrepancy_tables import (
@@ -212,7 +214,24 @@ def frames_text(found: Verdict) -> str:
     place = f"rows {seen.rows[0]} to {seen.rows[1] - 1}, columns {seen.columns[0]} to {seen.columns[1] - 1}"
     rest = seen.frames - seen.train - seen.test - seen.final
     over = f"; a rest of {count(rest, 'frame')}, too few to be dealt as well, is left out" if rest > 0 else ""
-    return f"{count(seen.frames, 'frame')} of {place}{share}: {dealt} that is left{over}."
+    words = f"{count(seen.frames, 'frame')} of {place}{share}: {dealt} that is left{over}."
+    return words + _unfitted_text(found)
+
+
+def _unfitted_text(found: Verdict) -> str:
+    """Return how many pixels are not compared, and where they come together; empty where none is left out."""
+    seen = found.examined
+    if not seen.unfitted:
+        return ""
+    spot = next((place for place in seen.places if place.map == "unfitted"), None)
+    where = (
+        "" if spot is None else f"; far more of them than chance puts there lie in {_words_of(spot.region)}"
+    )
+    return f" Not compared: {count(seen.unfitted, 'pixel')} without a fit to be relied upon{where}."
+
+
+def _words_of(region: dict[str, Any]) -> str:
+    return Region.model_validate(region).words()
 
 
 def verdict_level(found: Verdict) -> tuple[Level, str]:

@@ -34,6 +34,7 @@ _SURVEYED = {
     "next_y": "neighbours in a column alike",
     "lag": "successive frames alike",
     "spread": "levels change along the run",
+    "unfitted": "pixels without a fit to be relied upon come together",
 }
 
 

@@ -106,7 +106,7 @@ class Survey:
                 "share": share,
                 "surveyed": max(share, least),
                 "surveyed_by": dict(self.shares),
-                "places": spots,
+                "places": (*verdict.examined.places, *spots),
             }
         )
         return verdict.model_copy(update={"examined": examined})

@@ -19,6 +19,7 @@ from pchem_pipeline.discrepancy.where import (
     series_of,
     suspected_frames,
     suspected_regions,
+    unfitted_place,
 )
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.framework.region import Region
@@ -132,3 +133,16 @@ def test_a_place_counts_from_the_corner_of_the_sensor() -> None:
     assert moved.region == {"rows": [[10, 30]], "columns": [[42, 46]]}
     assert inside.shifted((20, 20), (0, 20), (0, 20)) == inside
     assert moved.spot() == "most in rows 10 to 29, columns 42 to 45, frames 3 to 8"
+
+
+def test_pixels_without_a_fit_have_a_place_where_they_come_together_and_else_none() -> None:
+    rng, alarms = np.random.default_rng(5), 0
+    for _ in range(200):
+        alarms += unfitted_place(rng.random((32, 32)) > 0.02) is not None
+    assert alarms <= 3  # 0.2 are meant
+    usable = rng.random((32, 32)) > 0.005
+    usable[:, 6:9] &= rng.random((32, 3)) > 0.25
+    place = unfitted_place(usable)
+    assert place is not None
+    assert place.region.overlap(Region(columns=((6, 9),)), usable.shape) > 0.6
+    assert unfitted_place(np.ones((32, 32), np.bool_)) is None

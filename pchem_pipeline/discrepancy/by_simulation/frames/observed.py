@@ -9,7 +9,9 @@ import numpy as np
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.suspects import suspected_parts
-from pchem_pipeline.discrepancy.observe.places import Part
+from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
+from pchem_pipeline.discrepancy.verdict import Examined, Surveyed
+from pchem_pipeline.discrepancy.where import unfitted_place
 from pchem_pipeline.effects.framework.evidence import Evidence
 
 _FEWEST_PIXELS = 32
@@ -64,6 +66,16 @@ class ObservedFrames:
     def samples(self) -> int:
         """Samples of train and test frames, those of each part that differs counted again."""
         return sum(self.frames.samples(part) for part in (Part(), *self.frames.parts))
+
+    def examined(self) -> Examined:
+        """Return what is looked at, and where the pixels are that have no fit to be relied upon."""
+        frames, usable = self.frames, self.plain.maps.usable
+        known, place = frames.splits.examined(frames.stack.shape), unfitted_place(usable)
+        window = frames.window or SensorWindow.whole(usable.shape)
+        spots = []
+        if place is not None and (region := window.on_sensor(place.region)) is not None:
+            spots.append(Surveyed(map="unfitted", region=region.numbers(), p=place.p))
+        return known.model_copy(update={"unfitted": int((~usable).sum()), "places": tuple(spots)})
 
     def doubt(self) -> str:
         """Say which share of the pixels is not identified, and what would help; empty below a half."""

@@ -204,6 +204,16 @@ def test_frames_that_no_part_has_are_told() -> None:
     assert "rest" not in frames_text(discrepancy_data("named", examined=whole).found)
 
 
+def test_pixels_that_are_not_compared_are_told_with_their_place() -> None:
+    seen = {"frames": 960, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320,
+            "histograms": None, "unfitted": 7}  # fmt: skip
+    words = frames_text(discrepancy_data("named", examined=seen).found)
+    assert words.endswith(" Not compared: 7 pixels without a fit to be relied upon.")
+    spot = {"map": "unfitted", "region": {"columns": [[2, 5]]}, "p": 1e-6}
+    words = frames_text(discrepancy_data("named", examined={**seen, "places": [spot]}).found)
+    assert words.endswith("; far more of them than chance puts there lie in columns 2 to 4.")
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_without_a_search_the_report_says_how_to_start_one(base: ReportData) -> None:
     report = rendered(base, None)
