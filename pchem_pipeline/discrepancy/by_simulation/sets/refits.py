@@ -36,6 +36,8 @@ _STEPS_OF_DEAR = 2
 _CLOSE = 0.05  # relative change of a factor that is not worth another simulation
 _LARGEST_STEP = np.log(4.0)  # of the logarithm of a factor
 _FURTHER = 2  # steps beyond one that explains less, where the data go on asking for the same
+# of a step, what the data ask for after it: too much for a good slope, and the most that is believed
+_SLOW, _SLOWEST = 0.5, 0.75
 _SHORTEST = 0.25  # of the step that the data ask for
 _CERTAIN = 3.5  # errors of a difference of means: less is chance
 _SMALLEST_SECANT = 0.05  # of the logarithm of a factor: shorter steps say nothing about the slope
@@ -168,7 +170,10 @@ class Refitter:
         length, gained, further = 1.0, np.inf, 0
         dear = is_dear(h.effect for h in hypotheses)
         for step_number in range(self.steps):
-            if best.settled or gained < _LEAST_GAIN or self._hopeless(best, gained, rival):
+            if best.settled or gained < _LEAST_GAIN:
+                break
+            # what falls short of its promise time after time says little by the next one
+            if length <= 1.0 and self._hopeless(best, gained, rival):
                 break
             if whole and self._explains_a_part(best):
                 return replace(best, short=True)
@@ -190,11 +195,12 @@ class Refitter:
             except NotFittedError:
                 now = best  # a step too far
             if now.score > best.score:
-                gained, best, length, further = now.score - best.score, now, 1.0, 0
-            elif now is not best and further < _FURTHER and length == 1.0 and float(now.change @ step) > 0.0:
+                gained, best, further = now.score - best.score, now, 0
+                length = _lengthened(now.change, step)
+            elif now is not best and further < _FURTHER and length >= 1.0 and float(now.change @ step) > 0.0:
                 further += 1  # on both sides of a dip the data ask for more of the same
             elif length > _SHORTEST:
-                length, further = length / 2.0, 0
+                length, further = min(length, 2.0) / 2.0, 0
             else:
                 break
         return best
@@ -411,6 +417,16 @@ def _error_of_difference(vectors: FloatArray, before: FloatArray, std: FloatArra
     scatter = (vectors - before).std(axis=0, ddof=1)
     usual = std * np.sqrt(np.mean((scatter / std) ** 2))
     return np.asarray(np.maximum(scatter, usual) / np.sqrt(len(vectors)))
+
+
+def _lengthened(change: FloatArray, step: FloatArray) -> float:
+    """Return by how much the next step is to be longer than the change that is asked for after a step.
+
+    Where each asks for nearly as much as the last one, slopes are too steep: all of them together are a
+    geometric series.
+    """
+    ratio = float(change @ step) / max(float(step @ step), 1e-12)
+    return 1.0 if ratio < _SLOW else 1.0 / (1.0 - min(ratio, _SLOWEST))
 
 
 def _as_long(change: FloatArray, step: FloatArray) -> FloatArray:
