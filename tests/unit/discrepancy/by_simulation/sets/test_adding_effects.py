@@ -161,6 +161,31 @@ def test_a_dip_on_the_way_to_the_best_strength_is_crossed(monkeypatch: pytest.Mo
     assert world.drawn <= 6 * 7
 
 
+def test_slopes_that_are_too_steep_cost_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of noise that grows with the signal, 0.7 e-: each step does a sixth of what it promises.
+
+    Too little in any statistic for the slopes to be corrected.
+    """
+    best = factor(effect("row_noise", 0.1))
+
+    def weak(effects: Sequence[Effect]) -> np.ndarray:
+        way = np.log(factor(effects[0]) / best) if effects else -50.0
+        return (np.arange(M) >= M // 2) * (40.0 + 3.0 * way) * (way > -50.0)
+
+    def draw(effects: tuple[Effect, ...], count: int) -> tuple[Any, np.ndarray]:
+        world.drawn += count
+        return SimpleNamespace(moved={}), weak(effects) + world.rng.standard_normal((count, M))
+
+    monkeypatch.setitem(globals(), "statistics", weak)
+    world = World([effect("row_noise", 0.1)])
+    monkeypatch.setattr(world, "draw", draw)
+    start = Hypothesis(effect("row_noise", 0.1 * np.exp(-0.7)), (np.arange(M) >= M // 2) * 18.0)
+    found = world.refitter().refined([start])
+    # of twelve statistics, two splits and six replicates
+    assert abs(np.log(factor(found.effects[0]) / best)) < 3.5 * np.sqrt((0.5 + 1.0 / 6.0) / 12.0) / 3.0
+    assert world.drawn <= 6 * 6
+
+
 @pytest.mark.parametrize("tags", [("row_noise",), ("row_noise", "frame_noise")])
 @pytest.mark.parametrize("power", [1.0, 1.0 / 3.0])
 def test_the_error_of_a_strong_effect_is_that_of_its_slope(
