@@ -93,6 +93,7 @@ class Acceptance:
         proven = 1.0 + change > np.where(measured, _MEASURED, _CONFIRMED) * stderr
         proven &= change > -LARGEST_DECREASE
         there = (clear & proven) | certain | (self._counted(added) & (change > -LARGEST_DECREASE))
+        there &= added.slopes.any(axis=1)  # what moves nothing has a strength without an error
         return tuple(h for h, is_there in zip(added.hypotheses, there, strict=True) if is_there)
 
     def _counted(self, added: Refitted) -> NDArray[np.bool_]:

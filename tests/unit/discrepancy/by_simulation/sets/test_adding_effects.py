@@ -891,6 +891,24 @@ def test_what_gets_no_name_needs_fewer_errors_and_more_of_them_in_the_final_fram
         assert bool(accept.established(added)) is there
 
 
+def test_an_effect_that_moves_nothing_is_not_there() -> None:
+    """Seen: missing codes where the pixels have no samples; no statistic moves, and no strength is off."""
+    world = World([])
+    unused: Any = None
+    added: Any = SimpleNamespace(
+        hypotheses=(Hypothesis(effect("row_noise", 0.1), np.zeros(M)),),
+        parts=np.zeros((1, M)),
+        slopes=np.zeros((1, M)),
+        mean=world.null.mean,
+        change=np.zeros(1),
+        stderr=np.zeros(1),
+        vectors=np.zeros((400, M)),
+        covariance=np.eye(M),
+        rest=np.zeros(M),
+    )
+    assert not Acceptance(world.null, world.z, unused, 0.0).established(added)
+
+
 @pytest.mark.parametrize(
     ("size", "other", "there"), [(6.0, 0.0, False), (300.0, 0.0, True), (300.0, 290.0, False)]
 )
