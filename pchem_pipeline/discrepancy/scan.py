@@ -68,6 +68,11 @@ class Suspect:
         return math.exp(max(self.log_p, _LEAST))
 
     @property
+    def log_places(self) -> float:
+        """Logarithm of the number of places that were looked at."""
+        return max(self.log_p - float(special.log_ndtr(-abs(self.z))), 0.0)
+
+    @property
     def only_there(self) -> bool:
         """Whether little of it is elsewhere."""
         return abs(self.outside) < _LITTLE * abs(self.inside)

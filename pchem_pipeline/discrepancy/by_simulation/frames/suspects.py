@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special, stats
 from scipy.ndimage import binary_dilation
 
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
@@ -24,14 +25,16 @@ from pchem_pipeline.discrepancy.observe.rare import N_SETS, rare_samples
 from pchem_pipeline.discrepancy.scan import scan_series, sharpest_range
 from pchem_pipeline.discrepancy.scan_events import scan_event_frames, scan_event_map
 from pchem_pipeline.discrepancy.scan_pairs import Limits, Shared, scan_pairs
-from pchem_pipeline.discrepancy.where import frame_series, suspected_regions
+from pchem_pipeline.discrepancy.where import frame_series, pixel_maps, suspected_regions
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import When
 
 FloatArray = NDArray[np.float64]
 
 #: Of a place among all places of all maps; maps rest on fits, whose errors are not quite normal.
-_SIGNIFICANCE_OF_MAPS = 1e-6
+_SIGNIFICANCE_OF_MAPS = 1e-4
+_SIGNIFICANCE_OF_GUESSES = 1.0  # of a place in all maps, which other maps must bear out
+_FARTHEST = 6.0  # standard deviations of a pixel's shape
 #: Of a place among all pairs, of frames among all series, and of either among rare samples: these follow from
 #: the order of the frames, and from the number of the samples.
 _SIGNIFICANCE = 1e-3
@@ -148,18 +151,45 @@ def _places_of_frames(
 
 
 def _regions(evidence: Evidence, usable: NDArray[np.bool_]) -> Iterator[_Found]:
-    """Yield the places of maps that stand out while little of it is elsewhere.
+    """Yield the places that stand out in a map, or in all shapes of the histograms together.
 
-    Not scattered pixels: effects of few pixels are simulated in others, and would never do to these what the
-    data do.
+    Where little of it is elsewhere, and not scattered pixels: effects of few pixels are simulated in others,
+    and would never do to these what the data do.
     """
-    for suspects in suspected_regions(evidence, _SIGNIFICANCE_OF_MAPS).values():
+    shapes = _Shapes(evidence)
+    for suspects in suspected_regions(evidence, _SIGNIFICANCE_OF_GUESSES).values():
         for one in suspects:
-            mask = one.region.mask((usable.shape[0], usable.shape[1]))
-            inside = int((usable & mask).sum())
-            placed = one.only_there and one.family != "pixels"
-            if placed and FEWEST_PIXELS <= inside <= _LARGEST * usable.sum():
-                yield _Found(abs(one.z), Part(one.region))
+            mask = usable & one.region.mask((usable.shape[0], usable.shape[1]))
+            if not one.only_there or one.family == "pixels":
+                continue
+            if not FEWEST_PIXELS <= mask.sum() <= _LARGEST * usable.sum():
+                continue
+            alone = one.log_p + np.log(len(pixel_maps(evidence)))
+            together = shapes.log_p(mask)
+            z = max(abs(one.z), float(-special.ndtri_exp(together)))
+            if min(alone, together + one.log_places) <= np.log(_SIGNIFICANCE_OF_MAPS):
+                yield _Found(z, Part(one.region))
+
+
+class _Shapes:
+    """The maps of the shapes of the histograms, of which effects move several at once."""
+
+    def __init__(self, evidence: Evidence):
+        self.usable = evidence.maps.usable
+        maps = [evidence.goodness, evidence.peaks, *evidence.scores.values()]
+        values = np.nan_to_num(np.array([each[self.usable] for each in maps], np.float64))
+        # means of places are nearly normal, single pixels less so
+        middle = np.median(values, axis=1, keepdims=True)
+        self.values = np.clip(values - middle, -_FARTHEST, _FARTHEST)
+        self.precision = np.linalg.pinv(np.atleast_2d(np.cov(self.values)), hermitian=True)
+
+    def log_p(self, mask: NDArray[np.bool_]) -> float:
+        """Return the logarithm of the probability that the means of some pixels, (y, x), are so far off."""
+        inside = mask[self.usable]
+        apart = self.values[:, inside].mean(axis=1) - self.values[:, ~inside].mean(axis=1)
+        number = 1.0 / (1.0 / inside.sum() + 1.0 / (~inside).sum())
+        distance = number * float(apart @ self.precision @ apart)
+        return float(stats.chi2.logsf(distance, len(self.values)))
 
 
 def _regions_of_rare(evidence: Evidence) -> Iterator[_Found]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -123,6 +125,28 @@ def test_a_part_of_sensor_or_run_with_heavy_tails_is_suspected(seed):
 @pytest.mark.parametrize("seed", [4, 5, 6])
 def test_no_part_is_suspected_where_none_differs(add, seed):
     assert parts_of(camera(seed, add)) == ()
+
+
+def test_a_part_is_suspected_by_what_several_shapes_show_together():
+    """As of telegraph noise in three rows: no map has the place by itself, and chance has none."""
+    frames = camera(7, nothing)
+    clean = observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=50)
+    rng, rows = np.random.default_rng(11), slice(5, 8)
+
+    def parts(shift, names):
+        scores = {name: rng.standard_normal(clean.maps.usable.shape) for name in clean.scores}
+        for name in names:
+            scores[name][rows] += shift
+        return suspected_parts(replace(clean, scores=scores), frames)
+
+    names, found = list(clean.scores), Region(rows=((5, 8),))
+    shift = 5.0 / np.sqrt(3.0 * SHAPE[1])
+    assert all(parts(0.0, names) == () for _ in range(10))
+    # in a map by itself, of thousands of places in two dozen maps, five standard errors are nothing
+    assert sum(len(parts(shift, names[:1])) for _ in range(3)) <= 1
+    seen = [part.region.overlap(found, SHAPE) for _ in range(4) for part in parts(shift, names[:5])]
+    assert len(seen) >= 3
+    assert np.median(seen) >= 0.8
 
 
 def test_statistics_of_a_part_are_those_of_a_sensor_of_its_own():
