@@ -120,21 +120,24 @@ def refit_maps(
         origin = histograms.origin.ravel()[some]
         return fit_histograms(counts[some], origin, law=law.of(some), start=start[some], settings=_SEARCHED)
 
-    known, every = np.flatnonzero(maps.usable.ravel()), np.arange(len(near))
+    acted_on = _acted_on(effects, (shape[0], shape[1])).ravel()
+    known = np.flatnonzero(maps.usable.ravel() & acted_on)
+    # an effect of a part of the sensor leads no other pixels astray
+    known = known if known.size else np.flatnonzero(maps.usable.ravel())
     probed = known[:: max(1, known.size // _PROBED)]
     probe = fitted(probed)
     if np.mean(np.isfinite(probe.bias)) < _LEAST_FITTED:
         raise NotFittedError("hardly a pixel can be fitted with it")
-    fit = fitted(every)
+    fit = fitted(np.arange(len(near)))
     for start in (_off_by(near, -1.0), _off_by(near, 1.0), _of_usual_noise(near, fit.columns)):
         if np.mean(_likelier(fitted(probed, start), probe)) > _OFTEN_BETTER:
-            other = fitted(every, start)
-            better = np.flatnonzero(_likelier(other, fit))
-            fit = fit.with_pixels(better, other.of(better))
+            other = fitted(known, start)
+            better = np.flatnonzero(_likelier(other, fit.of(known)))
+            fit = fit.with_pixels(known[better], other.of(better))
     new = fit.maps
     good = maps.usable.ravel() & np.isfinite(fit.columns).all(axis=1)
     stderr = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)).T
-    inside = good & _acted_on(effects, (shape[0], shape[1])).ravel()
+    inside = good & acted_on
     moved = {
         name: _change(after[inside] - before[inside], error[inside], unit)
         for (name, unit), before, after, error in zip(_UNITS.items(), flat, new, stderr, strict=True)
