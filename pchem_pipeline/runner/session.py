@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
+from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, InputError, StoreError
 from pchem_pipeline.compute.executor import Notices, SerialExecutor, make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.config.load import dump_config
@@ -24,6 +25,7 @@ from pchem_pipeline.stages.samples import SAMPLES_UNTIL, check_samples, sample_t
 from pchem_pipeline.stages.table import STAGES, pipeline_of
 from pchem_pipeline.store.files import write_json
 from pchem_pipeline.store.progress_file import ProgressFile
+from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
 
 
@@ -89,7 +91,11 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
     if command.options.dry_run:
         return _dry_run(target, stages, command)
     ahead = [name for name in stages if STAGES[name].compiled_ahead]
-    with working_run(target, command) as context, compiled_ahead(context.config, ahead):
+    with (
+        nothing_left_of_a_refusal(target.store),
+        working_run(target, command) as context,
+        compiled_ahead(context.config, ahead),
+    ):
         states = [_execute(name, context, stages) for name in stages]
         context.reporter.event("end", states={state.stage: state.words() for state in states})
         failed = [f"{state.stage}: {state.why}" for state in states if state.state == "failed"]
@@ -98,6 +104,26 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
         for words in filter(None, (STAGES[name].status_words for name in stages)):
             _check_failed_pixels(context, words)
     return states
+
+
+@contextlib.contextmanager
+def nothing_left_of_a_refusal(place: Path) -> Iterator[None]:
+    """Remove a store that was not there before, where a run is refused and no stage has done anything."""
+    existed = isinstance(place, RemotePath) or place.exists()
+    try:
+        yield
+    except (ConfigError, InputError, StoreError):
+        if not existed and _is_empty(place):
+            shutil.rmtree(place, ignore_errors=True)
+        raise
+
+
+def _is_empty(place: Path) -> bool:
+    """Tell whether no stage has done anything in a store, which may not exist."""
+    if not (place / ".pchem").is_dir():
+        return not place.exists()
+    records = RunStore.open(place).records
+    return all(records.read(name) is None for name in STAGES)
 
 
 def _bring_samples(target: Target, stages: Sequence[str], command: Command) -> None:

@@ -1,6 +1,7 @@
 """Bad input: one line with what, where and the cure, its exit code, and nothing lost."""
 
 import os
+import shutil
 import subprocess
 
 import h5py
@@ -259,6 +260,44 @@ def test_a_read_only_folder(shell, frames, small_disk):
     result = shell("run", "run.yaml", "--quiet")
     assert result.code == 4
     assert "choose another place for the store" in result.last
+
+
+@pytest.mark.parametrize("stage", ["histogram", "fit", "report", "electrons"])
+def test_a_stage_asked_for_too_early_leaves_nothing(shell, stage):
+    np.save(shell.folder / "a.npy", GOOD)
+    (shell.folder / "my run.yaml").write_text(OF_ONE_FILE)
+    result = shell(stage, "my run.yaml")
+    assert result.code == 4
+    assert result.last.startswith(f"pchem: {stage} needs ")
+    assert result.last.endswith(f"'{shell.folder / 'my run.yaml'}'")  # there is no store to be named
+    assert sorted(path.name for path in shell.folder.iterdir()) == ["a.npy", "my run.yaml"]
+
+
+def test_a_file_in_place_of_a_store_or_a_folder_is_left_alone_and_nothing_else(shell):
+    np.save(shell.folder / "a.npy", GOOD)
+    (shell.folder / "notes").write_text("of mine")
+    result = shell("run", "a.npy", "--store", "notes")
+    assert result.code == 4
+    assert "notes exists and is not a run; choose another --store or remove it" in result.last
+    for command in (("run", "a.npy", "--store", "notes/run.zarr"), ("init", "notes/run.yaml")):
+        result = shell(*command)
+        assert result.code == 4
+        assert result.last.endswith("there is a file where a folder is meant: choose another place")
+    assert sorted(path.name for path in shell.folder.iterdir()) == ["a.npy", "notes"]
+    assert (shell.folder / "notes").read_text() == "of mine"
+
+
+@pytest.mark.parametrize("command", ["fit", "discrepancy"])
+def test_a_region_beyond_the_sensor_is_one_line(shell, command, finished):
+    shutil.copytree(finished.parent, shell.folder, dirs_exist_ok=True)
+    before = sorted((shell.folder / "run.zarr").rglob("*"))
+    result = shell(command, "run.yaml", "--roi", "0:99,0:9")
+    assert result.code == 2
+    assert result.last == (
+        "pchem: --roi 0:99,0:9 reaches beyond the sensor of 20 x 28 pixels (y x x); choose within 0:20,0:28"
+    )
+    assert "Traceback" not in result.stderr
+    assert sorted((shell.folder / "run.zarr").rglob("*")) == before
 
 
 def test_usage_errors_are_exit_code_2(shell):
