@@ -91,11 +91,7 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
     if command.options.dry_run:
         return _dry_run(target, stages, command)
     ahead = [name for name in stages if STAGES[name].compiled_ahead]
-    with (
-        nothing_left_of_a_refusal(target.store),
-        working_run(target, command) as context,
-        compiled_ahead(context.config, ahead),
-    ):
+    with working_run(target, command) as context, compiled_ahead(context.config, ahead):
         states = [_execute(name, context, stages) for name in stages]
         context.reporter.event("end", states={state.stage: state.words() for state in states})
         failed = [f"{state.stage}: {state.why}" for state in states if state.state == "failed"]
@@ -119,9 +115,9 @@ def nothing_left_of_a_refusal(place: Path) -> Iterator[None]:
 
 
 def _is_empty(place: Path) -> bool:
-    """Tell whether no stage has done anything in a store, which may not exist."""
+    """Tell whether no stage has done anything in a store, which may be half made or not exist."""
     if not (place / ".pchem").is_dir():
-        return not place.exists()
+        return True
     records = RunStore.open(place).records
     return all(records.read(name) is None for name in STAGES)
 
@@ -155,7 +151,7 @@ def _execute(name: str, context: StageContext, stages: Sequence[str]) -> StageSt
 
 @contextlib.contextmanager
 def working_run(target: Target, command: Command) -> Iterator[StageContext]:
-    """Open and lock the run, and yield what its stages need.
+    """Open and lock the run, and yield what its stages need; a new one that is refused is taken away again.
 
     Raises:
         LockedError: another process works on the run.
@@ -163,12 +159,13 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
     """
     own, target = target.config, with_overrides(target, command)
     keep_to_limit(target.config.compute.max_memory)
-    store = RunStore.create(target.store)
-    progress_file = ProgressFile(store.path)
-    reporter = Reporter(
-        command.progress, quiet=command.quiet, log=command.log_json, progress_file=progress_file
-    )
     with contextlib.ExitStack() as stack:
+        stack.enter_context(nothing_left_of_a_refusal(target.store))
+        store = RunStore.create(target.store)
+        progress_file = ProgressFile(store.path)
+        reporter = Reporter(
+            command.progress, quiet=command.quiet, log=command.log_json, progress_file=progress_file
+        )
         stack.callback(reporter.close)
         stack.enter_context(store.locked())
         progress_file.show({"stage": ""})
