@@ -598,11 +598,16 @@ def test_names_in_all_scripts_keep_the_page_as_wide_as_the_window(
         "cells => cells.map(each => [getComputedStyle(each).unicodeBidi, getComputedStyle(each).textAlign])"
     )
     assert set(map(tuple, cells)) == {("plaintext", "left")}
-    if channels:  # the numbers of channels stand under the map
+    if channels:
+        # their numbers stand under the map
         frame = tab.page.locator(".map-frame").bounding_box()
         axis = tab.page.locator("#inspector-axis-x").bounding_box()
         assert (axis["x"], axis["width"]) == pytest.approx((frame["x"], frame["width"]), abs=2)
         assert axis["y"] >= frame["y"] + frame["height"] - 2
+        tab.page.fill("#inspector-x", "1")
+        tab.page.keyboard.press("Enter")
+        tab.wait(1)
+        assert tab.text("#inspector-title") == f"Channel 1 \u2068{NAMES[1]}\u2069"
 
 
 def test_a_third_failed(open_tab: Any, tmp_path: Path) -> None:
