@@ -199,8 +199,8 @@ class _Patience:
             many, have = (f"{silent} workers", "have") if silent > 1 else ("a worker", "has")
             self._notices.say(
                 f"{many} of {self._name} {have} given no sign of life for {_SILENT:g} s; dask gives the work "
-                "to others up to twice its distributed.scheduler.worker-ttl later (5 minutes unless it is set), "
-                "or at once if you kill it"
+                "to others up to twice its distributed.scheduler.worker-ttl later (5 minutes unless it is "
+                "set), or at once if you kill it"
             )
         self._silent = silent
 

@@ -203,7 +203,7 @@ def test_workers_that_all_leave_are_waited_for_and_given_up(processes, tmp_path)
     assert len(heard.lines) == 1
 
 
-def test_a_worker_that_hangs_is_said(processes, tmp_path, monkeypatch):
+def test_a_worker_that_hangs_is_said_and_may_be_killed(processes, tmp_path, monkeypatch):
     file, (_, worker, _) = processes
     monkeypatch.setattr(cluster, "_SILENT", 4.0)
     heard, found = Counted(), []
@@ -219,7 +219,7 @@ def test_a_worker_that_hangs_is_said(processes, tmp_path, monkeypatch):
 
     def say(line):
         heard.lines.append(line)
-        worker.send_signal(signal.SIGCONT)
+        worker.kill()  # as the line says
 
     executor._patience._notices = Notices(say, heard.check)
     try:
