@@ -13,7 +13,6 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.session import Command, run_stages, run_status
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
-from pchem_pipeline.store.run_store import RunStore
 
 _BEFORE = ("ingest", "histogram")
 _AFTERWARDS = ("fit", "maps", "ensemble", "report")
@@ -65,7 +64,7 @@ def _of_histograms(target: Target) -> bool:
     """Tell whether the search looks at histograms, not at frames: ready-made ones, or several samples'."""
     if not (target.store / "zarr.json").exists():
         return False
-    store = RunStore.open(target.store)
+    store = target.stored()
     return store.has("frames") and SensorInfo.read(store).kind != "frames"
 
 

@@ -60,7 +60,7 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
         what = f"{', '.join(unknown)} cannot be written" if unknown else "none is given"
         raise ConfigError(f"--format: {what}; choose from {', '.join(FORMATS)}")
     target = find_run(path)
-    store = RunStore.open(target.store)
+    store = target.stored()
     if "summary" not in store.attributes("maps"):
         raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
     _say_if_old(target)

@@ -20,7 +20,6 @@ from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.stages.report.drawing import drawing_executor, drawing_workers
 from pchem_pipeline.stages.report.report import gather
 from pchem_pipeline.store.files import storage_error, write_atomic
-from pchem_pipeline.store.run_store import RunStore
 
 #: Narrowest and widest figure, mm.
 _WIDTHS = (40.0, 400.0)
@@ -71,7 +70,7 @@ def gather_run(target: Target) -> ReportData:
     Raises:
         StoreError: the run lacks maps or histograms.
     """
-    store = RunStore.open(target.store)
+    store = target.stored()
     if not store.has("maps/conversion_gain"):
         raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
     time = target.config.input.integration_time or SensorInfo.read(store).integration_time

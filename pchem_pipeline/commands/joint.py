@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.commands.first_screen import run_to_first_screen
 from pchem_pipeline.commands.new_run import settings_of, settings_there
 from pchem_pipeline.config.load import dump_config, make_config
@@ -70,7 +70,7 @@ def run_joint(
 ) -> None:
     """Do every stage of a run of several samples, and what their own runs need for it.
 
-    A new YAML whose samples do not belong together is taken away again, so that its name is free.
+    The new YAML of a run that is refused is taken away again, so that its name is free.
 
     Raises:
         ConfigError: the samples do not belong together.
@@ -79,7 +79,7 @@ def run_joint(
     """
     try:
         run_to_first_screen(target, pipeline_of(target.config), command, say, strict=strict)
-    except ConfigError:
-        if is_new and target.config_path is not None and not target.store.exists():
+    except (ConfigError, InputError, StoreError):
+        if is_new and target.config_path is not None and not (target.store / ".pchem").is_dir():
             target.config_path.unlink(missing_ok=True)
         raise

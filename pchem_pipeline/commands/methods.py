@@ -7,9 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.stages.methods.result import METHODS_FILE, read_methods
-from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
     from pchem_pipeline.run.target import Target
@@ -34,11 +32,7 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
     if "with_runs" in values:
         values["with_runs"] = tuple(str(Path(path).resolve()) for path in values["with_runs"])
     changed = target.changed("methods", **values)  # says what is wrong with them
-    if not (target.store / "zarr.json").exists():
-        raise StoreError(
-            f"{target.store} does not exist; run: pchem run {quoted(target.config_path or target.store)}"
-        )
-    store = RunStore.open(target.store)
+    store = target.stored()
     # before anything of an earlier comparison is given up
     if store.has("histogram/counts"):
         open_other_runs(store, target.base_dir, changed.config.methods.with_runs)
@@ -49,7 +43,7 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
     reported = {state.stage: state.state for state in run_status(target)}["report"] != "missing"
     if reported:
         run_stages(target, ["report"], replace(command, options=replace(command.options, force=False)))
-    result = read_methods(RunStore.open(target.store))
+    result = read_methods(target.stored())
     if result is None:
         return ""
     from pchem_pipeline.report.pages.methods import methods_text

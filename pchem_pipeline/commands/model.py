@@ -69,7 +69,7 @@ def list_models(target: Target) -> list[ListedModel]:
     Raises:
         StoreError: there is no run, or it is damaged.
     """
-    store = RunStore.open(target.store)
+    store = target.stored()
     current = model_in_force(store, target.config.model)
     versions = {version.number: version for version in (*model_versions(store), current)}
     states = run_status(target)
@@ -125,7 +125,7 @@ def use_model(target: Target, number: int) -> str:
         LockedError: another process works on the run.
         StoreError: there is no run, or it or the YAML cannot be written.
     """
-    store = RunStore.open(target.store, writable=True)
+    store = target.stored(writable=True)
     with store.locked():
         before = _kept(store, target)
         version = version_with(store, number)
@@ -190,7 +190,7 @@ def adopt_verdict(target: Target) -> tuple[Target, ModelVersion | None]:
         LockedError: another process works on the run.
         StoreError: the store or the YAML cannot be written.
     """
-    store = RunStore.open(target.store, writable=True)
+    store = target.stored(writable=True)
     with store.locked():
         before = _kept(store, target)
         start, found = model_of(store, _SEARCH), read_verdict(store.path)

@@ -7,7 +7,6 @@ import glob
 import os
 import re
 import shlex
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from pchem_pipeline.config.load import dump_config, load_config, make_config, pa
 from pchem_pipeline.config.template import SCHEMA_NAME, commented_config, json_schema
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.runner.session import nothing_left_of_a_refusal
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath, place_of
@@ -169,17 +169,17 @@ def first_try(target: Target, text: str | None) -> Iterator[None]:
         target: the run.
         text: of its YAML; None: it has one.
     """
-    local = not isinstance(target.store, RemotePath)
-    had_store, path = not local or target.store.exists(), target.config_path
+    path = target.config_path
     had_yaml = text is None or path is None or path.exists()
+    had_run = isinstance(target.store, RemotePath) or (target.store / ".pchem").is_dir()
     if text is not None and path is not None:
         write_atomic(path, text.encode())
     try:
-        yield
+        with nothing_left_of_a_refusal(target.store):
+            yield
     except (ConfigError, InputError, StoreError) as error:
-        if had_store or not _is_empty(target.store):
+        if had_run or (target.store / ".pchem").is_dir():
             raise
-        shutil.rmtree(target.store, ignore_errors=True)
         if had_yaml or path is None:
             raise
         path.unlink(missing_ok=True)
@@ -190,14 +190,6 @@ def first_try(target: Target, text: str | None) -> Iterator[None]:
             f"{error}; a setting without an option goes into a YAML: pchem init {name} FILES, then pchem run "
             f"{name}"
         ) from error
-
-
-def _is_empty(place: Path) -> bool:
-    """Tell whether no stage has done anything in a store, which may not exist."""
-    if not (place / ".pchem").is_dir():
-        return not place.exists()
-    records = RunStore.open(place).records
-    return all(records.read(name) is None for name in STAGES)
 
 
 def _came_to_nothing(place: Path, path: Path) -> bool:

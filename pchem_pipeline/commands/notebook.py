@@ -39,7 +39,6 @@ from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.stages.report.pixels import bin_masses, pixel_fits, pixel_index
 from pchem_pipeline.stages.report.stored import read_histograms, read_model
-from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -91,7 +90,7 @@ class Run:
 
     def __init__(self, target: Target) -> None:
         self._target = target
-        self._store = RunStore.open(target.store)
+        self._store = target.stored()
         self._sensor = SensorInfo.read(self._store)
         self._groups: dict[str, xr.Dataset] = {}
         self.path: Path = target.store

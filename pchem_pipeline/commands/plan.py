@@ -16,7 +16,6 @@ from pchem_pipeline.planning.plan import LEAST_SHARE, Plan, SamplesPlan, plan_on
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import Target, parse_target
 from pchem_pipeline.store.files import write_atomic, write_json
-from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
     from pchem_pipeline.planning.verify import Verification
@@ -110,7 +109,7 @@ def _median_pixel(run: Path) -> dict[str, float]:
     """Return the medians of a run's maps."""
     from pchem_pipeline.run.target import find_run
 
-    store = RunStore.open(find_run(run).store)
+    store = find_run(run).stored()
     summary = store.attributes("maps").get("summary")
     if summary is None:
         raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")

@@ -45,7 +45,7 @@ def twin_of(target: Target, *, redraw: int | None = None, shape: tuple[int, int]
         StoreError: the run is not finished as far as its fit.
         ConfigError: no pixel has a fit, or the run has no frames.
     """
-    store = RunStore.open(target.store)
+    store = target.stored()
     check_run(store)
     sensor = SensorInfo.read(store)
     if sensor.kind == "histograms":

@@ -246,7 +246,7 @@ def make_server(path: Path, port: int = 0) -> tuple[ThreadingHTTPServer, str]:
         ConfigError: the port is taken.
         StoreError: there is no run, or none with a report that can be inspected.
     """
-    view = RunView(RunStore.open(find_run(path).store))
+    view = RunView(find_run(path).stored())
     view.check()
     handler = type("_RunHandler", (_Handler,), {"run_view": view})
     try:

@@ -30,6 +30,8 @@ _LIBRARIES = ("pchem-pipeline", "numpy", "scipy", "numba", "zarr", "distributed"
 #: seconds between looks for results, between looks at the workers while no result comes (at first, and at
 #: most where one is on its way), and without workers before it is said
 _POLL, _LOOK, _LONGEST, _SAY = 0.01, 1.0, 16.0, 5.0
+#: seconds without a heartbeat of a worker, while others have one, before it is said
+_SILENT = 30.0
 #: share of a worker's memory above which dask gives it no more work
 _USABLE = 0.8
 
@@ -157,22 +159,25 @@ class DistributedExecutor:
 
 
 class _Patience:
-    """Says once that no worker can work, and gives up after a while."""
+    """Says once that no worker can work, and gives up after a while; says that a worker is silent."""
 
     def __init__(self, name: str, seconds: float, notices: Notices) -> None:
         self._name, self._seconds, self._notices = name, seconds, notices
         self._since: float | None = None
         self._said = False
+        self._silent = 0
 
     def look(self, workers: Sequence[dict[str, Any]]) -> bool:
         """Tell whether a worker can work now.
 
         Args:
-            workers: what the scheduler tells of each, with ``status`` and ``memory_limit`` (bytes).
+            workers: what the scheduler tells of each, with ``status``, ``memory_limit`` (bytes) and
+                ``last_seen`` (s).
 
         Raises:
             IncompleteRunError: none could for too long.
         """
+        self._tell_silent([each["last_seen"] for each in workers if "last_seen" in each])
         if any(each["status"] == "running" for each in workers):
             self._since, self._said = None, False
             return True
@@ -186,6 +191,18 @@ class _Patience:
             why = f": all {len(workers)} are paused, their memory is nearly full" if workers else ""
             self._notices.say(f"waiting for workers of {self._name}{why}")
         return False
+
+    def _tell_silent(self, seen: Sequence[float]) -> None:
+        """Say how many workers gave no sign of life for long: dask waits for them, and so does the run."""
+        silent = sum(max(seen) - each > _SILENT for each in seen)
+        if silent > self._silent:
+            many, have = (f"{silent} workers", "have") if silent > 1 else ("a worker", "has")
+            self._notices.say(
+                f"{many} of {self._name} {have} given no sign of life for {_SILENT:g} s; dask gives the work "
+                "to others up to twice its distributed.scheduler.worker-ttl later (5 minutes unless it is "
+                "set), or at once if you kill it"
+            )
+        self._silent = silent
 
     def _last_words(self, workers: Sequence[dict[str, Any]]) -> str:
         waited = f"for {self._seconds:g} s (compute.wait_for_workers)"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pchem_pipeline.base.errors import ConfigError, StoreError
+from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.config.load import load_config, make_config, parse_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.store.files import read_json
@@ -27,6 +27,18 @@ class Target:
         content = self.config.model_dump(by_alias=True)
         content[section] = {**content[section], **values}
         return replace(self, config=make_config(content, "the command line"))
+
+    def stored(self, *, writable: bool = False) -> RunStore:
+        """Return its store.
+
+        Raises:
+            StoreError: it was never run, or its store cannot be used.
+        """
+        if self.config_path is not None and not (self.store / "zarr.json").exists():
+            raise StoreError(
+                f"there is no run at {self.store} yet; run: pchem run {quoted(self.config_path)}"
+            )
+        return RunStore.open(self.store, writable=writable)
 
 
 def find_run(path: Path) -> Target:

@@ -31,15 +31,17 @@ def execute(name: str, context: StageContext) -> StageState:
     stage = STAGES[name]
     before = status(stage, context)
     chosen = context.options.tiles is not None or context.options.roi is not None
-    if chosen and before.state == "complete":
-        context.selected(())  # refuses tiles and regions that the sensor does not have
     if before.state == "complete" and not context.options.force:
+        if chosen:
+            context.selected(())
         context.reporter.info(f"{name}: up to date")
         return before
     for upstream in stage.upstream:
         if context.store.records.read(upstream) is None:
-            place = quoted(context.store.path)
+            place = quoted(context.config_path or context.store.path)
             raise StoreError(f"{name} needs {upstream} first; run: pchem {upstream} {place}")
+    if chosen and stage.upstream:
+        context.selected(())  # refuses tiles and regions that the sensor does not have
     if context.options.dry_run:
         context.reporter.info(f"{name}: {before.words()} -> would run")
         return before

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
+from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, InputError, StoreError
 from pchem_pipeline.compute.executor import Notices, SerialExecutor, make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.config.load import dump_config
@@ -24,6 +25,7 @@ from pchem_pipeline.stages.samples import SAMPLES_UNTIL, check_samples, sample_t
 from pchem_pipeline.stages.table import STAGES, pipeline_of
 from pchem_pipeline.store.files import write_json
 from pchem_pipeline.store.progress_file import ProgressFile
+from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
 
 
@@ -100,6 +102,26 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
     return states
 
 
+@contextlib.contextmanager
+def nothing_left_of_a_refusal(place: Path) -> Iterator[None]:
+    """Remove a store that was not there before, where a run is refused and no stage has done anything."""
+    existed = isinstance(place, RemotePath) or place.exists()
+    try:
+        yield
+    except (ConfigError, InputError, StoreError):
+        if not existed and _is_empty(place):
+            shutil.rmtree(place, ignore_errors=True)
+        raise
+
+
+def _is_empty(place: Path) -> bool:
+    """Tell whether no stage has done anything in a store, which may be bare or not exist."""
+    if not (place / ".pchem").is_dir():
+        return not place.exists() or {each.name for each in place.iterdir()} <= {"zarr.json"}
+    records = RunStore.open(place).records
+    return all(records.read(name) is None for name in STAGES)
+
+
 def _bring_samples(target: Target, stages: Sequence[str], command: Command) -> None:
     """Bring the runs of the samples up to their histograms, where a run has several and looks at its input.
 
@@ -129,7 +151,7 @@ def _execute(name: str, context: StageContext, stages: Sequence[str]) -> StageSt
 
 @contextlib.contextmanager
 def working_run(target: Target, command: Command) -> Iterator[StageContext]:
-    """Open and lock the run, and yield what its stages need.
+    """Open and lock the run, and yield what its stages need; a new one that is refused is taken away again.
 
     Raises:
         LockedError: another process works on the run.
@@ -137,12 +159,13 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
     """
     own, target = target.config, with_overrides(target, command)
     keep_to_limit(target.config.compute.max_memory)
-    store = RunStore.create(target.store)
-    progress_file = ProgressFile(store.path)
-    reporter = Reporter(
-        command.progress, quiet=command.quiet, log=command.log_json, progress_file=progress_file
-    )
     with contextlib.ExitStack() as stack:
+        stack.enter_context(nothing_left_of_a_refusal(target.store))
+        store = RunStore.create(target.store)
+        progress_file = ProgressFile(store.path)
+        reporter = Reporter(
+            command.progress, quiet=command.quiet, log=command.log_json, progress_file=progress_file
+        )
         stack.callback(reporter.close)
         stack.enter_context(store.locked())
         progress_file.show({"stage": ""})

@@ -27,6 +27,14 @@ _CURES = {
     errno.EPERM: "no permission to write there: choose another place for the store",
 }
 
+#: of one place, not of every other as well
+_CURES_OF_A_PLACE = {
+    errno.EEXIST: "there is a file where a folder is meant: choose another place",
+    errno.ENOTDIR: "there is a file where a folder is meant: choose another place",
+    errno.EISDIR: "there is a folder where a file is meant: choose another place",
+    errno.ENAMETOOLONG: "choose a shorter name",
+}
+
 _ERRNO = re.compile(r"errno = (\d+)")
 
 
@@ -34,7 +42,8 @@ def storage_error(error: OSError, path: object) -> StoreError:
     """Translate an error of the file system into one line with its cure; one that is such a line stays."""
     if isinstance(error, StoreError):
         return error
-    cure = _CURES.get(error.errno or 0, "check the disk: its free space, quota and permissions")
+    cures = {**_CURES, **_CURES_OF_A_PLACE}
+    cure = cures.get(error.errno or 0, "check the disk: its free space, quota and permissions")
     return StoreError(f"cannot use {path}: {error.strerror or error}; {cure}")
 
 

@@ -5,44 +5,116 @@ file of the paper's size (9.3 GB) with scripts/simulate_full_size.py. Example:
 
     python scripts/simulate_full_size.py /data/full
     python scripts/bench/bench_run.py /data/full/frames/frames.raw --workers 2
+
+With ``--sync-pairs 5`` the same run is done five times as it is and five times with ``os.fsync`` replaced by
+nothing, by turns, and what it costs to be safe from power cuts is printed instead.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
+from statistics import median
 
-STAGES = ("ingest", "histogram", "fit", "maps", "ensemble", "report")
+from running import STAGES, machine, read_once
+
+#: takes the place of ``os.fsync`` in every process of a run; the file SYNCS gets a byte a call
+_FSYNC = """
+import os
+fsync = os.fsync
+log = os.open(os.environ["SYNCS"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+
+def counted(file):
+    os.write(log, b".")
+    if os.environ["DO_SYNC"] == "1":
+        fsync(file)
+
+os.fsync = counted
+"""
 
 
-def read_once(path: Path) -> float:
-    """Return the seconds that reading a file once takes."""
-    buffer = memoryview(bytearray(64 << 20))
-    start = time.perf_counter()
-    with path.open("rb", buffering=0) as file:
-        while file.readinto(buffer):
-            pass
-    return time.perf_counter() - start
+@dataclass(frozen=True)
+class Synced:
+    """What a run took that waits for the disk, or does not.
+
+    Attributes:
+        wall: seconds of the command.
+        cpu: CPU seconds of all its processes.
+        syncs: calls of ``os.fsync``.
+        written: seconds, of those after the command, until all it wrote is on the disk.
+    """
+
+    wall: float
+    cpu: float
+    syncs: int
+    written: float
 
 
-def run(frames: Path, store: Path, options: argparse.Namespace) -> tuple[float, float, float]:
+def run(
+    frames: Path, store: Path, options: argparse.Namespace, environment: Mapping[str, str] | None = None
+) -> tuple[float, float, float]:
     """Run the pipeline in a process of its own; return wall seconds, CPU seconds and peak MiB."""
     command = [str(Path(sys.executable).with_name("pchem")), "run", str(frames), "--store", str(store)]
     command += ["--mode", options.mode, "--workers", str(options.workers), "--backend", options.backend]
     command += ["--integration-time", "4.87", "--bit-depth", "14", "--quiet"]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     start = time.perf_counter()
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=environment)
     wall = time.perf_counter() - start
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return wall, cpu, after.ru_maxrss / 1024
+
+
+def run_synced(options: argparse.Namespace, sync: bool) -> Synced:
+    """Run the pipeline with its syncs, or with none that does anything, from a disk with nothing to write."""
+    with tempfile.TemporaryDirectory(prefix="bench-run-") as made:
+        folder = Path(made)
+        (folder / "sitecustomize.py").write_text(_FSYNC)
+        syncs, path = folder / "syncs", os.pathsep.join([made, os.environ.get("PYTHONPATH", "")])
+        environment = {**os.environ, "PYTHONPATH": path, "SYNCS": str(syncs), "DO_SYNC": str(int(sync))}
+        os.sync()
+        wall, cpu, _ = run(options.frames, folder / "bench.zarr", options, environment)
+        start = time.perf_counter()
+        os.sync()
+        return Synced(wall, cpu, syncs.stat().st_size, time.perf_counter() - start)
+
+
+def cost_of_syncs(options: argparse.Namespace) -> None:
+    """Print what runs with and without syncs take, by turns, and the ratio of each pair."""
+    run_synced(options, True)  # compiles, and has the frames in memory
+    titles = ("pair", "synced s", "not s", "ratio", "CPU s", "not", "syncs", "left s", "not")
+    print(f"{machine()}\n{options.frames.name}: mode {options.mode}, {options.workers} {options.backend}")
+    print("".join(f"{title:>9}" for title in titles))
+    pairs = []
+    for i in range(options.sync_pairs):
+        order = (True, False) if i % 2 else (False, True)
+        both = {sync: run_synced(options, sync) for sync in order}
+        pairs.append((both[True], both[False]))
+        show_pair(str(i + 1), both[True], both[False])
+    names = [field.name for field in fields(Synced)]
+    show_pair(
+        "median",
+        *(Synced(*(median(getattr(pair[i], name) for pair in pairs) for name in names)) for i in (0, 1)),
+    )
+    ratios = sorted(on.wall / off.wall for on, off in pairs)
+    print(f"ratio of a pair: median {median(ratios):.3f}, {ratios[0]:.3f} to {ratios[-1]:.3f}")
+
+
+def show_pair(name: str, on: Synced, off: Synced) -> None:
+    """Print a row: with syncs, without."""
+    cells = [name, f"{on.wall:.2f}", f"{off.wall:.2f}", f"{on.wall / off.wall:.3f}", f"{on.cpu:.2f}"]
+    cells += [f"{off.cpu:.2f}", f"{on.syncs:.0f}", f"{on.written:.2f}", f"{off.written:.2f}"]
+    print("".join(f"{cell:>9}" for cell in cells), flush=True)
 
 
 def main() -> None:
@@ -54,7 +126,16 @@ def main() -> None:
     parser.add_argument("--backend", default="threads")
     parser.add_argument("--mode", default="reference", choices=["copy", "reference"])
     parser.add_argument("--store", type=Path, help="keep the store here; default: a temporary folder")
+    parser.add_argument(
+        "--sync-pairs",
+        type=int,
+        default=0,
+        help="pairs of runs with and without syncs [0: one run, by stages]",
+    )
     options = parser.parse_args()
+    if options.sync_pairs:
+        cost_of_syncs(options)
+        return
     size = options.frames.stat().st_size
     with tempfile.TemporaryDirectory(prefix="bench-run-") as folder:
         store = options.store or Path(folder) / "bench.zarr"

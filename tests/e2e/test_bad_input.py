@@ -1,6 +1,7 @@
 """Bad input: one line with what, where and the cure, its exit code, and nothing lost."""
 
 import os
+import shutil
 import subprocess
 
 import h5py
@@ -259,6 +260,85 @@ def test_a_read_only_folder(shell, frames, small_disk):
     result = shell("run", "run.yaml", "--quiet")
     assert result.code == 4
     assert "choose another place for the store" in result.last
+
+
+@pytest.mark.parametrize("stage", ["histogram", "fit", "report", "electrons"])
+def test_a_stage_asked_for_too_early_leaves_nothing(shell, stage):
+    np.save(shell.folder / "a.npy", GOOD)
+    (shell.folder / "my run.yaml").write_text(OF_ONE_FILE)
+    result = shell(stage, "my run.yaml")
+    assert result.code == 4
+    assert result.last.startswith(f"pchem: {stage} needs ")
+    assert result.last.endswith(f"'{shell.folder / 'my run.yaml'}'")  # there is no store to be named
+    assert sorted(path.name for path in shell.folder.iterdir()) == ["a.npy", "my run.yaml"]
+
+
+def test_a_file_in_place_of_a_store_or_a_folder_is_left_alone_and_nothing_else(shell):
+    np.save(shell.folder / "a.npy", GOOD)
+    (shell.folder / "notes").write_text("of mine")
+    result = shell("run", "a.npy", "--store", "notes")
+    assert result.code == 4
+    assert "notes exists and is not a run; choose another --store or remove it" in result.last
+    for more in ((), ("--hidden", "row_noise")):
+        result = shell("demo", "--output", "notes", *more)
+        assert (result.code, result.stderr) == (2, "pchem: notes is a file; choose a folder with --output\n")
+    for command in (("run", "a.npy", "--store", "notes/run.zarr"), ("init", "notes/run.yaml")):
+        result = shell(*command)
+        assert result.code == 4
+        assert result.last.endswith("there is a file where a folder is meant: choose another place")
+    assert sorted(path.name for path in shell.folder.iterdir()) == ["a.npy", "notes"]
+    assert (shell.folder / "notes").read_text() == "of mine"
+
+
+def test_refusals_of_a_run_leave_neither_store_nor_yaml(shell):
+    np.save(shell.folder / "a.npy", GOOD)
+    (shell.folder / "notes").write_text("of mine")
+    (shell.folder / "a.yaml").write_text(OF_ONE_FILE)
+    for *command, words in (
+        ("run", "a.npy", "--log-json", ".", "--log-json .: cannot be written"),
+        ("ingest", "a.yaml", "--append", "ingest is not complete"),
+        ("view", "a.yaml", f"run: pchem run '{shell.folder / 'a.yaml'}'"),
+        ("export", "a.yaml", f"run: pchem run '{shell.folder / 'a.yaml'}'"),
+    ):
+        result = shell(*command)
+        assert result.code in (2, 4), command
+        assert words in result.last
+        assert sorted(path.name for path in shell.folder.iterdir()) == ["a.npy", "a.yaml", "notes"], command
+
+
+def test_a_joint_run_that_is_refused_leaves_no_yaml(shell, finished):
+    shutil.copytree(finished.parent, shell.folder, dirs_exist_ok=True)
+    (shell.folder / "notes").write_text("of mine")
+    (shell.folder / "other.yaml").write_text(
+        (shell.folder / "run.yaml").read_text().replace("run.zarr", "o.zarr")
+    )
+    result = shell("joint", "run.yaml", "other.yaml", "--store", "notes")
+    assert result.code == 2
+    assert "holds the same frames" in result.last
+    assert not (shell.folder / "notes.yaml").exists()
+    assert (shell.folder / "notes").read_text() == "of mine"
+
+
+def test_a_run_in_place_of_frames_is_one_line(shell, finished):
+    shutil.copytree(finished.parent, shell.folder, dirs_exist_ok=True)
+    result = shell("apply", "run.yaml", "run.zarr", "--output", "calibrated.zarr")
+    assert result.code == 4
+    assert "holds several datasets" in result.last
+    assert result.stderr.count("\n") == 1
+    assert not (shell.folder / "calibrated.zarr").exists()
+
+
+@pytest.mark.parametrize("command", ["fit", "discrepancy"])
+def test_a_region_beyond_the_sensor_is_one_line(shell, command, finished):
+    shutil.copytree(finished.parent, shell.folder, dirs_exist_ok=True)
+    before = sorted((shell.folder / "run.zarr").rglob("*"))
+    result = shell(command, "run.yaml", "--roi", "0:99,0:9")
+    assert result.code == 2
+    assert result.last == (
+        "pchem: --roi 0:99,0:9 reaches beyond the sensor of 20 x 28 pixels (y x x); choose within 0:20,0:28"
+    )
+    assert "Traceback" not in result.stderr
+    assert sorted((shell.folder / "run.zarr").rglob("*")) == before
 
 
 def test_usage_errors_are_exit_code_2(shell):

@@ -1,18 +1,14 @@
 """A dask cluster of real processes that are killed: the work goes on, or stops with one line."""
 
-import contextlib
 import functools
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
-from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.cluster import bytes_read, cluster_processes, counting_reads, signal_group, wait_for_marks
 from helpers.commands import assert_same_results
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
@@ -27,43 +23,6 @@ def slow_square(folder, number):
     (folder / f"{number}-{os.getpid()}").touch()
     time.sleep(0.15)
     return number**2
-
-
-@contextmanager
-def cluster_processes(folder, n_workers, *options, environment=None):
-    """A scheduler and workers, each a process with its own group; ended afterwards."""
-    file = folder / "scheduler.json"
-    started = []
-
-    def start(kind, *options):
-        command = [sys.executable, "-m", "dask", kind, "--no-dashboard", "--scheduler-file", str(file)]
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        folders = [str(each) for each in Path(__file__).parents[:2]]
-        base = environment or os.environ
-        here = os.pathsep.join([*folders, base.get("PYTHONPATH", "")])
-        own = {**base, "PYTHONPATH": here}  # the workers import this module
-        started.append(
-            subprocess.Popen([*command, *options], cwd=folder, env=own, start_new_session=True, **quiet)
-        )
-
-    start("scheduler", "--host", "127.0.0.1", "--port", "0")
-    for _ in range(n_workers):
-        start("worker", "--nthreads", "1", "--host", "127.0.0.1", *options)
-    deadline = time.monotonic() + 60
-    while not file.exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    try:
-        yield file, started
-    finally:
-        for process in started:
-            signal_group(process, signal.SIGKILL)
-            process.wait()
-
-
-def signal_group(process, number):
-    """Send a signal to a worker with the process that watches over it."""
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, number)
 
 
 @pytest.fixture
@@ -149,43 +108,10 @@ def test_a_worker_over_its_memory_is_one_line_and_the_run_goes_on_to_the_same_bi
     assert_same_results(store, finished)
 
 
-#: counts what a Python process reads of the frames: bytes, by `os.preadv` and by files that it opens
-COUNTING = """
-import io, os
-open_, preadv = io.open, os.preadv
-log = os.open(os.environ["READS"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
-
-def note(name, count):
-    if str(name).endswith("night.npy"):
-        os.write(log, f"{count}\\n".encode())
-    return count
-
-class Counted(io.FileIO):
-    def readinto(self, buffer):
-        return note(self.name, super().readinto(buffer))
-
-def opened(file, mode="r", buffering=-1, *more, **options):
-    if str(file).endswith("night.npy") and mode == "rb":
-        raw = Counted(file)
-        return raw if buffering == 0 else io.BufferedReader(raw)
-    return open_(file, mode, buffering, *more, **options)
-
-io.open = opened
-os.preadv = lambda file, *rest: note(os.readlink(f"/proc/self/fd/{file}"), preadv(file, *rest))
-"""
-
 NIGHT = """
 run: {store: NAME.zarr, tile: 8}
 input: {files: [night.npy], integration_time: 1.0, bit_depth: 14, mode: reference}
 """
-
-
-def wait_for_marks(store, stage, many):
-    """Wait until a stage has set some markers."""
-    deadline = time.monotonic() + 300
-    while len(list((store / ".pchem" / "done" / stage).rglob("*.json"))) < many:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 @pytest.mark.long
@@ -195,17 +121,12 @@ def test_four_workers_of_which_two_are_killed_and_one_is_paused(shell, tmp_path,
     rng = np.random.default_rng(14)
     electrons = rng.poisson(1.5, (6000, 64, 64)) + 0.3 * rng.standard_normal((6000, 64, 64))
     np.save(shell.folder / "night.npy", np.rint(100 + 8 * electrons).astype(np.uint16))
-    (tmp_path / "counting").mkdir()
-    (tmp_path / "counting" / "sitecustomize.py").write_text(COUNTING)
     for name in ("quiet", "night"):
         (shell.folder / f"{name}.yaml").write_text(NIGHT.replace("NAME", name))
     shell.ok("run", "quiet.yaml", "--until", "ensemble")
     reads = tmp_path / "reads"
-    shell.environment |= {
-        "READS": str(reads),
-        "PYTHONPATH": os.pathsep.join([str(tmp_path / "counting"), os.environ.get("PYTHONPATH", "")]),
-        "DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "20s",
-    }
+    shell.environment |= counting_reads(tmp_path / "counting", reads, "night.npy")
+    shell.environment["DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL"] = "20s"
     limit = ("--memory-limit", "2GB")
     store = shell.folder / "night.zarr"
     with cluster_processes(tmp_path, 4, *limit, environment=shell.environment) as (file, started):
@@ -229,7 +150,7 @@ def test_four_workers_of_which_two_are_killed_and_one_is_paused(shell, tmp_path,
         assert_same_results(shell.folder / "quiet.zarr", store)
     size = (shell.folder / "night.npy").stat().st_size
     # once, hash and all; or for the hash, and by workers, each its own rows
-    times = sum(map(int, reads.read_text().split())) / size
+    times = sum(bytes_read(reads).values()) / size
     assert abs(times - (2.0 if by_bands else 1.0)) < 0.15, times
 
 
@@ -280,6 +201,43 @@ def test_workers_that_all_leave_are_waited_for_and_given_up(processes, tmp_path)
         executor.close()
     assert 1 <= len(found) < 10
     assert len(heard.lines) == 1
+
+
+def test_a_worker_that_hangs_is_said_and_may_be_killed(processes, tmp_path, monkeypatch):
+    file, (_, worker, _) = processes
+    monkeypatch.setattr(cluster, "_SILENT", 4.0)
+    heard, found = Counted(), []
+    executor = make_executor(
+        ComputeSettings(backend="distributed", scheduler=str(file)), Notices(heard.lines.append, heard.check)
+    )
+    executor._client.wait_for_workers(2, timeout=60)
+
+    def on_result(number, outcome):
+        found.append(number)
+        if len(found) == 3:
+            worker.send_signal(signal.SIGSTOP)
+
+    def say(line):
+        heard.lines.append(line)
+        worker.kill()  # as the line says
+
+    executor._patience._notices = Notices(say, heard.check)
+    try:
+        executor.map(functools.partial(slow_square, tmp_path), range(20), on_result)
+    finally:
+        executor.close()
+    assert sorted(found) == list(range(20))
+    (line,) = heard.lines
+    assert line.startswith(f"a worker of the dask scheduler {file} has given no sign of life for 4 s; ")
+
+
+def test_silent_workers_are_counted():
+    lines = []
+    patience = cluster._Patience("the dask scheduler x", 60.0, Notices(lines.append))
+    for silent in (0, 1, 1, 2, 0, 1):
+        seen = [1000.0, *([900.0] * silent), *([990.0] * (3 - silent))]
+        assert patience.look([{"status": "running", "memory_limit": 0, "last_seen": each} for each in seen])
+    assert [line.partition(" of the ")[0] for line in lines] == ["a worker", "2 workers", "a worker"]
 
 
 def test_a_signal_ends_the_wait_for_workers(processes):

@@ -566,6 +566,50 @@ def test_hostile_words_are_shown_not_run(open_tab: Any, tmp_path: Path) -> None:
     assert tab.page.locator("img[src=x]").count() == 0
 
 
+#: of files and cameras: many scripts, words without an end, marks upon marks
+NAMES = (
+    "äöü Ελληνικά кириллица 日本語 한국어 हिन्दी ไทย ქართული አማርኛ தமிழ் བོད་ ᏣᎳᎩ \U0001f600",
+    "مستشعر الضوء (٣) abc",
+    "חיישן 12 <b>",
+    "\u202eunclosed",
+    "w" * 200,
+    "日本語" * 40,
+    "Z" + "\u0301\u0327\u0352" * 60,
+)
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("channels", [False, True], ids=["pixels", "channels"])
+def test_names_in_all_scripts_keep_the_page_as_wide_as_the_window(
+    open_tab: Any, tmp_path: Path, width: int, channels: bool
+) -> None:
+    store = make_run(
+        tmp_path, (1, len(NAMES)) if channels else (12, 16), failed=0.0, n_frames=60,
+        title=" ".join(NAMES), camera=" ".join(NAMES), run={"store": NAMES[1], "model": NAMES[4]},
+        inputs=[{"name": name, "size": 1, "hash": "0" * 32} for name in NAMES],
+        channel_names=NAMES if channels else (),
+    )  # fmt: skip
+    tab = open_tab(file_url(store), width)
+    tab.page.evaluate("for (const each of document.querySelectorAll('details')) each.open = true")
+    assert tab.page.evaluate("document.documentElement.scrollWidth") == width
+    heading = tab.page.locator("h1").bounding_box()
+    assert heading["height"] < 900
+    cells = tab.page.locator("#inputs tbody th").evaluate_all(
+        "cells => cells.map(each => [getComputedStyle(each).unicodeBidi, getComputedStyle(each).textAlign])"
+    )
+    assert set(map(tuple, cells)) == {("plaintext", "left")}
+    if channels:
+        # their numbers stand under the map
+        frame = tab.page.locator(".map-frame").bounding_box()
+        axis = tab.page.locator("#inspector-axis-x").bounding_box()
+        assert (axis["x"], axis["width"]) == pytest.approx((frame["x"], frame["width"]), abs=2)
+        assert axis["y"] >= frame["y"] + frame["height"] - 2
+        tab.page.fill("#inspector-x", "1")
+        tab.page.keyboard.press("Enter")
+        tab.wait(1)
+        assert tab.text("#inspector-title") == f"Channel 1 \u2068{NAMES[1]}\u2069"
+
+
 def test_a_third_failed(open_tab: Any, tmp_path: Path) -> None:
     store = make_run(tmp_path, (12, 16), failed=0.34, n_frames=60)
     tab = open_tab(file_url(store))

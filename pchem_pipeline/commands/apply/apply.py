@@ -91,7 +91,7 @@ def apply_to_frames(
     """
     target = with_overrides(target, command)
     keep_to_limit(target.config.compute.max_memory)
-    run = RunStore.open(target.store)
+    run = target.stored()
     reporter = Reporter(command.progress, quiet=command.quiet, log=command.log_json)
     with contextlib.ExitStack() as stack:
         stack.callback(reporter.close)

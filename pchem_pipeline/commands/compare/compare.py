@@ -106,7 +106,7 @@ def comparison_of(
     if not 0 <= tolerance < 1:
         raise ConfigError(f"--tolerance {tolerance:g}: a relative difference from 0 to below 1 is meant")
     targets = [find_run(path) for path in paths]
-    stores = [RunStore.open(target.store) for target in targets]
+    stores = [target.stored() for target in targets]
     for target, store in zip(targets, stores, strict=True):
         if not store.has("maps/conversion_gain"):
             raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")

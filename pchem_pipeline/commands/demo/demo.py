@@ -19,6 +19,17 @@ from pchem_pipeline.store.run_store import RunStore
 _COMPARED = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 
 
+def is_in_use(output: Path) -> bool:
+    """Tell whether there is something in a folder.
+
+    Raises:
+        ConfigError: it is a file.
+    """
+    if output.exists() and not output.is_dir():
+        raise ConfigError(f"{output} is a file; choose a folder with --output")
+    return output.exists() and any(output.iterdir())
+
+
 def run_demo(output: Path, *, size: int, n_frames: int, seed: int, quiet: bool = False) -> str:
     """Simulate a sensor of ``size`` x ``size`` pixels to TIFF, run every stage, and return a text.
 
@@ -33,7 +44,7 @@ def run_demo(output: Path, *, size: int, n_frames: int, seed: int, quiet: bool =
         ConfigError: the folder holds something else.
         PchEmError: a stage failed.
     """
-    if output.exists() and any(output.iterdir()) and not (output / "demo.yaml").exists():
+    if is_in_use(output) and not (output / "demo.yaml").exists():
         raise ConfigError(f"{output} is not empty; choose another folder with --output")
     config = RunConfig.model_validate(
         {

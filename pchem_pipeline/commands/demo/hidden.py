@@ -16,6 +16,7 @@ import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.commands.demo.comparison import COMPARED, compare
+from pchem_pipeline.commands.demo.demo import is_in_use
 from pchem_pipeline.commands.demo.unlisted import UNLISTED, Unlisted
 from pchem_pipeline.commands.model import adopt_verdict
 from pchem_pipeline.config.load import dump_config
@@ -136,7 +137,7 @@ def _parted(asked: str) -> tuple[str, Region | None, When | None]:
 
 def _check_folder(output: Path, asked: dict[str, Any]) -> None:
     """Refuse a folder that holds something else than the same demonstration."""
-    if not output.exists() or not any(output.iterdir()):
+    if not is_in_use(output):
         return
     known = read_json(output / _ASKED)
     if known == asked:

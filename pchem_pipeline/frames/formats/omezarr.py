@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -120,7 +121,10 @@ def _full_resolution(group: Any, settings: InputSettings) -> str | None:
 
 
 def _shapes(group: Any) -> dict[str, tuple[int, ...]]:
-    return {name: tuple(node.shape) for name, node in group.members(max_depth=None) if hasattr(node, "shape")}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of other files among the arrays
+        members = list(group.members(max_depth=None))
+    return {name: tuple(node.shape) for name, node in members if hasattr(node, "shape")}
 
 
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:

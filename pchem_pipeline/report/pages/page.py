@@ -15,6 +15,7 @@ from pchem_pipeline.report.charts.on_page import page_charts
 from pchem_pipeline.report.figures.figure import Figure, csv_text
 from pchem_pipeline.report.inspector.inspector import content_policy, json_for_html, text_of
 from pchem_pipeline.report.pages.glossary import GLOSSARY, explained
+from pchem_pipeline.report.style.wording import short_name, visible
 
 #: Numbers of a table that the page keeps.
 _LARGEST_TABLE = 6_000
@@ -81,14 +82,21 @@ def _template(name: str) -> jinja2.Template:
     folder = importlib.resources.files("pchem_pipeline.report") / "templates"
     environment = jinja2.Environment(
         autoescape=True,
+        finalize=_shown,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         loader=jinja2.FunctionLoader(lambda each: (folder / each).read_text(encoding="utf-8")),
     )
     environment.filters["together"] = _together
-    environment.filters["explained"] = lambda text: explained(_together(text))
+    environment.filters["explained"] = lambda text: explained(_together(visible(text)))
+    environment.filters["name"] = short_name
     return environment.get_template(name)
+
+
+def _shown(value: Any) -> Any:
+    """Let no text that comes from files change how the page around it looks."""
+    return visible(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 def _together(text: str) -> str:

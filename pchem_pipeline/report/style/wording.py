@@ -1,9 +1,10 @@
-"""Numbers in words: a value with its uncertainty and unit, rounded to what is known."""
+"""Numbers in words: a value with its uncertainty and unit, rounded to what is known; and names as shown."""
 
 from __future__ import annotations
 
 import math
 import re
+import unicodedata
 
 _UNITS = {
     "e-": "e⁻",
@@ -180,3 +181,26 @@ def percent(part: float, whole: float) -> str:
         return "> 99.99 %"
     digits = 2 if share < 1 else 1 if share < 10 or 99 < share < 100 else 0
     return f"{share:.{digits}f} %".replace(".0 %", " %")
+
+
+#: Characters that are not seen, or change how others are shown: those that turn the direction of a text,
+#: ends of lines, widths of nothing, controls. Joiners and direction marks stay, which scripts need.
+_UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b\u2028\u2029\u202a-\u202e\u2060\ufeff]")
+#: Characters of a name at most.
+_LONGEST_NAME = 200
+
+
+def visible(text: str) -> str:
+    """Return a text with unseen characters written as their code, so that no name can look like another."""
+    return _UNSEEN.sub(lambda found: f"\u200e\\u{ord(found[0]):04x}\u200e", text)  # from left to right
+
+
+def short_name(text: str) -> str:
+    """Return a name of at most 200 characters, visible and in one line; a longer one ends with dots."""
+    line = " ".join(text[: 4 * _LONGEST_NAME].split())
+    if len(text) <= 4 * _LONGEST_NAME and len(line) <= _LONGEST_NAME:
+        return visible(line)
+    end = _LONGEST_NAME
+    while end > 0 and line[end : end + 1] and unicodedata.category(line[end])[0] == "M":
+        end -= 1  # marks stay with their letter
+    return f"{visible(line[: end or _LONGEST_NAME].rstrip())} …"

@@ -53,8 +53,11 @@
     return minus(`${value.toFixed(decimals)} ± ${error.toFixed(decimals)}${tail}`);
   };
   const percent = (part, all) => (all ? `${short((100 * part) / all, 2)} %` : "0 %");
+  // a name written from right to left keeps its numbers to itself
+  const isolated = (name) =>
+    /[\u0590-\u08ff\ufb1d-\ufefc\u{10800}-\u{10fff}\u{1e800}-\u{1efff}]/u.test(name) ? `\u2068${name}\u2069` : name;
   const place = (i) => {
-    if (ny === 1) return `channel ${i}${facts.channels[i] ? ` ${facts.channels[i]}` : ""}`;
+    if (ny === 1) return `channel ${i}${facts.channels[i] ? ` ${isolated(facts.channels[i])}` : ""}`;
     return `pixel y = ${Math.floor(i / nx)}, x = ${i % nx}`;
   };
 

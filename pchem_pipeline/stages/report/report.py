@@ -26,6 +26,7 @@ from pchem_pipeline.report.inspector.inspector_data import InspectorData, PixelS
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
 from pchem_pipeline.report.pages.quick_look import check_sentence
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
+from pchem_pipeline.report.style.wording import short_name
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy.result import verdict_data
 from pchem_pipeline.stages.quick_look import read_sums, run_quick_look
@@ -232,7 +233,7 @@ def _shown(run: StoredRun, config: RunConfig) -> list[Chosen]:
     """Return the pixels that stand for the sensor."""
     chosen: list[Chosen] = [("", y, x) for y, x in config.report.pixels]
     if not chosen and run.sensor.names and run.sensor.nx <= _FEW_CHANNELS:
-        chosen = [(name, 0, x) for x, name in enumerate(run.sensor.names)]
+        chosen = [(short_name(name), 0, x) for x, name in enumerate(run.sensor.names)]
     if not chosen:
         chosen = choose_pixels(run.maps["read_noise_e"], run.maps["quanta_exposure"], run.fit["fit_status"])
     return chosen
@@ -282,7 +283,7 @@ def report_data(
         component_cases=[case_name(case) for case in cases],
         moments=moments,
         truth=run.truth,
-        channel_names=sensor.names,
+        channel_names=[short_name(name) for name in sensor.names],
         percentiles=config.maps.percentiles,
         outlier_sigmas=config.maps.outlier_sigmas,
         allowed_failed=config.run.allowed_failed_pixels,

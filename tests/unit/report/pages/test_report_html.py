@@ -256,6 +256,25 @@ def test_hostile_metadata_is_shown_not_run(data: ReportData) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_names_change_nothing_around_them() -> None:
+    """Text from right to left is isolated, what turns or hides others is written out, a title has an end."""
+    turned, long = "\u202egpj.raw", "W" * 1_000_000
+    odd = replace(
+        report_data((8, 8)),
+        title=long,
+        camera="مستشعر",
+        config_yaml=turned,
+        inputs=[{"name": turned, "size": 1, "hash": "0"}],
+    )
+    html = render_report(odd, QUICK).html
+    assert "\u202e" not in html
+    assert html.count("\u200e\\u202e\u200egpj.raw") == 2
+    assert "W" * 201 not in html
+    assert html.count("W" * 200 + " …") == 2
+    assert '<bdi dir="ltr">مستشعر</bdi>' in html
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_a_third_of_the_pixels_failed() -> None:
     data = report_data((24, 24), failed=0.34)
     levels = {flag.level: flag.text for flag in flags(data)}

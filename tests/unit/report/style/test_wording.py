@@ -10,10 +10,12 @@ from pchem_pipeline.report.style.wording import (
     percent,
     scientific,
     short,
+    short_name,
     signed,
     symbol,
     typeset,
     unit_text,
+    visible,
 )
 
 
@@ -123,3 +125,20 @@ def test_signed(value: float, text: str) -> None:
 def test_plain_sentences_get_the_signs_of_a_page() -> None:
     plain = "5 -> 3 e-, 0.1 e-/DN: one-sided, 1e-3"
     assert typeset(plain) == "5 → 3 e⁻, 0.1 e⁻/DN: one-sided, 1e-3"
+
+
+def test_what_is_not_seen_in_a_name_is_written() -> None:
+    assert visible("gpj.\u202eraw") == "gpj.\u200e\\u202e\u200eraw"
+    assert visible("a\u200bb\ufeff\x1b") == "a\u200e\\u200b\u200eb\u200e\\ufeff\u200e\u200e\\u001b\u200e"
+    written = "می\u200cخواهم 👩\u200d🔬 \u200fعربي µ é\n\tx"  # joiners and marks of direction are part of it
+    assert visible(written) == written
+
+
+def test_a_long_name_is_cut_behind_a_letter_with_its_marks() -> None:
+    assert short_name("  one\ntwo ") == "one two"
+    assert short_name("w" * 200) == "w" * 200
+    assert short_name("w" * 1_000_000) == "w" * 200 + " …"
+    assert short_name("e\u0301" * 500) == "e\u0301" * 100 + " …"
+    assert short_name("x" * 199 + "e\u0301" * 9) == "x" * 199 + " …"
+    assert short_name(" " * 5000 + "x").endswith("…")
+    assert len(short_name("\u0301" * 5000)) == 202

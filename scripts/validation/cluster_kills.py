@@ -1,0 +1,192 @@
+#!/usr/bin/env python3
+"""Run a stack on a dask cluster, kill two of its four workers and pause one; compare with threads.
+
+``.venv/bin/python scripts/validation/cluster_kills.py`` makes a stack of 4,000 frames of 512 x 512 pixels
+(2.1 GB), runs it with threads, and again on a scheduler and four workers of at most 2 GB each: one is killed,
+one paused (`SIGSTOP`) when a tenth of the tiles are fitted, another killed when half of them are. It prints
+what each process read of the camera file (noted by each at every read), all that it read by the kernel's
+``/proc/PID/io`` (libraries and store included, looked at every 0.2 s) and its peak memory, and ends with 1
+unless parameters, maps, ensemble and report are the same to the bit, and the frames were read as often as
+with threads: once, and the 250 of the ensemble again.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from pathlib import Path
+
+from kills import PCHEM, differences, results
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+from bench_growth import write_stack
+from helpers.cluster import bytes_read, cluster_processes, counting_reads, signal_group, wait_for_marks
+from running import STAGES, machine
+
+from pchem_pipeline.compute.environment import prepare_environment
+
+
+class Watch:
+    """Looks at processes until they end: what they have read, and their largest memory."""
+
+    def __init__(self) -> None:
+        self.roles: dict[int, str] = {}
+        self.read: dict[int, int] = defaultdict(int)
+        self.peak: dict[int, int] = defaultdict(int)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._look)
+        self._thread.start()
+
+    def end(self) -> None:
+        """Look no more."""
+        self._ended.set()
+        self._thread.join()
+
+    def _look(self) -> None:
+        while not self._ended.wait(0.2):
+            for root in list(self.roles):
+                for pid in _group(root):
+                    with contextlib.suppress(OSError, IndexError):
+                        io = Path(f"/proc/{pid}/io").read_text().split()
+                        status = Path(f"/proc/{pid}/status").read_text()
+                        self.read[pid] = max(self.read[pid], int(io[1]))
+                        self.peak[pid] = int(status.partition("VmHWM:")[2].split()[0])
+                        self.roles.setdefault(pid, self.roles[root])
+
+
+def _group(root: int) -> list[int]:
+    """Return the processes of a group."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            if int((entry / "stat").read_text().rpartition(")")[2].split()[2]) == root:
+                found.append(int(entry.name))
+    return found
+
+
+def run(store: Path, environment: dict[str, str]) -> "subprocess.Popen[str]":
+    """Start a run in a process group of its own."""
+    return subprocess.Popen(
+        [PCHEM, "run", "run.yaml", "--quiet"],
+        cwd=store.parent,
+        env=environment,
+        text=True,
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+
+
+def write_config(folder: Path, compute: dict[str, object]) -> Path:
+    """Write the YAML of a run into a new folder; return where its store will be."""
+    content = {"run": {"store": "run.zarr"}, "compute": compute, "report": {"figure_formats": []}}
+    content["input"] = {
+        "files": ["../stack.raw"],
+        "mode": "reference",
+        "bit_depth": 14,
+        "integration_time": 1,
+    }
+    folder.mkdir()
+    (folder / "run.yaml").write_text(json.dumps(content))
+    return folder / "run.zarr"
+
+
+def ended(process: "subprocess.Popen[str]") -> None:
+    """Wait for a run, which must end well."""
+    _, words = process.communicate(timeout=3600)
+    if process.returncode:
+        raise SystemExit(f"pchem run: exit code {process.returncode}: {words}")
+    print(f"ended well, with {len(words.splitlines())} warnings")
+
+
+def on_the_cluster(folder: Path, given: argparse.Namespace, tiles: int) -> tuple[Watch, Path]:
+    """Run the stack while two of four workers are killed and one is paused."""
+    environment = {**os.environ, **counting_reads(folder / "counting", folder / "reads", "stack.raw")}
+    if given.worker_ttl:
+        environment["DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL"] = f"{given.worker_ttl} s"
+    watch = Watch()
+    with cluster_processes(folder, 4, "--memory-limit", "2GB", environment=environment) as (file, started):
+        scheduler, *workers = started
+        compute: dict[str, object] = {"backend": "distributed", "scheduler": str(file), "workers": 2}
+        store = write_config(folder / "cluster", compute)
+        names = ("killed first", "killed second", "paused", "left alone")
+        watch.roles |= {worker.pid: f"worker, {name}" for worker, name in zip(workers, names, strict=True)}
+        watch.roles[scheduler.pid] = "scheduler"
+        start = time.monotonic()
+        process = run(store, environment)
+        watch.roles[process.pid] = "pchem run"
+        try:
+            wait_for_marks(store, "fit", max(1, tiles // 10))
+            signal_group(workers[0], signal.SIGKILL)
+            signal_group(workers[2], signal.SIGSTOP)
+            print(f"{time.monotonic() - start:.0f} s: one worker killed, one paused", flush=True)
+            wait_for_marks(store, "fit", tiles // 2)
+            signal_group(workers[1], signal.SIGKILL)
+            print(f"{time.monotonic() - start:.0f} s: another killed", flush=True)
+            ended(process)
+            print(f"{time.monotonic() - start:.0f} s: the run has ended")
+        finally:
+            process.kill()
+            watch.end()
+        signal_group(workers[2], signal.SIGCONT)  # it may still do what it had begun
+        time.sleep(5)
+    return watch, store
+
+
+def show(watch: Watch, reads: Path, size: int) -> float:
+    """Print what each process did; return how often the camera file was read."""
+    noted = bytes_read(reads)
+    print(f"{'process':<24}{'frames read, times':>20}{'all read, MB':>14}{'peak MiB':>10}")
+    for pid, role in watch.roles.items():
+        times = f"{noted.get(pid, 0) / size:.3f}"
+        print(f"{role:<24}{times:>20}{watch.read[pid] / 1e6:>14.0f}{watch.peak[pid] / 1024:>10.0f}")
+    return sum(noted.values()) / size
+
+
+def seconds(store: Path) -> list[float]:
+    """Return the wall time of each stage."""
+    folder = store / ".pchem" / "stages"
+    return [json.loads((folder / f"{name}.json").read_text())["seconds"] for name in STAGES]
+
+
+def main() -> int:
+    prepare_environment()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--frames", type=int, default=4000)
+    parser.add_argument("--side", type=int, default=512, help="rows and columns")
+    parser.add_argument("--worker-ttl", type=int, default=20, help="seconds of dask's worker-ttl; 0: its own")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="cluster-kills-") as made:
+        folder = Path(made)
+        write_stack(folder / "stack.raw", given.frames, (given.side, given.side))
+        size = (folder / "stack.raw").stat().st_size
+        plain = write_config(folder / "threads", {"backend": "threads", "workers": 2})
+        counted = counting_reads(folder / "counting alone", folder / "reads alone", "stack.raw")
+        print(
+            f"{machine()}\n{given.frames} frames of {given.side} x {given.side} pixels, {size / 1e9:.1f} GB"
+        )
+        ended(run(plain, {**os.environ, **counted}))
+        tiles = len(list((plain / ".pchem" / "done" / "fit").rglob("*.json")))
+        watch, store = on_the_cluster(folder, given, tiles)
+        times = show(watch, folder / "reads", size)
+        alone = sum(bytes_read(folder / "reads alone").values()) / size
+        print(f"{'stage':<12}{'threads, s':>12}{'cluster, s':>12}")
+        for name, one, other in zip(STAGES, seconds(plain), seconds(store), strict=True):
+            print(f"{name:<12}{one:>12.1f}{other:>12.1f}")
+        expected = results(plain)
+        wrong = differences(results(store), expected)
+        print(f"{tiles} tiles, {len(expected)} results compared, different: {', '.join(wrong) or 'none'}")
+        print(f"frames read {times:.3f} times, with threads {alone:.3f} times")
+        return 1 if wrong or abs(times - alone) > 0.001 else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
