@@ -210,11 +210,17 @@ class ReplicateSimulator:
         """Return the statistics of the model with an effect, shape (repeat, statistic)."""
         return np.array([self._rows[self._replicate(effect, j).key] for j in range(repeats)])
 
-    def refined(self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[Hypothesis]:
+    def refined(
+        self,
+        hypotheses: Sequence[Hypothesis],
+        shift: FloatArray,
+        noise: Noise,
+        told: Sequence[Effect] = (),
+    ) -> list[Hypothesis]:
         """Bring the strengths of the most promising hypotheses to what the data ask for, each by itself.
 
         Those are simulated several times in the end. One that is far behind the best by itself, and beside
-        it brings nothing, is left as it is.
+        it brings nothing, is left as it is; ``told`` are effects whose numbers are known better.
         """
         fits = [fit_set([h], shift, noise) for h in hypotheses]
         scores = np.array([fit.log_score(shift, noise) for fit in fits])
@@ -230,9 +236,11 @@ class ReplicateSimulator:
             return bool(helps) and hypotheses[i].tag != best.tag
 
         chosen = [int(i) for i in order if fits[i].factors[0] > 0.0 and promising(int(i))][:_REFINED]
-        tuned = self.tuned([(hypotheses[i],) for i in chosen], shift, noise, steps=2, close=_CLOSE)
-        sharp = {id(h.effect): h for h in self.fingerprints([one.effect for (one,) in tuned], REPEATS)}
-        better = {i: sharp.get(id(one.effect), one) for i, (one,) in zip(chosen, tuned, strict=True)}
+        free = [i for i in chosen if not any(hypotheses[i].effect is effect for effect in told)]
+        tuned = self.tuned([(hypotheses[i],) for i in free], shift, noise, steps=2, close=_CLOSE)
+        best_of = {i: hypotheses[i] for i in chosen} | {i: one for i, (one,) in zip(free, tuned, strict=True)}
+        sharp = {id(h.effect): h for h in self.fingerprints([h.effect for h in best_of.values()], REPEATS)}
+        better = {i: sharp.get(id(one.effect), one) for i, one in best_of.items()}
         return [better.get(int(i), hypotheses[i]) for i in order]
 
     def tuned(

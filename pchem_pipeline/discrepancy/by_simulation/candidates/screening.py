@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.by_simulation.candidates.by_histograms import Histograms
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import (
     MOST_HYPOTHESES,
     ReplicateSimulator,
@@ -23,7 +24,6 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import expected_codes
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import with_details
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
@@ -77,17 +77,23 @@ class Screening:
         """
         simulator = self._simulator(model, null, number, str(number))
         evidence = (self.observed.plain, *self.observed.parts[:2])
-        guesses = with_details(
-            self._guesses(simulator, model, null, evidence, MOST_HYPOTHESES),
+        histograms = Histograms(
             self.work.own_samples(model),
             self.work.mapped(model).fit.maps,
             self.observed.frames.effects(model),
             self.work.effort,
             self.observed.frames.acted_on,
         )
+        guesses = histograms.with_numbers(self._guesses(simulator, model, null, evidence, MOST_HYPOTHESES))
+        parts = self.observed.frames.parts
+        suggested = self._apart(model, histograms.suggested(self.classes, parts, guesses))
+        guesses += suggested
         hypotheses = simulator.fingerprints([*guesses, *placebo_for(guesses, self.classes)])
         shift = self.z.both - null.mean
-        hypotheses = simulator.refined(hypotheses, shift, noise_of_splits(null, 2, self.model_error))
+        noise = noise_of_splits(null, 2, self.model_error)
+        hypotheses = simulator.refined(hypotheses, shift, noise, histograms.told)
+        # what they do to pixels that are led astray says little about them: others do not go before them
+        hypotheses.sort(key=lambda h: all(h.effect is not each for each in suggested))
         self.defects.update(simulator.defects)
         return tuple(hypotheses), self._compared(hypotheses, null)
 
@@ -142,9 +148,12 @@ class Screening:
         """Return the guesses of all candidates that are not where a found effect of their kind is."""
         apart = self.observed.frames.seen_apart(self.observed.plain)
         beside = self._evidence_beside(model, null)
-        found = [effect for effect in model if effect not in self.given]
         self.work.effort.ask(self.observed.samples)
-        guesses = simulator.guesses(self.classes, evidence, apart, beside, most)
+        return self._apart(model, simulator.guesses(self.classes, evidence, apart, beside, most))
+
+    def _apart(self, model: tuple[Effect, ...], guesses: Sequence[Effect]) -> list[Effect]:
+        """Return the guesses that are not where a found effect of their kind is."""
+        found = [effect for effect in model if effect not in self.given]
         return [guess for guess in guesses if not share_place((*found, guess))]
 
     def _evidence_beside(self, model: tuple[Effect, ...], null: NullModel) -> Evidence | None:

@@ -46,7 +46,7 @@ _PROBED, _LEAST_FITTED = 24, 0.25
 # share of them that another start must fit clearly better for all pixels to be fitted from it
 _OFTEN_BETTER = 0.05
 # nats by which a bias an electron off must be likelier under a law that the plain fit did not know
-_CLEARLY = 4.0
+CLEARLY = 4.0
 
 
 class NotFittedError(PchEmError):
@@ -129,7 +129,7 @@ def refit_maps(
     if np.mean(np.isfinite(probe.bias)) < _LEAST_FITTED:
         raise NotFittedError("hardly a pixel can be fitted with it")
     fit = fitted(np.arange(len(near)))
-    for start in (_off_by(near, -1.0), _off_by(near, 1.0), _of_usual_noise(near, fit.columns)):
+    for start in (off_by(near, -1.0), off_by(near, 1.0), _of_usual_noise(near, fit.columns)):
         if np.mean(_likelier(fitted(probed, start), probe)) > _OFTEN_BETTER:
             other = fitted(known, start)
             better = np.flatnonzero(_likelier(other, fit.of(known)))
@@ -155,7 +155,7 @@ def _acted_on(effects: Sequence[Effect], shape: tuple[int, int]) -> NDArray[np.b
     return np.asarray(np.logical_or.reduce(inside)) if inside else np.ones(shape, np.bool_)
 
 
-def _off_by(start: FloatArray, electrons: float) -> FloatArray:
+def off_by(start: FloatArray, electrons: float) -> FloatArray:
     """Return parameters (n, 4) whose bias is lower, and exposure higher, by so many electrons.
 
     Under noise of another law the peak that was taken for that of no electron may be that of one.
@@ -180,7 +180,7 @@ def _of_usual_noise(near: FloatArray, fitted: FloatArray) -> FloatArray:
 def _likelier(one: FitResult, other: FitResult) -> NDArray[np.bool_]:
     """Tell which pixels a fit explains clearly better than another one, shape (n,)."""
     with np.errstate(invalid="ignore"):
-        return np.asarray(one.log_likelihood > other.log_likelihood + _CLEARLY)
+        return np.asarray(one.log_likelihood > other.log_likelihood + CLEARLY)
 
 
 def expected_codes(

@@ -7,7 +7,7 @@ that the histograms say, for a fraction of the cost of one simulation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,23 +16,24 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, leads_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, off_by
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.model.histogram.count import histogram_frames
 
 BoolArray = NDArray[np.bool_]
-Place = tuple[Region | None, When | None]
-
 #: Pixels that tell effects apart.
 MANY_PIXELS = 1024
 #: Pixels that tell numbers well enough to begin with.
 FEW_PIXELS = 256
 _MOST_STARTS = 3  # of one effect
-_FEWEST_PIXELS, _FEWEST_FRAMES = 16, 200  # of a place, whose histograms tell numbers
+# nats that an effect for which no estimator speaks must explain, and times as strong as is typical, where a
+# plain fit is led astray
+_SPEAKS, _STRONG = 15.0, 5.0
 _FARTHEST = 30.0  # factor of a fingerprint: beyond, it is another hypothesis
 _ALIKE = 0.5  # nats: fits that came to the same
+_ASTRAY = 5.0  # nats of a pixel that an effect explains, from which on it may mistake the peak of no electron
 
 
 class PixelLikelihood:
@@ -83,6 +84,26 @@ class PixelLikelihood:
         fits.sort(key=lambda item: -item[0])
         return [member.effect for _, member in fits] or list(guesses)
 
+    def suggested(self, kinds: Iterable[type[Effect]]) -> list[Effect]:
+        """Return effects that explain much of the histograms, as fitted, the likeliest first.
+
+        An estimator goes by what an effect does to pixels that are fitted well: where it is so strong that
+        their bias is off by an electron, it may see nothing. Of each kind from two strengths on.
+        """
+        fits: list[tuple[float, Effect]] = []
+        for kind in kinds:
+            typical = next((e for e in kind.typical() if e.strength), None)
+            if typical is None or not is_told(typical):
+                continue
+            for start in (typical, typical.scaled(_STRONG)):
+                one = self._fit([start], ())
+                if one is not None and not one.members[0].at_limit:
+                    rise = float(one.fit.log_likelihood.sum()) - self._without[self._sets.present]
+                    fits.append((rise, one.members[0].effect))
+        fits = sorted((fit for fit in fits if fit[0] > _SPEAKS), key=lambda fit: -fit[0])
+        best = {effect.tag: effect for _, effect in reversed(fits)}
+        return sorted(best.values(), key=lambda effect: [e for _, e in fits].index(effect))
+
     def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         """Return the effects of a set at the numbers that are likeliest together, where a law tells them."""
         told = [h.effect for h in hypotheses if is_told(h.effect)]
@@ -120,6 +141,9 @@ class PixelLikelihood:
             if without is None:
                 without = float(sets.fit(()).fit.log_likelihood.sum())
                 self._without[sets.present] = without
+            if fitted.fit.log_likelihood.sum() - without > _ASTRAY * len(fitted.fit.log_likelihood):
+                for electrons in (-1.0, 1.0):
+                    fitted = _at_other_peaks(sets, fitted, electrons)
         except Exception:
             return None
         return None if without - float(fitted.fit.log_likelihood.sum()) > _ALIKE else fitted
@@ -163,55 +187,15 @@ def _at(hypothesis: Hypothesis, effect: Effect) -> Hypothesis:
     return Hypothesis(effect, hypothesis.fingerprint * factor)
 
 
-def with_details(
-    guesses: Sequence[Effect],
-    frames: NDArray[np.unsignedinteger],
-    maps: PixelMaps,
-    present: Sequence[Effect],
-    effort: Effort,
-    acted_on: Callable[[Effect], tuple[BoolArray, BoolArray]],
-) -> list[Effect]:
-    """Return guesses with the numbers that the histograms tell, the likeliest of an effect in a place first.
-
-    Those of effects with a law of more numbers than a strength, by the samples on which they act; others, and
-    those that no pixel can be fitted with, stay as they are. Guesses that come to the same are one.
-
-    Args:
-        guesses: of all effects.
-        frames: (frame, y, x), DN.
-        maps: of their pixels under the model.
-        present: effects of the model.
-        effort: counts the work.
-        acted_on: returns the frames, (frame,), and the pixels, (y, x), on which an effect acts.
-    """
-    if not all(effect.everywhere for effect in present):
-        return list(guesses)
-    known: dict[Place, PixelLikelihood | None] = {}
-
-    def likelihood(effect: Effect) -> PixelLikelihood | None:
-        place = effect.region, effect.when
-        if place not in known:
-            some, inside = acted_on(effect)
-            usable = maps.usable & inside
-            enough = usable.sum() >= _FEWEST_PIXELS and some.sum() >= _FEWEST_FRAMES
-            own = frames if some.all() else frames[some]
-            known[place] = (
-                PixelLikelihood(own, replace(maps, usable=usable), present, effort, FEW_PIXELS)
-                if enough
-                else None
-            )
-        return known[place]
-
-    found: list[Effect] = []
-    for tag in dict.fromkeys(g.tag for g in guesses):
-        own = [g for g in guesses if g.tag == tag]
-        for region, when in dict.fromkeys((g.region, g.when) for g in own):
-            there = [g for g in own if (g.region, g.when) == (region, when)]
-            anywhere = [g.at_place(None) for g in there]
-            has_numbers = any(is_told(g) and len(Member.of(g).coordinates) > 1 for g in anywhere)
-            by = likelihood(there[0]) if has_numbers else None
-            found += there if by is None else [g.at_place(region, when) for g in by.detailed(anywhere)]
-    return found
+def _at_other_peaks(sets: SetComparison, fitted: FittedSet, electrons: float) -> FittedSet:
+    """Return a fit with pixels whose bias is so many electrons lower where that is likelier, or as it is."""
+    other = sets.fit(fitted.members, off_by(fitted.fit.parameters, electrons))
+    better = other.fit.log_likelihood > fitted.fit.log_likelihood + CLEARLY
+    if not better.any():
+        return fitted
+    start = np.where(better[:, None], other.fit.parameters, fitted.fit.parameters)
+    both = other if better.all() else sets.fit(other.members, start)
+    return max(fitted, other, both, key=lambda one: float(one.fit.log_likelihood.sum()))
 
 
 def is_told(effect: Effect) -> bool:

@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
+from pchem_pipeline.discrepancy.by_simulation.candidates.by_histograms import Histograms
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     PixelLikelihood,
     Witness,
     is_told,
-    with_details,
 )
 from pchem_pipeline.discrepancy.effort import Effort
+from pchem_pipeline.discrepancy.observe.observe import fitted_maps
+from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region, When
@@ -27,6 +29,7 @@ from pchem_pipeline.effects.framework.registry import effect_class
 
 SIDE, FRAMES, EXPOSURE, STEP = 16, 3000, 1.5, 8.0  # pixels, frames, e-, DN per e-
 HEAVY, SKEW = effect_class("heavy_tailed_noise"), effect_class("noise_skew")
+GROWING = effect_class("signal_dependent_noise")
 
 
 def frames_of(noise: NDArray[np.float64], seed: int) -> NDArray[np.uint16]:
@@ -63,8 +66,8 @@ def test_share_and_width_of_a_tail_are_found_from_afar(share: float, factor: flo
     frames = frames_of(mixture(np.random.default_rng(3), share, factor), 4)
     guesses = [HEAVY(share=0.02, factor=3.0), HEAVY(share=0.5, factor=1.3), SKEW(share=0.2)]
     effort = Effort(None)
-    found, skew = with_details(guesses, frames, maps_of(0.28), (), effort, acted_on)
-    assert skew == SKEW(share=0.2)  # a strength is all that it has: the statistics tell it
+    found, skew = Histograms(frames, maps_of(0.28), (), effort, acted_on).with_numbers(guesses)
+    assert skew.tag == "noise_skew"
     assert effort.spent > 0.0
     likelihood = PixelLikelihood(frames, maps_of(0.28), (), effort, 256)
     fit = likelihood._fit([found], ())
@@ -81,7 +84,7 @@ def test_numbers_of_a_tail_in_a_part_are_told_by_the_samples_there() -> None:
     tails = frames_of(mixture(np.random.default_rng(5), 0.3, 2.0), 6)
     frames[:2000, 4:8] = tails[:2000, 4:8]
     guesses = [HEAVY(share=0.02, factor=3.0, region=there, when=when), HEAVY(share=0.02, factor=3.0)]
-    placed, everywhere = with_details(guesses, frames, maps_of(0.28), (), Effort(None), acted_on)
+    placed, everywhere = Histograms(frames, maps_of(0.28), (), Effort(None), acted_on).with_numbers(guesses)
     assert (placed.region, placed.when) == (there, when)
     assert placed.share == pytest.approx(0.3, abs=0.08)  # type: ignore[attr-defined]
     assert placed.factor == pytest.approx(2.0, abs=0.15)  # type: ignore[attr-defined]
@@ -93,12 +96,45 @@ def test_numbers_of_a_tail_in_a_part_are_told_by_the_samples_there() -> None:
 def test_guesses_of_few_pixels_and_other_effects_stay_as_they_are() -> None:
     frames = frames_of(mixture(np.random.default_rng(5), 0.1, 2.2), 6)
     placed = HEAVY(share=0.02, factor=3.0, region=Region(rows=((0, 1),), columns=((0, 8),)))
-    others: list[Effect] = [placed, effect_class("row_noise")(row_noise_dn=1.0), SKEW(share=0.3)]
-    assert with_details(others, frames, maps_of(0.28), (), Effort(None), acted_on) == others
+    others: list[Effect] = [placed, effect_class("row_noise")(row_noise_dn=1.0)]
+    assert Histograms(frames, maps_of(0.28), (), Effort(None), acted_on).with_numbers(others) == others
     present = (effect_class("row_noise")(row_noise_dn=1.0, region=Region(rows=((0, 4),))),)
     everywhere = [HEAVY(share=0.02, factor=3.0)]
-    assert with_details(everywhere, frames, maps_of(0.28), present, Effort(None), acted_on) == everywhere
-    assert [is_told(each) for each in (*others, HEAVY(share=0.1))] == [False, False, True, True]
+    assert (
+        Histograms(frames, maps_of(0.28), present, Effort(None), acted_on).with_numbers(everywhere)
+        == everywhere
+    )
+    assert [is_told(each) for each in (*others, HEAVY(share=0.1))] == [False, False, True]
+
+
+def test_a_strong_effect_for_which_no_estimator_speaks_is_found_where_a_plain_fit_is_led_astray() -> None:
+    """Of noise of 0.7 e- a root electron a plain fit finds hardly a true peak."""
+    rng, there = np.random.default_rng(13), Region(rows=((2, 7),))
+    shape = FRAMES, SIDE, SIDE
+    charge = rng.poisson(EXPOSURE, shape)
+    strong = np.zeros(shape, np.bool_)
+    strong[:, 2:7] = True
+    width = np.sqrt(0.25**2 + np.where(strong, 0.7**2 * charge, 0.0))
+    frames = np.rint(100.0 + STEP * (charge + width * rng.standard_normal(shape))).astype(np.uint16)
+    maps = fitted_maps(frames, np.zeros((SIDE, SIDE), np.bool_))
+    part, kinds = Part(there), {"signal_dependent_noise": GROWING, "noise_skew": SKEW}
+    found = Histograms(frames, maps, (), Effort(None), acted_on).suggested(kinds, [part], ())
+    assert found[0].tag == "signal_dependent_noise"
+    assert found[0].region == there
+    assert found[0].noise_e == pytest.approx(0.7, rel=0.1)  # type: ignore[attr-defined]
+    clean = np.where(strong, np.roll(frames, 7, axis=1), frames)  # rows of the rest
+    maps = fitted_maps(clean, np.zeros((SIDE, SIDE), np.bool_))
+    assert Histograms(clean, maps, (), Effort(None), acted_on).suggested(kinds, [part], ()) == []
+
+
+def test_a_strength_is_told_though_the_plain_fit_has_the_bias_off_by_an_electron() -> None:
+    frames = frames_of(exgaussian(np.random.default_rng(8), 0.95), 9)
+    off = PixelMaps.known(
+        [m + shift for m, shift in zip(maps_of(0.3).maps, (1.0, 0.0, -STEP, 0.0), strict=True)],
+        np.ones((SIDE, SIDE), np.bool_),
+    )
+    [found] = PixelLikelihood(frames, off, (), Effort(None)).detailed([SKEW(share=0.6)])
+    assert found.share == pytest.approx(0.95, abs=0.02)  # type: ignore[attr-defined]
 
 
 def test_a_skew_is_told_from_tails_and_tails_from_a_skew() -> None:

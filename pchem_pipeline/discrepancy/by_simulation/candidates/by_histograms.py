@@ -1,0 +1,94 @@
+"""Guesses by the histograms of pixels on which an effect acts: its numbers, and what no estimator sees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
+    FEW_PIXELS,
+    PixelLikelihood,
+    is_told,
+)
+from pchem_pipeline.discrepancy.effort import Effort
+from pchem_pipeline.discrepancy.observe.places import Part
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+
+BoolArray = NDArray[np.bool_]
+
+_FEWEST_PIXELS, _FEWEST_FRAMES = 16, 200  # of a place, whose histograms tell numbers
+_MOST_IN_A_PART = 2  # effects for which no estimator speaks
+
+
+@dataclass
+class Histograms:
+    """The pixels of a stack, place by place.
+
+    Attributes:
+        frames: (frame, y, x), DN.
+        maps: of their pixels under the model.
+        present: effects of the model.
+        effort: counts the work.
+        acted_on: returns the frames, (frame,), and the pixels, (y, x), on which an effect acts.
+        told: effects of which the numbers are those that the histograms tell.
+    """
+
+    frames: NDArray[np.unsignedinteger]
+    maps: PixelMaps
+    present: Sequence[Effect]
+    effort: Effort
+    acted_on: Callable[[Effect], tuple[BoolArray, BoolArray]]
+    told: list[Effect] = field(default_factory=list)
+    _known: dict[Part, PixelLikelihood | None] = field(default_factory=dict, repr=False)
+
+    def with_numbers(self, guesses: Sequence[Effect]) -> list[Effect]:
+        """Return guesses with the numbers that histograms tell, the likeliest of an effect in a place first.
+
+        Those of effects with a law, by the samples on which they act: a strong effect has moved the pixels
+        from which its estimator takes a strength. Others, and those that no pixel can be fitted with, stay as
+        they are. Guesses that come to the same are one.
+        """
+        found: list[Effect] = []
+        for tag in dict.fromkeys(g.tag for g in guesses):
+            own = [g for g in guesses if g.tag == tag]
+            for region, when in dict.fromkeys((g.region, g.when) for g in own):
+                there = [g for g in own if (g.region, g.when) == (region, when)]
+                anywhere = [g.at_place(None) for g in there]
+                by = self._of(there[0]) if any(is_told(g) for g in anywhere) else None
+                likely = [] if by is None else [g.at_place(region, when) for g in by.detailed(anywhere)]
+                found += likely or there
+                self.told += likely
+        return found
+
+    def suggested(
+        self, classes: Mapping[str, type[Effect]], parts: Sequence[Part], guesses: Sequence[Effect]
+    ) -> list[Effect]:
+        """Return what explains much of the histograms of parts, of effects that are not guessed there."""
+        found: list[Effect] = []
+        for part in parts:
+            known = {g.tag for g in guesses if (g.region, g.when) == (part.region, part.when)}
+            kinds = [kind for tag, kind in classes.items() if tag not in known]
+            by = self._of(kinds[0].typical()[0].at_place(part.region, part.when)) if kinds else None
+            likely = [] if by is None else by.suggested(kinds)[:_MOST_IN_A_PART]
+            found += [effect.at_place(part.region, part.when) for effect in likely]
+        self.told += found
+        return found
+
+    def _of(self, effect: Effect) -> PixelLikelihood | None:
+        """Return the likelihood of the samples on which an effect acts; None: too few, or no one law."""
+        place = Part(effect.region, effect.when)
+        if place not in self._known:
+            some, inside = self.acted_on(effect)
+            usable = self.maps.usable & inside
+            enough = usable.sum() >= _FEWEST_PIXELS and some.sum() >= _FEWEST_FRAMES
+            told = enough and all(each.everywhere for each in self.present)
+            own = self.frames if some.all() else self.frames[some]
+            maps = replace(self.maps, usable=usable)
+            self._known[place] = (
+                PixelLikelihood(own, maps, self.present, self.effort, FEW_PIXELS) if told else None
+            )
+        return self._known[place]
