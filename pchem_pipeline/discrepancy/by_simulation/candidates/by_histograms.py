@@ -33,7 +33,7 @@ class Histograms:
         maps: of their pixels under the model.
         present: effects of the model.
         effort: counts the work.
-        acted_on: returns the frames, (frame,), and the pixels, (y, x), on which an effect acts.
+        samples_of: returns the frames, (frame,), and the pixels, (y, x), of a part.
         told: effects of which the numbers are those that the histograms tell.
     """
 
@@ -41,7 +41,7 @@ class Histograms:
     maps: PixelMaps
     present: Sequence[Effect]
     effort: Effort
-    acted_on: Callable[[Effect], tuple[BoolArray, BoolArray]]
+    samples_of: Callable[[Part], tuple[BoolArray, BoolArray]]
     told: list[Effect] = field(default_factory=list)
     _known: dict[Part, PixelLikelihood | None] = field(default_factory=dict, repr=False)
 
@@ -58,7 +58,7 @@ class Histograms:
             for region, when in dict.fromkeys((g.region, g.when) for g in own):
                 there = [g for g in own if (g.region, g.when) == (region, when)]
                 anywhere = [g.at_place(None) for g in there]
-                by = self._of(there[0]) if any(is_told(g) for g in anywhere) else None
+                by = self._of(Part(region, when)) if any(is_told(g) for g in anywhere) else None
                 likely = [] if by is None else [g.at_place(region, when) for g in by.detailed(anywhere)]
                 found += likely or there
                 self.told += likely
@@ -71,24 +71,23 @@ class Histograms:
         found: list[Effect] = []
         for part in parts:
             known = {g.tag for g in guesses if (g.region, g.when) == (part.region, part.when)}
+            by = self._of(part)
             kinds = [kind for tag, kind in classes.items() if tag not in known]
-            by = self._of(kinds[0].typical()[0].at_place(part.region, part.when)) if kinds else None
             likely = [] if by is None else by.suggested(kinds)[:_MOST_IN_A_PART]
             found += [effect.at_place(part.region, part.when) for effect in likely]
         self.told += found
         return found
 
-    def _of(self, effect: Effect) -> PixelLikelihood | None:
-        """Return the likelihood of the samples on which an effect acts; None: too few, or no one law."""
-        place = Part(effect.region, effect.when)
-        if place not in self._known:
-            some, inside = self.acted_on(effect)
+    def _of(self, part: Part) -> PixelLikelihood | None:
+        """Return the likelihood of the samples of a part; None: they are too few, or have no one law."""
+        if part not in self._known:
+            some, inside = self.samples_of(part)
             usable = self.maps.usable & inside
             enough = usable.sum() >= _FEWEST_PIXELS and some.sum() >= _FEWEST_FRAMES
             told = enough and all(each.everywhere for each in self.present)
             own = self.frames if some.all() else self.frames[some]
             maps = replace(self.maps, usable=usable)
-            self._known[place] = (
+            self._known[part] = (
                 PixelLikelihood(own, maps, self.present, self.effort, FEW_PIXELS) if told else None
             )
-        return self._known[place]
+        return self._known[part]

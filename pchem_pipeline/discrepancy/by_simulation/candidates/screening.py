@@ -82,7 +82,7 @@ class Screening:
             self.work.mapped(model).fit.maps,
             self.observed.frames.effects(model),
             self.work.effort,
-            self.observed.frames.acted_on,
+            self.observed.frames.samples_of,
         )
         guesses = histograms.with_numbers(self._guesses(simulator, model, null, evidence, MOST_HYPOTHESES))
         parts = self.observed.frames.parts

@@ -168,9 +168,8 @@ class FrameStack:
         """Return how many samples of the train and test frames are in a part."""
         return int(part.frames(self.seen_numbers).sum()) * int(self.inside(part).sum())
 
-    def acted_on(self, effect: Effect) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return on which of the train and test frames, (frame,), and pixels, (y, x), an effect acts."""
-        part = Part(effect.region, effect.when)
+    def samples_of(self, part: Part) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return which of the train and test frames, (frame,), and which pixels, (y, x), are a part."""
         return part.frames(self.seen_numbers), self.inside(part)
 
     def inside(self, part: Part) -> NDArray[np.bool_]:

@@ -55,9 +55,9 @@ def exgaussian(rng: np.random.Generator, share: float) -> NDArray[np.float64]:
     return 0.3 * (smooth + share * (rng.standard_exponential(shape) - 1.0))
 
 
-def acted_on(effect: Effect) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    some = np.ones(FRAMES, np.bool_) if effect.when is None else effect.when.frames(np.arange(FRAMES))
-    inside = np.ones((SIDE, SIDE), np.bool_) if effect.region is None else effect.region.mask((SIDE, SIDE))
+def samples_of(part: Part) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    some = np.ones(FRAMES, np.bool_) if part.when is None else part.when.frames(np.arange(FRAMES))
+    inside = np.ones((SIDE, SIDE), np.bool_) if part.region is None else part.region.mask((SIDE, SIDE))
     return some, inside
 
 
@@ -66,7 +66,7 @@ def test_share_and_width_of_a_tail_are_found_from_afar(share: float, factor: flo
     frames = frames_of(mixture(np.random.default_rng(3), share, factor), 4)
     guesses = [HEAVY(share=0.02, factor=3.0), HEAVY(share=0.5, factor=1.3), SKEW(share=0.2)]
     effort = Effort(None)
-    found, skew = Histograms(frames, maps_of(0.28), (), effort, acted_on).with_numbers(guesses)
+    found, skew = Histograms(frames, maps_of(0.28), (), effort, samples_of).with_numbers(guesses)
     assert skew.tag == "noise_skew"
     assert effort.spent > 0.0
     likelihood = PixelLikelihood(frames, maps_of(0.28), (), effort, 256)
@@ -84,7 +84,7 @@ def test_numbers_of_a_tail_in_a_part_are_told_by_the_samples_there() -> None:
     tails = frames_of(mixture(np.random.default_rng(5), 0.3, 2.0), 6)
     frames[:2000, 4:8] = tails[:2000, 4:8]
     guesses = [HEAVY(share=0.02, factor=3.0, region=there, when=when), HEAVY(share=0.02, factor=3.0)]
-    placed, everywhere = Histograms(frames, maps_of(0.28), (), Effort(None), acted_on).with_numbers(guesses)
+    placed, everywhere = Histograms(frames, maps_of(0.28), (), Effort(None), samples_of).with_numbers(guesses)
     assert (placed.region, placed.when) == (there, when)
     assert placed.share == pytest.approx(0.3, abs=0.08)  # type: ignore[attr-defined]
     assert placed.factor == pytest.approx(2.0, abs=0.15)  # type: ignore[attr-defined]
@@ -97,11 +97,11 @@ def test_guesses_of_few_pixels_and_other_effects_stay_as_they_are() -> None:
     frames = frames_of(mixture(np.random.default_rng(5), 0.1, 2.2), 6)
     placed = HEAVY(share=0.02, factor=3.0, region=Region(rows=((0, 1),), columns=((0, 8),)))
     others: list[Effect] = [placed, effect_class("row_noise")(row_noise_dn=1.0)]
-    assert Histograms(frames, maps_of(0.28), (), Effort(None), acted_on).with_numbers(others) == others
+    assert Histograms(frames, maps_of(0.28), (), Effort(None), samples_of).with_numbers(others) == others
     present = (effect_class("row_noise")(row_noise_dn=1.0, region=Region(rows=((0, 4),))),)
     everywhere = [HEAVY(share=0.02, factor=3.0)]
     assert (
-        Histograms(frames, maps_of(0.28), present, Effort(None), acted_on).with_numbers(everywhere)
+        Histograms(frames, maps_of(0.28), present, Effort(None), samples_of).with_numbers(everywhere)
         == everywhere
     )
     assert [is_told(each) for each in (*others, HEAVY(share=0.1))] == [False, False, True]
@@ -118,13 +118,13 @@ def test_a_strong_effect_for_which_no_estimator_speaks_is_found_where_a_plain_fi
     frames = np.rint(100.0 + STEP * (charge + width * rng.standard_normal(shape))).astype(np.uint16)
     maps = fitted_maps(frames, np.zeros((SIDE, SIDE), np.bool_))
     part, kinds = Part(there), {"signal_dependent_noise": GROWING, "noise_skew": SKEW}
-    found = Histograms(frames, maps, (), Effort(None), acted_on).suggested(kinds, [part], ())
+    found = Histograms(frames, maps, (), Effort(None), samples_of).suggested(kinds, [part], ())
     assert found[0].tag == "signal_dependent_noise"
     assert found[0].region == there
     assert found[0].noise_e == pytest.approx(0.7, rel=0.1)  # type: ignore[attr-defined]
     clean = np.where(strong, np.roll(frames, 7, axis=1), frames)  # rows of the rest
     maps = fitted_maps(clean, np.zeros((SIDE, SIDE), np.bool_))
-    assert Histograms(clean, maps, (), Effort(None), acted_on).suggested(kinds, [part], ()) == []
+    assert Histograms(clean, maps, (), Effort(None), samples_of).suggested(kinds, [part], ()) == []
 
 
 def test_a_strength_is_told_though_the_plain_fit_has_the_bias_off_by_an_electron() -> None:
