@@ -22,7 +22,6 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.histogram.count import histogram_frames
 
-BoolArray = NDArray[np.bool_]
 #: Pixels that tell effects apart.
 MANY_PIXELS = 1024
 #: Pixels that tell numbers well enough to begin with.
@@ -92,10 +91,7 @@ class PixelLikelihood:
         """
         fits: list[tuple[float, Effect]] = []
         for kind in kinds:
-            typical = next((e for e in kind.typical() if e.strength), None)
-            if typical is None or not is_told(typical):
-                continue
-            for start in (typical, typical.scaled(_STRONG)):
+            for start in _starts(kind):
                 one = self._fit([start], ())
                 if one is not None and not one.members[0].at_limit:
                     rise = float(one.fit.log_likelihood.sum()) - self._without[self._sets.present]
@@ -185,6 +181,16 @@ def _at(hypothesis: Hypothesis, effect: Effect) -> Hypothesis:
     if not 1.0 / _FARTHEST < factor < _FARTHEST:
         return hypothesis
     return Hypothesis(effect, hypothesis.fingerprint * factor)
+
+
+def _starts(kind: type[Effect]) -> tuple[Effect, ...]:
+    """Return what is typical of an effect and the same stronger; nothing where no law tells it."""
+    # what a stranger's effect raises is told where it is asked for its guesses
+    try:
+        typical = next((e for e in kind.typical() if e.strength and is_told(e)), None)
+        return () if typical is None else (typical, typical.scaled(_STRONG))
+    except Exception:
+        return ()
 
 
 def _at_other_peaks(sets: SetComparison, fitted: FittedSet, electrons: float) -> FittedSet:
