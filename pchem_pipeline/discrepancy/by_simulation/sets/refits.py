@@ -22,6 +22,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     log_density,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError, Refit
+from pchem_pipeline.discrepancy.by_simulation.sets.steps import Steps
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
@@ -34,11 +35,6 @@ _ENOUGH = 12  # replicates that tell a scatter
 _MOST_STEPS = 5
 _STEPS_OF_DEAR = 2
 _CLOSE = 0.05  # relative change of a factor that is not worth another simulation
-_LARGEST_STEP = np.log(4.0)  # of the logarithm of a factor
-_FURTHER = 2  # steps beyond one that explains less, where the data go on asking for the same
-# of a step, what the data ask for after it: too much for a good slope, and the most that is believed
-_SLOW, _SLOWEST = 0.5, 0.75
-_SHORTEST = 0.25  # of the step that the data ask for
 _CERTAIN = 3.5  # errors of a difference of means: less is chance
 _SMALLEST_SECANT = 0.05  # of the logarithm of a factor: shorter steps say nothing about the slope
 _TRIAL = 0.3  # step of the logarithm of a factor by which a slope is measured
@@ -165,25 +161,19 @@ class Refitter:
         """
         words = " + ".join(h.tag for h in hypotheses)
         self.allow(words)
-        best = now = self.simulated(tuple(hypotheses), None, replicates)
-        step = best.change
-        length, gained, further = 1.0, np.inf, 0
+        way = Steps.begin(self.simulated(tuple(hypotheses), None, replicates))
         dear = is_dear(h.effect for h in hypotheses)
         for step_number in range(self.steps):
-            if best.settled or gained < _LEAST_GAIN:
+            best = way.best
+            if best.settled or way.gained < _LEAST_GAIN:
                 break
-            # what falls short of its promise time after time says little by the next one
-            if length <= 1.0 and self._hopeless(best, gained, rival):
+            if way.kept_its_promise and self._hopeless(best, way.gained, rival):
                 break
             if whole and self._explains_a_part(best):
                 return replace(best, short=True)
             if dear and (step_number >= _STEPS_OF_DEAR or (step_number and best.score < rival)):
                 break
-            if 0 < further <= _FURTHER:
-                start, step = now, _as_long(now.change, step)
-            else:
-                start, step = best, best.change * length
-            step = np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
+            start, step = way.ahead()
             moved = _moved(start.hypotheses, step)
             if moved is None:
                 break
@@ -193,17 +183,10 @@ class Refitter:
             except EffortSpentError:
                 break  # what was simulated is not lost
             except NotFittedError:
-                now = best  # a step too far
-            if now.score > best.score:
-                gained, best, further = now.score - best.score, now, 0
-                length = _lengthened(now.change, step)
-            elif now is not best and further < _FURTHER and length >= 1.0 and float(now.change @ step) > 0.0:
-                further += 1  # on both sides of a dip the data ask for more of the same
-            elif length > _SHORTEST:
-                length, further = min(length, 2.0) / 2.0, 0
-            else:
+                now = None  # a step too far
+            if not way.taken(step, now):
                 break
-        return best
+        return way.best
 
     def _hopeless(self, one: Refitted, gained: float, rival: float) -> bool:
         """Tell whether a set will not come near another one: it promises less, or its steps gain too little.
@@ -417,21 +400,6 @@ def _error_of_difference(vectors: FloatArray, before: FloatArray, std: FloatArra
     scatter = (vectors - before).std(axis=0, ddof=1)
     usual = std * np.sqrt(np.mean((scatter / std) ** 2))
     return np.asarray(np.maximum(scatter, usual) / np.sqrt(len(vectors)))
-
-
-def _lengthened(change: FloatArray, step: FloatArray) -> float:
-    """Return by how much the next step is to be longer than the change that is asked for after a step.
-
-    Where each asks for nearly as much as the last one, slopes are too steep: all of them together are a
-    geometric series.
-    """
-    ratio = float(change @ step) / max(float(step @ step), 1e-12)
-    return 1.0 if ratio < _SLOW else 1.0 / (1.0 - min(ratio, _SLOWEST))
-
-
-def _as_long(change: FloatArray, step: FloatArray) -> FloatArray:
-    """Return a change, made as long as a step."""
-    return np.asarray(change * (np.linalg.norm(step) / max(float(np.linalg.norm(change)), 1e-12)))
 
 
 def _step(before: Sequence[Effect], after: Sequence[Effect]) -> FloatArray:
