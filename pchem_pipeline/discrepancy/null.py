@@ -20,11 +20,14 @@ from scipy import special
 
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.observe.laws import without_skew
+from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 FloatArray = NDArray[np.float64]
 
 _OF_ORDER = ("time", "frame", "space")
-_OF_CODES = tuple(f"code.{what}" for what in ("rough", "alternating", "period2", "period4", "largest"))
+# statistics of neighbouring codes, and the period that they look at, DN
+_OF_CODES = {"code.alternating": 2, "code.period2": 2, "code.largest": 2, "code.rough": 3, "code.period4": 4}
+_SHORTER = 1.5  # than the comb of the electrons such a period must be
 
 # of the correlations between statistics; their estimates from few replicates are noise, so pull them to 0
 _SHRINKAGE = 0.6
@@ -299,15 +302,21 @@ class Measured:
         return (self.train + self.test) / 2.0
 
 
-def free_of_parameters(names: Sequence[str]) -> NDArray[np.bool_]:
+def free_of_parameters(names: Sequence[str], maps: PixelMaps) -> NDArray[np.bool_]:
     """Tell of statistics whether they are what they are whatever the pixels' fitted parameters, shape (m,).
 
     Given the histograms, frames without an effect are in random order: all along time, between pixels and
-    frames follows from that alone. So do codes that differ from their neighbours; the smooth rest of the
-    histograms' shape is what the parameters bend.
+    frames follows from that alone. So do codes that differ from their neighbours, if electrons are farther
+    apart than that; the smooth rest of the histograms' shape is what the parameters bend.
+
+    Args:
+        names: of the statistics.
+        maps: fitted parameters, of which the gain tells how far apart electrons are.
     """
+    step = float(np.nanmedian(1.0 / maps.conversion_gain[maps.usable])) if maps.usable.any() else 0.0
+    free = {name for name, period in _OF_CODES.items() if _SHORTER * period <= step}
     kinds = ((STATISTICS[name].family, name) for name in names)
-    return np.array([f in _OF_ORDER or name in _OF_CODES for f, name in kinds], np.bool_)
+    return np.array([f in _OF_ORDER or name in free for f, name in kinds], np.bool_)
 
 
 def disagrees(

@@ -167,7 +167,7 @@ class FrameExplainer:
         names = tuple(name for name in own[0] if all(name in each for each in (*own[1:], *vectors)))
         if observed.doubt():
             # where the pixels are not identified only what does not rest on their parameters counts
-            names = tuple(np.array(names)[free_of_parameters(names)].tolist())
+            names = tuple(np.array(names)[free_of_parameters(names, observed.plain.maps)].tolist())
         first = NullModel.from_replicates(names, as_matrix(names, vectors))
         effort.begin()
         z, defects = Measured(*as_matrix(names, own)), dict[str, str]()

@@ -64,5 +64,5 @@ def is_clear(
         return False
     z = np.abs(np.array(list(evidence.z.values())))
     if evidence.ambiguous > _DOUBTFUL:
-        z = z[free_of_parameters(tuple(evidence.z))]
+        z = z[free_of_parameters(tuple(evidence.z), evidence.maps)]
     return bool(z.max(initial=0.0) > _CLEAR)

@@ -8,6 +8,7 @@ from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancie
 from pchem_pipeline.discrepancy.null import free_of_parameters
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.estimators.codes import few_shifts
+from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 NOISY = PlainCamera(0.62, 1.2, 9.0, (20, 20), 600)
 QUICK = DiscrepancySettings(replicates=20, extended_replicates=12, candidates=("row_noise",))
@@ -33,12 +34,17 @@ def test_row_noise_is_found_on_a_noisy_sensor():
 
 
 def test_what_rests_on_the_parameters_does_not_count_where_they_are_not_identified():
-    names = ("shape.C3.mean", "space.row.readout.variance", "code.smooth", "code.rough")
-    assert free_of_parameters(names).tolist() == [False, True, False, True]
+    names = ("shape.C3.mean", "space.row.readout.variance", "code.smooth", "code.rough", "code.period4")
+    # of electrons that are four codes apart the parameters bend codes of that period, too
+    for step, told in ((12.0, [True, True]), (4.6, [True, False]), (3.9, [False, False])):
+        maps = PixelMaps.known(
+            [np.full((2, 2), v) for v in (1.0, 1.0 / step, 100.0, 2.0)], np.full((2, 2), True)
+        )
+        assert free_of_parameters(names, maps).tolist() == [False, True, False, *told]
     found = find_discrepancies(NOISY.frames(11), settings=QUICK)
     counted = found.statistics[0]
     assert "space.row.readout.variance" in counted
-    assert free_of_parameters(counted).all()
+    assert not {"shape.C3.mean", "code.smooth"} & set(counted)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
