@@ -71,7 +71,7 @@ class PixelLikelihood:
         self._without: dict[tuple[Effect, ...], float] = {}  # log-likelihood, by what is present
 
     def detailed(self, guesses: Sequence[Effect]) -> list[Effect]:
-        """Return an effect as fitted from several starts, the likeliest first, each once; else as guessed."""
+        """Return an effect as fitted from several starts, each once, the likeliest first; none if it cannot be."""
         fits: list[tuple[float, Member]] = []
         for guess in guesses[:_MOST_STARTS]:
             one = self._fit([guess], ())
@@ -81,7 +81,7 @@ class PixelLikelihood:
             if not any(abs(likely - known) < _ALIKE for known, _ in fits):
                 fits.append((likely, one.members[0]))
         fits.sort(key=lambda item: -item[0])
-        return [member.effect for _, member in fits] or list(guesses)
+        return [member.effect for _, member in fits]
 
     def suggested(self, kinds: Iterable[type[Effect]]) -> list[Effect]:
         """Return effects that explain much of the histograms, as fitted, the likeliest first.
@@ -96,9 +96,11 @@ class PixelLikelihood:
                 if one is not None and not one.members[0].at_limit:
                     rise = float(one.fit.log_likelihood.sum()) - self._without[self._sets.present]
                     fits.append((rise, one.members[0].effect))
-        fits = sorted((fit for fit in fits if fit[0] > _SPEAKS), key=lambda fit: -fit[0])
-        best = {effect.tag: effect for _, effect in reversed(fits)}
-        return sorted(best.values(), key=lambda effect: [e for _, e in fits].index(effect))
+        best: dict[str, Effect] = {}
+        for rise, effect in sorted(fits, key=lambda fit: -fit[0]):
+            if rise > _SPEAKS:
+                best.setdefault(effect.tag, effect)
+        return list(best.values())
 
     def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         """Return the effects of a set at the numbers that are likeliest together, where a law tells them."""
