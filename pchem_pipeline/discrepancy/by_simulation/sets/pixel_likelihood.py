@@ -71,7 +71,7 @@ class PixelLikelihood:
         self._without: dict[tuple[Effect, ...], float] = {}  # log-likelihood, by what is present
 
     def detailed(self, guesses: Sequence[Effect]) -> list[Effect]:
-        """Return an effect as fitted from several starts, each once, the likeliest first; none if it cannot be."""
+        """Return an effect as fitted from several starts, the likeliest first; none where no fit holds."""
         fits: list[tuple[float, Member]] = []
         for guess in guesses[:_MOST_STARTS]:
             one = self._fit([guess], ())
