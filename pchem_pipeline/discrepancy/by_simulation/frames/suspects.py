@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special, stats
+from scipy import special
 from scipy.ndimage import binary_dilation
 
+from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
 from pchem_pipeline.discrepancy.observe.places import FEWEST_FRAMES, FEWEST_PIXELS, Part
 from pchem_pipeline.discrepancy.observe.rare import N_SETS, rare_samples
@@ -156,7 +157,7 @@ def _regions(evidence: Evidence, usable: NDArray[np.bool_]) -> Iterator[_Found]:
     Where little of it is elsewhere, and not scattered pixels: effects of few pixels are simulated in others,
     and would never do to these what the data do.
     """
-    shapes = _Shapes(evidence)
+    shapes, log_maps = _Shapes(evidence), float(np.log(len(pixel_maps(evidence))))
     for suspects in suspected_regions(evidence, _SIGNIFICANCE_OF_GUESSES).values():
         for one in suspects:
             mask = usable & one.region.mask((usable.shape[0], usable.shape[1]))
@@ -164,11 +165,10 @@ def _regions(evidence: Evidence, usable: NDArray[np.bool_]) -> Iterator[_Found]:
                 continue
             if not FEWEST_PIXELS <= mask.sum() <= _LARGEST * usable.sum():
                 continue
-            alone = one.log_p + np.log(len(pixel_maps(evidence)))
-            together = shapes.log_p(mask)
-            z = max(abs(one.z), float(-special.ndtri_exp(together)))
-            if min(alone, together + one.log_places) <= np.log(_SIGNIFICANCE_OF_MAPS):
-                yield _Found(z, Part(one.region))
+            z = shapes.z(mask)
+            together = float(special.log_ndtr(-z)) + one.log_places
+            if min(one.log_p + log_maps, together) <= np.log(_SIGNIFICANCE_OF_MAPS):
+                yield _Found(max(abs(one.z), z), Part(one.region))
 
 
 class _Shapes:
@@ -183,13 +183,13 @@ class _Shapes:
         self.values = np.clip(values - middle, -_FARTHEST, _FARTHEST)
         self.precision = np.linalg.pinv(np.atleast_2d(np.cov(self.values)), hermitian=True)
 
-    def log_p(self, mask: NDArray[np.bool_]) -> float:
-        """Return the logarithm of the probability that the means of some pixels, (y, x), are so far off."""
+    def z(self, mask: NDArray[np.bool_]) -> float:
+        """Return by how many standard deviations the means of pixels, (y, x), are off (Hotelling 1931)."""
         inside = mask[self.usable]
         apart = self.values[:, inside].mean(axis=1) - self.values[:, ~inside].mean(axis=1)
         number = 1.0 / (1.0 / inside.sum() + 1.0 / (~inside).sum())
         distance = number * float(apart @ self.precision @ apart)
-        return float(stats.chi2.logsf(distance, len(self.values)))
+        return float(chi_square(np.array(distance), len(self.values)))
 
 
 def _regions_of_rare(evidence: Evidence) -> Iterator[_Found]:
