@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
+from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.null import NullModel, moments
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 
@@ -124,8 +124,7 @@ class StatisticsGap:
         total, families = 0.0, {}
         own, covariance = self._own_distances(replicates, strengths), self._covariance(mean)
         for family, index in self._members().items():
-            squared = _squared_distances((z - mean)[None, index], covariance[np.ix_(index, index)])
-            distance = 0.5 * float(squared[0])
+            distance = 0.5 * float(np.sum(covariance.among(index).white((z - mean)[index]) ** 2))
             families[family] = (distance - float(own[family].mean())) / self.n_samples
             total += distance
         chance = np.asarray(np.sum(list(own.values()), axis=0), np.float64)
@@ -133,10 +132,10 @@ class StatisticsGap:
         variance = 2.0 * max(total - float(chance.mean()), 0.0)
         return Gap.of(total, chance, self.n_samples, variance=variance, families=families)
 
-    def _covariance(self, mean: FloatArray) -> FloatArray:
-        """Return the covariance that measures a model that gives ``mean``, shape (m, m)."""
+    def _covariance(self, mean: FloatArray) -> Covariance:
+        """Return the covariance that measures a model that gives ``mean``."""
         counts = self.null.events * np.maximum(mean - self.null.mean, 0.0)
-        return np.asarray(self.null.covariance + np.diag(counts))
+        return self.null.covariance.plus(counts)
 
     def _members(self) -> dict[str, list[int]]:
         """Return the places of the statistics of each family that has any."""
@@ -164,15 +163,9 @@ class StatisticsGap:
             if strengths is not None:
                 apart = apart + sides * (random.standard_normal(len(strengths)) @ strengths)
             for family, index in self._members().items():
-                squared = _squared_distances(apart[:, index], covariance[np.ix_(index, index)])
-                own[family].append(0.5 * squared)
+                white = covariance.among(index).white(apart[:, index])
+                own[family].append(0.5 * np.sum(white**2, axis=1))
         found = {family: np.concatenate(values) for family, values in own.items()}
         # the vectors are kept with it: an id is given again to what comes after them
         self._known[key] = replicates, strengths, found
         return found
-
-
-def _squared_distances(residuals: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the squared Mahalanobis distances of residuals, shape (n, m)."""
-    white = linalg.solve_triangular(linalg.cholesky(covariance, lower=True), residuals.T, lower=True)
-    return np.asarray(np.sum(white**2, axis=0))

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.observe.laws import without_skew
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -57,7 +58,7 @@ class NullModel:
         names: of the statistics, shape (m,).
         mean: shape (m,).
         std: standard deviations, shape (m,).
-        covariance: shrunk towards its diagonal, shape (m, m).
+        covariance: shrunk towards its diagonal.
         replicates: the vectors, shape (b, m).
         skewness: of the statistics of one split, shape (m,).
         effective_tests: number of independent statistics that the largest of them is worth.
@@ -67,7 +68,7 @@ class NullModel:
     names: tuple[str, ...]
     mean: FloatArray
     std: FloatArray
-    covariance: FloatArray
+    covariance: Covariance
     replicates: FloatArray
     skewness: FloatArray
     effective_tests: float
@@ -91,7 +92,7 @@ class NullModel:
         if before is not None:
             moved = before.moved_by(vectors)
             pooled = np.where(moved, std, _pooled(std, len(vectors), before.std, before.n_replicates))
-            covariance *= np.outer(pooled / std, pooled / std)
+            covariance = covariance.scaled(pooled / std)
             std, skewness, tests = pooled, before.skewness, before.effective_tests
         return cls(names, mean, std, covariance, vectors, skewness, tests)
 
@@ -152,15 +153,15 @@ class NullModel:
         return look_elsewhere(float(self.p_values(z, splits).min()), self.effective_tests)
 
 
-def moments(vectors: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def moments(vectors: FloatArray) -> tuple[FloatArray, FloatArray, Covariance]:
     """Return mean, standard deviation and shrunk covariance of replicates, shape (b, m)."""
     mean = vectors.mean(axis=0)
-    std = _std(vectors - mean)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = np.corrcoef(vectors, rowvar=False)
-    correlation = np.where(np.isfinite(correlation), correlation, 0.0) * (1.0 - _SHRINKAGE)
-    np.fill_diagonal(correlation, 1.0)
-    return mean, std, correlation * np.outer(std, std)
+    off = vectors - mean
+    std, length = _std(off), np.linalg.norm(off, axis=0)
+    # deviations of length 1, whose products are the correlations; one that is always the same has none
+    common = np.sqrt(1.0 - _SHRINKAGE) * off / np.where(length > 0.0, length, 1.0)
+    own = np.where(length > 0.0, _SHRINKAGE, 1.0)
+    return mean, std, Covariance(own, common).scaled(std)
 
 
 def two_sided(pulls: FloatArray, freedom: float) -> FloatArray:

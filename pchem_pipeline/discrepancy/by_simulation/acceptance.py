@@ -83,7 +83,7 @@ class Acceptance:
         first, n = self.first, len(added.vectors)
         certain = _certain(added, self.z.both - first.mean, noise_of_splits(first, 2, self.model_error))
         noise = noise_of_splits(first, 1, self.model_error)
-        noise = replace(noise, covariance=added.covariance * (1.0 + 1.0 / n))
+        noise = replace(noise, covariance=added.covariance.times(1.0 + 1.0 / n))
         # about the set at its best fit: strong effects do not add up to what they do together
         allowed = noise.of(lesser(added.slopes, added.parts))
         change, stderr = correction(added.slopes, self.z.final - added.mean, allowed)

@@ -187,7 +187,7 @@ class AddedRounds:
                 behind, error = compared.witnessed.get(one.tags, (one.score - compared.chosen.score, None))
                 other = _Other(hypothesis.effect, behind, one.mean, one.rest, True, error)
                 found.setdefault(hypothesis.tag, other)
-        noise = Noise(this.null.covariance / 2.0, self.settings.model_error)
+        noise = Noise(this.null.covariance.times(0.5), self.settings.model_error)
         shift = self.z.both - this.null.mean
         best = fit_set(this.added.hypotheses, shift, noise).log_score(shift, noise)
         refitted = {*compared.chosen.tags, *found}
@@ -196,7 +196,7 @@ class AddedRounds:
                 continue
             fit = fit_set([*kept, hypothesis], shift, noise)
             mean = this.null.mean + fit.parts.sum(axis=0)
-            rest = (self.z.both - mean) / np.sqrt(np.diag(noise.of(fit.parts)))
+            rest = (self.z.both - mean) / np.sqrt(noise.of(fit.parts).variances)
             behind = fit.log_score(shift, noise) - best
             if hypothesis.tag not in found or behind > found[hypothesis.tag].behind:
                 closes = bool(fit.factors[-1] > 0.0)

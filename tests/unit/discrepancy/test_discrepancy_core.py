@@ -21,6 +21,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     tolerance,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import expected_codes
+from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, look_elsewhere
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
@@ -31,6 +32,7 @@ from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_class
 
 NAMES = tuple(STATISTICS)[:40]
+UNIT = Covariance.independent(np.ones(40))
 
 
 def _null(rng: np.random.Generator, b: int = 60, m: int = 40) -> NullModel:
@@ -154,7 +156,7 @@ def test_sidak() -> None:
 def test_factors_and_their_errors_are_those_of_least_squares() -> None:
     rng = np.random.default_rng(14)
     first, second = rng.normal(size=40), rng.normal(size=40)
-    noise = Noise(np.eye(40), 0.0)
+    noise = Noise(UNIT, 0.0)
     pulls = []
     for _ in range(400):
         shift = 8.0 * first + 5.0 * second + rng.normal(size=40)
@@ -169,7 +171,7 @@ def test_the_right_one_of_three_is_named() -> None:
     rng = np.random.default_rng(15)
     prints = {tag: rng.normal(size=40) for tag in ("row_noise", "frame_noise", "exposure_drift")}
     hypotheses = [_hypothesis(tag, print_) for tag, print_ in prints.items()]
-    noise = Noise(np.eye(40), 0.1)
+    noise = Noise(UNIT, 0.1)
     shifts = tuple(3.0 * prints["frame_noise"] + rng.normal(size=40) for _ in range(2))
     choice = choose(hypotheses, (shifts[0], shifts[1]), noise)
     assert choice is not None
@@ -183,7 +185,7 @@ def test_two_at_once_are_both_named() -> None:
     hypotheses = [_hypothesis(tag, print_) for tag, print_ in prints.items()]
     mean = 3.0 * prints["row_noise"] + 2.0 * prints["exposure_drift"]
     shifts = tuple(mean + rng.normal(size=40) for _ in range(2))
-    choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(np.eye(40), 0.05))
+    choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(UNIT, 0.05))
     assert choice is not None
     assert choice.best.tags == {"row_noise", "exposure_drift"}
 
@@ -194,7 +196,7 @@ def test_twins_are_ambiguous() -> None:
     twin = print_ + 0.02 * rng.normal(size=40)
     hypotheses = [_hypothesis("row_noise", print_), _hypothesis("frame_noise", twin)]
     shifts = tuple(3.0 * print_ + rng.normal(size=40) for _ in range(2))
-    choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(np.eye(40), 0.1))
+    choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(UNIT, 0.1))
     assert choice is not None
     assert {r.hypothesis.tag for r in choice.rivals[0]} == {"row_noise", "frame_noise"}
     assert max(choice.probability) < 0.98
@@ -207,7 +209,11 @@ def test_nothing_is_chosen_where_nothing_is() -> None:
         _hypothesis("frame_noise", rng.normal(size=40)),
     ]
     chosen = [
-        choose(hypotheses, (rng.normal(size=40), rng.normal(size=40)), Noise(np.eye(40), 0.1))
+        choose(
+            hypotheses,
+            (rng.normal(size=40), rng.normal(size=40)),
+            Noise(UNIT, 0.1),
+        )
         for _ in range(50)
     ]
     assert sum(choice is not None for choice in chosen) <= 2
@@ -216,7 +222,7 @@ def test_nothing_is_chosen_where_nothing_is() -> None:
 def test_a_wrong_effect_scores_below_the_right_one_on_frames_that_it_did_not_see() -> None:
     rng = np.random.default_rng(19)
     right, wrong = rng.normal(size=40), rng.normal(size=40)
-    noise = Noise(np.eye(40), 0.1)
+    noise = Noise(UNIT, 0.1)
     shifts = (2.0 * right + rng.normal(size=40), 2.0 * right + rng.normal(size=40))
     scores = [
         score_set([_hypothesis(tag, f)], shifts, noise).score

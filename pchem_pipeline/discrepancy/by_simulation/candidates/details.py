@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, log_density
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
@@ -148,9 +147,8 @@ def _correction(refitter: Refitter, one: Refitted, details: Sequence[_Detail]) -
     noise, kept = refitter.noise(one.covariance, len(one.vectors)), refitter.kept(one.hypotheses)
     slopes = np.concatenate([one.slopes, [detail.slope for detail in details]])
     residual = refitter.target - one.mean
-    factor = linalg.cholesky(noise.among(kept).of(one.parts[:, kept]), lower=True)
-    design = linalg.solve_triangular(factor, slopes[:, kept].T, lower=True)
-    left = linalg.solve_triangular(factor, residual[kept], lower=True)
+    covariance = noise.among(kept).of(one.parts[:, kept])
+    design, left = covariance.white(slopes[:, kept]).T, covariance.white(residual[kept])
     n = len(one.hypotheses)
     scaling = [bool(h.effect.strength) for h in one.hypotheses]
     damping = np.where(np.arange(len(slopes)) < n, 1e-6, _USUAL_ERROR**-2.0)

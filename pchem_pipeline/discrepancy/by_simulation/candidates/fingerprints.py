@@ -19,8 +19,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, optimize
+from scipy import optimize
 
+from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.effects.framework.effect import Effect
 
 FloatArray = NDArray[np.float64]
@@ -71,27 +72,27 @@ class Noise:
     """Covariance of the difference of measured and predicted statistics.
 
     Attributes:
-        covariance: of the statistics under the null, its estimation included, shape (m, m).
+        covariance: of the statistics under the null, its estimation included.
         model_error: relative error of a fingerprint, no unit.
         events: of exact counts, by how much an event raises the statistic, over the number of splits in the
             mean; 0 for all others, shape (m,). Their number scatters as Poisson counts do; without an effect
             that predicts some there is none.
     """
 
-    covariance: FloatArray
+    covariance: Covariance
     model_error: float
     events: FloatArray | float = 0.0
 
     def among(self, kept: NDArray[np.bool_]) -> Noise:
         """Return the noise of some of the statistics, (m,)."""
         events = np.broadcast_to(self.events, kept.shape)[kept]
-        return replace(self, covariance=self.covariance[np.ix_(kept, kept)], events=events)
+        return replace(self, covariance=self.covariance.among(kept), events=events)
 
-    def of(self, prediction: FloatArray) -> FloatArray:
+    def of(self, prediction: FloatArray) -> Covariance:
         """Return the covariance where the prediction, (e, m), is the sum of the effects' shifts."""
         counts = self.events * np.abs(prediction.sum(axis=0))
         allowed = tolerance(prediction, self.model_error, self.events)
-        return self.covariance + np.diag(allowed**2 + counts)
+        return self.covariance.plus(allowed**2 + counts)
 
 
 @dataclass(frozen=True)
@@ -127,34 +128,32 @@ class SetFit:
     def distance(self, other: SetFit, noise: Noise) -> float:
         """Return how far the predictions of two sets lie apart, in standard deviations of the statistics."""
         mine, theirs = self.parts, other.parts
-        factor = linalg.cholesky(noise.of(np.concatenate([mine, theirs]) / np.sqrt(2.0)), lower=True)
-        white = linalg.solve_triangular(factor, mine.sum(axis=0) - theirs.sum(axis=0), lower=True)
-        return float(np.sqrt(white @ white))
+        covariance = noise.of(np.concatenate([mine, theirs]) / np.sqrt(2.0))
+        return float(np.linalg.norm(covariance.white(mine.sum(axis=0) - theirs.sum(axis=0))))
 
 
 def correction(
-    slopes: FloatArray, residual: FloatArray, covariance: FloatArray, scatter: FloatArray | None = None
+    slopes: FloatArray, residual: FloatArray, covariance: Covariance, scatter: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Return relative changes of the strengths that a residual asks for, and standard errors, (e,) each.
 
     Args:
         slopes: how the statistics go with each strength, shape (e, m).
         residual: what the model with all effects leaves, shape (m,).
-        covariance: of the residual, shape (m, m), with what is not held against the effects.
+        covariance: of the residual, with what is not held against the effects.
         scatter: deviations like that of the residual, of replicates, shape (b, m): the weights of so many
             statistics are tuned to a covariance that is itself estimated, and what they make of replicates
             that had no part in it is the error if it is larger; None: there are too few.
     """
-    factor = linalg.cholesky(covariance, lower=True)
-    design = linalg.solve_triangular(factor, slopes.T, lower=True)
+    design = covariance.white(slopes).T
     weights = np.linalg.pinv(design)
 
     def asked(rows: FloatArray) -> FloatArray:
-        return np.asarray(weights @ linalg.solve_triangular(factor, rows, lower=True))
+        return np.asarray(weights @ covariance.white(rows).T)
 
     stderr = np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
     if scatter is not None:
-        stderr = np.maximum(stderr, asked(scatter.T).std(axis=1, ddof=1))
+        stderr = np.maximum(stderr, asked(scatter).std(axis=1, ddof=1))
     return np.clip(asked(residual), -LARGEST_DECREASE, _LARGEST_INCREASE), stderr
 
 
@@ -175,11 +174,10 @@ def tolerance(parts: FloatArray, model_error: float, events: FloatArray | float)
     return np.asarray(model_error * np.sqrt(own + leaked))
 
 
-def log_density(residual: FloatArray, covariance: FloatArray) -> float:
+def log_density(residual: FloatArray, covariance: Covariance) -> float:
     """Return the Gaussian log density of a residual, up to a constant, nats."""
-    factor = linalg.cholesky(covariance, lower=True)
-    white = linalg.solve_triangular(factor, residual, lower=True)
-    return float(-0.5 * white @ white - np.sum(np.log(np.diag(factor))))
+    white = covariance.white(residual)
+    return float(-0.5 * white @ white - covariance.log_root_determinant)
 
 
 def fit_set(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> SetFit:
@@ -190,18 +188,17 @@ def fit_set(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -
         shift: measured statistics minus null mean, shape (m,).
         noise: covariance of the shift.
     """
-    columns = np.array([h.fingerprint for h in hypotheses]).T
+    columns = np.array([h.fingerprint for h in hypotheses])
     factors = np.ones(len(hypotheses))
     stderr = np.full(len(hypotheses), np.inf)
     for _ in range(_REWEIGHTINGS):
-        factor = linalg.cholesky(noise.of(columns.T * factors[:, None]), lower=True)
-        design = linalg.solve_triangular(factor, columns, lower=True)
-        target = linalg.solve_triangular(factor, shift, lower=True)
-        factors, _ = optimize.nnls(design, target)
+        covariance = noise.of(columns * factors[:, None])
+        design = covariance.white(columns).T
+        factors, _ = optimize.nnls(design, covariance.white(shift))
         variance = np.diag(np.linalg.pinv(design.T @ design))
         # where effects do the same, rounding may leave less than nothing of what separates them
         stderr = np.sqrt(np.where(variance > 0.0, variance, np.inf))
-    counted = (columns.T * factors[:, None] * noise.events > 0.0) & (shift > 0.0)
+    counted = (columns * factors[:, None] * noise.events > 0.0) & (shift > 0.0)
     return SetFit(tuple(hypotheses), factors, stderr, np.asarray(counted.any(axis=1)))
 
 
@@ -431,7 +428,7 @@ def _all_needed(scored: ScoredSet, shifts: tuple[FloatArray, FloatArray], noise:
         return False
     parts = (first.parts + second.parts) / 2.0
     shift = (shifts[0] + shifts[1]) / 2.0
-    both = replace(noise, covariance=noise.covariance / 2.0)
+    both = replace(noise, covariance=noise.covariance.times(0.5))
     return len(parts) == 1 or all(
         seen_among(part, np.delete(parts, member, axis=0), shift, both) for member, part in enumerate(parts)
     )
@@ -447,6 +444,6 @@ def seen_among(part: FloatArray, others: FloatArray, shift: FloatArray, noise: N
         noise: of the shift.
     """
     blur = _BLUR * tolerance(others, noise.model_error, noise.events)
-    scale = np.sqrt(np.diag(noise.covariance) + blur**2)
+    scale = np.sqrt(noise.covariance.variances + blur**2)
     left, own = (shift - others.sum(axis=0)) / scale, part / scale
     return bool(np.any((np.abs(left) > _SEEN) & (np.abs(own) > _MOVED) & (left * own > 0.0)))

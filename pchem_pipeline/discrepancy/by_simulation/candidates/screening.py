@@ -36,7 +36,7 @@ _DOUBT = 0.2  # of the logarithm of a factor that was fitted without the effects
 
 def noise_of_splits(null: NullModel, splits: int, model_error: float) -> Noise:
     """Return the noise of the mean of so many splits less the mean of the replicates."""
-    covariance = null.covariance * (1.0 / splits + 1.0 / null.n_replicates)
+    covariance = null.covariance.times(1.0 / splits + 1.0 / null.n_replicates)
     return Noise(covariance, model_error, null.events / splits)
 
 
@@ -112,14 +112,15 @@ class Screening:
         guesses = self._guesses(simulator, model, null, (), _MOST_BESIDE)
         hypotheses = simulator.fingerprints([*guesses, *placebo_for(guesses, self.classes)])
         self.defects.update(simulator.defects)
-        return self._compared(hypotheses, null, _DOUBT**2 * slopes.T @ slopes)
+        return self._compared(hypotheses, null, _DOUBT * slopes)
 
     def _compared(
-        self, hypotheses: Sequence[Hypothesis], null: NullModel, doubt: FloatArray | float = 0.0
+        self, hypotheses: Sequence[Hypothesis], null: NullModel, doubt: FloatArray | None = None
     ) -> Choice | None:
-        """Compare sets on the splits; ``doubt`` is covariance beside that of chance, (m, m)."""
+        """Compare sets on the splits; ``doubt`` are modes of scatter beside chance, (k, m)."""
         noise = noise_of_splits(null, 1, self.model_error)
-        noise = replace(noise, covariance=noise.covariance + doubt)
+        if doubt is not None:
+            noise = replace(noise, covariance=noise.covariance.with_modes(doubt))
         shifts = (self.z.train - null.mean, self.z.test - null.mean)
         return choose(hypotheses, shifts, noise) if hypotheses else None
 

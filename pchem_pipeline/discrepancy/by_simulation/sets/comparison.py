@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, special
+from scipy import special
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
@@ -497,9 +497,9 @@ def _beyond_others(refitter: Refitter, one: Refitted, place: int) -> bool:
     largest = np.abs(others[np.arange(len(others)), most])
     others = np.abs(others) * np.maximum(np.abs(seen[most]) / np.maximum(largest, 1e-12), 1.0)[:, None]
     noise = refitter.noise(one.covariance, len(one.vectors))
-    left = np.maximum(np.abs(seen) - others.sum(axis=0), 0.0) / np.sqrt(np.diag(noise.of(others)))
+    left = np.maximum(np.abs(seen) - others.sum(axis=0), 0.0) / np.sqrt(noise.of(others).variances)
     left *= np.sign(seen)
-    return own_signature(own, others, left, np.sqrt(np.diag(noise.covariance)))
+    return own_signature(own, others, left, np.sqrt(noise.covariance.variances))
 
 
 def _seen_beside(refitter: Refitter, part: FloatArray, others: Refitted) -> bool:
@@ -525,6 +525,5 @@ def _untouched(one: Refitted, place: int, noise: FloatArray) -> bool:
 
 def _apart(first: Refitted, second: Refitted) -> float:
     """Return how far two predictions lie apart, in standard deviations of the statistics."""
-    factor = linalg.cholesky((first.covariance + second.covariance) / 2.0, lower=True)
-    white = linalg.solve_triangular(factor, first.mean - second.mean, lower=True)
-    return float(np.sqrt(white @ white))
+    covariance = first.covariance.plus(second.covariance.own).with_modes(second.covariance.common)
+    return float(np.linalg.norm(covariance.times(0.5).white(first.mean - second.mean)))

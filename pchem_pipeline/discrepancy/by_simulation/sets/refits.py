@@ -23,6 +23,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError, Refit
 from pchem_pipeline.discrepancy.by_simulation.sets.steps import Steps
+from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
@@ -62,7 +63,7 @@ class Refitted:
         stderr: relative standard errors of the factors (of ``strength ** power``), shape (e,).
         fit: of the pixels with them.
         vectors: statistics of replicates drawn from it, shape (b, m).
-        covariance: of the statistics of one split under it, shape (m, m).
+        covariance: of the statistics of one split under it.
         slopes: how the statistics go with the logarithm of each factor, shape (e, m): a quantile of a sum of
             squares goes as a root of a strong effect, which is less than the shift that it has made.
         change: logarithms of the factors by which the data ask for more of each, shape (e,).
@@ -79,7 +80,7 @@ class Refitted:
     stderr: FloatArray
     fit: Refit
     vectors: FloatArray
-    covariance: FloatArray
+    covariance: Covariance
     slopes: FloatArray
     change: FloatArray
     rest: FloatArray
@@ -275,13 +276,13 @@ class Refitter:
         placed = any(not h.effect.everywhere for h in hypotheses)
         return np.array([placed or "@" not in name for name in self.null.names])
 
-    def noise(self, covariance: FloatArray, replicates: int) -> Noise:
+    def noise(self, covariance: Covariance, replicates: int) -> Noise:
         """Return the noise of the data less the mean of so many replicates."""
-        return Noise(covariance * (1.0 / self.splits + 1.0 / replicates), _FINE_ERROR, self.events)
+        return Noise(covariance.times(1.0 / self.splits + 1.0 / replicates), _FINE_ERROR, self.events)
 
-    def scatter(self, covariance: FloatArray, replicates: int) -> FloatArray:
+    def scatter(self, covariance: Covariance, replicates: int) -> FloatArray:
         """Return standard deviations of the same, by chance alone, shape (m,)."""
-        return np.asarray(np.sqrt(np.diag(self.noise(covariance, replicates).covariance)))
+        return np.asarray(np.sqrt(self.noise(covariance, replicates).covariance.variances))
 
     def simulated(
         self,
@@ -322,14 +323,14 @@ class Refitter:
             covariance,
             slopes,
             change,
-            rest=residual / np.sqrt(np.diag(allowed)),
+            rest=residual / np.sqrt(allowed.variances),
             score=log_density(residual, allowed),
             promise=log_density(promised, allowed),
             chance=log_density(np.zeros_like(residual), allowed) - residual.size / 2.0,
         )
 
     def _shifts(
-        self, hypotheses: tuple[Hypothesis, ...], vectors: FloatArray, covariance: FloatArray
+        self, hypotheses: tuple[Hypothesis, ...], vectors: FloatArray, covariance: Covariance
     ) -> FloatArray:
         """Return by how much each effect has moved the statistics, shape (e, m).
 
@@ -337,7 +338,7 @@ class Refitter:
         its own, not that of the fingerprints.
         """
         parts = np.array([h.fingerprint for h in hypotheses])
-        error = np.sqrt(np.diag(covariance) * (1.0 / len(vectors) + 1.0 / self.null.n_replicates))
+        error = np.sqrt(covariance.variances * (1.0 / len(vectors) + 1.0 / self.null.n_replicates))
         apart = vectors.mean(axis=0) - self.null.mean - parts.sum(axis=0)
         return _spread(parts, beyond_chance(apart, error))
 
@@ -347,7 +348,7 @@ class Refitter:
         parts: FloatArray,
         before: Refitted | None,
         vectors: FloatArray,
-        covariance: FloatArray,
+        covariance: Covariance,
     ) -> FloatArray:
         """Return how the statistics go with the logarithm of each factor, shape (e, m).
 
@@ -362,12 +363,12 @@ class Refitter:
         if length < _SMALLEST_SECANT**2:
             return old
         apart = vectors.mean(axis=0) - before.mean - step @ old
-        error = _error_of_difference(vectors, before.vectors, np.sqrt(np.diag(covariance)))
+        error = _error_of_difference(vectors, before.vectors, np.sqrt(covariance.variances))
         slope = old + np.outer(step, beyond_chance(apart, error) / length)
         # a secant holds between the two; a shift in proportion to the factor has its end's slope
         return np.asarray(slope * np.exp(step / 2.0)[:, None])
 
-    def _covariance(self, vectors: FloatArray) -> FloatArray:
+    def _covariance(self, vectors: FloatArray) -> Covariance:
         """Return the covariance of the statistics: that of the null, and more where they scatter more.
 
         Statistics that the effects neither move nor widen scatter as they did.
@@ -375,7 +376,7 @@ class Refitter:
         null = self.null
         ratio = np.maximum(vectors.std(axis=0, ddof=1) / null.std, 1.0)
         ratio[~null.moved_by(vectors)] = 1.0
-        return np.asarray(null.covariance * np.outer(ratio, ratio))
+        return null.covariance.scaled(ratio)
 
 
 def is_dear(effects: Iterable[Effect]) -> bool:

@@ -200,7 +200,7 @@ def _beaten(refitter: Refitter, members: Sequence[Hypothesis], best: Refitted) -
     noise = replace(refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=LOOSE)
     fit = fit_set(members, shift, noise)
     parts = fit.parts
-    left = np.abs(shift - parts.sum(axis=0)) / np.sqrt(np.diag(noise.of(parts)))
+    left = np.abs(shift - parts.sum(axis=0)) / np.sqrt(noise.of(parts).variances)
     if complete and np.any((left > _SEEN) & (np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift))):
         return True
     score = fit.log_score(shift, noise)
