@@ -351,6 +351,19 @@ def test_ome_zarr(tmp_path: Path, version: int) -> None:
         read(path)
 
 
+@pytest.mark.parametrize("axes", [["c", "y", "x"], [{"name": "c"}, {"name": "y"}, {"name": "x"}]])
+def test_channels_of_ome_zarr_are_reported(tmp_path: Path, axes: list[Any]) -> None:
+    path = tmp_path / "image.zarr"
+    group = zarr.open_group(path, mode="w", zarr_format=2)
+    group.create_array("0", data=STACK)
+    group.attrs["multiscales"] = [{"axes": axes, "datasets": [{"path": "0"}]}]
+    reader = ZarrReader.open(path, InputSettings())
+    np.testing.assert_array_equal(reader.read(), STACK)
+    assert "7 channels; they are read as frames" in reader.notes[0]
+    group.attrs["multiscales"] = [{"axes": ["t", "y", "x"], "datasets": [{"path": "0"}]}]
+    assert not ZarrReader.open(path, InputSettings()).notes
+
+
 def test_zarr_damage(tmp_path: Path) -> None:
     path = tmp_path / "a.zarr"
     zarr.create_array(path, data=STACK, chunks=(3, 19, 22))
