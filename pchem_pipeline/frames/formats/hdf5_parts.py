@@ -14,15 +14,16 @@ from pchem_pipeline.base.errors import InputError, install_hint
 
 def external_links(file: Any) -> dict[str, str]:
     """Return the links to what may be stacks in other files: path in this file -> name of the other."""
-    import h5py
+    from h5py import h5l
 
+    links = file.id.links  # not visititems_links, which fails at links of kinds that it does not know
     found: dict[str, str] = {}
 
-    def visit(name: str, link: Any) -> None:
-        if isinstance(link, h5py.ExternalLink):
-            found[name] = link.filename
+    def visit(name: bytes, info: Any) -> None:
+        if info.type == h5l.TYPE_EXTERNAL:
+            found[name.decode("utf-8", "replace")] = links.get_val(name)[0].decode("utf-8", "replace")
 
-    file.visititems_links(visit)
+    links.visit(visit, info=True)
     return {name: other for name, other in found.items() if getattr(file.get(name), "ndim", 3) >= 3}
 
 
@@ -38,7 +39,7 @@ def check_links(path: Path, links: dict[str, str], wanted: str | None) -> None:
         more = f" and {len(asked) - 4} more" if len(asked) > 4 else ""
         raise InputError(
             f"{path}: its frames are in other files: {shown}{more}; name those instead, and what this file "
-            "says besides by --integration-time and --bit-depth"
+            "says besides by --integration-time and --bit-depth, or choose a dataset here by --dataset"
         )
 
 
@@ -68,7 +69,7 @@ def check_sources(path: Path, dataset: Any) -> tuple[str, ...]:
     for source in sources:
         if "%" in source.file_name:  # numbered files without an end: as many as there are
             continue
-        if not _is_whole(path, dataset, source):
+        if not _is_whole(path, source):
             bad.append(source.file_name)
     if bad:
         raise InputError(
@@ -83,7 +84,7 @@ def _elsewhere(path: Path, names: set[str]) -> tuple[str, ...]:
     return (words,) if names else ()
 
 
-def _is_whole(path: Path, dataset: Any, source: Any) -> bool:
+def _is_whole(path: Path, source: Any) -> bool:
     """Tell whether a part of a virtual dataset is there and as large as it was."""
     import h5py
 
@@ -91,14 +92,22 @@ def _is_whole(path: Path, dataset: Any, source: Any) -> bool:
     try:
         with h5py.File(other, "r") as file:
             part = file.get(source.dset_name)
-            if part is None:
-                return False
-            if source.src_space.get_select_type() == h5py.h5s.SEL_ALL:
-                return bool(part.size >= source.vspace.get_select_npoints())
-            _, last = source.src_space.get_select_bounds()
-            return all(length > end for length, end in zip(part.shape, last, strict=True))
-    except (OSError, ValueError):
+            return part is not None and _fits(part, source)
+    except OSError:
         return False
+
+
+def _fits(part: Any, source: Any) -> bool:
+    """Tell whether a part has all samples that are taken from it; those without an end take what is there."""
+    from h5py import h5s
+
+    try:
+        if source.src_space.get_select_type() == h5s.SEL_ALL:
+            return bool(part.size >= source.vspace.get_select_npoints())
+        _, last = source.src_space.get_select_bounds()
+    except (RuntimeError, ValueError):  # no end
+        return True
+    return all(length > end for length, end in zip(part.shape, last, strict=True))
 
 
 def check_filters(path: Path, dataset: Any) -> None:

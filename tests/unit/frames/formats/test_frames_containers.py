@@ -169,6 +169,21 @@ def test_hdf5_virtual_dataset(tmp_path: Path, from_row: int) -> None:
         read(path)
 
 
+def test_hdf5_virtual_dataset_without_an_end(tmp_path: Path) -> None:
+    """A virtual dataset may grow with its source: it has as many frames as there are."""
+    with h5py.File(tmp_path / "part.h5", "w") as file:
+        file.create_dataset("data", data=STACK, maxshape=(None, *STACK.shape[1:]))
+        source = h5py.VirtualSource(file["data"])
+    layout = h5py.VirtualLayout((1, *STACK.shape[1:]), STACK.dtype, maxshape=(None, *STACK.shape[1:]))
+    layout[: h5py.h5s.UNLIMITED] = source[: h5py.h5s.UNLIMITED]
+    with h5py.File(tmp_path / "all.h5", "w") as file:
+        file.create_virtual_dataset("data", layout)
+    check_windows(tmp_path / "all.h5", STACK)
+    (tmp_path / "part.h5").unlink()
+    with pytest.raises(InputError, match=r"missing or too short|holds no frames"):
+        read(tmp_path / "all.h5")
+
+
 @pytest.mark.parametrize("there", [True, False])
 def test_hdf5_links_into_other_files(tmp_path: Path, there: bool) -> None:
     """A master file names its data files, whose frames it does not hold; its masks are no frames."""
