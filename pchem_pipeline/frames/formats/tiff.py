@@ -68,7 +68,7 @@ class TiffReader(ContiguousReader):
     """Pages of a TIFF file as frames."""
 
     format_name = "tiff"
-    suffixes: ClassVar[tuple[str, ...]] = (".tif", ".tiff", ".btf", ".tf8")
+    suffixes: ClassVar[tuple[str, ...]] = (".tif", ".tiff", ".btf", ".tf8", ".stk")
     magic: ClassVar[tuple[bytes, ...]] = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
     _segments: _Segments | None = None
@@ -295,6 +295,8 @@ def _check_pages(path: Path, pages: Sequence[Any]) -> None:
             f"{path}: colour or multi-channel images ({photometric}, {planes} samples a pixel); "
             "monochrome raw frames are needed"
         )
+    if len(first.shape) > (2 if planes == 1 else 3):
+        raise InputError(f"{path}: pages of {_words(first)}, which are volumes; write one frame a page")
     if planes > 1 and len(pages) > 1:
         raise InputError(f"{path}: {len(pages)} pages of {planes} planes each; write one frame a page")
     if planes > 1 and int(first.compression) != 1:

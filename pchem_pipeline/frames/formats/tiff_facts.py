@@ -38,6 +38,7 @@ _CLASSIC, _BIG = _Kind(2, 12, 4, 4), _Kind(8, 20, 8, 8)
 _MOST_TAGS = 4096
 _EXPOSURE_TAG, _EXIF_TAG = 33434, 34665
 _MICRO_MANAGER_TAG = 51123
+_STK_PLANES_TAG = 33629
 _MAKE_TAG, _MODEL_TAG, _DATE_TAG = 271, 272, 306
 
 
@@ -84,9 +85,12 @@ def _broken_chain(path: Path, pages: int, size: int) -> InputError:
 
 
 def images_behind_one_page(file: Any) -> int:
-    """Return the frames behind a single directory (ImageJ above 4 GB, tifffile's truncated series)."""
+    """Return the frames behind a single directory (ImageJ above 4 GB, MetaMorph, tifffile's truncated)."""
     if file.is_imagej and file.imagej_metadata:
         return max(1, int(file.imagej_metadata.get("images", 1)))
+    tags = file.pages[0].tags
+    if _STK_PLANES_TAG in tags:
+        return max(1, tags[_STK_PLANES_TAG].count)
     record = _shaped(file)
     return math.prod(record["shape"][:-2]) if record.get("truncated") else 1
 

@@ -129,6 +129,25 @@ def test_imagej_stack_with_one_directory(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(path), STACK)
 
 
+def test_metamorph_stack_with_one_directory(tmp_path: Path) -> None:
+    """MetaMorph writes one directory, and counts the planes behind it by a tag of its own."""
+    path = tmp_path / "a.stk"
+    n = len(STACK)
+    tags: list[Any] = [(33629, "2I", n, tuple(range(2 * n)), True)]
+    tifffile.imwrite(path, STACK[0], metadata=None, photometric="minisblack", extratags=tags)
+    with path.open("ab") as stream, tifffile.TiffFile(path) as file:
+        assert path.stat().st_size == file.pages[0].dataoffsets[0] + STACK[0].nbytes
+        stream.write(STACK[1:].tobytes())
+    np.testing.assert_array_equal(read(path), STACK)
+
+
+def test_volumes_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "volume.tif"
+    tifffile.imwrite(path, STACK, photometric="minisblack", volumetric=True, tile=(2, 16, 16))
+    with pytest.raises(InputError, match="pages of 6 x 21 x 34 uint16, which are volumes"):
+        read(path)
+
+
 def test_pages_are_frames_although_metadata_tell_several_series(tmp_path: Path) -> None:
     path = tmp_path / "series.tif"
     with tifffile.TiffWriter(path) as writer:
