@@ -90,7 +90,7 @@ def images_behind_one_page(file: Any) -> int:
         return max(1, int(file.imagej_metadata.get("images", 1)))
     tags = file.pages[0].tags
     if _STK_PLANES_TAG in tags:
-        return max(1, tags[_STK_PLANES_TAG].count)
+        return max(1, int(tags[_STK_PLANES_TAG].count))
     record = _shaped(file)
     return math.prod(record["shape"][:-2]) if record.get("truncated") else 1
 
