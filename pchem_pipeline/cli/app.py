@@ -132,7 +132,7 @@ def run(
         int | None, typer.Option(help="camera files: bits to shift right, of left-justified samples")
     ] = None,
     dataset: Annotated[
-        str | None, typer.Option(help="camera files: path of the frames inside an HDF5 or zarr file")
+        str | None, typer.Option(help="camera files: which frames inside an HDF5, zarr or FITS file")
     ] = None,
     kind: Annotated[
         Literal["dark", "light", "unknown"] | None,

@@ -31,7 +31,7 @@ def apply(
     ] = "frames",
     dataset: Annotated[
         str | None,
-        typer.Option(help="path of the frames inside an HDF5 or zarr file  [default: as the run has it]"),
+        typer.Option(help="frames inside an HDF5, zarr or FITS file  [default: as the run has it]"),
     ] = None,
     format: Annotated[Literal["zarr", "tiff", "fits"], typer.Option(help="format of the output")] = "zarr",
     keep_modes: Annotated[

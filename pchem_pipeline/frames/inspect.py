@@ -10,7 +10,7 @@ from typing import Literal
 
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.identity import file_size, hash_file, sample_hash
-from pchem_pipeline.frames.reader import FrameReader
+from pchem_pipeline.frames.reader import FrameReader, shared_notes
 from pchem_pipeline.frames.registry import detect_format, reader_class
 from pchem_pipeline.frames.resolve import resolve_files
 from pchem_pipeline.frames.settings import InputSettings
@@ -96,7 +96,7 @@ def survey(
     if check_duplicates:
         _mark_duplicates(report.good)
     readers = [reader for entry, reader in opened if not entry.problem]
-    report.notes += dict.fromkeys(note for reader in readers for note in reader.notes)
+    report.notes += shared_notes(readers)
     report.notes += _gaps([entry.path for entry in report.files])
     return readers, report
 

@@ -7,6 +7,7 @@ Readers from elsewhere come through the entry point group ``pchem_pipeline.reade
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar, Self
@@ -141,6 +142,21 @@ def check_window(
             "C order"
         )
     return y0, y1
+
+
+def shared_notes(readers: Sequence[FrameReader]) -> list[str]:
+    """Return the remarks on all files; one that many share stands once, with the name of the first."""
+    names: dict[str, list[str]] = {}
+    for reader in readers:
+        for note in dict.fromkeys(reader.notes):
+            name = f"{reader.paths[0].name}: "
+            about = [name] if note.startswith(name) else []
+            names.setdefault(note.removeprefix(name), []).extend(about)
+    notes = []
+    for words, about in names.items():
+        more = f" and {len(about) - 1} more: " if len(about) > 1 else ": "
+        notes.append(about[0].removesuffix(": ") + more + words if about else words)
+    return notes
 
 
 def changed(path: Path, what: str) -> InputError:

@@ -26,6 +26,15 @@ _OURS = {
     "ser": ("ser", "SerReader"),
     "raw": ("raw", "RawReader"),
 }
+#: first bytes of files that hold others -> what made them
+_PACKED = {
+    b"\x1f\x8b": "gzip",
+    b"BZh": "bzip2",
+    b"\xfd7zXZ": "xz",
+    b"\x28\xb5\x2f\xfd": "zstd",
+    b"PK\x03\x04": "zip",
+    b"7z\xbc\xaf\x27\x1c": "7-Zip",
+}
 
 
 @functools.cache
@@ -115,14 +124,26 @@ def detect_format(path: Path) -> str:
     for name in names:
         if reader_class(name).recognises(path, head):
             return name
-    suffixes = frame_suffixes()
-    by_suffix = suffixes.get(path.suffix.lower())
+    by_suffix = frame_suffixes().get(path.suffix.lower())
+    if by_suffix != "raw":  # raw samples may begin like anything
+        check_unpacked(path, head)
     if by_suffix is None:
         raise InputError(
             f"{path}: not a known camera format ({', '.join(names)}); name it in input.format "
             "(raw needs input.shape and input.dtype, or a sidecar file)"
         )
     return by_suffix
+
+
+def check_unpacked(path: Path, head: bytes) -> None:
+    """Refuse a file that holds another one: libraries may unpack it, but its bytes are not where they say.
+
+    Raises:
+        InputError: its first bytes are those of a program that packs files.
+    """
+    for magic, program in _PACKED.items():
+        if head.startswith(magic):
+            raise InputError(f"{path}: packed by {program}; unpack it first")
 
 
 def _head(path: Path) -> bytes:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import shared_facts
 from pchem_pipeline.frames.inspect import InputReport
-from pchem_pipeline.frames.reader import FrameReader, check_window
+from pchem_pipeline.frames.reader import FrameReader, check_window, shared_notes
 from pchem_pipeline.frames.settings import InputSettings
 
 _SCRATCH_BYTES = 1 << 24
@@ -88,8 +88,7 @@ class FrameSequence(FrameReader):
             self.timestamps = np.concatenate([each for each in stamps if each is not None])[self._first : end]
         _check_same_camera(readers)
         self.camera, moved = shared_facts(reader.camera for reader in readers)
-        notes = [note for reader in readers for note in reader.notes] + ([moved] if moved else [])
-        self.notes = tuple(dict.fromkeys(notes))
+        self.notes = (*shared_notes(readers), *([moved] if moved else []))
 
     @classmethod
     def open(cls, path: Path, settings: InputSettings) -> Self:

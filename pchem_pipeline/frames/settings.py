@@ -100,7 +100,8 @@ class InputSettings(Section):
     )
     dataset: str | None = Field(
         default=None,
-        description="HDF5 and zarr: path of the array inside the file; null: the only 3-D array there",
+        description="HDF5 and zarr: path of the array inside the file; FITS: number or name of the image; "
+        "null: the only 3-D array, or image, there",
     )
     bit_shift: int | None = Field(
         default=None,

@@ -28,7 +28,7 @@ class ApplySettings:
             frames), ``flat`` (none), ``run`` (of the characterisation), a number (e-), or a file with a map.
         remove: take the common modes that the model of the run names from the frames.
         format: one of `FORMATS`.
-        dataset: path of the frames inside an HDF5 or zarr file; None: as the run has it.
+        dataset: which frames inside an HDF5, zarr or FITS file; None: as the run has it.
     """
 
     kinds: tuple[str, ...] = KINDS

@@ -21,7 +21,9 @@ def choose_dataset(path: Path, shapes: Mapping[str, tuple[int, ...]], wanted: st
     """
     stacks = [name for name, shape in shapes.items() if len(shape) >= 3]
     images = [name for name, shape in shapes.items() if len(shape) == 2]
-    listed = ", ".join(f"{name} {shapes[name]}" for name in [*stacks, *images][:12])
+    names = [*stacks, *images]
+    listed = ", ".join(f"{name} {shapes[name]}" for name in names[:12])
+    listed += f" and {len(names) - 12} more" if len(names) > 12 else ""
     if wanted is not None:
         name = wanted.strip("/")
         if name in shapes:

@@ -8,6 +8,7 @@ than half as fast (0.9 against 2.4 GB/s) into arrays of their own.
 
 from __future__ import annotations
 
+import itertools
 import re
 import threading
 import warnings
@@ -31,7 +32,7 @@ from pchem_pipeline.frames.camera import (
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, unsigned_type
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
 from pchem_pipeline.frames.reader import changed, check_window
-from pchem_pipeline.frames.registry import require
+from pchem_pipeline.frames.registry import check_unpacked, require
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -63,6 +64,8 @@ class FitsReader(ContiguousReader):
         reader = cls()
         try:
             size = path.stat().st_size
+            with path.open("rb") as stream:
+                check_unpacked(path, stream.read(8))
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # truncation and sloppy headers are reported below
                 reader._inspect(path, size, settings)
@@ -87,7 +90,9 @@ class FitsReader(ContiguousReader):
             signed = False if biased else check_samples(path, stored, settings)
             n, rows, columns = stack_shape(path, sizes, "image")
             compressed = isinstance(hdu, fits.CompImageHDU)
+            self.notes = _value_notes(path, header, n)
             if compressed:
+                self.notes += _coding_notes(path, number, biased=biased)
                 self.rows_per_read = min(rows, int(hdu.tile_shape[-2]))
             start = 0 if compressed else int(hdu.fileinfo()["datLoc"])
             end = hdus[-1].fileinfo()["datLoc"] + hdus[-1].fileinfo()["datSpan"]
@@ -108,7 +113,7 @@ class FitsReader(ContiguousReader):
     def _read_facts(self, *headers: Any) -> None:
         """Take each fact from the last header that has it."""
         last = [*reversed(headers)]
-        times, depths = _stated(last, _TIME_KEYWORDS, duration_of), _stated(last, _DEPTH_KEYWORDS, bits_of)
+        times, depths = _stated(last, _TIME_KEYWORDS, _duration), _stated(last, _DEPTH_KEYWORDS, _bits)
         self.take_facts(StatedFacts(_camera(last), next(times, None), next(depths, None)))
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
@@ -166,9 +171,59 @@ def _image(path: Path, hdus: Any, settings: InputSettings) -> tuple[int, Any, An
         names += f" and {len(images) - 12} more" if len(images) > 12 else ""
         raise InputError(
             f"{path}: images in the file{' of that name' * (settings.dataset is not None)}: {names}; "
-            "choose one by its number in input.dataset"
+            "choose one by its number in input.dataset (--dataset), or write the frames as one cube"
         )
     return *images[0], hdus[0].header
+
+
+def _value_notes(path: Path, header: Any, frames: int) -> tuple[str, ...]:
+    """Say where pixels may be no samples, or planes no frames."""
+    notes = []
+    if "BLANK" in header:
+        notes.append(
+            f"{path.name}: BLANK = {header['BLANK']} marks pixels without a value; they are read as stored"
+        )
+    if frames == 3:
+        notes.append(
+            f"{path.name}: its 3 planes are read as frames; if they are colours, write each to a file of its "
+            "own"
+        )
+    return tuple(notes)
+
+
+def _coding_notes(path: Path, number: int, *, biased: bool) -> tuple[str, ...]:
+    """Say where compression lost information.
+
+    Args:
+        path: the file.
+        number: of the image in it.
+        biased: unsigned by BZERO.
+
+    Raises:
+        InputError: unsigned samples in PLIO, of which the library does not take back the shift.
+    """
+    from astropy.io import fits
+
+    with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
+        header = hdus[number].header
+        coding = str(header.get("ZCMPTYPE", "")).strip()
+        options = {str(header[f"ZNAME{i}"]).strip(): header.get(f"ZVAL{i}") for i in _numbers(header)}
+    if coding.startswith("PLIO") and biased:
+        raise InputError(
+            f"{path}: unsigned samples compressed by PLIO, which cannot be decoded reliably; unpack it by "
+            "funpack"
+        )
+    if coding.startswith("HCOMPRESS") and float(options.get("SCALE") or 0) != 0:
+        return (
+            f"{path.name}: HCOMPRESS with scale {options['SCALE']} loses information; noise and histograms "
+            "are no longer those of the camera",
+        )
+    return ()
+
+
+def _numbers(header: Any) -> Iterator[int]:
+    """Yield the numbers of the options of a compression: ZNAME1, ZNAME2, ..."""
+    return itertools.takewhile(lambda number: f"ZNAME{number}" in header, itertools.count(1))
 
 
 def _camera(headers: Sequence[Any]) -> CameraFacts:
@@ -187,10 +242,21 @@ def _camera(headers: Sequence[Any]) -> CameraFacts:
     )
 
 
-def _stated(headers: Sequence[Any], names: Sequence[str], read: Callable[[Any], Any]) -> Iterator[Any]:
+def _stated(headers: Sequence[Any], names: Sequence[str], read: Callable[[Any, str], Any]) -> Iterator[Any]:
     """Yield the values that can be read, header by header."""
-    values = (read(header.get(name)) for header in headers for name in names)
+    found = ((header, name) for header in headers for name in names if name in header)
+    values = (read(header[name], str(header.comments[name])) for header, name in found)
     return (value for value in values if value is not None)
+
+
+def _duration(value: Any, comment: str) -> float | None:
+    """Return a duration in s; its unit stands in brackets at the beginning of the comment, else it is s."""
+    unit = re.match(r"\s*\[(\w+)\]", comment)
+    return duration_of(value, unit[1] if unit else "s")
+
+
+def _bits(value: Any, comment: str) -> int | None:
+    return bits_of(value)
 
 
 def _keyword(headers: Sequence[Any], names: Sequence[str]) -> tuple[Any, str]:

@@ -18,10 +18,16 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.base.errors import InputError, quoted
 from pchem_pipeline.frames.camera import FACT_NAMES, StatedFacts, facts_from_names, text_of
 from pchem_pipeline.frames.formats.choice import choose_dataset
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, unsigned_type
+from pchem_pipeline.frames.formats.hdf5_parts import (
+    check_filters,
+    check_links,
+    check_sources,
+    external_links,
+)
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
 from pchem_pipeline.frames.reader import changed, check_window
 from pchem_pipeline.frames.registry import require
@@ -37,7 +43,7 @@ class Hdf5Reader(ContiguousReader):
 
     format_name = "hdf5"
     suffixes: ClassVar[tuple[str, ...]] = (".h5", ".hdf5", ".hdf", ".nxs", ".nx5")
-    magic: ClassVar[tuple[bytes, ...]] = (b"\x89HDF\r\n\x1a\n",)
+    magic: ClassVar[tuple[bytes, ...]] = (b"\x89HDF\r\n\x1a\n", b"MATLAB 7.3 MAT-file")
 
     @classmethod
     def open(cls, path: Path, settings: InputSettings) -> Self:
@@ -52,6 +58,11 @@ class Hdf5Reader(ContiguousReader):
         except InputError:
             raise
         except Exception as error:  # a damaged file can break the library anywhere
+            if "already open for write" in str(error):
+                raise InputError(
+                    f"{path}: is being written, or was never closed; wait for its program, or free it by: "
+                    f"h5clear -s {quoted(path)}"
+                ) from error
             raise InputError(
                 f"{path}: not a sound HDF5 file, or truncated ({error}); copy it again"
             ) from error
@@ -61,12 +72,18 @@ class Hdf5Reader(ContiguousReader):
         import h5py
 
         found: dict[str, tuple[int, ...]] = {}
+        detectors = []
 
         def visit(name: str, item: Any) -> None:
             if isinstance(item, h5py.Dataset):
                 found[name] = item.shape or ()
+            elif _is_detector(item):
+                detectors.append(item)
 
         file.visititems(visit)
+        wanted = settings.dataset
+        if not any(len(shape) >= 3 for shape in found.values()) or wanted is not None:
+            check_links(path, external_links(file), wanted)
         self._name = choose_dataset(path, found, settings.dataset)
         dataset = file[self._name]
         self._signed = check_samples(path, dataset.dtype, settings)
@@ -75,9 +92,11 @@ class Hdf5Reader(ContiguousReader):
         self.dtype = unsigned_type(dataset.dtype)
         self._full = tuple(dataset.shape)
         size = path.stat().st_size
+        check_filters(path, dataset)
+        self.notes = check_sources(path, dataset) + _reversed_axes(path, dataset)
         if dataset.chunks is not None:
             check_coded(path, self.shape, dataset.chunks, self.dtype.itemsize, size)
-            self.notes = _missing_chunks(path, dataset)
+            self.notes += _missing_chunks(path, dataset)
             _check_chunk_sizes(path, dataset)
         offsets = _plain_offsets(path, file, dataset, self.shape)
         if offsets is not None:
@@ -85,7 +104,8 @@ class Hdf5Reader(ContiguousReader):
             self.set_layout(path, layout, size)
         elif dataset.chunks is not None:
             self.rows_per_read = min(self.shape[1], int(dataset.chunks[-2]))
-        self.take_facts(_stated_facts(dataset))
+        parent = dataset.parent
+        self.take_facts(_stated_facts(dataset, [parent, *(detectors if len(detectors) == 1 else [])]))
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`."""
@@ -203,16 +223,34 @@ def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) 
     return [path]
 
 
-def _stated_facts(dataset: Any) -> StatedFacts:
-    """Return what the attributes of the dataset and the values beside it say (count_time in NeXus)."""
+def _is_detector(group: Any) -> bool:
+    return text_of(group.attrs.get("NX_class")) == "NXdetector"
+
+
+def _stated_facts(dataset: Any, groups: list[Any]) -> StatedFacts:
+    """Return what the attributes of the dataset say, else the values beside it (count_time in NeXus).
+
+    Args:
+        dataset: the frames.
+        groups: the group of the dataset, and the detector where the frames are in NXdata by a link.
+    """
     values = {name: np.ravel(value)[0] for name, value in dataset.attrs.items() if np.size(value) == 1}
-    beside, units = {}, {}
-    names = {name: name for name in FACT_NAMES}
-    if text_of(dataset.parent.attrs.get("NX_class")) == "NXdetector":
-        names["description"] = "camera"  # so NeXus calls make and model
-    for stored, name in names.items():
-        other = dataset.parent.get(stored)
-        if getattr(other, "size", 0) == 1:
-            beside[name] = np.ravel(other[()])[0]
-            units[name] = other.attrs.get("units")
+    beside: dict[str, Any] = {}
+    units: dict[str, Any] = {}
+    for group in groups:
+        names = {name: name for name in FACT_NAMES}
+        if _is_detector(group):
+            names["description"] = "camera"  # so NeXus calls make and model
+        for stored, name in names.items():
+            other = group.get(stored)
+            if getattr(other, "size", 0) == 1 and name not in beside:
+                beside[name] = np.ravel(other[()])[0]
+                units[name] = other.attrs.get("units")
     return facts_from_names({**beside, **values}, units)
+
+
+def _reversed_axes(path: Path, dataset: Any) -> tuple[str, ...]:
+    """Say how the axes of an array of MATLAB are read, which writes them in reverse order."""
+    if "MATLAB_class" not in dataset.attrs or dataset.ndim < 2:
+        return ()
+    return (f"{path.name}: written by MATLAB: the last axis there is read as frames, columns as rows",)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -77,6 +77,7 @@ class ZarrReader(FrameReader):
         piece = getattr(array, "shards", None) or array.chunks
         check_coded(path, self.shape, piece, self.dtype.itemsize, file_size(path))
         self.take_facts(facts_from_names(attributes))
+        self.notes = _channel_notes(path, _axes(node), self._full)
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`."""
@@ -115,9 +116,27 @@ def _full_resolution(group: Any, settings: InputSettings) -> str | None:
     """Return the path of the first level of an OME-Zarr image (0.5 and before), else None."""
     if settings.dataset is not None:
         return None
-    record = group.attrs.get("ome", group.attrs)
-    scales = record.get("multiscales") if hasattr(record, "get") else None
+    scales = _scales(group)
     return str(scales[0]["datasets"][0]["path"]) if scales else None
+
+
+def _scales(group: Any) -> Any:
+    """Return the record of the levels of an OME-Zarr image; None where there is none."""
+    record = group.attrs.get("ome", group.attrs)
+    return record.get("multiscales") if hasattr(record, "get") else None
+
+
+def _axes(node: Any) -> list[str]:
+    """Return the names of the axes of an OME-Zarr image, as far as it says."""
+    axes = (_scales(node) or [{}])[0].get("axes", [])
+    return [str(axis.get("name", "") if hasattr(axis, "get") else axis) for axis in axes]
+
+
+def _channel_notes(path: Path, axes: Sequence[str], shape: Sequence[int]) -> tuple[str, ...]:
+    """Say that channels are read as frames."""
+    if "c" not in axes or len(axes) != len(shape) or (channels := shape[axes.index("c")]) < 2:
+        return ()
+    return (f"{path.name}: its metadata call the images {channels} channels; they are read as frames",)
 
 
 def _shapes(group: Any) -> dict[str, tuple[int, ...]]:

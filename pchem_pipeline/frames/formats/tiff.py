@@ -41,6 +41,8 @@ from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 _QUIET = logging.NullHandler()
+#: parts of the names of compressions that keep no exact samples, or need not
+_LOSSY = ("JPEG", "LERC", "WEBP")
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class TiffReader(ContiguousReader):
     """Pages of a TIFF file as frames."""
 
     format_name = "tiff"
-    suffixes: ClassVar[tuple[str, ...]] = (".tif", ".tiff", ".btf", ".tf8")
+    suffixes: ClassVar[tuple[str, ...]] = (".tif", ".tiff", ".btf", ".tf8", ".stk")
     magic: ClassVar[tuple[bytes, ...]] = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
     _segments: _Segments | None = None
@@ -107,11 +109,8 @@ class TiffReader(ContiguousReader):
         first = pages[0]
         _check_pages(path, pages)
         signed = check_samples(path, np.dtype(first.dtype), settings)
-        channels = stated_channels(file)
-        if channels > 1 and len(pages) > 1:
-            notes.append(
-                f"{path.name}: its metadata call the pages {channels} channels; they are read as frames"
-            )
+        count = len(pages) if len(pages) > 1 else images_behind_one_page(file)
+        notes += _channel_notes(path, *stated_channels(file), count) + _value_notes(path, pages)
         self.notes = tuple(notes)
         stored = np.dtype(first.dtype).newbyteorder(file.byteorder)
         offsets = _contiguous_offsets(path, file, pages, size)
@@ -236,8 +235,47 @@ def _coding(page: Any) -> tuple[Any, ...]:
     )
 
 
+def _channel_notes(path: Path, channels: int, images: int, pages: int) -> list[str]:
+    """Say that pages called channels are read as frames; refuse those that have another axis, too."""
+    if channels < 2 or pages < 2:
+        return []
+    if images == pages > channels:
+        raise InputError(
+            f"{path}: its metadata call the {pages} pages {channels} channels of {pages // channels} images "
+            "each; write each channel as a file of its own"
+        )
+    return [f"{path.name}: its metadata call the pages {channels} channels; they are read as frames"]
+
+
+def _value_notes(path: Path, pages: Sequence[Any]) -> list[str]:
+    """Say where samples may not be what the camera delivered: planes, lost in coding, unwritten, inverted."""
+    notes = []
+    if (planes := pages[0].samplesperpixel) > 1:
+        notes.append(f"{path.name}: the {planes} planes of its page are read as frames")
+    names = {getattr(page.compression, "name", "") for page in pages}
+    lossy = [name for name in names if any(word in name for word in _LOSSY)]
+    if lossy:
+        notes.append(
+            f"{path.name}: {', '.join(sorted(lossy))} coding can lose information; noise and histograms "
+            "may no longer be those of the camera"
+        )
+    unwritten = sum(page.databytecounts.count(0) for page in pages)
+    if unwritten:
+        total = sum(len(page.databytecounts) for page in pages)
+        notes.append(
+            f"{path.name}: {unwritten} of {total} strips or tiles were never written; they are read as "
+            f"{pages[0].nodata}"
+        )
+    if getattr(pages[0].photometric, "name", "") == "MINISWHITE":
+        notes.append(
+            f"{path.name}: its tags call 0 white; samples are read as stored: if more light makes them "
+            "smaller, invert them first"
+        )
+    return notes
+
+
 def _check_pages(path: Path, pages: Sequence[Any]) -> None:
-    """Refuse colour, and pages of different shape or type."""
+    """Refuse colour, pages of different shape or type, and pages that were not written to their end."""
     first = pages[0]
     for number, page in enumerate(pages):
         if page.dtype is None or not all(isinstance(length, int) for length in page.shape):
@@ -257,8 +295,19 @@ def _check_pages(path: Path, pages: Sequence[Any]) -> None:
             f"{path}: colour or multi-channel images ({photometric}, {planes} samples a pixel); "
             "monochrome raw frames are needed"
         )
+    if len(first.shape) > (2 if planes == 1 else 3):
+        raise InputError(f"{path}: pages of {_words(first)}, which are volumes; write one frame a page")
     if planes > 1 and len(pages) > 1:
         raise InputError(f"{path}: {len(pages)} pages of {planes} planes each; write one frame a page")
+    if planes > 1 and int(first.compression) != 1:
+        raise InputError(f"{path}: one page of {planes} compressed planes; write one frame a page")
+    for number, page in enumerate(pages):
+        offsets, counts = len(page.dataoffsets), len(page.databytecounts)
+        if offsets != counts or offsets < math.prod(page.chunked):
+            raise InputError(
+                f"{path}: page {number} names {offsets} strips or tiles and {counts} sizes, where "
+                f"{math.prod(page.chunked)} are needed: not written to its end; copy or write it again"
+            )
 
 
 def _words(page: Any) -> str:
@@ -274,6 +323,8 @@ def _contiguous_offsets(path: Path, file: Any, pages: Sequence[Any], size: int) 
     if any(
         page.bitspersample != 8 * dtype.itemsize or page.is_tiled or page.predictor != 1 for page in pages
     ):
+        return None
+    if any(0 in page.databytecounts for page in pages):  # never written: nothing lies at their offsets
         return None
     rows, columns = first.shape[-2:]
     frame = rows * columns * dtype.itemsize

@@ -36,8 +36,9 @@ class _Kind(NamedTuple):
 _CLASSIC, _BIG = _Kind(2, 12, 4, 4), _Kind(8, 20, 8, 8)
 #: tags of a directory, as in tifffile
 _MOST_TAGS = 4096
-_EXPOSURE_TAG = 33434
+_EXPOSURE_TAG, _EXIF_TAG = 33434, 34665
 _MICRO_MANAGER_TAG = 51123
+_STK_PLANES_TAG = 33629
 _MAKE_TAG, _MODEL_TAG, _DATE_TAG = 271, 272, 306
 
 
@@ -84,9 +85,12 @@ def _broken_chain(path: Path, pages: int, size: int) -> InputError:
 
 
 def images_behind_one_page(file: Any) -> int:
-    """Return the frames behind a single directory (ImageJ above 4 GB, tifffile's truncated series)."""
+    """Return the frames behind a single directory (ImageJ above 4 GB, MetaMorph, tifffile's truncated)."""
     if file.is_imagej and file.imagej_metadata:
         return max(1, int(file.imagej_metadata.get("images", 1)))
+    tags = file.pages[0].tags
+    if _STK_PLANES_TAG in tags:
+        return max(1, int(tags[_STK_PLANES_TAG].count))
     record = _shaped(file)
     return math.prod(record["shape"][:-2]) if record.get("truncated") else 1
 
@@ -110,12 +114,14 @@ def _ome(file: Any) -> str:
     return (file.ome_metadata or "") if file.is_ome else ""
 
 
-def stated_channels(file: Any) -> int:
-    """Return the number of channels that ImageJ or OME metadata state; 1 if they do not."""
+def stated_channels(file: Any) -> tuple[int, int]:
+    """Return the channels, and the images of all of them, that ImageJ or OME metadata state; else (1, 1)."""
     if file.is_imagej and file.imagej_metadata:
-        return int(file.imagej_metadata.get("channels", 1))
-    match = re.search(r'SizeC="(\d+)"', _ome(file))
-    return int(match[1]) if match else 1
+        record = file.imagej_metadata
+        return int(record.get("channels", 1)), int(record.get("images", 1))
+    found = (re.search(rf'Size{axis}="(\d+)"', _ome(file)) for axis in "CZT")
+    sizes = [int(match[1]) if match else 1 for match in found]
+    return sizes[0], math.prod(sizes)
 
 
 def stated_facts(file: Any, page: Any) -> StatedFacts:
@@ -136,6 +142,7 @@ def stated_facts(file: Any, page: Any) -> StatedFacts:
         own.integration_time,
         _ome_time(_ome(file)),
         _ratio(_tag(page, _EXPOSURE_TAG)),
+        _ratio(exif.get("ExposureTime")) if isinstance(exif := _tag(page, _EXIF_TAG), dict) else None,
         duration_of(record.get("Exposure-ms"), "ms"),
     )
     depths = (_ome_depth(_ome(file)), own.bit_depth, _odd_depth(page.bitspersample))

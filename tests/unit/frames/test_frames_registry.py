@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import builtins
+import bz2
+import gzip
 import importlib
+import lzma
 import os
 import re
 import shutil
@@ -16,9 +19,10 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError, MissingDependencyError
+from pchem_pipeline.base.errors import ConfigError, InputError, MissingDependencyError
 from pchem_pipeline.frames import registry
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.reader import FrameReader, check_window
@@ -54,6 +58,25 @@ class TextReader(FrameReader):
 
 class NoReader:
     """Not a reader at all."""
+
+
+@pytest.mark.parametrize("pack", [gzip, bz2, lzma])
+@pytest.mark.parametrize("name", ["a.fits", "a.fits.packed"])
+@pytest.mark.parametrize("given", ["auto", "fits"])
+def test_packed_files_are_refused(tmp_path: Path, pack: Any, name: str, given: str) -> None:
+    """A library that unpacks by itself must not tell where frames lie in a file that it did not read."""
+    path = tmp_path / name
+    fits.PrimaryHDU(np.random.default_rng(1).integers(0, 65536, (4, 30, 40)).astype(np.uint16)).writeto(
+        tmp_path / "plain.fits"
+    )
+    with pack.open(path, "wb") as stream:
+        stream.write((tmp_path / "plain.fits").read_bytes())
+    with pytest.raises(InputError, match=r"packed by (gzip|bzip2|xz); unpack it first"):
+        open_frames(InputSettings(files=(str(path),), format=given), tmp_path)
+    samples = tmp_path / "a.raw"
+    samples.write_bytes(b"PK\x03\x04" + bytes(20))
+    with open_frames(InputSettings(files=(str(samples),), shape=(3, 2), dtype="uint16"), tmp_path) as reader:
+        assert reader.shape == (2, 3, 2)
 
 
 @pytest.fixture(autouse=True)

@@ -122,6 +122,134 @@ def test_nexus(tmp_path: Path) -> None:
     assert reader.bit_depth == 16
 
 
+def test_nexus_facts_of_frames_that_are_linked(tmp_path: Path) -> None:
+    """Most programs put one array into NXdata and NXdetector; what is said of it stands in the detector."""
+    path = tmp_path / "linked.nxs"
+    with h5py.File(path, "w") as file:
+        detector = file.create_group("entry/instrument/detector")
+        detector.attrs["NX_class"] = "NXdetector"
+        detector["count_time"] = 250.0
+        detector["count_time"].attrs["units"] = "ms"
+        detector["description"] = "Maker Model"
+        file["entry/data/data"] = STACK
+        detector["data"] = file["entry/data/data"]
+    check_windows(path, STACK)
+    reader = Hdf5Reader.open(path, InputSettings())
+    assert reader.integration_time == pytest.approx(0.25)
+    assert reader.camera.name == "Maker Model"
+
+
+def write_parts(folder: Path, from_row: int = 0) -> Path:
+    """Write the stack as a virtual dataset of three files, maybe without their first rows."""
+    _, rows, columns = STACK.shape
+    layout = h5py.VirtualLayout((len(STACK), rows - from_row, columns), STACK.dtype)
+    for i, (start, end) in enumerate([(0, 3), (3, 6), (6, 7)]):
+        with h5py.File(folder / f"part{i}.h5", "w") as file:
+            file["data"] = STACK[start:end]
+        source = h5py.VirtualSource(f"part{i}.h5", "data", (end - start, rows, columns))
+        layout[start:end] = source[:, from_row:] if from_row else source
+    with h5py.File(folder / "all.h5", "w") as file:
+        file.create_virtual_dataset("data", layout)
+    return folder / "all.h5"
+
+
+@pytest.mark.parametrize("from_row", [0, 4])
+def test_hdf5_virtual_dataset(tmp_path: Path, from_row: int) -> None:
+    """The library reads parts that it does not find as 0; they must not pass for frames."""
+    path = write_parts(tmp_path, from_row)
+    np.testing.assert_array_equal(read(path), STACK[:, from_row:])
+    assert "other files (3)" in Hdf5Reader.open(path, InputSettings()).notes[0]
+    with h5py.File(tmp_path / "part1.h5", "w") as file:
+        file["data"] = STACK[3:5]
+    words = r"all\.h5: 1 of the 3 parts of /data are missing or too short, the first in part1\.h5"
+    with pytest.raises(InputError, match=words):
+        read(path)
+    (tmp_path / "part1.h5").unlink()
+    with pytest.raises(InputError, match=words):
+        read(path)
+
+
+def test_hdf5_virtual_dataset_without_an_end(tmp_path: Path) -> None:
+    """A virtual dataset may grow with its source: it has as many frames as there are."""
+    with h5py.File(tmp_path / "part.h5", "w") as file:
+        file.create_dataset("data", data=STACK, maxshape=(None, *STACK.shape[1:]))
+        source = h5py.VirtualSource(file["data"])
+    layout = h5py.VirtualLayout((1, *STACK.shape[1:]), STACK.dtype, maxshape=(None, *STACK.shape[1:]))
+    layout[: h5py.h5s.UNLIMITED] = source[: h5py.h5s.UNLIMITED]
+    with h5py.File(tmp_path / "all.h5", "w") as file:
+        file.create_virtual_dataset("data", layout)
+    check_windows(tmp_path / "all.h5", STACK)
+    (tmp_path / "part.h5").unlink()
+    with pytest.raises(InputError, match=r"missing or too short|holds no frames"):
+        read(tmp_path / "all.h5")
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_hdf5_links_into_other_files(tmp_path: Path, there: bool) -> None:
+    """A master file names its data files, whose frames it does not hold; its masks are no frames."""
+    path = tmp_path / "master.h5"
+    with h5py.File(path, "w") as file:
+        file["mask"] = np.zeros(STACK.shape[1:], np.uint32)
+        file["entry/data_000001"] = h5py.ExternalLink("data_000001.h5", "/data")
+    if there:
+        with h5py.File(tmp_path / "data_000001.h5", "w") as file:
+            file["data"] = STACK
+    with pytest.raises(InputError, match=r"in other files: entry/data_000001 in data_000001\.h5; name those"):
+        read(path)
+    with pytest.raises(InputError, match="in other files"):
+        read(path, dataset="/entry/data_000001")
+    with h5py.File(path, "a") as file:
+        file["frames"] = STACK
+    np.testing.assert_array_equal(read(path), STACK)
+
+
+def test_hdf5_samples_in_a_raw_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with h5py.File("a.h5", "w") as file:
+        file.create_dataset("frames", data=STACK, external=[("samples.bin", 0, STACK.nbytes)])
+    np.testing.assert_array_equal(read(tmp_path / "a.h5"), STACK)
+    monkeypatch.chdir(tmp_path.parent)
+    with pytest.raises(InputError, match=r"a\.h5: the samples of /frames lie in samples\.bin, which is not"):
+        read(tmp_path / "a.h5")
+
+
+def test_hdf5_filter_that_is_not_installed(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("frames", data=STACK, chunks=(1, 19, 22), compression="gzip")
+    data = bytearray(path.read_bytes())
+    place = data.index(b"deflate\0") - 8
+    assert data[place : place + 2] == b"\1\0"
+    data[place : place + 2] = (40_000).to_bytes(2, "little")
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"/frames is coded by HDF5 filter 40000 \(deflate\), which is not"):
+        read(path)
+
+
+def test_hdf5_left_open_by_its_writer(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w", libver="latest") as file:
+        file["frames"] = STACK
+        file.swmr_mode = True
+        file.flush()
+        copy = tmp_path / "copy.h5"
+        copy.write_bytes(path.read_bytes())
+    with pytest.raises(InputError, match=r"copy\.h5: is being written, or was never closed; .*h5clear -s"):
+        read(copy)
+
+
+def test_matlab_file(tmp_path: Path) -> None:
+    """Version 7.3 is HDF5 behind a block of text, its axes in reverse order."""
+    path = tmp_path / "frames.mat"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        file["frames"] = STACK
+        file["frames"].attrs["MATLAB_class"] = np.bytes_("uint16")
+    with path.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64")
+    np.testing.assert_array_equal(read(path), STACK)
+    assert "the last axis there is read as frames" in Hdf5Reader.open(path, InputSettings()).notes[0]
+
+
 def test_hdf5_single_frames(tmp_path: Path) -> None:
     for i, frame in enumerate(STACK):
         with h5py.File(tmp_path / f"f{i + 7}.h5", "w") as file:
@@ -141,6 +269,11 @@ def test_hdf5_candidates_are_listed(tmp_path: Path) -> None:
     check_windows(path, STACK, dataset="/dark/frames")
     with pytest.raises(InputError, match=r"no dataset 'flat'; there are: dark/frames"):
         read(path, dataset="flat")
+    with h5py.File(path, "w") as file:
+        for i in range(15):
+            file[f"frame{i}"] = STACK[0]
+    with pytest.raises(InputError, match=r"and 3 more; choose one"):
+        read(path)
     with h5py.File(path, "w") as file:
         file["temperature"] = np.arange(4)
     with pytest.raises(InputError, match="holds no dataset of frames"):
@@ -231,6 +364,19 @@ def test_ome_zarr(tmp_path: Path, version: int) -> None:
     group.create_array("two", data=np.zeros((4, 2, 1, 8, 9), np.uint16))
     with pytest.raises(InputError, match="2 axes before rows and columns"):
         read(path)
+
+
+@pytest.mark.parametrize("axes", [["c", "y", "x"], [{"name": "c"}, {"name": "y"}, {"name": "x"}]])
+def test_channels_of_ome_zarr_are_reported(tmp_path: Path, axes: list[Any]) -> None:
+    path = tmp_path / "image.zarr"
+    group = zarr.open_group(path, mode="w", zarr_format=2)
+    group.create_array("0", data=STACK)
+    group.attrs["multiscales"] = [{"axes": axes, "datasets": [{"path": "0"}]}]
+    reader = ZarrReader.open(path, InputSettings())
+    np.testing.assert_array_equal(reader.read(), STACK)
+    assert "7 channels; they are read as frames" in reader.notes[0]
+    group.attrs["multiscales"] = [{"axes": ["t", "y", "x"], "datasets": [{"path": "0"}]}]
+    assert not ZarrReader.open(path, InputSettings()).notes
 
 
 def test_zarr_damage(tmp_path: Path) -> None:

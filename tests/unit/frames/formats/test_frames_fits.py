@@ -88,6 +88,52 @@ def test_facts_are_taken_from_the_header(tmp_path: Path, keyword: str, extension
     assert reader.bit_depth == 16
 
 
+@pytest.mark.parametrize(
+    ("comment", "seconds"), [("[ms] exposure", 0.0125), ("exposure", 12.5), ("[s] it", 12.5)]
+)
+def test_unit_of_the_exposure(tmp_path: Path, comment: str, seconds: float) -> None:
+    unit = fits.PrimaryHDU(STACK)
+    unit.header["EXPOSURE"] = (12.5, comment)
+    unit.writeto(tmp_path / "a.fits")
+    assert FitsReader.open(tmp_path / "a.fits", InputSettings()).integration_time == pytest.approx(seconds)
+
+
+def test_values_that_may_be_no_samples_are_reported(tmp_path: Path) -> None:
+    for i in range(3):
+        unit = fits.PrimaryHDU(STACK[i : i + 3])
+        unit.header["BLANK"] = -32768
+        unit.writeto(tmp_path / f"f{i}.fits")
+    with open_frames(InputSettings(files=(str(tmp_path),)), tmp_path) as reader:
+        assert reader.report.notes == [
+            "f0.fits and 2 more: BLANK = -32768 marks pixels without a value; they are read as stored",
+            "f0.fits and 2 more: its 3 planes are read as frames; if they are colours, write each to a file "
+            "of its own",
+        ]
+
+
+def test_compression_that_loses_is_reported(tmp_path: Path) -> None:
+    path = tmp_path / "a.fits"
+    for scale, notes in ((0, 0), (4, 1)):
+        unit = fits.CompImageHDU(
+            STACK, compression_type="HCOMPRESS_1", hcomp_scale=scale, tile_shape=(1, *STACK.shape[1:])
+        )
+        unit.writeto(path, overwrite=True)
+        reader = FitsReader.open(path, InputSettings())
+        assert len(reader.notes) == notes
+        assert np.array_equal(reader.read(), STACK) == (scale == 0)
+
+
+def test_unsigned_plio_is_refused(tmp_path: Path) -> None:
+    """The format's own library writes it, shifted by an offset that astropy does not take back."""
+    path = tmp_path / "a.fits"
+    fits.CompImageHDU((STACK & 0xFFF).astype(np.int16), compression_type="PLIO_1").writeto(path)
+    np.testing.assert_array_equal(read(path, dtype="uint16"), STACK & 0xFFF)
+    with fits.open(path, mode="update", disable_image_compression=True) as file:
+        file[1].header["BZERO"] = 32768
+    with pytest.raises(InputError, match="unsigned samples compressed by PLIO"):
+        read(path)
+
+
 def test_several_images_must_be_chosen_from(tmp_path: Path) -> None:
     path = tmp_path / "two.fits"
     units = [fits.PrimaryHDU(), fits.ImageHDU(STACK, name="DARK"), fits.ImageHDU(STACK + 1, name="FLAT")]

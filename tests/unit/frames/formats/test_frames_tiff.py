@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.tiff import TiffReader
@@ -127,6 +129,25 @@ def test_imagej_stack_with_one_directory(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(path), STACK)
 
 
+def test_metamorph_stack_with_one_directory(tmp_path: Path) -> None:
+    """MetaMorph writes one directory, and counts the planes behind it by a tag of its own."""
+    path = tmp_path / "a.stk"
+    n = len(STACK)
+    tags: list[Any] = [(33629, "2I", n, tuple(range(2 * n)), True)]
+    tifffile.imwrite(path, STACK[0], metadata=None, photometric="minisblack", extratags=tags)
+    with path.open("ab") as stream, tifffile.TiffFile(path) as file:
+        assert path.stat().st_size == file.pages[0].dataoffsets[0] + STACK[0].nbytes
+        stream.write(STACK[1:].tobytes())
+    np.testing.assert_array_equal(read(path), STACK)
+
+
+def test_volumes_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "volume.tif"
+    tifffile.imwrite(path, STACK, photometric="minisblack", volumetric=True, tile=(2, 16, 16))
+    with pytest.raises(InputError, match="pages of 6 x 21 x 34 uint16, which are volumes"):
+        read(path)
+
+
 def test_pages_are_frames_although_metadata_tell_several_series(tmp_path: Path) -> None:
     path = tmp_path / "series.tif"
     with tifffile.TiffWriter(path) as writer:
@@ -190,6 +211,75 @@ def test_facts_are_taken_from_the_file(tmp_path: Path) -> None:
     tifffile.imwrite(plain, STACK, photometric="minisblack")
     assert TiffReader.open(plain, InputSettings()).integration_time is None
     assert TiffReader.open(plain, InputSettings()).bit_depth is None
+
+
+def test_exposure_in_the_exif_directory(tmp_path: Path) -> None:
+    tags = ImageFileDirectory_v2()
+    tags[34665] = {33434: IFDRational(487, 100)}
+    Image.fromarray(STACK[0]).save(tmp_path / "a.tif", tiffinfo=tags)
+    assert TiffReader.open(tmp_path / "a.tif", InputSettings()).integration_time == pytest.approx(4.87)
+
+
+def test_channels_beside_frames_are_refused(tmp_path: Path) -> None:
+    """Frames of two channels in turn are no samples of one law; frames called channels are frames."""
+    imagej, ome = tmp_path / "imagej.tif", tmp_path / "a.ome.tif"
+    mixed = STACK.reshape(3, 2, *STACK.shape[1:])
+    tifffile.imwrite(imagej, mixed, imagej=True, metadata={"axes": "TCYX"})
+    tifffile.imwrite(ome, mixed, metadata={"axes": "TCYX"}, photometric="minisblack")
+    for path in (imagej, ome):
+        with pytest.raises(InputError, match="the 6 pages 2 channels of 3 images each"):
+            read(path)
+    tifffile.imwrite(imagej, STACK, imagej=True, metadata={"axes": "CYX"})
+    reader = TiffReader.open(imagej, InputSettings())
+    np.testing.assert_array_equal(reader.read(), STACK)
+    assert "6 channels; they are read as frames" in reader.notes[0]
+    text = tifffile.tiffcomment(ome)
+    tifffile.imwrite(ome, STACK[:3], description=text.encode(), metadata=None, photometric="minisblack")
+    np.testing.assert_array_equal(read(ome), STACK[:3])  # the other channel lies in another file
+
+
+def test_strips_that_were_never_written(tmp_path: Path) -> None:
+    """GDAL leaves empty strips out: offset 0 and 0 bytes, where other bytes of the file must not be read."""
+    path = tmp_path / "sparse.tif"
+    tifffile.imwrite(path, STACK, photometric="minisblack", metadata=None)
+    with tifffile.TiffFile(path, mode="r+b") as file:
+        tags = file.pages[2].tags
+        tags["StripOffsets"].overwrite(0)
+        tags["StripByteCounts"].overwrite(0)
+    reader = TiffReader.open(path, InputSettings())
+    expected = STACK.copy()
+    expected[2] = 0
+    np.testing.assert_array_equal(reader.read(), expected)
+    assert "1 of 6 strips or tiles were never written; they are read as 0" in reader.notes[0]
+
+
+def test_page_without_its_strips(tmp_path: Path) -> None:
+    path = tmp_path / "unfinished.tif"
+    tifffile.imwrite(path, STACK, photometric="minisblack", metadata=None, rowsperstrip=8, compression="lzw")
+    with tifffile.TiffFile(path) as file:
+        place = file.pages[1].tags["StripOffsets"].offset
+    data = bytearray(path.read_bytes())
+    data[place : place + 2] = (40_000).to_bytes(2, "little")  # a tag that no program knows
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"unfinished\.tif: page 1 names 0 strips or tiles and 3 sizes"):
+        read(path)
+
+
+def test_compressed_planes_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "planes.tif"
+    tifffile.imwrite(path, STACK, photometric="minisblack", planarconfig="separate", compression="zlib")
+    with pytest.raises(InputError, match="one page of 6 compressed planes; write one frame a page"):
+        read(path)
+
+
+def test_samples_that_are_not_as_the_camera_made_them_are_reported(tmp_path: Path) -> None:
+    lossy = [Image.fromarray((frame >> 4).astype(np.uint8)) for frame in STACK]
+    lossy[0].save(tmp_path / "jpeg.tif", save_all=True, append_images=lossy[1:], compression="jpeg")
+    tifffile.imwrite(tmp_path / "white.tif", STACK, photometric="miniswhite")
+    tifffile.imwrite(tmp_path / "planes.tif", STACK, photometric="minisblack", planarconfig="separate")
+    words = {"jpeg": "JPEG coding can lose information", "white": "0 white", "planes": "the 6 planes"}
+    for name, said in words.items():
+        assert said in TiffReader.open(tmp_path / f"{name}.tif", InputSettings()).notes[0]
 
 
 def test_colour_is_refused(tmp_path: Path) -> None:
