@@ -71,6 +71,7 @@ _TWO_PI = 2.0 * math.pi
 _GAIN_SCALES = (2.0, 0.5, 1.5, 0.67, 1.22, 0.82)
 _N_ATTEMPTS_SINGLE, _N_ATTEMPTS_JOINT = 4 + len(_GAIN_SCALES), 2
 _N_GAINS = 25  # of the scan over the gain, from a fifth of the sd to 2.5 sd
+_GAIN_COLUMNS = 48  # at the end of `Scratch.rows`, where no evaluation comes
 _GAIN_NOISE = 0.1225  # e-^2
 
 _LINE_NOISES = (0.15, 0.22, 0.3, 0.38, 0.46, 0.55, 0.65, 0.8, 0.95, 1.15)  # e-
@@ -94,25 +95,14 @@ def regression_basis() -> NDArray[np.float64]:
 
 
 @kernel(borrows=True)
-def ecf_power(
-    histogram: Histogram,
-    step: float,
-    n_frequencies: int,
-    work: NDArray[np.float64],
-) -> None:
-    """Leave the squared modulus of the ECF at ``step * (1 ... n)`` in ``work[0]``.
+def _clenshaw(histogram: Histogram, first: int, end: int, work: NDArray[np.float64]) -> None:
+    """Leave b_0 and b_1 of Clenshaw's recurrence in ``work[2:4]``, from 2 cos(angle) in ``work[1]``.
 
-    By Clenshaw's recurrence ``b_i = c_i + 2 cos(angle) b_{i+1} - b_{i+2}``, two DN at a time and all
-    frequencies side by side; ``|sum c_i exp(i angle)|^2 = b_0^2 + b_1^2 - 2 cos(angle) b_0 b_1``.
+    ``b_i = c_i + 2 cos(angle) b_{i+1} - b_{i+2}``, two DN at a time and all frequencies side by side; then
+    ``sum c_i exp(i angle) = b_0 - b_1 exp(-i angle)``. Columns ``first ... end - 1``, and some beyond.
     """
     weights, n_bins = histogram.weights, histogram.n_bins
-    base = 2.0 * math.cos(_TWO_PI * step)
-    before, present = 2.0, base
-    for m in range(n_frequencies + _SIDE_BY_SIDE * SIMD_WIDTH):
-        work[1, m] = present
-        before, present = present, base * present - before
-    share = 1.0 / (histogram.n * histogram.n)
-    for m in range(0, n_frequencies, _SIDE_BY_SIDE * SIMD_WIDTH):
+    for m in range(first, end, _SIDE_BY_SIDE * SIMD_WIDTH):
         turn1, turn2 = simd_load(work, 1, m), simd_load(work, 1, m + SIMD_WIDTH)
         turn3 = simd_load(work, 1, m + 2 * SIMD_WIDTH)
         odd1 = odd2 = odd3 = counting() * 0.0
@@ -125,9 +115,27 @@ def ecf_power(
             even1 = fused(turn1, odd1, left - even1)
             even2 = fused(turn2, odd2, left - even2)
             even3 = fused(turn3, odd3, left - even3)
-        simd_store(work, 0, m, share * (even1 * even1 + odd1 * odd1 - turn1 * even1 * odd1))
-        simd_store(work, 0, m + SIMD_WIDTH, share * (even2 * even2 + odd2 * odd2 - turn2 * even2 * odd2))
-        simd_store(work, 0, m + 2 * SIMD_WIDTH, share * (even3 * even3 + odd3 * odd3 - turn3 * even3 * odd3))
+        simd_store(work, 2, m, even1)
+        simd_store(work, 2, m + SIMD_WIDTH, even2)
+        simd_store(work, 2, m + 2 * SIMD_WIDTH, even3)
+        simd_store(work, 3, m, odd1)
+        simd_store(work, 3, m + SIMD_WIDTH, odd2)
+        simd_store(work, 3, m + 2 * SIMD_WIDTH, odd3)
+
+
+@kernel(borrows=True)
+def ecf_power(histogram: Histogram, step: float, n_frequencies: int, work: NDArray[np.float64]) -> None:
+    """Leave the squared modulus of the ECF at ``step * (1 ... n)`` in ``work[0]``."""
+    base = 2.0 * math.cos(_TWO_PI * step)
+    before, present = 2.0, base
+    for m in range(n_frequencies + _SIDE_BY_SIDE * SIMD_WIDTH):
+        work[1, m] = present
+        before, present = present, base * present - before
+    _clenshaw(histogram, np.int64(0), n_frequencies, work)
+    share = 1.0 / (histogram.n * histogram.n)
+    for m in range(0, n_frequencies, SIMD_WIDTH):
+        turn, even, odd = simd_load(work, 1, m), simd_load(work, 2, m), simd_load(work, 3, m)
+        simd_store(work, 0, m, share * (even * even + odd * odd - turn * even * odd))
 
 
 @kernel(borrows=True)
@@ -237,9 +245,21 @@ def assemble(
     """
     if not (a > 0.0 and math.isfinite(a) and exposure > 0.0 and math.isfinite(exposure)):
         return False, False
+    clear: bool = _on_lobe(histogram, a, exposure, ecf_at(histogram, 1.0 / a), theta)
+    return True, clear
+
+
+@kernel(borrows=True)
+def _on_lobe(
+    histogram: Histogram,
+    a: float,
+    exposure: float,
+    lobe: tuple[float, float],
+    theta: NDArray[np.float64],
+) -> bool:
+    """Fill a start from modulus (unnormalised) and phase of the ECF at 1/a; tell whether it stands clear."""
     _, _, _, _, n, mean, variance = histogram
-    modulus, phase = ecf_at(histogram, 1.0 / a)
-    modulus /= n
+    modulus, phase = lobe[0] / n, lobe[1]
     s2 = max(variance - exposure * a * a, 0.16 * a * a)
     bias = mean - exposure * a
     clear = modulus > 3.0 / math.sqrt(n)
@@ -262,7 +282,7 @@ def assemble(
     theta[3] = math.log(
         min(max(s2, QUANTISATION_VARIANCE, 0.0025 * a * a), max(variance, QUANTISATION_VARIANCE))
     )
-    return True, clear
+    return bool(clear)
 
 
 @kernel(borrows=True)
@@ -392,14 +412,24 @@ def _first_start(
 @kernel(inline=True)
 def _scan_gains(pixel: Pixel, evaluate: Any, scratch: Scratch, theta: NDArray[np.float64]) -> bool:
     """Fill ``theta`` with the likeliest of a row of gains, the read noise taken as 0.35 e-."""
-    trial = scratch.small[HERE]
+    trial, work = scratch.small[HERE], scratch.rows
     histogram = histogram_of(pixel, np.int64(0))
-    best = -math.inf
-    for place in range(_N_GAINS):
-        a = math.sqrt(histogram.variance) * 0.2 * 12.5 ** (place / (_N_GAINS - 1.0))
+    first, best = work.shape[1] - _GAIN_COLUMNS, -math.inf
+    end = first + _N_GAINS
+    shortest = 0.2 * math.sqrt(histogram.variance)
+    for m in range(first, work.shape[1]):
+        work[4, m] = a = shortest * 12.5 ** ((m - first) / (_N_GAINS - 1.0))
+        work[1, m] = 2.0 * math.cos(_TWO_PI / a)
+    _clenshaw(histogram, first, end, work)
+    for m in range(first, end):
+        a = work[4, m]
         exposure = histogram.variance / (a * a) - _GAIN_NOISE
         if exposure > 0.0 and a > MIN_STEP:
-            assemble(histogram, a, exposure, trial)
+            angle = _TWO_PI / a
+            real = work[2, m] - 0.5 * work[3, m] * work[1, m]
+            imaginary = work[3, m] * math.sin(angle)
+            lobe = math.hypot(real, imaginary), math.atan2(imaginary, real) + angle * histogram.first
+            _on_lobe(histogram, a, exposure, lobe, trial)
             trial[3] = math.log(max(_GAIN_NOISE * a * a, QUANTISATION_VARIANCE))
             best = _likeliest(pixel, evaluate, scratch, best, theta)
     return best > -math.inf
