@@ -53,6 +53,8 @@ MINIMUM_BLOCKS = 4
 #: with an unambiguous sample would bias the statistics of the rest.
 UNTRUSTWORTHY = FAILED | FitStatus.NOT_INFORMATIVE
 _MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
+_FINEST_STEP = 2.5  # DN per electron, the least that whole DN show
+_STRAY_STEP = 1.0 / 3.0  # of the steps of most pixels
 
 
 def observe(
@@ -263,7 +265,20 @@ def _fitted(
     result = fit_histograms(counts, origin, *outside.T.astype(np.int64), settings=settings, start=start)
     parameters = result.columns
     usable = wanted & ((result.fit_status & UNTRUSTWORTHY) == 0) & np.isfinite(parameters).all(axis=1)
+    usable &= ~_without_steps(parameters[:, 1], usable)
     return result, parameters, usable & _inside(counts, outside)
+
+
+def _without_steps(gain: FloatArray, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tell which pixels have no steps of electrons that whole DN could show, where most pixels have, (n,).
+
+    In the dark, as in reference columns, a few of many fits find such a comb by chance; replicates of what
+    they found would be of bright pixels.
+    """
+    if not usable.any():
+        return np.zeros_like(usable)
+    step = 1.0 / np.where(usable, gain, np.nan)
+    return np.asarray((step < _FINEST_STEP) & (step < _STRAY_STEP * np.nanmedian(step)))
 
 
 def _inside(counts: NDArray[Any], outside: FloatArray) -> NDArray[np.bool_]:

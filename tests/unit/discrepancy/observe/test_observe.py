@@ -13,10 +13,7 @@ from scipy import special, stats
 from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe import law_numba, sums_numba, tables_numba
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.observe.observe import (
-    observe,
-    observe_histograms,
-)
+from pchem_pipeline.discrepancy.observe.observe import _without_steps, observe, observe_histograms
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
 from pchem_pipeline.effects.framework.evidence import SCORES, Evidence
 from pchem_pipeline.model.fit.settings import FitSettings
@@ -480,3 +477,13 @@ def test_squares_of_equal_samples_are_told_from_those_of_chance() -> None:
     hit = plain.copy()
     hit[::20, 3:6, 3:6] = 4095
     assert abs(observe(hit, np.arange(600), n_run=600, block_frames=50).z["space.equal.squares"]) < 5
+
+
+def test_a_comb_too_fine_for_whole_dn_is_none_where_other_pixels_have_a_coarse_one() -> None:
+    steps = np.array([14.0, 13.0, 0.84, 15.0, 2.4, 4.0])
+    usable = np.ones(6, np.bool_)
+    assert _without_steps(1.0 / steps, usable).tolist() == [False, False, True, False, True, False]
+    # a sensor of such steps is what it is, and so is one whose usable pixels have them
+    assert not _without_steps(1.0 / np.array([2.2, 1.9, 0.9, 2.4]), usable[:4]).any()
+    assert not _without_steps(1.0 / steps, steps < 3.0).any()
+    assert not _without_steps(1.0 / steps, ~usable).any()
