@@ -1,8 +1,9 @@
 """The null over the whole range of sensors: nothing is hidden, and nothing may be found.
 
 Sensors are drawn at random (``tests/helpers/plain_camera.py``, which shares no code with the package): read
-noise 0.15 to 0.8 e-, H 0.05 to 20, 3 to 30 DN per electron, 300 to 20,000 frames, 16^2 to 256^2 pixels; of
-the largest, fewer pixels and frames are simulated, so that many sensors fit into the time.
+noise 0.15 to 0.8 e-, H 0.05 to 20, 3 to 30 DN per electron, 300 to 20,000 frames, 16^2 to 256^2 pixels, all
+alike or laid out by taps, columns, colours, stars, reference columns and the like; of the largest, fewer
+pixels and frames are simulated, so that many sensors fit into the time.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ def one_of_range(seed: int, most_samples: float) -> dict[str, Any]:
     camera = drawn_camera(np.random.default_rng([seed, 1]), most_samples)
     sensor = {
         "read_noise_e": camera.read_noise_e, "exposure": camera.exposure, "step": camera.step,
-        "shape": camera.shape, "n_frames": camera.n_frames,
+        "shape": camera.shape, "n_frames": camera.n_frames, "layout": camera.layout,
     }  # fmt: skip
     record: dict[str, Any] = {"seed": seed, **sensor}
     cpu = time.process_time()
@@ -104,6 +105,7 @@ def one_of_range(seed: int, most_samples: float) -> dict[str, Any]:
 def _line(r: dict[str, Any]) -> str:
     size = f"{r['shape'][0]}x{r['shape'][1]}x{r['n_frames']}"
     sensor = f"s_e {r['read_noise_e']:.2f}  H {r['exposure']:7.3f}  {r['step']:4.1f} DN/e-  {size:14s}"
+    sensor += f" {r.get('layout', 'even'):10s}"
     p = f"p {r['p']:.2g}" if "p" in r else r.get("why", "")[:90]
     said = f"{r['verdict']:12s} {p} {r.get('effects') or ''}"
     return f"{r['seed']:6d}  {sensor} {said}  ({r['cpu_seconds']:.0f} s)"

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.plain_camera import PlainCamera
+from helpers.plain_camera import LAYOUTS, PlainCamera
 
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.null import free_of_parameters
@@ -21,6 +21,14 @@ def test_perfect_frames_of_a_noisy_sensor_cannot_tell_and_what_would_help_is_sai
     assert "pchem joint" in found.doubt
     assert found.doubt in found.sentence
     assert found.word == "cannot tell"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_perfect_frames_of_a_sensor_of_any_layout_are_not_called_wrong(layout):
+    camera = PlainCamera(0.25, 2.5, 10.0, (48, 64), 1500, (0.01, 0.01, 0.08, 3.0), layout)
+    found = find_discrepancies(camera.frames(21)).verdict
+    assert found.verdict == "consistent", found.sentence
 
 
 def test_row_noise_is_found_on_a_noisy_sensor():
