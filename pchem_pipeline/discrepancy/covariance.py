@@ -28,11 +28,6 @@ class Covariance:
     own: FloatArray
     common: FloatArray
 
-    @classmethod
-    def independent(cls, variances: FloatArray) -> Covariance:
-        """Return that of statistics which have nothing in common, shape (m,)."""
-        return cls(variances, np.zeros((0, variances.size)))
-
     @property
     def variances(self) -> FloatArray:
         """Variance of each statistic, shape (m,)."""
@@ -64,26 +59,18 @@ class Covariance:
 
     def white(self, rows: FloatArray) -> FloatArray:
         """Return vectors, (..., m), in a basis in which they scatter independently with a deviation of 1."""
-        scaled = rows / self._scale
-        modes, change = self._modes
+        scale, modes, change, _ = self._whitening
+        scaled = rows / scale
         return np.asarray(scaled + ((scaled @ modes.T) * change) @ modes)
 
     @property
     def log_root_determinant(self) -> float:
         """Half the logarithm of the determinant."""
-        return self._whitening[2]
-
-    @property
-    def _scale(self) -> FloatArray:
-        return self._whitening[0]
-
-    @property
-    def _modes(self) -> tuple[FloatArray, FloatArray]:
-        return self._whitening[1]
+        return self._whitening[3]
 
     @cached_property
-    def _whitening(self) -> tuple[FloatArray, tuple[FloatArray, FloatArray], float]:
-        """The own deviations; common modes as orthonormal rows, and by how much each is shrunk; the above.
+    def _whitening(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        """Own deviations, common modes as orthonormal rows, by how much each shrinks, the determinant.
 
         Of ``I + V.T V`` the symmetric root, from the eigenvectors of the smaller of ``V V.T`` and ``V.T V``.
         """
@@ -97,4 +84,4 @@ class Covariance:
         if few:
             modes = modes @ common / np.sqrt(sizes)[:, None]
         half = float(np.sum(np.log(scale)) + 0.5 * np.sum(np.log1p(sizes)))
-        return scale, (modes, 1.0 / np.sqrt(1.0 + sizes) - 1.0), half
+        return scale, modes, 1.0 / np.sqrt(1.0 + sizes) - 1.0, half

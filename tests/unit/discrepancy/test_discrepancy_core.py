@@ -32,7 +32,7 @@ from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_class
 
 NAMES = tuple(STATISTICS)[:40]
-UNIT = Covariance.independent(np.ones(40))
+UNIT = Covariance(np.ones(40), np.zeros((0, 40)))
 
 
 def _null(rng: np.random.Generator, b: int = 60, m: int = 40) -> NullModel:

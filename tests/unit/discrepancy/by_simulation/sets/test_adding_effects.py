@@ -884,7 +884,7 @@ def test_what_gets_no_name_needs_fewer_errors_and_more_of_them_in_the_final_fram
             change=np.zeros(1),
             stderr=np.array([error]),
             vectors=np.zeros((400, M)),
-            covariance=Covariance.independent(np.ones(M)),
+            covariance=Covariance(np.ones(M), np.zeros((0, M))),
             rest=np.zeros(M),
         )
         final = world.null.mean + np.eye(M)[0] * in_final
@@ -904,7 +904,7 @@ def test_an_effect_that_moves_nothing_is_not_there() -> None:
         change=np.zeros(1),
         stderr=np.zeros(1),
         vectors=np.zeros((400, M)),
-        covariance=Covariance.independent(np.ones(M)),
+        covariance=Covariance(np.ones(M), np.zeros((0, M))),
         rest=np.zeros(M),
     )
     assert not Acceptance(world.null, world.z, unused, 0.0).established(added)
@@ -929,7 +929,7 @@ def test_an_effect_beyond_doubt_is_there_though_few_frames_know_its_strength_bad
         change=np.zeros(len(parts)),
         stderr=np.full(len(parts), 0.26),
         vectors=np.zeros((400, M)),
-        covariance=Covariance.independent(np.ones(M)),
+        covariance=Covariance(np.ones(M), np.zeros((0, M))),
         rest=np.zeros(M),
     )
     accept = Acceptance(world.null, Measured(seen, seen, seen), unused, 0.0)
@@ -965,7 +965,7 @@ def test_a_few_events_are_an_effect_though_they_hardly_tell_its_strength(
         change=np.zeros(1),
         stderr=np.array([0.36]),
         vectors=vectors,
-        covariance=Covariance.independent(np.full(9, 1.3**2)),
+        covariance=Covariance(np.full(9, 1.3**2), np.zeros((0, 9))),
         rest=(seen - made) * first / error,
     )
     z = null.mean + seen * first
@@ -989,7 +989,7 @@ def test_strong_effects_need_not_add_up_to_be_there() -> None:
         change=np.zeros(2),
         stderr=np.full(2, 0.02),
         vectors=np.zeros((400, M)),
-        covariance=Covariance.independent(np.ones(M)),
+        covariance=Covariance(np.ones(M), np.zeros((0, M))),
         rest=np.zeros(M),
     )
     accept = Acceptance(world.null, Measured(seen, seen, seen), unused, 0.0)
