@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _TAIL_PIXELS, _TAIL_DOUBT = 40, 0.15
 # widths that are guessed, at a share so small that samples and moments go in proportion to it
-_FACTORS, _SMALL, _MOST = (1.25, 1.4, 1.6, 2.0, 2.5, 3.0, 5.0), 1e-3, 4
+_FACTORS, _SMALL, _MOST = (1.25, 1.4, 1.6, 2.0, 2.5, 3.0, 5.0, 8.0, 13.0), 1e-3, 4
 
 
 @register_effect

@@ -49,6 +49,12 @@ _OFTEN_BETTER = 0.05
 CLEARLY = 4.0
 
 
+# where all samples count, whatever the law expects
+_CONTEST = _SEARCHED.model_copy(update={"tail_guard": 0.0})
+# lowest samples of a pixel that may have led it astray, and e- below the next one
+_FEW_SAMPLES, _FAR_BELOW = 3, 0.5
+
+
 class NotFittedError(PchEmError):
     """Hardly a pixel can be fitted with a law: its effects, so strong, are not in the data."""
 
@@ -134,6 +140,10 @@ def refit_maps(
             other = fitted(known, start)
             better = np.flatnonzero(_likelier(other, fit.of(known)))
             fit = fit.with_pixels(known[better], other.of(better))
+    astray, start = at_other_peaks(counts, histograms.origin.ravel(), law, fit.columns)
+    inside = maps.usable.ravel()[astray] & acted_on[astray]
+    if inside.any():
+        fit = fit.with_pixels(astray[inside], fitted(astray[inside], start))
     new = fit.maps
     good = maps.usable.ravel() & np.isfinite(fit.columns).all(axis=1)
     stderr = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)).T
@@ -164,6 +174,45 @@ def off_by(start: FloatArray, electrons: float) -> FloatArray:
     off[:, 0] = np.maximum(start[:, 0] + electrons, _LEAST_LEFT * start[:, 0])
     off[:, 2] -= electrons / start[:, 1]
     return off
+
+
+def at_other_peaks(
+    counts: NDArray[Any], origin: NDArray[np.integer], law: SampleLaw, now: FloatArray
+) -> tuple[NDArray[np.intp], FloatArray]:
+    """Find pixels whose bias a few samples below all others led astray, and what is likelier under a law.
+
+    The PCD has no place for a sample far below its peaks, and a fit that counts each one lowers the bias by
+    electrons for it; an effect that makes such samples would then be judged by pixels without any. Those that
+    have some are fitted anew, from what the tail guard makes of them and from an electron beside that, too.
+
+    Args:
+        counts: histograms, (n, B).
+        origin: DN of bin 0, (n,).
+        law: of the samples of these pixels.
+        now: (H, g, mu, sigma) as fitted with it, (n, 4).
+
+    Returns:
+        Those that are clearly likelier elsewhere, (m,), and their parameters there, (n, 4).
+    """
+    found, seen = now.copy(), np.cumsum(counts, axis=1)
+    lowest = np.stack([np.argmax(seen > k, axis=1) for k in range(_FEW_SAMPLES + 1)], axis=1)
+    apart = np.diff(lowest, axis=1).max(axis=1) * now[:, 1]
+    some = np.flatnonzero(apart > _FAR_BELOW)
+    if not some.size:
+        return some, found
+    guarded = fit_histograms(counts[some], origin[some]).columns
+    best = None
+    for start in (now[some], guarded, off_by(guarded, -1.0), off_by(guarded, 1.0)):
+        fit = fit_histograms(counts[some], origin[some], law=law.of(some), start=start, settings=_CONTEST)
+        if best is None:
+            best = first = fit
+        else:
+            better = np.flatnonzero(fit.log_likelihood > best.log_likelihood)
+            best = best.with_pixels(better, fit.of(better))
+    assert best is not None
+    moved = _likelier(best, first)
+    found[some[moved]] = best.columns[moved]
+    return some[moved], found
 
 
 def _of_usual_noise(near: FloatArray, fitted: FloatArray) -> FloatArray:

@@ -131,7 +131,7 @@ def compare(
     """
     trials = Trials(refitter, tuple(held), witness)
     tried, beside = trials.tried, _asked_once(beside)
-    singles = _singles(hypotheses, choice)
+    singles = witness.ranked(_singles(hypotheses, choice))
     # what the likeliest set is made of, then that set: it may leave no others worth a refit
     first = len(choice.best.hypotheses)
     for hypothesis in _dear_last(singles[:first]):

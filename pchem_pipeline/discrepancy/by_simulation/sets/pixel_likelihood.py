@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_likelihood.members import Member, leads_in_histograms
+from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, leads_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, off_by
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, at_other_peaks, off_by
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -26,6 +26,8 @@ from pchem_pipeline.model.histogram.count import histogram_frames
 MANY_PIXELS = 1024
 #: Pixels that tell numbers well enough to begin with.
 FEW_PIXELS = 256
+FloatArray = NDArray[np.float64]
+
 _MOST_STARTS = 3  # of one effect
 # nats that an effect for which no estimator speaks must explain, and times as strong as is typical, where a
 # plain fit is led astray
@@ -111,6 +113,12 @@ class PixelLikelihood:
         likely = {member.tag: member.effect for member in fit.members}
         return tuple(_at(h, likely[h.tag]) if h.tag in likely else h for h in hypotheses)
 
+    def rise(self, effects: Sequence[Effect]) -> float | None:
+        """Return by how much effects raise the likelihood at their likeliest numbers, nats; None: no fit."""
+        fit = self._fit(effects, ())
+        known = None if fit is None else self._without.get(self._sets.present)
+        return None if fit is None or known is None else float(fit.fit.log_likelihood.sum()) - known
+
     def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
         """Return how far a set is behind another in likelihood, nats, and the standard error (Vuong 1989).
 
@@ -139,9 +147,10 @@ class PixelLikelihood:
             if without is None:
                 without = float(sets.fit(()).fit.log_likelihood.sum())
                 self._without[sets.present] = without
+            fitted = _at_other_peaks(sets, fitted)
             if fitted.fit.log_likelihood.sum() - without > _ASTRAY * len(fitted.fit.log_likelihood):
                 for electrons in (-1.0, 1.0):
-                    fitted = _at_other_peaks(sets, fitted, electrons)
+                    fitted = _from(sets, fitted, off_by(fitted.fit.parameters, electrons))
         except Exception:
             return None
         return None if without - float(fitted.fit.log_likelihood.sum()) > _ALIKE else fitted
@@ -158,11 +167,32 @@ class Witness:
     of: Callable[[Sequence[Effect], int], PixelLikelihood | None] = lambda effects, pixels: None
 
     def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
-        """Return a set at its likeliest numbers; see `PixelLikelihood.begun`."""
-        if not any(is_told(h.effect) for h in hypotheses):
+        """Return a set at its likeliest numbers; see `PixelLikelihood.begun`.
+
+        A number beside the strength stays as it is told here; a few pixels tell it badly.
+        """
+        told = [h.effect for h in hypotheses if is_told(h.effect)]
+        if not told:
             return tuple(hypotheses)
-        pixels = self.of([h.effect for h in hypotheses], FEW_PIXELS)
+        number = MANY_PIXELS if any(len(Member.of(e).coordinates) > 1 for e in told) else FEW_PIXELS
+        pixels = self.of([h.effect for h in hypotheses], number)
         return tuple(hypotheses) if pixels is None else pixels.begun(hypotheses)
+
+    def ranked(self, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return hypotheses, those that have a law of the samples in the order of their likelihood.
+
+        What lies far from all peaks raises the likelihood under any law that has something there; statistics
+        that count such samples do not tell how far they lie, and the likelihood does.
+        """
+        places = [i for i, h in enumerate(hypotheses) if _has_law(h.effect)]
+        pixels = self.of([hypotheses[i].effect for i in places], FEW_PIXELS) if len(places) > 1 else None
+        if pixels is None:
+            return list(hypotheses)
+        rises = {i: rise for i in places if (rise := pixels.rise([hypotheses[i].effect])) is not None}
+        found = list(hypotheses)
+        for place, i in zip(sorted(rises), sorted(rises, key=lambda i: -rises[i]), strict=True):
+            found[place] = hypotheses[i]
+        return found
 
     def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
         """Return how far a set is behind another; see `PixelLikelihood.behind`.
@@ -195,15 +225,33 @@ def _starts(kind: type[Effect]) -> tuple[Effect, ...]:
         return ()
 
 
-def _at_other_peaks(sets: SetComparison, fitted: FittedSet, electrons: float) -> FittedSet:
-    """Return a fit with pixels whose bias is so many electrons lower where that is likelier, or as it is."""
-    other = sets.fit(fitted.members, off_by(fitted.fit.parameters, electrons))
+def _from(sets: SetComparison, fitted: FittedSet, start: FloatArray) -> FittedSet:
+    """Return a fit with pixels at what another start (n, 4) leads to where that is likelier, or as it is."""
+    other = sets.fit(fitted.members, start)
     better = other.fit.log_likelihood > fitted.fit.log_likelihood + CLEARLY
     if not better.any():
         return fitted
     start = np.where(better[:, None], other.fit.parameters, fitted.fit.parameters)
     both = other if better.all() else sets.fit(other.members, start)
     return max(fitted, other, both, key=lambda one: float(one.fit.log_likelihood.sum()))
+
+
+def _at_other_peaks(sets: SetComparison, fitted: FittedSet) -> FittedSet:
+    """Return a fit with the pixels that samples below all others led astray put right, or as it is."""
+    parameters, shared = fitted.fit.parameters, fitted.fit.shared
+    law = law_of(sets.present, fitted.members, shared, parameters, sets.samples)
+    moved, start = at_other_peaks(sets.train, sets.origin, law, parameters)
+    if not moved.size:
+        return fitted
+    other = sets.fit(fitted.members, start)
+    return max(fitted, other, key=lambda one: float(one.fit.log_likelihood.sum()))
+
+
+def _has_law(effect: Effect) -> bool:
+    """Tell whether a law of a sample, if only a rough one, has an effect that its histograms show first."""
+    return is_told(effect) or (
+        effect.everywhere and type(effect).rough_law and leads_in_histograms(type(effect))
+    )
 
 
 def is_told(effect: Effect) -> bool:

@@ -23,6 +23,7 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import (
 )
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.effects.adc.adc_inl import AdcInl
+from pchem_pipeline.effects.analog.heavy_tailed_noise import HeavyTailedNoise
 from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
@@ -309,6 +310,26 @@ def test_a_bias_that_the_plain_fit_has_off_by_an_electron_is_found_under_the_rig
 
     assert np.mean(off(seen.maps)) > 0.2
     assert np.mean(off(fit.maps)) < 0.03
+
+
+def test_one_sample_far_below_all_others_leads_no_pixel_astray_under_a_law_that_has_such_samples():
+    """Where 5 % of the pixels had their bias off by electrons, tails came out as wide as half the truth."""
+    camera, rng = PlainCamera(0.25, 3.5, 13.0, (16, 16), 750, SPREAD), np.random.default_rng(2)
+    exposure, _, bias, _ = camera.maps(np.random.default_rng(7))
+    frames = camera.frames(7)
+    struck = rng.random((16, 16)) < 0.3
+    depth = rng.uniform(2.5, 4.5, int(struck.sum()))  # e- below the bias
+    frames[300][struck] = np.rint(bias[struck] - 13.0 * depth)
+    seen = observe(frames, np.arange(750), n_run=750, block_frames=50)
+    tails = HeavyTailedNoise(share=0.001, factor=12.0)
+    fit = refit_maps(frames, seen.maps, [tails], seen.covariance)
+
+    def off(maps):
+        return (np.abs(maps.quanta_exposure - exposure) > 0.5) & maps.usable
+
+    assert np.mean(off(seen.maps)[struck]) > 0.5
+    assert np.mean(off(fit.maps)[struck]) < 0.05
+    assert not np.any(off(fit.maps)[~struck])
 
 
 def test_parameters_move_by_the_pixels_that_an_effect_is_about():

@@ -32,10 +32,10 @@ HEAVY, SKEW = effect_class("heavy_tailed_noise"), effect_class("noise_skew")
 GROWING = effect_class("signal_dependent_noise")
 
 
-def frames_of(noise: NDArray[np.float64], seed: int) -> NDArray[np.uint16]:
+def frames_of(noise: NDArray[np.float64], seed: int, exposure: float = EXPOSURE) -> NDArray[np.uint16]:
     """Return frames of pixels with some read noise, e-: an own simulator, independent of the product's."""
     rng = np.random.default_rng(seed)
-    charge = rng.poisson(EXPOSURE, noise.shape)
+    charge = rng.poisson(exposure, noise.shape)
     return np.rint(100.0 + STEP * (charge + noise)).astype(np.uint16)
 
 
@@ -135,6 +135,38 @@ def test_a_strength_is_told_though_the_plain_fit_has_the_bias_off_by_an_electron
     )
     [found] = PixelLikelihood(frames, off, (), Effort(None)).detailed([SKEW(share=0.6)])
     assert found.share == pytest.approx(0.95, abs=0.02)  # type: ignore[attr-defined]
+
+
+def test_rare_and_wide_tails_are_told_though_they_led_plain_fits_astray() -> None:
+    """A fit that must count a sample far below all others lowers the bias for it, at times by electrons."""
+    frames = frames_of(mixture(np.random.default_rng(21), 0.003, 8.0)[:1000], 22, exposure=3.5)
+    maps = fitted_maps(frames, np.zeros((SIDE, SIDE), np.bool_))
+    mistaken = np.abs(maps.quanta_exposure - 3.5)[maps.usable] > 0.5
+    assert np.mean(mistaken) > 0.03
+    likelihood = PixelLikelihood(frames, maps, (), Effort(None))
+    fit = likelihood._fit([HEAVY(share=0.003, factor=4.0)], ())
+    assert fit is not None
+    (share, factor), error = fit.coordinates("heavy_tailed_noise")
+    assert abs(share - 0.003) < 4.0 * error[0] < 0.007
+    assert abs(factor - 8.0) < 4.0 * error[1] < 4.0
+    left = np.abs(fit.fit.parameters[:, 0] - 3.5) > 0.5
+    assert np.mean(left) < 0.2 * np.mean(mistaken)
+
+
+def test_hypotheses_come_in_the_order_of_their_likelihood_where_a_law_has_them() -> None:
+    """Bits that flip put as many samples as low as wide tails do, but all at one distance."""
+    row = Hypothesis(effect_class("row_noise")(row_noise_dn=0.5), np.ones(3))
+    bit = Hypothesis(effect_class("bit_errors")(share=0.001, bit=5, fault="flip"), np.ones(3))
+    tails = Hypothesis(HEAVY(share=0.003, factor=8.0), np.ones(3))
+    wide = frames_of(mixture(np.random.default_rng(23), 0.003, 8.0), 24)
+    flipped = frames_of(np.random.default_rng(25).normal(0.0, 0.25, (FRAMES, SIDE, SIDE)), 26)
+    flipped ^= (np.random.default_rng(27).random(flipped.shape) < 0.002).astype(np.uint16) << 5
+    for frames, first, second in ((wide, tails, bit), (flipped, bit, tails)):
+        likelihood = PixelLikelihood(frames, maps_of(0.25), (), Effort(None))
+        witness = Witness(lambda effects, pixels, known=likelihood: known)
+        for given in ([bit, row, tails], [tails, row, bit]):
+            assert witness.ranked(given) == [first, row, second]
+    assert Witness().ranked([bit, row, tails]) == [bit, row, tails]  # of no one law nothing is said
 
 
 def test_a_skew_is_told_from_tails_and_tails_from_a_skew() -> None:
