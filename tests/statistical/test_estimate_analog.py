@@ -57,6 +57,7 @@ def test_nothing_is_guessed_where_nothing_is():
         (NoiseSkew(share=-0.6), 0.25),
         (Nonlinearity(step_change=0.01), 0.35),
         (Nonlinearity(step_change=-0.01), 0.35),
+        (Nonlinearity(step_change=-0.01, noise="bent"), 0.35),
         (SignalDependentNoise(noise_e=0.08), 0.25),
     ],
     ids=lambda v: v.tag if isinstance(v, Effect) else "",

@@ -2,7 +2,8 @@
 
 The capacitance of the sense node and the gain of the source follower depend on the voltage, so the response
 of a pixel bends (Janesick 2007, chapter on V/V and V/e- nonlinearity): ``k`` electrons give ``k (1 + b (k -
-1) / 2)`` in units of the first step, and the step from ``k`` to ``k + 1`` is ``1 + b k``.
+1) / 2)`` in units of the first step, and the step from ``k`` to ``k + 1`` is ``1 + b k``. What comes after the
+read noise (an amplifier, a converter) bends that as well: at ``k`` electrons it is ``1 + b k`` times as large.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.estimators.response import strength_of
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 
@@ -24,13 +26,16 @@ if TYPE_CHECKING:
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
+Noise = Literal["kept", "bent"]
+
+
 @register_effect
 class Nonlinearity(Effect):
     """Relative change of the step per electron, the same in every pixel.
 
     Signature: the score of position against the square of the electron number (He1C2) has one sign in all
-    pixels; then He3C1 and He3. Nothing in time or space. The gain that the PCD finds is that of the steps
-    which the pixel's exposure reaches.
+    pixels; then He3C1 and He3; He2C1 where the read noise is bent, too. Nothing in time or space. The gain
+    that the PCD finds is that of the steps which the pixel's exposure reaches.
     """
 
     tag: Literal["nonlinearity"] = Field(default="nonlinearity", description="name of the effect")
@@ -54,10 +59,17 @@ class Nonlinearity(Effect):
         description="relative change of the step per electron (five electrons up, steps differ by five times "
         "this), 1/e-",
     )
+    noise: Noise = Field(
+        default="kept",
+        description="kept: what bends comes before the read noise (sense node); bent: after it (amplifiers)",
+    )
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the signal (frame, y, x), e-, on a bent comb; draws nothing."""
-        bend = np.zeros(values.shape) if context.charge is None else context.charge.astype(np.float64)
+        if self.noise == "bent":
+            bend = values.astype(np.float64)
+        else:
+            bend = np.zeros(values.shape) if context.charge is None else context.charge.astype(np.float64)
         bend *= bend - 1.0
         bend *= 0.5 * self.step_change
         bend += values
@@ -70,9 +82,19 @@ class Nonlinearity(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the change whose bend of the comb (He1C2) is that seen."""
-        return strength_of(evidence, cls(step_change=1e-3), "He1C2", signed=True)
+        """Return the change whose bend of the comb (He1C2) is that seen, before the read noise and after."""
+        kinds: tuple[Noise, ...] = "kept", "bent"
+        each = [strength_of(evidence, cls(step_change=1e-3, noise=n), "He1C2", signed=True) for n in kinds]
+        return [effect for found in each for effect in found]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law with the comb bent."""
-        return model.with_levels(curvature=self.step_change)
+        """Return the law with the comb bent, and the noise around it where that is."""
+        law = model.with_levels(curvature=self.step_change)
+        if self.noise == "kept":
+            return law
+        flat = maps.flat
+        analog = np.maximum(flat.read_noise_dn**2 - QUANTISATION_VARIANCE, 0.0)
+        variance = np.nan_to_num(analog * flat.conversion_gain**2)
+        return law.with_variance(
+            per_electron=2.0 * self.step_change * variance, per_electron2=self.step_change**2 * variance
+        )

@@ -250,16 +250,16 @@ class SampleLaw:
         *,
         dn2: ArrayLike = 0.0,
         e2: ArrayLike = 0.0,
-        per_electron: float = 0.0,
-        per_electron2: float = 0.0,
+        per_electron: Number = 0.0,
+        per_electron2: Number = 0.0,
     ) -> SampleLaw:
         """Return a copy with more variance.
 
         Args:
             dn2: DN^2, scalar or (n,).
             e2: e-^2, scalar or (n,).
-            per_electron: e-^2 per electron.
-            per_electron2: e-^2 per electron squared.
+            per_electron: e-^2 per electron, scalar or (n,).
+            per_electron2: e-^2 per electron squared, scalar or (n,).
         """
         return replace(
             self,

@@ -50,6 +50,7 @@ STRONG: list[Effect] = [
     InterpixelCapacitance(coupling=0.1, anisotropy=0.3),
     NoiseSkew(share=-0.9),
     Nonlinearity(step_change=0.1),
+    Nonlinearity(step_change=0.1, noise="bent"),
     RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.7),
     RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.7, samples=4, spread="exponential"),
     RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.6, sampling="single", correlation_frames=11.0),
@@ -242,6 +243,16 @@ def test_the_comb_bends():
     after, before, k, _ = analog(Nonlinearity(step_change=-0.02), (4, 3, 5), charge=np.arange(5))
     levels = (after - before + k)[0, 0]
     np.testing.assert_allclose(np.diff(levels), 1 - 0.02 * np.arange(4), atol=1e-12)
+
+
+def test_noise_that_comes_before_the_bend_is_as_large_as_the_steps():
+    for noise, slope in (("bent", 1 - 0.02 * (np.arange(5) - 0.5)), ("kept", np.ones(5))):
+        effect = Nonlinearity(step_change=-0.02, noise=noise)
+        after, _, _, r = analog(effect, (400, 30, 5), charge=np.arange(5))
+        levels = np.arange(5) * (1 - 0.02 * (np.arange(5) - 1) / 2)
+        # its mean moves by b sigma^2 / 2, a thousandth of an electron
+        seen = ((after - levels) * r).mean(axis=(0, 1)) / (r * r).mean(axis=(0, 1))
+        np.testing.assert_allclose(seen, slope, atol=5 * 0.01 * 0.3 * np.sqrt(15 / 400 / 30))
 
 
 def test_capacitance_moves_charge_without_losing_any():
@@ -438,6 +449,7 @@ CODES = np.arange(60, 240)
         NoiseSkew(share=0.5),
         NoiseSkew(share=-0.7),
         Nonlinearity(step_change=0.02),
+        Nonlinearity(step_change=-0.02, noise="bent"),
         SignalDependentNoise(noise_e=0.1),
         SignalDependentNoise(noise_e=0.05, growth="linear"),
         InterpixelCapacitance(coupling=0.01, anisotropy=0.5),
