@@ -1,9 +1,10 @@
 """Nonlinear response: the step from one electron to the next changes with their number.
 
 The capacitance of the sense node and the gain of the source follower depend on the voltage, so the response
-of a pixel bends (Janesick 2007, chapter on V/V and V/e- nonlinearity): ``k`` electrons give ``k (1 + b (k -
-1) / 2)`` in units of the first step, and the step from ``k`` to ``k + 1`` is ``1 + b k``. What comes after the
-read noise (an amplifier, a converter) bends that as well: at ``k`` electrons it is ``1 + b k`` times as large.
+of a pixel bends (Janesick 2007, chapter on V/V and V/e- nonlinearity): ``k`` electrons give
+``k (1 + b (k - 1) / 2)`` in units of the first step, and the step from ``k`` to ``k + 1`` is ``1 + b k``.
+What comes after the read noise (an amplifier, a converter) bends that as well: it is ``1 + b k`` times as
+large at ``k`` electrons.
 """
 
 from __future__ import annotations
