@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.common_modes import quantile_means, responsivity, with_offsets
-from pchem_pipeline.effects.estimators.levels.change_points import Steps, find_steps, noise_variance
-from pchem_pipeline.effects.estimators.levels.two_levels import between_two_levels
+from pchem_pipeline.effects.estimators.levels.change_points import Steps, noise_variance
+from pchem_pipeline.effects.estimators.levels.two_levels import likeliest_parts
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 
@@ -142,11 +142,10 @@ class BiasJumps(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the change points of the quadrants' means, and random jumps of like size and rate.
+        """Return change points of the means of quadrants or halves, and random jumps of like size and rate.
 
-        What is common to the quadrants is taken out first, so that neither a drift nor frame noise is
-        taken for jumps; where each sits on one of two levels, that tells short visits and jumps of several at
-        once. Jumps too many or too small to be told apart still leave a correlation in time.
+        What is common to all is taken out first, so that neither a drift nor frame noise is taken for jumps;
+        where each sits on one of two levels, that tells short visits and jumps of several at once. Jumps too many or too small to be told apart still leave a correlation in time.
         """
         if evidence.time is None or evidence.time.frames.size < 16:
             return ()
@@ -156,7 +155,7 @@ class BiasJumps(Effect):
         drawn = sorted((d for d in drawn if d[0] > _SIGNIFICANT), reverse=True)
         random = [cls(amplitude_dn=a / alpha, rate=rate, parts=name) for _, a, rate, name in drawn[:2]]
         gaps = np.diff(time.frames, prepend=-1).astype(np.float64)
-        found = between_two_levels(means, gaps, find_steps(means, gaps))
+        parts, found = likeliest_parts(means, gaps, _PARTS)
         jumps = np.concatenate([np.diff(steps.levels) for steps in found])
         if not jumps.size:
             return random
@@ -165,7 +164,8 @@ class BiasJumps(Effect):
         rate = min(max(jumps.size / covered, 1e-6), 0.5)
         path = tuple(_as_path(time, steps, size) for steps in found)
         size /= alpha
-        return [cls(amplitude_dn=size, rate=rate, path=path), cls(amplitude_dn=size, rate=rate), *random]
+        as_seen = cls(amplitude_dn=size, rate=rate, parts=parts, path=path)
+        return [as_seen, as_seen.model_copy(update={"path": ()}), *random]
 
     def shared_offset(self) -> SharedOffset:
         """Return that frames have one: at which level others are is not known."""

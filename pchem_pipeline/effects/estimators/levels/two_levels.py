@@ -9,16 +9,18 @@ together at given levels, and the levels by least squares along it.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from pchem_pipeline.effects.estimators.levels.change_points import Steps, centred, noise_variance
+from pchem_pipeline.effects.estimators.levels.change_points import Steps, centred, find_steps, noise_variance
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
+
+Layout = TypeVar("Layout", bound=str)
 
 _MOST_SERIES = 4  # states grow as powers of two
 _ROUNDS = 8
@@ -73,6 +75,38 @@ def between_two_levels(series: FloatArray, gaps: FloatArray, steps: Sequence[Ste
     rest = series - np.stack([_profile(each, n) for each in found], axis=1)
     two = float(noise.squares(rest - rest.mean(axis=0)).sum()) + _price(n, number, 2 * m)
     return found if two < known else list(steps)
+
+
+def likeliest_parts(
+    series: FloatArray, gaps: FloatArray, layouts: Mapping[Layout, FloatArray]
+) -> tuple[Layout, list[Steps]]:
+    """Return which groups of series jump together, and the jumps of each.
+
+    Where series do, each by itself would be found to jump at slightly other times. By the same measure as
+    between the two ways to find jumps.
+
+    Args:
+        series: shape (n, m).
+        gaps: time between each value and the one before, in units of the shortest, shape (n,).
+        layouts: weights of the series in the mean of each group, shape (p, m), p of 2 or more: each series by
+            itself first.
+    """
+    n, m = series.shape
+    contrast = series - series.mean(axis=1, keepdims=True)
+    own = float(np.mean([noise_variance(one) for one in contrast.T])) * m / (m - 1.0)
+    found: list[tuple[float, Layout, list[Steps]]] = []
+    noise: _Noise | None = None
+    for layout, weights in layouts.items():
+        means = series @ weights.T
+        steps = between_two_levels(means, gaps, find_steps(means, gaps))
+        profile = np.stack([_profile(each, n) for each in steps], axis=1) @ (weights > 0)
+        rest = series - profile - (series - profile).mean(axis=0)
+        noise = noise or _Noise(own, max(float(rest.mean(axis=1).var()), own / m))
+        levels = sum(each.levels.size for each in steps)
+        price = _price(n, levels - len(steps), levels)
+        found.append((float(noise.squares(rest).sum()) + price, layout, steps))
+    _, layout, steps = min(found, key=lambda each: each[0])
+    return layout, steps
 
 
 def _price(n: int, jumps: int, levels: int) -> float:
