@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.common_modes import quantile_means, responsivity, with_offsets
-from pchem_pipeline.effects.estimators.levels.change_points import Steps, noise_variance
+from pchem_pipeline.effects.estimators.levels.change_points import noise_variance
 from pchem_pipeline.effects.estimators.levels.two_levels import likeliest_parts
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset
@@ -145,7 +145,8 @@ class BiasJumps(Effect):
         """Return change points of the means of quadrants or halves, and random jumps of like size and rate.
 
         What is common to all is taken out first, so that neither a drift nor frame noise is taken for jumps;
-        where each sits on one of two levels, that tells short visits and jumps of several at once. Jumps too many or too small to be told apart still leave a correlation in time.
+        where each sits on one of two levels, that tells short visits and jumps of several at once. Jumps too
+        many or too small to be told apart still leave a correlation in time.
         """
         if evidence.time is None or evidence.time.frames.size < 16:
             return ()
@@ -156,14 +157,20 @@ class BiasJumps(Effect):
         random = [cls(amplitude_dn=a / alpha, rate=rate, parts=name) for _, a, rate, name in drawn[:2]]
         gaps = np.diff(time.frames, prepend=-1).astype(np.float64)
         parts, found = likeliest_parts(means, gaps, _PARTS)
-        jumps = np.concatenate([np.diff(steps.levels) for steps in found])
+        # more light blurs what the samples say of the offset, and parts may differ in it
+        shown = _PARTS[parts] @ [
+            responsivity(evidence, inside) for inside in _quadrants(evidence.maps.usable.shape)
+        ]
+        levels = [steps.levels / share for steps, share in zip(found, shown, strict=True)]
+        jumps = np.concatenate([np.diff(each) for each in levels])
         if not jumps.size:
             return random
         size = float(np.sqrt((jumps**2).mean()))
         covered = len(found) * (int(time.frames[-1]) - int(time.frames[0]) + 1)
         rate = min(max(jumps.size / covered, 1e-6), 0.5)
-        path = tuple(_as_path(time, steps, size) for steps in found)
-        size /= alpha
+        path = tuple(
+            _as_path(time, steps.starts, each / size) for steps, each in zip(found, levels, strict=True)
+        )
         as_seen = cls(amplitude_dn=size, rate=rate, parts=parts, path=path)
         return [as_seen, as_seen.model_copy(update={"path": ()}), *random]
 
@@ -242,8 +249,18 @@ def _correlated(frames: NDArray[np.int64], means: NDArray[np.float64]) -> tuple[
     return best
 
 
-def _as_path(time: TimeSeries, steps: Steps, scale: float) -> Path:
-    """Return the levels over ``scale`` with the frames at which they begin (the middle of a gap in time)."""
-    cuts = steps.starts[1:]
-    starts = [int(time.frames[0]), *((time.frames[cuts - 1] + time.frames[cuts] + 1) // 2).tolist()]
-    return tuple(zip(starts, np.round(steps.levels / scale, 6).tolist(), strict=True))
+def _quadrants(shape: tuple[int, ...]) -> list[NDArray[np.bool_]]:
+    """Return which pixels are in each quadrant, (y, x): top left, top right, bottom left, bottom right."""
+    bottom, right = (np.arange(n) >= n // 2 for n in shape)
+    return [
+        np.asarray((bottom == below)[:, None] & (right == beside))
+        for below in (False, True)
+        for beside in (False, True)
+    ]
+
+
+def _as_path(time: TimeSeries, starts: NDArray[np.int64], levels: NDArray[np.float64]) -> Path:
+    """Return levels with the frames at which they begin (the middle of a gap in time)."""
+    cuts = starts[1:]
+    begins = [int(time.frames[0]), *((time.frames[cuts - 1] + time.frames[cuts] + 1) // 2).tolist()]
+    return tuple(zip(begins, np.round(levels, 6).tolist(), strict=True))

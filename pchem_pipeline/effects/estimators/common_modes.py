@@ -34,10 +34,16 @@ def run_position(frames: NDArray[np.int64], n_run: int) -> FloatArray:
     return np.asarray(frames.clip(0, n_run - 1) / max(n_run - 1, 1), np.float64)
 
 
-def responsivity(evidence: Evidence) -> float:
-    """Return the mean change of r per DN of a common offset, in (0, 1] (see the module's text)."""
+def responsivity(evidence: Evidence, inside: NDArray[np.bool_] | None = None) -> float:
+    """Return the mean change of r per DN of a common offset, in (0, 1] (see the module's text).
+
+    Args:
+        evidence: of some pixels.
+        inside: those that count, (y, x); None: all.
+    """
     maps = evidence.maps
-    ratio = (evidence.readout_std[maps.usable] / maps.read_noise_dn[maps.usable]) ** 2
+    some = maps.usable if inside is None else maps.usable & inside
+    ratio = (evidence.readout_std[some] / maps.read_noise_dn[some]) ** 2
     ratio = ratio[np.isfinite(ratio)]
     return float(np.clip(ratio.mean(), 0.02, 1.0)) if ratio.size else 1.0
 

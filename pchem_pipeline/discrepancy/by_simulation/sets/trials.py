@@ -32,6 +32,7 @@ _FAR_SHARE_OF_PART = 0.5  # the same of a set that leaves something
 _LEFT = 0.02  # chance of what a complete set may leave, anywhere among the statistics
 _SEEN = 4.0  # deviations that a set leaves of a statistic for it to stand out
 _LITTLE = 0.03  # of what there is to explain, nats
+_CLEARLY = 5.0  # standard errors of a difference of likelihoods
 _VANISHED = 4.5  # standard errors of its strength below which an effect of a set is not established
 
 
@@ -166,7 +167,18 @@ class Trials:
         alone = len(members) == 1 and bool(self.tried)
         if not (alone or self.complete):
             return True
-        return not _beaten(self.refitter, (*self.held, *members), self.best)
+        return not (
+            _beaten(self.refitter, (*self.held, *members), self.best) or (alone and self._less_likely(members))
+        )
+
+    def _less_likely(self, members: Sequence[Hypothesis]) -> bool:
+        """Tell whether the histograms of the pixels are clearly less likely with a set than with the best.
+
+        Of what they do not tell, nothing is said.
+        """
+        effects = [h.effect for h in (*self.held, *members)]
+        answer = self.witness.behind(effects, self.best.effects)
+        return answer is not None and answer[0] < -FAR - _CLEARLY * answer[1]
 
 
 def leaves_nothing(refitter: Refitter, one: Refitted) -> bool:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-# cosines of the common mode, and the errors that a jump must be large
-_WAVES = 12
+# cosines of the common mode, where it wanders, and the errors that a jump must be large
+_WAVES = (0, 12)
 _JUMP = 4.0
 
 
@@ -88,7 +88,11 @@ def find_steps(
         _refine(contrast, starts, bonus, least)
     if sum(len(s) for s in starts) == m:
         return [Steps(np.zeros(1, np.int64), np.zeros(1)) for _ in range(m)]
-    starts, levels = _with_common(series, starts, variance * m / (m - 1.0))
+    # where the common mode may wander, only its edge tells a step of one series: no more freedom than seen
+    own = variance * m / (m - 1.0)
+    _, starts, levels = min(
+        (_with_common(series, starts, own, waves) for waves in _WAVES), key=lambda one: one[0]
+    )
     return [
         Steps(np.array(begins, np.int64), centred(level, begins, n))
         for level, begins in zip(levels, starts, strict=True)
@@ -96,19 +100,20 @@ def find_steps(
 
 
 def _with_common(
-    series: NDArray[np.float64], starts: list[list[int]], variance: float
-) -> tuple[list[list[int]], list[NDArray[np.float64]]]:
+    series: NDArray[np.float64], starts: list[list[int]], variance: float, n_waves: int
+) -> tuple[float, list[list[int]], list[NDArray[np.float64]]]:
     """Return which series jump at the cuts, and the levels of all, the common mode included.
 
     Least squares in which the common mode counts less, by as much as it is noisier than a mean of ``m`` white
-    series, and may wander smoothly (a few cosines).
+    series, and may wander smoothly (some cosines). First comes what is left, with Schwarz's price of each
+    number.
     """
     n, m = series.shape
     noise = noise_variance(series.mean(axis=1))
     weight = min(1.0, float(np.sqrt(variance / m / noise))) if noise > 0 else 1.0
     metric = np.eye(m) - (1.0 - weight) / m
-    waves = np.cos(np.pi * np.outer(np.arange(n) + 0.5, np.arange(1, _WAVES + 1)) / n)
-    common = np.concatenate([waves[:, None, :] * row.sum() for row in metric], axis=1).reshape(n * m, _WAVES)
+    waves = np.cos(np.pi * np.outer(np.arange(n) + 0.5, np.arange(1, n_waves + 1)) / n)
+    common = np.concatenate([waves[:, None, :] * row.sum() for row in metric], axis=1).reshape(n * m, n_waves)
     cuts = _together(sorted({cut for begins in starts for cut in begins[1:]}))
     starts = [[0, *cuts] for _ in range(m)]
     while True:
@@ -117,7 +122,8 @@ def _with_common(
         )
         design = np.concatenate([segments, common], axis=1)
         inverse = np.linalg.pinv(design.T @ design, rcond=1e-10, hermitian=True)
-        found = inverse @ (design.T @ (series @ metric).ravel())
+        wanted = (series @ metric).ravel()
+        found = inverse @ (design.T @ wanted)
         owner = np.repeat(np.arange(m), [len(begins) for begins in starts])
         levels = [found[: owner.size][owner == q] for q in range(m)]
         weakest: dict[int, tuple[float, int]] = {}
@@ -133,7 +139,8 @@ def _with_common(
         # one series a cut: the others' jumps are the surer without it
         dropped = {(cut, q) for cut, (square, q) in weakest.items() if square < _JUMP**2}
         if not dropped:
-            return starts, levels
+            left = float(((wanted - design @ found) ** 2).sum()) / variance
+            return left + float(np.log(n)) * found.size, starts, levels
         starts = [[cut for cut in begins if (cut, q) not in dropped] for q, begins in enumerate(starts)]
 
 

@@ -454,12 +454,33 @@ def test_a_second_witness_decides_between_effects_that_the_statistics_tell_badly
     assert open_ is not None
     assert plain.chosen.tags == open_.chosen.tags == {"row_noise"}
     assert found.chosen.tags == {"frame_noise"}
-    assert asked == [("frame_noise", "row_noise"), ("row_noise", "frame_noise")]
+    # once whether its refit is in vain
+    assert asked == [("frame_noise", "row_noise")] * 2 + [("row_noise", "frame_noise")]
     first, second = found.rivals_of("frame_noise")
     assert (first.hypothesis.tag, second.hypothesis.tag) == ("frame_noise", "row_noise")
     assert (second.score, second.stderr) == (-12.0, 4.0)
     assert second.probability == pytest.approx(stats.norm.cdf(-3.0), rel=0.01)
     assert open_.rivals_of("row_noise")[1].probability > 0.1
+
+
+@pytest.mark.parametrize(
+    ("answer", "refitted"), [((-900.0, 20.0), False), ((-900.0, 250.0), True), (None, True)]
+)
+def test_what_the_histograms_rule_out_is_not_refitted(
+    answer: tuple[float, float] | None, refitted: bool
+) -> None:
+    """A look-alike's fingerprint may promise all; its refits cost what a second effect would need."""
+    world = World([effect("row_noise", 0.5)])
+    twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
+
+    class Sure(Witness):
+        def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
+            return answer
+
+    found = world.compare(hypothesis("row_noise", 0.5), twin, witness=Sure())
+    assert found is not None
+    assert found.chosen.tags == {"row_noise"}
+    assert ({"frame_noise"} in [one.tags for one in found.tried]) == refitted
 
 
 def test_two_effects_with_signatures_of_their_own_are_found_together() -> None:
