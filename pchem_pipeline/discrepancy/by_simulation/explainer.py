@@ -33,7 +33,7 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, compare
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import PixelLikelihood, Witness
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import PixelLikelihood, Witness, is_told
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.sets.trials import leaves_nothing
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
@@ -149,6 +149,9 @@ class FrameExplainer:
     defects: dict[str, str] = field(default_factory=dict)
     unexplained: Unexplained | None = None
     doubtful: Callable[[], NullModel] | None = None
+    _likelihoods: dict[tuple[int, tuple[Effect, ...], tuple[Effect, ...]], PixelLikelihood] = field(
+        default_factory=dict, repr=False
+    )
 
     @classmethod
     def begin(
@@ -323,8 +326,14 @@ class FrameExplainer:
         present = frames.effects([e for e in self.model if e in self.extended.given])
         if not all(effect.everywhere for effect in (*present, *effects)):
             return None
-        samples = self.work.own_samples((*present, *effects))
-        return PixelLikelihood(samples, self.observed.plain.maps, present, self.work.effort, pixels)
+        # a law has all samples; others may have replaced some
+        key = pixels, present, tuple(effect for effect in effects if not is_told(effect))
+        if key not in self._likelihoods:
+            samples = self.work.own_samples((*present, *effects))
+            self._likelihoods[key] = PixelLikelihood(
+                samples, self.observed.plain.maps, present, self.work.effort, pixels
+            )
+        return self._likelihoods[key]
 
     def replaced(self, null: NullModel) -> NullModel | None:
         """Put what no effect with a name makes in the place of all that were added, if it leaves less.

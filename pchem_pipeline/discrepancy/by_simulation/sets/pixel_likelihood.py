@@ -33,6 +33,7 @@ _MOST_STARTS = 3  # of one effect
 # plain fit is led astray
 _SPEAKS, _STRONG = 15.0, 5.0
 _FARTHEST = 30.0  # factor of a fingerprint: beyond, it is another hypothesis
+_PROBED = 64  # pixels
 _ALIKE = 0.5  # nats: fits that came to the same
 _ASTRAY = 5.0  # nats of a pixel that an effect explains, from which on it may mistake the peak of no electron
 
@@ -70,6 +71,7 @@ class PixelLikelihood:
             np.stack([values[y[some], x[some]] for values in maps.maps], axis=1),
             effort=effort,
         )
+        self._asked: dict[tuple[frozenset[str], tuple[Effect, ...]], FittedSet | None] = {}
         self._without: dict[tuple[Effect, ...], float] = {}  # log-likelihood, by what is present
 
     def detailed(self, guesses: Sequence[Effect]) -> list[Effect]:
@@ -107,7 +109,7 @@ class PixelLikelihood:
     def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         """Return the effects of a set at the numbers that are likeliest together, where a law tells them."""
         told = [h.effect for h in hypotheses if is_told(h.effect)]
-        fit = self._fit(told, [h.effect for h in hypotheses if not is_told(h.effect)])
+        fit = self._fit_once(told, [h.effect for h in hypotheses if not is_told(h.effect)])
         if fit is None or any(member.at_limit for member in fit.members):
             return tuple(hypotheses)
         likely = {member.tag: member.effect for member in fit.members}
@@ -115,7 +117,7 @@ class PixelLikelihood:
 
     def rise(self, effects: Sequence[Effect]) -> float | None:
         """Return by how much effects raise the likelihood at their likeliest numbers, nats; None: no fit."""
-        fit = self._fit(effects, ())
+        fit = self._fit_once(effects, ())
         known = None if fit is None else self._without.get(self._sets.present)
         return None if fit is None or known is None else float(fit.fit.log_likelihood.sum()) - known
 
@@ -129,11 +131,19 @@ class PixelLikelihood:
             other: the same but for those that `is_told`.
         """
         besides = [e for e in one if not is_told(e)]
-        fits = [self._fit([e for e in each if is_told(e)], besides) for each in (one, other)]
+        fits = [self._fit_once([e for e in each if is_told(e)], besides) for each in (one, other)]
         if fits[0] is None or fits[1] is None:
             return None
         rise, error = self._sets.difference(fits[0], fits[1])
         return rise - (fits[0].fit.shared.size - fits[1].fit.shared.size), error
+
+    def _fit_once(self, effects: Sequence[Effect], besides: Sequence[Effect]) -> FittedSet | None:
+        """Fit effects from where they are asked about first: other strengths of the same lead to the same."""
+        without = [e.model_dump_json(exclude={e.strength}) for e in effects]
+        asked = frozenset(without), tuple(besides)
+        if asked not in self._asked:
+            self._asked[asked] = self._fit(effects, besides)
+        return self._asked[asked]
 
     def _fit(self, effects: Sequence[Effect], besides: Sequence[Effect]) -> FittedSet | None:
         """Fit effects; None where that cannot be done, or led to less than there is without them."""
@@ -150,7 +160,7 @@ class PixelLikelihood:
             fitted = _at_other_peaks(sets, fitted)
             if fitted.fit.log_likelihood.sum() - without > _ASTRAY * len(fitted.fit.log_likelihood):
                 for electrons in (-1.0, 1.0):
-                    fitted = _from(sets, fitted, off_by(fitted.fit.parameters, electrons))
+                    fitted = _electrons_off(sets, fitted, electrons)
         except Exception:
             return None
         return None if without - float(fitted.fit.log_likelihood.sum()) > _ALIKE else fitted
@@ -194,15 +204,17 @@ class Witness:
             found[place] = hypotheses[i]
         return found
 
-    def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
-        """Return how far a set is behind another; see `PixelLikelihood.behind`.
+    def behind(
+        self, one: Sequence[Effect], other: Sequence[Effect], number: int = MANY_PIXELS
+    ) -> tuple[float, float] | None:
+        """Return how far a set is behind another by so many pixels; see `PixelLikelihood.behind`.
 
         None also where they differ in what no law of a sample holds.
         """
         tags = {e.tag for e in one} ^ {e.tag for e in other}
         if not all(is_told(e) for e in (*one, *other) if e.tag in tags):
             return None
-        pixels = self.of((*one, *other), MANY_PIXELS)
+        pixels = self.of((*one, *other), number)
         return None if pixels is None else pixels.behind(one, other)
 
 
@@ -225,15 +237,37 @@ def _starts(kind: type[Effect]) -> tuple[Effect, ...]:
         return ()
 
 
-def _from(sets: SetComparison, fitted: FittedSet, start: FloatArray) -> FittedSet:
-    """Return a fit with pixels at what another start (n, 4) leads to where that is likelier, or as it is."""
-    other = sets.fit(fitted.members, start)
-    better = other.fit.log_likelihood > fitted.fit.log_likelihood + CLEARLY
+def _electrons_off(sets: SetComparison, fitted: FittedSet, electrons: float) -> FittedSet:
+    """Return a fit with pixels whose bias is so many electrons lower where that is likelier, or as it is.
+
+    Some pixels tell first whether it ever is: from there a fit takes many steps.
+    """
+    if len(sets.train) > 2 * _PROBED:
+        some = slice(None, None, len(sets.train) // _PROBED)
+        few = replace(
+            sets,
+            train=sets.train[some],
+            test=sets.test[some],
+            origin=sets.origin[some],
+            kept=sets.kept[some],
+            start=fitted.fit.parameters[some],
+            _known={},
+        )
+        probe = few.fit(fitted.members)
+        if not _likelier(few.fit(fitted.members, off_by(few.start, electrons)), probe).any():
+            return fitted
+    other = sets.fit(fitted.members, off_by(fitted.fit.parameters, electrons))
+    better = _likelier(other, fitted)
     if not better.any():
         return fitted
     start = np.where(better[:, None], other.fit.parameters, fitted.fit.parameters)
     both = other if better.all() else sets.fit(other.members, start)
     return max(fitted, other, both, key=lambda one: float(one.fit.log_likelihood.sum()))
+
+
+def _likelier(one: FittedSet, other: FittedSet) -> NDArray[np.bool_]:
+    """Tell which pixels a fit explains clearly better than another one, (n,)."""
+    return np.asarray(one.fit.log_likelihood > other.fit.log_likelihood + CLEARLY)
 
 
 def _at_other_peaks(sets: SetComparison, fitted: FittedSet) -> FittedSet:

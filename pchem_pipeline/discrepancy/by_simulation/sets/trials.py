@@ -16,7 +16,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Witness
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import FEW_PIXELS, Witness
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import look_elsewhere
@@ -168,7 +168,8 @@ class Trials:
         if not (alone or self.complete):
             return True
         return not (
-            _beaten(self.refitter, (*self.held, *members), self.best) or (alone and self._less_likely(members))
+            _beaten(self.refitter, (*self.held, *members), self.best)
+            or (alone and self._less_likely(members))
         )
 
     def _less_likely(self, members: Sequence[Hypothesis]) -> bool:
@@ -177,7 +178,7 @@ class Trials:
         Of what they do not tell, nothing is said.
         """
         effects = [h.effect for h in (*self.held, *members)]
-        answer = self.witness.behind(effects, self.best.effects)
+        answer = self.witness.behind(effects, self.best.effects, FEW_PIXELS)
         return answer is not None and answer[0] < -FAR - _CLEARLY * answer[1]
 
 

@@ -434,12 +434,16 @@ def test_a_second_witness_decides_between_effects_that_the_statistics_tell_badly
     asked: list[tuple[str, str]] = []
 
     class Decided(Witness):
-        def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
+        def behind(
+            self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
+        ) -> tuple[float, float] | None:
             asked.append((one[0].tag, other[0].tag))
             return (12.0, 4.0) if one[0].tag == "frame_noise" else (-12.0, 4.0)
 
     class Undecided(Witness):
-        def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
+        def behind(
+            self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
+        ) -> tuple[float, float] | None:
             return -3.0, 4.0
 
     TRUTH["frame_noise"] = (row[0] + 0.5 * np.eye(M)[1], row[1])
@@ -474,7 +478,9 @@ def test_what_the_histograms_rule_out_is_not_refitted(
     twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
 
     class Sure(Witness):
-        def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
+        def behind(
+            self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
+        ) -> tuple[float, float] | None:
             return answer
 
     found = world.compare(hypothesis("row_noise", 0.5), twin, witness=Sure())

@@ -234,11 +234,11 @@ def test_what_no_law_of_a_sample_holds_is_not_told() -> None:
 
 def test_a_fit_that_went_astray_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """It was 23,000 nats below the plain one, and another effect took the place of the true one."""
-    likelihood = PixelLikelihood(
-        frames_of(exgaussian(np.random.default_rng(17), 0.4), 18), maps_of(0.3), (), Effort(None), 64
-    )
+    frames = frames_of(exgaussian(np.random.default_rng(17), 0.4), 18)
+    likelihood = PixelLikelihood(frames, maps_of(0.3), (), Effort(None), 64)
     heavy, skew = HEAVY(share=0.1, factor=2.0), SKEW(share=0.3)
-    assert likelihood.behind([heavy], [skew]) is not None
+    answer = likelihood.behind([heavy], [skew])
+    assert answer is not None
     plain = SetComparison.fit
 
     def astray(self: SetComparison, members: Sequence[Member], *rest: Any) -> FittedSet:
@@ -248,6 +248,9 @@ def test_a_fit_that_went_astray_says_nothing(monkeypatch: pytest.MonkeyPatch) ->
         return replace(found, fit=replace(found.fit, log_likelihood=found.fit.log_likelihood - 100.0))
 
     monkeypatch.setattr(SetComparison, "fit", astray)
+    # what was asked before is not fitted again, at whatever strength
+    assert likelihood.behind([HEAVY(share=0.2, factor=2.0)], [SKEW(share=0.2)]) == answer
+    likelihood = PixelLikelihood(frames, maps_of(0.3), (), Effort(None), 64)
     assert likelihood.behind([heavy], [skew]) is None
     hypothesis = Hypothesis(skew, np.ones(2))
     assert likelihood.begun([hypothesis]) == (hypothesis,)
