@@ -155,6 +155,11 @@ class SetComparison:
         """
         return replace(self, kept=kept, start=start, failed=dict(self.failed), _known={})
 
+    def of(self, rows: slice, start: FloatArray) -> SetComparison:
+        """Return the same of some of the rows, begun elsewhere: ``start`` has shape (n, 4)."""
+        taken = {name: getattr(self, name)[rows] for name in ("train", "test", "origin", "kept")}
+        return replace(self, **taken, start=start[rows], failed=dict(self.failed), _known={})
+
     @property
     def n_test(self) -> float:
         """Samples that count in the scored part."""

@@ -62,6 +62,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _CLEARLY_LESS = 0.5  # of the gap that named effects leave, the most that may stay with another form
+_LIKELIHOODS = 6  # that are remembered
 _DESCRIBED = 0.5  # of the gap, the most that a measured component may leave to be worth telling
 
 
@@ -329,6 +330,8 @@ class FrameExplainer:
         # a law has all samples; others may have replaced some
         key = pixels, present, tuple(effect for effect in effects if not is_told(effect))
         if key not in self._likelihoods:
+            if len(self._likelihoods) >= _LIKELIHOODS:
+                del self._likelihoods[next(iter(self._likelihoods))]
             samples = self.work.own_samples((*present, *effects))
             self._likelihoods[key] = PixelLikelihood(
                 samples, self.observed.plain.maps, present, self.work.effort, pixels

@@ -47,8 +47,6 @@ _PROBED, _LEAST_FITTED = 24, 0.25
 _OFTEN_BETTER = 0.05
 # nats by which a bias an electron off must be likelier under a law that the plain fit did not know
 CLEARLY = 4.0
-
-
 # where all samples count, whatever the law expects
 _CONTEST = _SEARCHED.model_copy(update={"tail_guard": 0.0})
 # lowest samples of a pixel that may have led it astray, and e- below the next one
@@ -192,7 +190,7 @@ def at_other_peaks(
         now: (H, g, mu, sigma) as fitted with it, (n, 4).
 
     Returns:
-        Those that are clearly likelier elsewhere, (m,), and their parameters there, (n, 4).
+        Those that are clearly likelier elsewhere, (m,); and all parameters, theirs from there, (n, 4).
     """
     found, seen = now.copy(), np.cumsum(counts, axis=1)
     lowest = np.stack([np.argmax(seen > k, axis=1) for k in range(_FEW_SAMPLES + 1)], axis=1)
@@ -201,15 +199,15 @@ def at_other_peaks(
     if not some.size:
         return some, found
     guarded = fit_histograms(counts[some], origin[some]).columns
-    best = None
-    for start in (now[some], guarded, off_by(guarded, -1.0), off_by(guarded, 1.0)):
-        fit = fit_histograms(counts[some], origin[some], law=law.of(some), start=start, settings=_CONTEST)
-        if best is None:
-            best = first = fit
-        else:
-            better = np.flatnonzero(fit.log_likelihood > best.log_likelihood)
-            best = best.with_pixels(better, fit.of(better))
-    assert best is not None
+
+    def fitted(start: FloatArray) -> FitResult:
+        return fit_histograms(counts[some], origin[some], law=law.of(some), start=start, settings=_CONTEST)
+
+    first = best = fitted(now[some])
+    for start in (guarded, off_by(guarded, -1.0), off_by(guarded, 1.0)):
+        fit = fitted(start)
+        better = np.flatnonzero(fit.log_likelihood > best.log_likelihood)
+        best = best.with_pixels(better, fit.of(better))
     moved = _likelier(best, first)
     found[some[moved]] = best.columns[moved]
     return some[moved], found

@@ -22,18 +22,19 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.histogram.count import histogram_frames
 
+FloatArray = NDArray[np.float64]
+
 #: Pixels that tell effects apart.
 MANY_PIXELS = 1024
 #: Pixels that tell numbers well enough to begin with.
 FEW_PIXELS = 256
-FloatArray = NDArray[np.float64]
-
 _MOST_STARTS = 3  # of one effect
 # nats that an effect for which no estimator speaks must explain, and times as strong as is typical, where a
 # plain fit is led astray
 _SPEAKS, _STRONG = 15.0, 5.0
 _FARTHEST = 30.0  # factor of a fingerprint: beyond, it is another hypothesis
 _PROBED = 64  # pixels
+_REMEMBERED = 12  # fits: each holds the masses of all codes
 _ALIKE = 0.5  # nats: fits that came to the same
 _ASTRAY = 5.0  # nats of a pixel that an effect explains, from which on it may mistake the peak of no electron
 
@@ -142,6 +143,8 @@ class PixelLikelihood:
         without = [e.model_dump_json(exclude={e.strength}) for e in effects]
         asked = frozenset(without), tuple(besides)
         if asked not in self._asked:
+            if len(self._asked) >= _REMEMBERED:
+                del self._asked[next(iter(self._asked))]
             self._asked[asked] = self._fit(effects, besides)
         return self._asked[asked]
 
@@ -243,16 +246,7 @@ def _electrons_off(sets: SetComparison, fitted: FittedSet, electrons: float) -> 
     Some pixels tell first whether it ever is: from there a fit takes many steps.
     """
     if len(sets.train) > 2 * _PROBED:
-        some = slice(None, None, len(sets.train) // _PROBED)
-        few = replace(
-            sets,
-            train=sets.train[some],
-            test=sets.test[some],
-            origin=sets.origin[some],
-            kept=sets.kept[some],
-            start=fitted.fit.parameters[some],
-            _known={},
-        )
+        few = sets.of(slice(None, None, len(sets.train) // _PROBED), fitted.fit.parameters)
         probe = few.fit(fitted.members)
         if not _likelier(few.fit(fitted.members, off_by(few.start, electrons)), probe).any():
             return fitted
