@@ -42,6 +42,7 @@ class FrameReader(ABC):
         notes: remarks for the user on what was left out or assumed.
         rows_per_read: rows that are decoded together, so that they come at no more cost than one; 1 where
             any rows can be read alone.
+        order_by_habit: whether the format has arrays that do not say which axis is time.
     """
 
     format_name: ClassVar[str] = ""
@@ -58,6 +59,7 @@ class FrameReader(ABC):
     timestamps: NDArray[np.float64] | None = None
     notes: tuple[str, ...] = ()
     rows_per_read: int = 1
+    order_by_habit: ClassVar[bool] = False
 
     @classmethod
     @abstractmethod

@@ -42,6 +42,7 @@ class Hdf5Reader(ContiguousReader):
     """One dataset of an HDF5 file."""
 
     format_name = "hdf5"
+    order_by_habit = True
     suffixes: ClassVar[tuple[str, ...]] = (".h5", ".hdf5", ".hdf", ".nxs", ".nx5")
     magic: ClassVar[tuple[bytes, ...]] = (b"\x89HDF\r\n\x1a\n", b"MATLAB 7.3 MAT-file")
 
