@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 import typer
 
 from pchem_pipeline import __version__
-from pchem_pipeline.base.errors import ExitCode, PchEmError
+from pchem_pipeline.base.errors import ConfigError, ExitCode, PchEmError
 from pchem_pipeline.cli.apply import apply
 from pchem_pipeline.cli.methods import methods
 from pchem_pipeline.cli.options import (
@@ -318,13 +318,18 @@ def figures(
     """Write every figure for a paper, its numbers beside it as CSV."""
     from pchem_pipeline.commands.figures import Wanted, figures_of_run
 
-    wanted = Wanted(_listed(formats), width, style, _listed(only), dpi, workers, progress)
+    wanted = Wanted(
+        _listed(formats, "--format"), width, style, _listed(only, "--only"), dpi, workers, progress
+    )
     for path in figures_of_run(target, output, wanted):
         typer.echo(path)
 
 
-def _listed(text: str) -> tuple[str, ...]:
-    return tuple(part.strip() for part in text.split(",") if part.strip())
+def _listed(text: str, option: str) -> tuple[str, ...]:
+    names = tuple(part.strip() for part in text.split(",") if part.strip())
+    if text and not names:
+        raise ConfigError(f"{option}: {text!r} names none; write names with commas between them")
+    return names
 
 
 @app.command()

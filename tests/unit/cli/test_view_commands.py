@@ -48,6 +48,12 @@ def test_what_cannot_be_drawn_is_refused_before_anything_is_read(wanted: Wanted,
         figures_of_run(Path("nowhere.zarr"), Path("out"), wanted)
 
 
+@pytest.mark.parametrize("option", ["--only", "--format"])
+def test_a_list_of_nothing_does_not_mean_all(option: str) -> None:
+    with pytest.raises(ConfigError, match=f"{option}: ' ,' names none"):
+        invoke("figures", "run.zarr", option, " ,")
+
+
 def test_a_folder_without_a_run_is_told(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="there is no run at"):
         figures_of_run(tmp_path, tmp_path / "out", Wanted())
