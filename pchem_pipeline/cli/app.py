@@ -293,7 +293,7 @@ def export(
     """Write maps as FITS, TIFF or npz, and a CSV summary."""
     from pchem_pipeline.commands.export import export_run
 
-    for path in export_run(target, output, _listed(formats.lower())):
+    for path in export_run(target, output, _listed(formats.lower(), "--format")):
         typer.echo(path)
 
 
