@@ -31,6 +31,7 @@ from pchem_pipeline.discrepancy.verdict import (
     State,
     Step,
     Verdict,
+    form_of,
     parameters_of,
 )
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
@@ -119,6 +120,7 @@ class Addition:
             # one that is not confirmed is not confused with those that it beats
             candidates=self.candidates[:1] if self.alone and not self.confirmed else self.candidates,
             parameters=parameters_of(self.effect, self.strength_stderr),
+            form=form_of(self.effect),
             place=place_words(self.effect),
             gap_before=self.before.value,
             gap_after=self.after.value,

@@ -327,6 +327,7 @@ class Step(_Part):
         verdict: of this step alone.
         candidates: those compared, the likeliest first.
         parameters: numbers of the named or the likeliest effect.
+        form: what else its fields say that is not their default, in words.
         place: where and when it acts, in words; empty: everywhere, always.
         gap_before, gap_after, gap_floor: on the final samples without and with it, nats per sample.
         gap_interval_after: 95 % interval of the gap with it.
@@ -344,6 +345,7 @@ class Step(_Part):
     verdict: State
     candidates: tuple[Candidate, ...]
     parameters: dict[str, Measured]
+    form: dict[str, str] = {}
     place: str = ""
     gap_before: Number
     gap_after: Number
@@ -582,6 +584,16 @@ def parameters_of(effect: Effect, stderr: float) -> dict[str, Measured]:
         )
         for name, value in effect.model_dump(exclude={"tag"}).items()
         if isinstance(value, int | float) and not isinstance(value, bool)
+    }
+
+
+def form_of(effect: Effect) -> dict[str, str]:
+    """Return the words in an effect's fields, such as the shape of a drift, that are not the default."""
+    fields = type(effect).model_fields
+    return {
+        name: value
+        for name, value in effect.model_dump(exclude={"tag"}).items()
+        if isinstance(value, str) and value != fields[name].default
     }
 
 

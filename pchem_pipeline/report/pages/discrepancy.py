@@ -278,6 +278,7 @@ def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
                 f"{name} {fitted_or_chosen(p.value, p.stderr, unit_text(p.unit))}"
                 for name, p in step.parameters.items()
             ]
+            values += [f"{name} {word}" for name, word in step.form.items()]
             value, more = _size_texts(step, values)
             place = (f"in {step.place}",) if step.place else ()
             facts.append(KeyFact(data.title(step.likeliest), value, (*more, *place)))

@@ -238,25 +238,26 @@ def _beside(step: Step) -> str:
 
 def _parameters(data: DiscrepancyData) -> Table:
     rows = tuple(
-        (
-            f"{tag}: {name}",
-            fitted_or_chosen(p.value, p.stderr, unit_text(p.unit)),
-            data.title(tag) + _beside(step),
-            data.sources.get(tag, ""),
-        )
+        (f"{tag}: {name}", value, data.title(tag) + _beside(step), data.sources.get(tag, ""))
         for step in data.found.steps
         for tag in [step.likeliest]
-        for name, p in step.parameters.items()
         if tag and (step.effect or step.verdict == "described" or data.found.verdict == "ambiguous")
+        for name, value in _values(step).items()
     )
     return Table(
         "discrepancy-parameters",
         "Parameters of the effects",
-        "The strength with its standard error, and the numbers that set its form, which were chosen and have "
-        "none. They are the keys of model.effects in the run's YAML.",
+        "The strength with its standard error, and the numbers and words that set its form, which were "
+        "chosen and have none. They are the keys of model.effects in the run's YAML.",
         ("parameter", "value", "effect", "source"),
         rows,
     )
+
+
+def _values(step: Step) -> dict[str, str]:
+    """Return the numbers and words of an effect, as text."""
+    numbers = {n: fitted_or_chosen(p.value, p.stderr, unit_text(p.unit)) for n, p in step.parameters.items()}
+    return numbers | step.form
 
 
 def _moved(steps: Sequence[Step]) -> Table:

@@ -103,6 +103,7 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
         values = [
             f"{name} = {fitted_or_chosen(p.value, p.stderr, p.unit)}" for name, p in step.parameters.items()
         ]
+        values += [f"{name} = {word}" for name, word in step.form.items()]
         lines += _listed(f"{step.likeliest} in {step.place}" if step.place else step.likeliest, values, 0)
     if not step.effect and found.verdict == "ambiguous":
         lines += [

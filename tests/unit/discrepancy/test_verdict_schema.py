@@ -11,7 +11,14 @@ import pytest
 from helpers.discrepancy_material import UNTESTABLE, VERDICTS, result, verdict_of
 
 from pchem_pipeline.base.errors import StoreError
-from pchem_pipeline.discrepancy.verdict import SCHEMA_VERSION, Place, Verdict, parameters_of, read_verdict
+from pchem_pipeline.discrepancy.verdict import (
+    SCHEMA_VERSION,
+    Place,
+    Verdict,
+    form_of,
+    parameters_of,
+    read_verdict,
+)
 from pchem_pipeline.effects.framework.registry import effect_class
 
 OPTIONAL = {"schema_version", "set_aside"}
@@ -158,6 +165,14 @@ def test_the_unit_of_a_parameter_is_that_of_its_description(tag: str, name: str,
     kind = effect_class(tag)
     effect = kind.model_construct(**{name: 1 if kind.model_fields[name].annotation is int else 1.0})
     assert parameters_of(effect, 0.1)[name].unit == unit
+
+
+def test_the_form_of_an_effect_is_told_where_it_is_not_the_usual_one() -> None:
+    bent = effect_class("nonlinearity").model_validate({"step_change": -0.01, "noise": "bent"})
+    assert form_of(bent) == {"noise": "bent"}
+    assert form_of(effect_class("nonlinearity").model_validate({"step_change": -0.01})) == {}
+    here = {"region": {"rows": [[0, 4]]}}
+    assert form_of(effect_class("row_noise").model_validate({"row_noise_dn": 1.0, **here})) == {}
 
 
 def test_only_the_strength_has_a_standard_error() -> None:

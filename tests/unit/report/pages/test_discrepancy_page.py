@@ -173,11 +173,13 @@ def test_what_is_measured_has_its_numbers_and_no_rivals(base: ReportData) -> Non
     measured["candidates"] = [{**measured["candidates"][0], "effect": "empirical_noise"}]
     measured["separate"] = {}
     measured["parameters"] = {"noise_dn": {"value": 0.784, "stderr": 0.021, "unit": "DN"}}
+    measured["form"] = {"spectrum": "one_over_f"}
     drawn = discrepancy_data("unexplained", steps=[measured], unexplained=[])
     data = replace(drawn, found=drawn.found.model_copy(update={"verdict": "described"}))
     tables = {table.id: table for part in discrepancy_tables(data).values() for table in part}
     assert not [name for name in tables if name.startswith("discrepancy-candidates")]
-    (row,) = tables["discrepancy-parameters"].rows
+    row, form = tables["discrepancy-parameters"].rows
+    assert form[:2] == ("empirical_noise: spectrum", "one_over_f")
     assert row[:2] == ("empirical_noise: noise_dn", "0.784 ± 0.021 DN")
     assert row[2].endswith("(measured)")
     text = Page(rendered(base, data).pages["discrepancy.html"]).text
