@@ -26,6 +26,8 @@ _AMBIGUOUS = 4.0
 _LEAST, _OF_NULL = 140.0, 6.0
 #: Share of that which is kept for measuring what no effect explains.
 _KEPT = 0.25
+#: The same that is left for fits, whatever it cost to find out what candidates would do.
+_FOR_FITS = 0.4
 
 
 class EffortSpentError(Exception):
@@ -56,6 +58,7 @@ class Effort:
         spent: CPU seconds by count.
         most: the same at which nothing more is begun; infinite until the null distribution is there.
         kept: of that, for the end.
+        for_fits: the least that is left for fits of candidates once they are compared.
         tried: tags of all effects with which the pixels were fitted.
         ambiguous: share of the pixels whose bias may be off by an electron.
     """
@@ -64,6 +67,7 @@ class Effort:
     spent: float = 0.0
     most: float = math.inf
     kept: float = 0.0
+    for_fits: float = 0.0
     tried: set[str] = field(default_factory=set)
     ambiguous: float = 0.0
 
@@ -71,6 +75,11 @@ class Effort:
         """Set the limit, now that the null distribution has been paid."""
         limit = math.inf if self.share is None else self.share * max(_LEAST, _OF_NULL * self.spent)
         self.most, self.kept = self.spent + (1.0 - _KEPT) * limit, _KEPT * limit
+        self.for_fits = _FOR_FITS * limit
+
+    def leave_for_fits(self) -> None:
+        """Let something be left for fits: a search that asks all candidates and fits none is in vain."""
+        self.most = max(self.most, self.spent + self.for_fits)
 
     def release(self) -> None:
         """Let what was kept be spent."""

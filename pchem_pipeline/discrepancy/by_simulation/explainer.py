@@ -243,6 +243,8 @@ class FrameExplainer:
         self.work.effort.check("another round of effects" if number else "the candidates were compared")
         self.work.effort.tried.clear()
         hypotheses, choice = self.screening.of(self.model, null, number)
+        if number == 0:
+            self.work.effort.leave_for_fits()
         if choice is None or not (disagrees or choice.advantage > CONVINCING):
             return None
         return Explanation(hypotheses, choice)

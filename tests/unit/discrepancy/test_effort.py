@@ -50,6 +50,21 @@ def test_a_small_search_has_its_least_and_one_without_a_limit_none():
     assert math.isinf(free.most)
 
 
+def test_however_much_the_candidates_cost_some_is_left_to_fit_them():
+    """Of a strong glow in bursts 115 guesses were simulated, and none was fitted."""
+    effort = Effort(1.0)
+    effort.begin()
+    limit = effort.most + effort.kept
+    effort.leave_for_fits()
+    assert effort.most + effort.kept == limit  # enough is left
+    effort.spent = effort.most + 50.0
+    effort.leave_for_fits()
+    effort.check("a candidate was fitted")
+    effort.spent += 0.4 * limit
+    with pytest.raises(EffortSpentError):
+        effort.check("the next")
+
+
 def test_a_fit_with_a_law_of_many_components_costs_more():
     plain, mixed = SampleLaw(), SampleLaw().with_noise([0.9, 0.05, 0.05], shift_e=[0.0, -1.0, 1.0])
     assert (plain.components, mixed.components) == (1, 3)
@@ -94,7 +109,8 @@ def noisy_rows():
     return np.maximum(frames, 0).astype(np.uint16)
 
 
-def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tried(noisy_rows):
+def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tried(noisy_rows, monkeypatch):
+    monkeypatch.setattr("pchem_pipeline.discrepancy.effort._FOR_FITS", 0.0)
     free = find_discrepancies(noisy_rows, settings=QUICK).verdict
     assert free.effects == ("row_noise",)
     assert free.limit == ""
