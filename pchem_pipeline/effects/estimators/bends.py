@@ -289,11 +289,13 @@ def _response(pixels: SampledPixels, codes: NDArray[np.int64]) -> NDArray[np.flo
         if not 0 <= first <= total.shape[0] - n_cells:
             continue
         # a deviation at an edge moves the samples there into the upper cell
-        change = np.zeros((n_cells, n_cells + 1))
-        change[cells, cells] = density[:-1]
-        change[cells, cells + 1] = -density[1:]
-        change -= tangents.T @ (tangents / mass @ change)
-        total[first : first + n_cells, first : first + n_cells + 1] += change
+        taken = np.zeros((len(tangents), n_cells + 1))
+        taken[:, :-1] = tangents / mass * density[:-1]
+        taken[:, 1:] -= tangents / mass * density[1:]
+        change = total[first : first + n_cells, first : first + n_cells + 1]
+        change -= tangents.T @ taken
+        change[cells, cells] += density[:-1]
+        change[cells, cells + 1] -= density[1:]
     return total[n_cells:-n_cells, n_cells:-n_cells]
 
 
