@@ -55,6 +55,7 @@ class Stage:
         summary: help of its command; empty where the command line gives it options of its own.
         applies: tells from the configuration whether a run has the stage.
         on_demand: done only where it is asked for by name.
+        may_write_nothing: it may be complete without the first of what it ``writes``.
         follows: stages that write the files which this one reads as input.
         reads_input: it looks at the camera files, or at the runs of the samples, as they are now.
         single_pass: what does its work, and that of the stages after it, in one pass over the input.
@@ -78,6 +79,7 @@ class Stage:
     summary: str = ""
     applies: Callable[[RunConfig], bool] = _every_run
     on_demand: bool = False
+    may_write_nothing: bool = False
     follows: tuple[str, ...] = ()
     reads_input: bool = False
     single_pass: SinglePass | None = None

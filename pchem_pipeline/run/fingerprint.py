@@ -92,7 +92,8 @@ def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) 
     """Return the state of a stage that was begun, and why."""
     if stage.upstream and "sensor" not in context.store.attributes("frames"):
         return "stale", "the run has no input"  # ingest was killed while it was done again
-    if done and stage.writes and not (stage.on_demand or context.store.has(stage.writes[0])):
+    written = not stage.writes or stage.may_write_nothing or context.store.has(stage.writes[0])
+    if done and not written:
         return "stale", f"{stage.writes[0]} is no longer in the store"  # a hand took it out
     content = fingerprint_content(stage, context)
     before = present_content(context.store, record.content)

@@ -120,6 +120,7 @@ _ALL = (
         writes=("ensemble", "ensemble_tiles"),
         run=f"{_HERE}.ensemble.ensemble:run",
         summary="Predict the ensemble from the maps; compare with the data.",
+        may_write_nothing=True,
         compiled_ahead=True,
     ),
     Stage(
@@ -154,6 +155,7 @@ _ALL = (
         run=f"{_HERE}.discrepancy.discrepancy:run",
         identity=f"{_HERE}.identities:search_start",
         on_demand=True,
+        may_write_nothing=True,
         compiled_ahead=True,
         kernels=f"{_HERE}.discrepancy.discrepancy:compile_kernels",
     ),

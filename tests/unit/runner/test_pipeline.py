@@ -3,6 +3,7 @@
 import functools
 import json
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -90,6 +91,21 @@ def test_a_second_run_does_nothing(make):
     assert len(CALLS) == 12
     assert execute("fit", make()).state == "complete"
     assert len(CALLS) == 12
+
+
+def test_what_a_hand_took_out_of_the_store_is_made_again(make, monkeypatch):
+    """`maps` was up to date, and what reads them sent to `maps`."""
+    context = make()
+    execute("fit", context)
+    execute("maps", context)
+    context.store.delete("maps")
+    assert status(FAKES["maps"], context).words() == "stale - maps is no longer in the store"
+    assert execute("maps", context).state == "complete"
+    assert context.store.read("maps/bias").shape == (20, 30)
+    # one that found nothing to write is complete without it
+    context.store.delete("maps")
+    monkeypatch.setitem(FAKES, "maps", replace(FAKES["maps"], may_write_nothing=True))
+    assert status(FAKES["maps"], context).state == "complete"
 
 
 def test_a_changed_setting_redoes_the_stages_that_read_it(make):
