@@ -75,7 +75,9 @@ class Effort:
         """Set the limit, now that the null distribution has been paid."""
         limit = math.inf if self.share is None else self.share * max(_LEAST, _OF_NULL * self.spent)
         self.most, self.kept = self.spent + (1.0 - _KEPT) * limit, _KEPT * limit
-        self.for_fits = _FOR_FITS * limit
+        # one that was asked to be short is as short as that
+        short = self.share is not None and self.share < 1.0
+        self.for_fits = 0.0 if short else _FOR_FITS * limit
 
     def leave_for_fits(self) -> None:
         """Let something be left for fits: a search that asks all candidates and fits none is in vain."""

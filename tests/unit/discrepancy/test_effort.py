@@ -63,6 +63,12 @@ def test_however_much_the_candidates_cost_some_is_left_to_fit_them():
     effort.spent += 0.4 * limit
     with pytest.raises(EffortSpentError):
         effort.check("the next")
+    short = Effort(0.1)  # as it was asked for
+    short.begin()
+    short.spent = short.most
+    short.leave_for_fits()
+    with pytest.raises(EffortSpentError):
+        short.check("a candidate was fitted")
 
 
 def test_a_fit_with_a_law_of_many_components_costs_more():
@@ -109,8 +115,7 @@ def noisy_rows():
     return np.maximum(frames, 0).astype(np.uint16)
 
 
-def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tried(noisy_rows, monkeypatch):
-    monkeypatch.setattr("pchem_pipeline.discrepancy.effort._FOR_FITS", 0.0)
+def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tried(noisy_rows):
     free = find_discrepancies(noisy_rows, settings=QUICK).verdict
     assert free.effects == ("row_noise",)
     assert free.limit == ""
