@@ -34,8 +34,9 @@ class DiscrepancySettings(Section):
     clear_samples: int = Field(
         default=1 << 22,
         ge=1 << 14,
-        description="the same where so few already disagree by 30 standard deviations with a model without "
-        "effects: more would take longer, and tell weaker effects beside it; the value of max_samples: all",
+        description="the same where so few, or twice as many, or four times, already disagree by 15 standard "
+        "deviations with a model without effects: more would take longer, and tell weaker effects beside it; "
+        "the value of max_samples: all",
     )
     max_pixels: int = Field(
         default=1 << 13,

@@ -16,9 +16,12 @@ from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.stages.discrepancy.window import choose_window, read_window
 
-#: Standard deviations of the largest statistic. Of 60 clean sensors of all kinds none had more than 20 in
-#: what is looked at here: without simulations the statistics of poor ones are not quite standard normal.
-_CLEAR = 30.0
+#: Standard deviations of the largest statistic. Some poor sensors have as many without any effect (of 60 of
+#: all kinds none more than 20), as without simulations their statistics are not quite standard normal: of
+#: these less is compared, with simulations that tell.
+_CLEAR = 15.0
+#: Replicates that are enough where much is wrong, of the plain model and of one with effects.
+_REPLICATES, _EXTENDED = 24, 12
 #: Share of the pixels whose bias may be off by an electron, from which on only those statistics count that do
 #: not rest on the pixels' parameters.
 _DOUBTFUL = 0.1
@@ -32,19 +35,31 @@ def fewer_samples(
 ) -> DiscrepancySettings:
     """Return the settings with as few samples to be compared as show the disagreement beyond any doubt.
 
+    Those of ``clear_samples``, or twice as many, and so on; and fewer replicates.
+
     Args:
         source: the frames.
         settings: as configured, or as the memory allows.
         roi: rows and columns that the user asked for.
         places: where the survey found that the sensor stands out.
     """
-    few = settings.model_copy(update={"max_samples": min(settings.clear_samples, settings.max_samples)})
-    small, large = (choose_window(source.shape, each, roi, places) for each in (few, settings))
-    if small.share(source.shape) >= large.share(source.shape):
-        return settings
-    length = block_length(small.numbers.size, settings.block_frames)
-    clear = is_clear(read_window(source, small), small.numbers, n_run=source.shape[0], block_frames=length)
-    return few if clear else settings
+    most = choose_window(source.shape, settings, roi, places).share(source.shape)
+    samples = settings.clear_samples
+    while samples < settings.max_samples:
+        few = settings.model_copy(update={"max_samples": samples})
+        window = choose_window(source.shape, few, roi, places)
+        if window.share(source.shape) >= most:
+            break
+        length = block_length(window.numbers.size, settings.block_frames)
+        frames = read_window(source, window)
+        if is_clear(frames, window.numbers, n_run=source.shape[0], block_frames=length):
+            lower = {
+                "replicates": min(settings.replicates, _REPLICATES),
+                "extended_replicates": min(settings.extended_replicates, _EXTENDED),
+            }
+            return few.model_copy(update=lower)
+        samples *= 2
+    return settings
 
 
 def is_clear(

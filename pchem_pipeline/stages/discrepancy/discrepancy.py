@@ -35,7 +35,7 @@ from pchem_pipeline.store.run_store import RunStore
 
 _STAGE = "discrepancy"
 #: Settings that the memory, or a clear disagreement, may lower.
-_TAKEN = ("max_samples", "max_pixels")
+_TAKEN = ("max_samples", "max_pixels", "replicates", "extended_replicates")
 _USUAL_CODES = 128.0  # of the law of a pixel, where there are no histograms yet
 
 

@@ -176,9 +176,10 @@ def posterior_of(
         starts = np.stack([_shifted(start, each) for each in shifts])
         if replaced is not None:
             starts = np.concatenate([starts, _usual(pixels, population)[None]])
-        learnt, evidence = _learn(pixels.of(some), starts[:, some], population)
+        about = pixels.about(starts)
+        maxima, learnt, evidence = _learn(pixels.of(some), about.of(some), population)
         if evidence > most:
-            best, most = (starts, learnt), evidence
+            best, most = (about.with_those(maxima, some), learnt), evidence
     assert best is not None
     return _climb(pixels, *best, _LAST_STEPS).posterior(best[1])
 
@@ -262,6 +263,16 @@ class _Pixels:
         information[:, :, 1] /= own[:, 1, None]
         return value, score, information
 
+    def about(self, theta: FloatArray) -> _Maxima:
+        """Return the parabolas about theta (j, n, 4)."""
+        j, n = theta.shape[:2]
+        theta = _inside(theta)
+        flat = self.of(np.tile(np.arange(n), j))
+        value, score, information = flat.parabolas(theta.reshape(-1, 4))
+        return _Maxima(
+            theta, value.reshape(j, n), score.reshape(j, n, 4), information.reshape(j, n, 4, 4), np.ones(n)
+        )
+
 
 @dataclass
 class _Maxima:
@@ -297,10 +308,31 @@ class _Maxima:
         weight = np.exp(evidence - evidence.max(axis=0))
         return mean, covariance, weight / weight.sum(axis=0)
 
-    def likely(self, population: Population) -> FloatArray:
-        """Return the maxima without those kinds that hardly a pixel has, shape (i, n, 4)."""
+    @property
+    def _parabolas(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        return self.theta, self.value, self.score, self.information
+
+    def of(self, some: NDArray[np.intp]) -> _Maxima:
+        """Return those of some pixels."""
+        theta, value, score, information = self._parabolas
+        return _Maxima(
+            theta[:, some], value[:, some], score[:, some], information[:, some], self.widening[some]
+        )
+
+    def with_those(self, found: _Maxima, some: NDArray[np.intp]) -> _Maxima:
+        """Return it with what was found for some pixels, if that has all kinds of maxima; changes it."""
+        if found.value.shape[0] < self.value.shape[0]:
+            return self
+        for old, own in zip(self._parabolas, found._parabolas, strict=True):
+            old[:, some] = own
+        return self
+
+    def likely(self, population: Population) -> _Maxima:
+        """Return the maxima without those kinds that hardly a pixel has."""
         share = self.solve(population)[2].mean(axis=1)
-        return np.asarray(self.theta[(share > _RARE) | (np.arange(share.size) == 0)])
+        some = (share > _RARE) | (np.arange(share.size) == 0)
+        theta, value, score, information = self._parabolas
+        return _Maxima(theta[some], value[some], score[some], information[some], self.widening)
 
     def posterior(self, population: Population) -> Posterior:
         """Return the posterior under a population."""
@@ -308,11 +340,12 @@ class _Maxima:
         return Posterior(population, _inside(theta), covariance, weight)
 
 
-def _climb(pixels: _Pixels, theta: FloatArray, population: Population, steps: int) -> _Maxima:
-    """Find the posterior maxima near theta (j, n, 4) by damped scoring steps, each pixel by itself."""
-    j, n = theta.shape[:2]
+def _climb(pixels: _Pixels, start: _Maxima, population: Population, steps: int) -> _Maxima:
+    """Find the posterior maxima near others (j, n) by damped scoring steps, each pixel by itself."""
+    j, n = start.value.shape
     flat = pixels.of(np.tile(np.arange(n), j))
-    x = _inside(theta).reshape(-1, 4)
+    x, value = start.theta.reshape(-1, 4).copy(), start.value.ravel().copy()
+    score, information = start.score.reshape(-1, 4).copy(), start.information.reshape(-1, 4, 4).copy()
     prior = np.linalg.inv(population.scatter)
 
     def height(at: FloatArray, value: FloatArray) -> FloatArray:
@@ -320,7 +353,6 @@ def _climb(pixels: _Pixels, theta: FloatArray, population: Population, steps: in
         far = np.einsum("na,ab,nb->n", off, prior, off)
         return np.asarray(value - 0.5 * (_TAILS + 4.0) * np.log1p(far / _TAILS))
 
-    value, score, information = flat.parabolas(x)
     top, share = height(x, value), np.ones(len(x))
     for _ in range(steps):
         active = np.flatnonzero(share > 1e-3)
@@ -355,21 +387,21 @@ def _climb(pixels: _Pixels, theta: FloatArray, population: Population, steps: in
     )
 
 
-def _learn(pixels: _Pixels, theta: FloatArray, population: Population) -> tuple[Population, float]:
-    """Return the population that makes the histograms likeliest, and how likely a pixel's is, nats.
+def _learn(pixels: _Pixels, start: _Maxima, population: Population) -> tuple[_Maxima, Population, float]:
+    """Return maxima, the population that makes the histograms likeliest, and how likely a pixel's is, nats.
 
     A centre that has an uncertainty stays.
     """
     before = -np.inf
     for _ in range(_ROUNDS):
-        maxima = _climb(pixels, theta, population, _NEWTON_STEPS)
+        maxima = _climb(pixels, start, population, _NEWTON_STEPS)
         population = _expectation_maximisation(maxima, population)
-        theta = maxima.likely(population)
+        start = maxima.likely(population)
         now = float(maxima.evidence.mean())
         if abs(now - before) < _SETTLED:
             break
         before = now
-    return population, now
+    return start, population, now
 
 
 def _expectation_maximisation(maxima: _Maxima, population: Population) -> Population:

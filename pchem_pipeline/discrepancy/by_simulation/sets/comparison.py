@@ -55,7 +55,6 @@ _SEEN = 4.0  # deviations that the others leave of a statistic for it to ask for
 _MOVED = 3.0  # by which that effect must move it
 _UNTOUCHED = 0.5  # of that, the most by which the others may move it
 _NO_WORSE = 10.0  # nats by which fewer replicates may make a set look worse
-_PLACEBO_STEPS = 1  # corrections of its strength: it is not to win
 _NEARLY_AS_GOOD = 40.0  # nats between sets that a second witness is asked about
 _MOST_ALIKE = 3  # look-alikes of a single effect that are refitted before anything beside it
 _SILENT = Witness()
@@ -274,9 +273,11 @@ def _placebo(
     closing = [(fit.log_score(shift, noise), i) for i, fit in enumerate(fits) if fit.factors[-1] > 0.0]
     if not closing:
         return []
-    best = pool[max(closing)[1]]
+    index = max(closing)[1]
+    best = pool[index].times(float(fits[index].factors[-1]))
     try:
-        return [replace(refitter, steps=_PLACEBO_STEPS).refined((*others, best))]
+        # at the strength that its fingerprint asks for: it is not to win
+        return [replace(refitter, steps=0).refined((*others, best))]
     # its defect is told where it is asked for its guesses; at the limit of the work its fingerprint must do
     except Exception:
         return []

@@ -168,18 +168,30 @@ class Stack:
         buffer[...] = self.values[t0:t1, y0:y1]
 
 
+ALL = DiscrepancySettings().max_samples
+
+
 @pytest.mark.parametrize(
-    ("row_noise", "fewest", "clear"),
-    [(0.0, 1 << 17, False), (0.25, 1 << 17, False), (3.0, 1 << 17, True), (3.0, 1 << 25, False)],
-)
-def test_few_samples_are_compared_where_they_disagree_clearly(row_noise, fewest, clear):
+    ("row_noise", "fewest", "compared"),
+    # as many as show it: the fewest, or twice or four times as many
+    [
+        (0.0, 1 << 17, ALL), (0.25, 1 << 17, ALL), (3.0, 1 << 17, 1 << 17), (3.0, 1 << 25, ALL),
+        (3.0, 1 << 16, 1 << 16), (1.0, 1 << 16, 1 << 17), (0.8, 1 << 16, 1 << 18),
+    ],
+)  # fmt: skip
+def test_few_samples_are_compared_where_they_disagree_clearly(row_noise, fewest, compared):
     rng = np.random.default_rng(5)
     light = 11.0 * (rng.poisson(2.0, (900, 16, 24)) + 0.3 * rng.standard_normal((900, 16, 24)))
     stack = np.rint(100.0 + light + row_noise * rng.standard_normal((900, 16, 1))).astype(np.uint16)
     settings = DiscrepancySettings(clear_samples=fewest)
     found = fewer_samples(Stack(stack), settings, None, {})
-    assert (found.max_samples == fewest < settings.max_samples) is clear
-    assert clear or found == settings
+    assert found.max_samples == compared
+    if compared == ALL:
+        assert found == settings
+    else:
+        assert (found.replicates, found.extended_replicates) == (24, 12)
+    own = settings.model_copy(update={"replicates": 20})
+    assert fewer_samples(Stack(stack), own, None, {}).replicates == 20
 
 
 def test_what_is_wrong_with_frames_is_no_clear_disagreement():
