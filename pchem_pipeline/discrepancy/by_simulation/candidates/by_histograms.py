@@ -22,6 +22,8 @@ BoolArray = NDArray[np.bool_]
 
 _FEWEST_PIXELS, _FEWEST_FRAMES = 16, 200  # of a place, whose histograms tell numbers
 _MOST_IN_A_PART = 2  # effects for which no estimator speaks
+# nats of few pixels, and share of what the best one explains, by which an effect is far behind that
+_FAR, _FAR_SHARE = 10.0, 0.1
 
 
 @dataclass
@@ -52,16 +54,21 @@ class Histograms:
         from which its estimator takes a strength. Others, and those that no pixel can be fitted with, stay as
         they are. Guesses that come to the same are one.
         """
+        by_place: dict[Part, dict[str, list[Effect]]] = {}
+        for g in guesses:
+            by_place.setdefault(Part(g.region, g.when), {}).setdefault(g.tag, []).append(g)
+        likely: dict[tuple[str, Part], list[Effect]] = {}
+        for place, own in by_place.items():
+            anywhere = {tag: [g.at_place(None) for g in there] for tag, there in own.items()}
+            told = {tag: there for tag, there in anywhere.items() if any(is_told(g) for g in there)}
+            by = self._of(place) if told else None
+            for tag, effects in {} if by is None else _likeliest(by, told).items():
+                likely[tag, place] = [e.at_place(place.region, place.when) for e in effects]
         found: list[Effect] = []
         for tag in dict.fromkeys(g.tag for g in guesses):
-            own = [g for g in guesses if g.tag == tag]
-            for region, when in dict.fromkeys((g.region, g.when) for g in own):
-                there = [g for g in own if (g.region, g.when) == (region, when)]
-                anywhere = [g.at_place(None) for g in there]
-                by = self._of(Part(region, when)) if any(is_told(g) for g in anywhere) else None
-                likely = [] if by is None else [g.at_place(region, when) for g in by.detailed(anywhere)]
-                found += likely or there
-                self.told += likely
+            for place, own in by_place.items():
+                found += likely.get((tag, place)) or own.get(tag, [])
+        self.told += [effect for effects in likely.values() for effect in effects]
         return found
 
     def suggested(
@@ -91,3 +98,20 @@ class Histograms:
                 PixelLikelihood(own, maps, self.present, self.effort, FEW_PIXELS) if told else None
             )
         return self._known[part]
+
+
+def _likeliest(by: PixelLikelihood, guesses: Mapping[str, Sequence[Effect]]) -> dict[str, list[Effect]]:
+    """Return the numbers of effects in a place, by tag: as a part of its pixels tells them first.
+
+    As all of them do where an effect comes near the best one; the others are in vain, or beside it, where
+    numbers that were fitted without it say little.
+    """
+    few = by.fewer()
+    rough = {tag: few.fitted(own) for tag, own in guesses.items()}
+    best = max((fits[0][0] for fits in rough.values() if fits), default=0.0)
+    found = {}
+    for tag, fits in rough.items():
+        near = bool(fits) and fits[0][0] > (1.0 - _FAR_SHARE) * best - _FAR
+        fits = by.fitted([effect for _, effect in fits]) if near and few is not by else fits
+        found[tag] = [effect for _, effect in fits]
+    return found

@@ -7,6 +7,7 @@ that the histograms say, for a fraction of the cost of one simulation.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -34,6 +35,7 @@ _MOST_STARTS = 3  # of one effect
 _SPEAKS, _STRONG = 15.0, 5.0
 _FARTHEST = 30.0  # factor of a fingerprint: beyond, it is another hypothesis
 _PROBED = 64  # pixels
+_SILENT = 0.5  # nats of so many pixels: an effect that explains less is not in more of them
 _REMEMBERED = 12  # fits: each holds the masses of all codes
 _ALIKE = 0.5  # nats: fits that came to the same
 _ASTRAY = 5.0  # nats of a pixel that an effect explains, from which on it may mistake the peak of no electron
@@ -74,19 +76,33 @@ class PixelLikelihood:
         )
         self._asked: dict[tuple[frozenset[str], tuple[Effect, ...]], FittedSet | None] = {}
         self._without: dict[tuple[Effect, ...], float] = {}  # log-likelihood, by what is present
+        self._fewer: PixelLikelihood | None = None
 
-    def detailed(self, guesses: Sequence[Effect]) -> list[Effect]:
-        """Return an effect as fitted from several starts, the likeliest first; none where no fit holds."""
-        fits: list[tuple[float, Member]] = []
+    def fewer(self) -> PixelLikelihood:
+        """Return that of a part of these pixels, a first answer for a fraction of the work; itself if few."""
+        n = len(self._sets.train)
+        if n <= 2 * _PROBED:
+            return self
+        if self._fewer is None:
+            self._fewer = copy.copy(self)
+            self._fewer._sets = self._sets.of(slice(None, None, n // _PROBED), self._sets.start)
+            self._fewer._asked, self._fewer._without = {}, {}
+        return self._fewer
+
+    def fitted(self, guesses: Sequence[Effect]) -> list[tuple[float, Effect]]:
+        """Return an effect as fitted from several starts, and by how much it is likelier than none, nats.
+
+        The likeliest first; none where no fit holds.
+        """
+        fits: list[tuple[float, Effect]] = []
         for guess in guesses[:_MOST_STARTS]:
             one = self._fit([guess], ())
             if one is None or one.members[0].at_limit:
                 continue
-            likely = float(one.fit.log_likelihood.sum())
-            if not any(abs(likely - known) < _ALIKE for known, _ in fits):
-                fits.append((likely, one.members[0]))
-        fits.sort(key=lambda item: -item[0])
-        return [member.effect for _, member in fits]
+            rise = float(one.fit.log_likelihood.sum()) - self._without[self._sets.present]
+            if not any(abs(rise - known) < _ALIKE for known, _ in fits):
+                fits.append((rise, one.members[0].effect))
+        return sorted(fits, key=lambda fit: -fit[0])
 
     def suggested(self, kinds: Iterable[type[Effect]]) -> list[Effect]:
         """Return effects that explain much of the histograms, as fitted, the likeliest first.
@@ -96,16 +112,10 @@ class PixelLikelihood:
         """
         fits: list[tuple[float, Effect]] = []
         for kind in kinds:
-            for start in _starts(kind):
-                one = self._fit([start], ())
-                if one is not None and not one.members[0].at_limit:
-                    rise = float(one.fit.log_likelihood.sum()) - self._without[self._sets.present]
-                    fits.append((rise, one.members[0].effect))
-        best: dict[str, Effect] = {}
-        for rise, effect in sorted(fits, key=lambda fit: -fit[0]):
-            if rise > _SPEAKS:
-                best.setdefault(effect.tag, effect)
-        return list(best.values())
+            rough = self.fewer().fitted(_starts(kind))
+            if rough and rough[0][0] > _SILENT:
+                fits += rough[:1] if self.fewer() is self else self.fitted([rough[0][1]])
+        return [effect for rise, effect in sorted(fits, key=lambda fit: -fit[0]) if rise > _SPEAKS]
 
     def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         """Return the effects of a set at the numbers that are likeliest together, where a law tells them."""

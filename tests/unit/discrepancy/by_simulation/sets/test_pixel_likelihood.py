@@ -133,7 +133,7 @@ def test_a_strength_is_told_though_the_plain_fit_has_the_bias_off_by_an_electron
         [m + shift for m, shift in zip(maps_of(0.3).maps, (1.0, 0.0, -STEP, 0.0), strict=True)],
         np.ones((SIDE, SIDE), np.bool_),
     )
-    [found] = PixelLikelihood(frames, off, (), Effort(None)).detailed([SKEW(share=0.6)])
+    [(_, found)] = PixelLikelihood(frames, off, (), Effort(None)).fitted([SKEW(share=0.6)])
     assert found.share == pytest.approx(0.95, abs=0.02)  # type: ignore[attr-defined]
 
 
