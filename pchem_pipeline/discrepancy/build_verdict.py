@@ -253,6 +253,7 @@ def build_verdict(
     untestable: Mapping[str, str],
     defects: Mapping[str, str],
     n_replicates: int,
+    work: float,
 ) -> Discrepancy:
     """Put the verdict together.
 
@@ -264,6 +265,7 @@ def build_verdict(
         untestable: effects that such data cannot show, and why.
         defects: candidates that failed, and why.
         n_replicates: drawn in all.
+        work: CPU seconds by count.
     """
     # e-, and the share of the read noise, of pixels whose gain and read noise are open would be made up
     sizes = {
@@ -291,6 +293,7 @@ def build_verdict(
             examined=looked_at[1],
             p_global=Change(before=found.first.global_p(both, 2), after=found.last.global_p(both, 2)),
             replicates=n_replicates,
+            work=round(work, 1),
             versions={"statistics": VERSION},
         ),
         model=model,

@@ -23,7 +23,7 @@ _ASKED = 2.0e-6
 #: starts, flat maxima and more electron numbers.
 _AMBIGUOUS = 4.0
 #: CPU seconds, by count, that a search has at least, and what it has of the cost of the null distribution.
-_LEAST, _OF_NULL = 140.0, 6.0
+_LEAST, _OF_NULL = 170.0, 6.0
 #: Share of that which is kept for measuring what no effect explains.
 _KEPT = 0.25
 #: The same that is left for fits, whatever it cost to find out what candidates would do.

@@ -70,7 +70,7 @@ class DiscrepancySettings(Section):
         default=1.0,
         gt=0,
         description="limit of the search, in counted work, so that the same search ends at the same place "
-        "on any machine: 1 is six times the work of the null distribution, or some 140 CPU seconds; "
+        "on any machine: 1 is six times the work of the null distribution, or some 170 CPU seconds; "
         "null: none",
     )
     candidates: tuple[str, ...] | None = Field(

@@ -83,6 +83,11 @@ class Explainer(Protocol[Explanation]):
         """Replicates drawn so far."""
         ...
 
+    @property
+    def spent(self) -> float:
+        """CPU seconds so far, by count."""
+        ...
+
     def doubt(self) -> str:
         """Say why the pixels are not identified and what would help; empty where they are."""
         ...
@@ -194,6 +199,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
         untestable=by.untestable,
         defects=by.defects,
         n_replicates=by.n_replicates,
+        work=by.spent,
     )
 
 

@@ -404,6 +404,7 @@ class Verdict(_Part):
         examined: what was looked at.
         p_global: chance of the largest deviation.
         replicates: simulated stacks or histograms in all.
+        work: CPU seconds by count, on a core of about 2020: the same on any machine.
         versions: of what a verdict depends on.
     """
 
@@ -424,6 +425,7 @@ class Verdict(_Part):
     examined: Examined
     p_global: Change
     replicates: int
+    work: Number = _NAN
     versions: dict[str, int | str]
 
     def to_json(self) -> str:

@@ -68,7 +68,12 @@ def null_of_range(seed: int, most_samples: float = MOST_SAMPLES) -> dict[str, An
     found = one_of_range(seed, most_samples)
     failed = found["why"] if found["verdict"] == "error" else None
     return {
-        "verdict": {"verdict": found["verdict"], "effects": found.get("effects", ()), "replicates": 0},
+        "verdict": {
+            "verdict": found["verdict"],
+            "effects": found.get("effects", ()),
+            "replicates": 0,
+            "work": found.get("work"),
+        },
         "sensor": found,
         "cpu_seconds": found["cpu_seconds"],
         "error": failed,
@@ -93,7 +98,7 @@ def one_of_range(seed: int, most_samples: float) -> dict[str, Any]:
         found = find_discrepancies(camera.frames(seed)).verdict
         record |= {
             "verdict": found.verdict, "effects": found.effects, "p": found.p_global.before,
-            "defects": found.defects,
+            "defects": found.defects, "work": found.work,
         }  # fmt: skip
     except (InputError, PchEmError) as error:
         record |= {"verdict": "refused", "why": str(error)}

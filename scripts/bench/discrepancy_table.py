@@ -18,6 +18,7 @@ def print_table(records: Iterable[Record]) -> None:
     """Print how often each aim was reached, with Wilson's interval, and what the stacks of a row cost."""
     rows = [(record, Answer(record)) for record in records]
     columns = f"{'reached':>9s}{'share':>8s}{'95 %':>14s}   {'aim':9s}{'CPU s: median':>14s}{'longest':>9s}"
+    columns += f"{'counted: med.':>14s}{'longest':>9s}"
     print(f"\n{'row':62s}{columns}")
 
     def of(*kinds: str) -> list[tuple[Record, Answer]]:
@@ -76,8 +77,14 @@ def _row(
     n = len(rows)
     hits = sum(not a.failed and true(r, a) for r, a in rows)
     low, high = wilson(hits, n)
-    seconds = sorted(r["cpu_seconds"] for r, _ in rows if "cpu_seconds" in r)
-    cost = f"{median(seconds):14.0f}{seconds[-1]:9.0f}" if seconds else f"{'-':>14s}{'-':>9s}"
+    # by count: the same on any machine, and whatever else that does
+    costs = (
+        [r["cpu_seconds"] for r, _ in rows if "cpu_seconds" in r],
+        [work for r, _ in rows if (work := (r.get("verdict") or {}).get("work"))],
+    )
+    cost = "".join(
+        f"{median(each):14.0f}{max(each):9.0f}" if each else f"{'-':>14s}{'-':>9s}" for each in costs
+    )
     share = f"{100 * hits / n:6.1f} %" if n else f"{'-':>8s}"
     print(
         f"{title:62s}{hits:4d}/{n:<4d}{share}{f'[{100 * low:.0f}, {100 * high:.0f}]':>14s}   {aim:9s}{cost}"

@@ -227,6 +227,11 @@ class HistogramExplainer:
         """Drawn so far."""
         return self.replicates.done
 
+    @property
+    def spent(self) -> float:
+        """CPU seconds so far, by count."""
+        return self.replicates.effort.spent
+
     def doubt(self) -> str:
         """Return nothing: each candidate is fitted with the parameters, so what they bend is no evidence."""
         return ""

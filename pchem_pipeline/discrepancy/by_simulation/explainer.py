@@ -225,6 +225,11 @@ class FrameExplainer:
         """Parts of simulated stacks so far."""
         return self.work.done
 
+    @property
+    def spent(self) -> float:
+        """CPU seconds so far, by count."""
+        return self.work.effort.spent
+
     def doubt(self) -> str:
         """Say which share of the pixels is not identified, and what would help; empty below a half."""
         return self.observed.doubt()

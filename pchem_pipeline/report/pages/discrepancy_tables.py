@@ -354,5 +354,7 @@ def _examined(data: DiscrepancyData) -> Table:
         )
     if found.replicates:
         rows.append(("simulated replicates", f"{found.replicates:,}"))
+    if math.isfinite(found.work):
+        rows.append(("work of the search, CPU s of a core of about 2020", f"{found.work:,.0f}"))
     rows += [(f"version: {name}", str(version)) for name, version in found.versions.items()]
     return Table("discrepancy-examined", "What was examined", "", ("item", "value"), tuple(rows))

@@ -30,7 +30,7 @@ def state_of(before: float, after: float, pull: float, monkeypatch: pytest.Monke
     monkeypatch.setattr(skeleton, "build_verdict", lambda found, *_, **__: found)
     by: Any = SimpleNamespace(
         settings=DiscrepancySettings(), model=(), first=NULL, z=Measured(z, z, z), samples="frames",
-        most_rounds=1, evidence=None, examined=None, untestable={}, defects={}, n_replicates=60,
+        most_rounds=1, evidence=None, examined=None, untestable={}, defects={}, n_replicates=60, spent=12.0,
         gap=lambda _: gaps[0], doubt=lambda: "", suspects=lambda _: True, explain=lambda *_: True,
         add=lambda *_: NULL, replaced=lambda _: None, unfinished=lambda *_: False,
         describe=lambda *_: None, probable=lambda: None, tolerance=lambda: 0.0,
