@@ -32,8 +32,10 @@ TRIED = (
 )  # fmt: skip
 SEALED = (
     "mains_gain", "blended_frames", "bursting_block", "row_tilt", "noisy_time",
-    "empty_samples", "loud_column", "negative_ghost", *OUTSIDE,
+    "empty_samples", "negative_ghost", *OUTSIDE,
 )  # fmt: skip
+#: what has a name since effects may act in a part: column noise in a few columns
+NAMED_SINCE = ("loud_column",)
 #: effects that a stationary stack hardly tells apart: the one for the other is no invention
 TWINS = (
     ("overdispersed_counts", "branching_counts"),
