@@ -153,5 +153,9 @@ def _command(
     """Return what the common options ask for."""
     from pchem_pipeline.run.stage import Options
     from pchem_pipeline.runner.session import Command
+    from pchem_pipeline.store.tiles import tile_ranges
+
+    if tiles is not None:
+        tile_ranges(tiles)  # what is no list of tiles is told before anything is read
 
     return Command(Options(force=force, dry_run=dry_run, tiles=tiles, roi=region_of(roi)), **rest)

@@ -274,7 +274,9 @@ class StageContext:
         if self.options.tiles is None and self.options.roi is None:
             return list(units)
         grid = self.tiles()
-        chosen = {t.key for t in (parse_tiles(self.options.tiles, grid) if self.options.tiles else grid)}
+        chosen = {
+            t.key for t in (grid if self.options.tiles is None else parse_tiles(self.options.tiles, grid))
+        }
         if self.options.roi is not None:
             chosen &= {t.key for t in roi_tiles(self.options.roi, grid)}
         return [unit for unit in units if unit is WHOLE or chosen & set(unit.keys)]

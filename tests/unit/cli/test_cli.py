@@ -220,3 +220,11 @@ def test_what_is_written_beside_a_store_lies_on_this_machine(arguments, tmp_path
 def test_simulated_frames_lie_on_this_machine():
     with pytest.raises(ConfigError, match=r"^s3://lab/frames: only stores"):
         parse_config("simulate: {output: 's3://lab/frames'}")
+
+
+@pytest.mark.parametrize("text", ["", "7", "0.0,", "0.a"])
+def test_what_is_no_list_of_tiles_is_told_before_anything_is_read(calls, text):
+    for command in (("fit", "run.zarr"), ("run", "a.tif")):
+        with pytest.raises(ConfigError, match=r"^--tiles: .* is not a tile; write iy.ix, such as 0.3"):
+            invoke(*command, "--tiles", text)
+    assert calls == []
