@@ -284,6 +284,25 @@ class Surveyed(_Part):
     p: Number
 
 
+class Elsewhere(_Part):
+    """Whether the model that was found holds in another window of the sensor.
+
+    Attributes:
+        rows, columns: of that, first and end.
+        deviates: what does not agree with it there, beyond doubt; empty: nothing.
+    """
+
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+    deviates: str = ""
+
+    def words(self) -> str:
+        """Return where that is."""
+        return (
+            f"rows {self.rows[0]} to {self.rows[1] - 1}, columns {self.columns[0]} to {self.columns[1] - 1}"
+        )
+
+
 class Examined(_Part):
     """What was looked at.
 
@@ -298,6 +317,7 @@ class Examined(_Part):
             successive frames, shapes of the histograms, pairs of pixels in rows, columns and frames.
         places: where those stand out.
         unfitted: pixels that are not compared, since they have no fit to be relied upon.
+        elsewhere: where the model that was found was looked at again; None: nowhere.
     """
 
     frames: int
@@ -312,6 +332,7 @@ class Examined(_Part):
     surveyed_by: dict[str, Number] = {}
     places: tuple[Surveyed, ...] = ()
     unfitted: int = 0
+    elsewhere: Elsewhere | None = None
 
     @property
     def origin(self) -> tuple[int, int]:
@@ -489,6 +510,16 @@ class Verdict(_Part):
         if not rivals or self.verdict in ("consistent", "cannot_tell"):
             return ""
         return f"nearest: {rivals[0]}" if step.verdict == "unexplained" else " or ".join(rivals)
+
+    def checked(self, elsewhere: Elsewhere) -> Verdict:
+        """Return it with what another window of the sensor says of the model that was found."""
+        changes: dict[str, Any] = {"examined": self.examined.model_copy(update={"elsewhere": elsewhere})}
+        if elsewhere.deviates:
+            not_there = f"; it does not hold in {elsewhere.words()}, where {elsewhere.deviates}."
+            changes["sentence"] = self.sentence.removesuffix(".") + not_there
+            if self.verdict == "named":
+                changes["verdict"] = "named_in_part"
+        return self.model_copy(update=changes)
 
     def on_sensor(
         self,

@@ -50,7 +50,6 @@ from pchem_pipeline.discrepancy.null import (
 from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import search, silent
-from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.discrepancy.verdict import Discrepancy, Examined
 from pchem_pipeline.effects.framework.added_exposure import added_exposures
 from pchem_pipeline.effects.framework.compose import along_chain
@@ -103,11 +102,15 @@ def find_discrepancies(
     """
     settings = settings or DiscrepancySettings()
     numbers = np.arange(stack.shape[0], dtype=np.int64) if numbers is None else numbers
-    splits = split_frames(numbers, block_length(stack.shape[0], settings.block_frames))
-    if bit_depth is None:
-        bit_depth = min(int(stack.max()).bit_length() + 1, 24)
-    frames = FrameStack(stack, numbers, splits, n_run or int(numbers[-1]) + 1, bit_depth, integration_time)
-    frames = replace(frames, window=window)
+    frames = FrameStack.of(
+        stack,
+        numbers,
+        settings.block_frames,
+        n_run=n_run,
+        bit_depth=bit_depth,
+        integration_time=integration_time,
+        window=window,
+    )
     classes = candidate_classes(settings)
     tell("splitting the samples and looking at each part")
     observed = ObservedFrames.of(frames)

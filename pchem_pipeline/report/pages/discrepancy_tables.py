@@ -352,6 +352,9 @@ def _examined(data: DiscrepancyData) -> Table:
         rows.append(
             (f"whole sensor: {_surveyed(place.map, data)}", f"{words} (p {probability_text(place.p)})")
         )
+    if examined.elsewhere is not None:
+        there = examined.elsewhere
+        rows.append(("looked at again", f"{there.words()}: {there.deviates or 'the model holds there'}"))
     if found.replicates:
         rows.append(("simulated replicates", f"{found.replicates:,}"))
     if math.isfinite(found.work):

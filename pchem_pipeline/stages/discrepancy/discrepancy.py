@@ -8,18 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
-from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
+from pchem_pipeline.base.errors import InputError, PchEmError, StoreError, quoted
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.by_likelihood.explainer import find_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.observed import SampleHistograms
+from pchem_pipeline.discrepancy.by_simulation.elsewhere import deviation
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
+from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
+from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Replicate
+from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
+from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.compilation import compile_observation
 from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
-from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy
+from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy, Elsewhere
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.run.frame_source import open_source
@@ -29,7 +35,13 @@ from pchem_pipeline.simulate.chain import dn_dtype
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
 from pchem_pipeline.stages.discrepancy.clear import fewer_samples
 from pchem_pipeline.stages.discrepancy.survey import Survey, mean_codes, survey
-from pchem_pipeline.stages.discrepancy.window import choose_window, read_window, within_memory
+from pchem_pipeline.stages.discrepancy.window import (
+    Window,
+    choose_window,
+    other_window,
+    read_window,
+    within_memory,
+)
 from pchem_pipeline.stages.samples import open_samples
 from pchem_pipeline.store.run_store import RunStore
 
@@ -83,32 +95,92 @@ def run(context: StageContext) -> None:
 def _run_frames(
     context: StageContext, before: Sequence[Effect], roi: tuple[int, ...] | None, tell: Callable[[str], None]
 ) -> None:
-    sensor, source = context.sensor, open_source(context)
+    source = open_source(context)
     block_length(source.shape[0], context.config.discrepancy.block_frames)
     compile_observation(source.dtype)
-    settings, seen = _surveyed(context, source, before, roi, tell)
-    window = choose_window(source.shape, settings, roi, seen.places)
-    found = find_discrepancies(
-        read_window(source, window),
-        window.numbers,
-        settings,
-        n_run=source.shape[0],
-        bit_depth=context.config.input.bit_depth or sensor.bit_depth,
-        integration_time=context.integration_time or 1.0,
-        model=before,
-        mapper=_Mapper(context),
-        window=SensorWindow(
-            window.rows,
-            window.columns,
-            (source.shape[1], source.shape[2]),
-            tuple(place.region for place in seen.places.values()),
-        ),
-        tell=tell,
-    )
+    settings, seen, whole = _surveyed(context, source, before, roi, tell)
+    search = _Search(context, source, before, roi, seen, tell)
+    window, found = search.found(settings, "")
+    elsewhere = search.elsewhere(settings, "elsewhere-", window, found)
+    if elsewhere is not None and elsewhere.deviates and whole != settings:
+        context.note(
+            f"what was found does not hold in {elsewhere.words()}, where {elsewhere.deviates}: as many "
+            "samples are compared as discrepancy.max_samples allows"
+        )
+        window, found = search.found(whole, "whole-")
+        elsewhere = search.elsewhere(whole, "whole-elsewhere-", window, found)
     verdict = found.verdict.on_sensor(source.shape[1:], window.rows, window.columns, window.pixel)
-    found = replace(found, verdict=seen.told(verdict, window.share(source.shape)))
+    verdict = seen.told(verdict, window.share(source.shape))
+    found = replace(found, verdict=verdict if elsewhere is None else verdict.checked(elsewhere))
     _write(context, found)
     write_added_exposure(context.store, _STAGE, found.added, found.model, window.rows, window.columns)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Compares windows of the frames with simulations.
+
+    Attributes:
+        context: of the stage.
+        source: the frames.
+        before: effects that the model had.
+        roi: rows and columns that the user asked for.
+        seen: what was seen of the whole sensor.
+        tell: hears what is done next.
+    """
+
+    context: StageContext
+    source: FrameSource
+    before: Sequence[Effect]
+    roi: tuple[int, ...] | None
+    seen: Survey
+    tell: Callable[[str], None]
+
+    def found(self, settings: DiscrepancySettings, prefix: str) -> tuple[Window, Discrepancy]:
+        """Search for what the model is missing in the window of the settings; ``prefix`` begins its units."""
+        window = choose_window(self.source.shape, settings, self.roi, self.seen.places)
+        found = find_discrepancies(
+            read_window(self.source, window),
+            window.numbers,
+            settings,
+            **self._taken(window),
+            model=self.before,
+            mapper=_Mapper(self.context, prefix),
+            tell=self.tell,
+        )
+        return window, found
+
+    def elsewhere(
+        self, settings: DiscrepancySettings, prefix: str, window: Window, found: Discrepancy
+    ) -> Elsewhere | None:
+        """Look whether effects with a name hold in another window; None: there are none, or no window."""
+        other = other_window(window, self.source.shape, self.roi)
+        if other is None or not found.verdict.effects:
+            return None
+        self.tell("looking whether that holds elsewhere")
+        frames = FrameStack.of(
+            read_window(self.source, other), other.numbers, settings.block_frames, **self._taken(other)
+        )
+        try:
+            observed = ObservedFrames.of(frames)
+        except InputError:
+            return None  # hardly a pixel can be used there
+        by = Simulations(observed, _Mapper(self.context, prefix), settings.seed, Effort(None))
+        return Elsewhere(rows=other.rows, columns=other.columns, deviates=deviation(by, found.model))
+
+    def _taken(self, window: Window) -> dict[str, Any]:
+        """Return how the frames of a window were taken."""
+        return {
+            "n_run": self.source.shape[0],
+            "bit_depth": self.context.config.input.bit_depth or self.context.sensor.bit_depth,
+            "integration_time": self.context.integration_time or 1.0,
+            "window": SensorWindow(
+                window.rows,
+                window.columns,
+                (self.source.shape[1], self.source.shape[2]),
+                tuple(place.region for place in self.seen.places.values()),
+            ),
+        }
 
 
 def _surveyed(
@@ -117,8 +189,10 @@ def _surveyed(
     before: Sequence[Effect],
     roi: tuple[int, ...] | None,
     tell: Callable[[str], None],
-) -> tuple[DiscrepancySettings, Survey]:
-    """Look at the whole sensor, once; return that, and the settings with as much as is compared closely.
+) -> tuple[DiscrepancySettings, Survey, DiscrepancySettings]:
+    """Look at the whole sensor, once; return that between two settings.
+
+    The first have as much as is compared closely, the second as much as may be.
 
     Its marker keeps both: a search that was stopped goes on in the same window, whatever it may take then.
 
@@ -140,17 +214,22 @@ def _surveyed(
             settings = less
         tell("looking at every pixel and every frame")
         seen = _survey(context, source, settings)
-        few = fewer_samples(source, settings, roi, seen.places) if not before else settings
+        most, few = settings, fewer_samples(source, settings, roi, seen.places) if not before else settings
         if few != settings:
             context.note(
                 f"the disagreement is clear in {few.max_samples:,} samples; raise discrepancy.clear_samples "
                 "to compare more: smaller errors, and weaker effects beside it"
             )
             settings, seen = few, _survey(context, source, few)
-        taken = {name: getattr(settings, name) for name in _TAKEN}
-        known = {"window": taken, **seen.numbers()}
+        known = {"window": _taken_of(settings), "whole": _taken_of(most), **seen.numbers()}
         context.run_units([WHOLE], lambda _: known, by_tiles=False, total=1)
-    return settings.model_copy(update=known["window"]), Survey.of_numbers(known)
+    whole = known.get("whole", known["window"])
+    few, most = (settings.model_copy(update=each) for each in (known["window"], whole))
+    return few, Survey.of_numbers(known), most
+
+
+def _taken_of(settings: DiscrepancySettings) -> dict[str, int]:
+    return {name: getattr(settings, name) for name in _TAKEN}
 
 
 def _survey(context: StageContext, source: FrameSource, settings: DiscrepancySettings) -> Survey:
@@ -219,10 +298,12 @@ class _Mapper:
     """Runs replicates as units of the stage; those done before an interruption are not done again."""
 
     context: StageContext
+    prefix: str = ""  # of the keys of its replicates
     total: int = 1  # with what was done before
 
     def __call__(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:
         """Return the statistics of each replicate, or what it raised."""
+        replicates = [replace(each, key=self.prefix + each.key) for each in replicates]
         units = {r.key: _Unit(r) for r in replicates}
         self.total += len(units)
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from pchem_pipeline.frames.stream import FrameSource, FrameStream
 
 # frames tell more than pixels about what happens in time; pixels more about what is rare
 _FRAMES_WANTED = 6000
+_SHARED = 0.5  # of two windows, the most that may be the same for the one to say something of the other
 #: Windows tried along each edge of the sensor.
 _TRIED = 64
 #: Bytes of a search: with its program and kernels, however small the window; of a sample; of a pixel, and of
@@ -82,6 +84,31 @@ def choose_window(
         starts = np.linspace(0, n_frames - length, frames // length).astype(np.int64)
         numbers = (starts[:, None] + np.arange(length)).ravel()
     return Window(numbers, (y0, y1), (x0, x1))
+
+
+def other_window(window: Window, shape: tuple[int, int, int], roi: Sequence[int] | None) -> Window | None:
+    """Return a window of the same size as far from one as there is; None where most of both is the same.
+
+    Args:
+        window: rows, columns and frames.
+        shape: frames, rows, columns of the stack.
+        roi: rows and columns that the user asked for: y0, y1, x0, x1.
+    """
+    y0, y1, x0, x1 = roi or (0, shape[1], 0, shape[2])
+    height, width = (end - first for first, end in (window.rows, window.columns))
+
+    def away(corner: tuple[int, int]) -> tuple[int, int]:
+        y, x = corner[0] - window.rows[0], corner[1] - window.columns[0]
+        return -max(height - abs(y), 0) * max(width - abs(x), 0), y**2 + x**2
+
+    rows, columns = (
+        {first, (first + end - size) // 2, end - size}
+        for first, end, size in ((y0, y1, height), (x0, x1, width))
+    )
+    y, x = max(itertools.product(sorted(rows), sorted(columns)), key=away)
+    if -away((y, x))[0] > _SHARED * height * width:
+        return None
+    return Window(window.numbers, (y, y + height), (x, x + width))
 
 
 def search_bytes(window: Window, codes: float) -> int:

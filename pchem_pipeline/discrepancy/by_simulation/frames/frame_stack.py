@@ -12,7 +12,7 @@ from pchem_pipeline.discrepancy.by_simulation.frames.suspects import with_ends
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Acquisition
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics
-from pchem_pipeline.discrepancy.splits import Splits, split_frames
+from pchem_pipeline.discrepancy.splits import Splits, block_length, split_frames
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
@@ -44,6 +44,29 @@ class FrameStack:
     integration_time: float
     parts: tuple[Part, ...] = ()
     window: SensorWindow | None = None
+
+    @classmethod
+    def of(
+        cls,
+        stack: NDArray[np.unsignedinteger],
+        numbers: IntArray,
+        block_frames: int | None,
+        *,
+        n_run: int | None,
+        bit_depth: int | None,
+        integration_time: float,
+        window: SensorWindow | None,
+    ) -> FrameStack:
+        """Split frames; what is None is told by them.
+
+        Raises:
+            InputError: they are too few.
+        """
+        splits = split_frames(numbers, block_length(stack.shape[0], block_frames))
+        if bit_depth is None:
+            bit_depth = min(int(stack.max()).bit_length() + 1, 24)
+        n_run = n_run or int(numbers[-1]) + 1
+        return cls(stack, numbers, splits, n_run, bit_depth, integration_time, window=window)
 
     @property
     def seen(self) -> IntArray:

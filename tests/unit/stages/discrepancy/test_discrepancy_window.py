@@ -5,16 +5,25 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.discrepancy_material import verdict_of
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.quick.places import SensorPlace
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.discrepancy.verdict import Elsewhere, Verdict
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.stages.discrepancy import discrepancy
 from pchem_pipeline.stages.discrepancy.clear import fewer_samples, is_clear
 from pchem_pipeline.stages.discrepancy.survey import Survey
-from pchem_pipeline.stages.discrepancy.window import choose_window, read_window, search_bytes, within_memory
+from pchem_pipeline.stages.discrepancy.window import (
+    Window,
+    choose_window,
+    other_window,
+    read_window,
+    search_bytes,
+    within_memory,
+)
 
 WHOLE = DiscrepancySettings(max_pixels=1 << 25)
 
@@ -197,3 +206,32 @@ def test_few_samples_are_compared_where_they_disagree_clearly(row_noise, fewest,
 def test_what_is_wrong_with_frames_is_no_clear_disagreement():
     stack = np.full((400, 16, 16), 7, np.uint16)
     assert not is_clear(stack, np.arange(400), n_run=400, block_frames=20)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "roi", "other"),
+    [
+        ((16, 48), (16, 48), None, ((0, 32), (0, 32))),
+        ((0, 32), (40, 64), None, ((32, 64), (0, 24))),
+        ((16, 48), (23, 55), None, ((0, 32), (0, 32))),
+        ((0, 64), (0, 64), None, None),
+        ((0, 64), (0, 50), None, None),
+        ((8, 24), (8, 24), (0, 24, 8, 40), ((0, 16), (24, 40))),
+    ],
+)
+def test_another_window_of_the_same_size_lies_as_far_away_as_there_is_room(rows, columns, roi, other):
+    window = Window(np.arange(100), rows, columns)
+    found = other_window(window, (100, 64, 64), roi)
+    assert (None if found is None else (found.rows, found.columns)) == other
+
+
+def test_a_name_that_does_not_hold_elsewhere_is_in_part():
+    verdict = verdict_of("named")
+    there = Elsewhere(rows=(0, 32), columns=(8, 40))
+    assert verdict.checked(there).model_copy(update={"examined": verdict.examined}) == verdict
+    found = verdict.checked(there.model_copy(update={"deviates": "row means scatter"}))
+    assert found.verdict == "named_in_part"
+    assert found.sentence.endswith(
+        "; it does not hold in rows 0 to 31, columns 8 to 39, where row means scatter."
+    )
+    assert Verdict.from_json(found.to_json()) == found

@@ -1,0 +1,55 @@
+"""Whether a model that explains one window of the sensor holds in another one.
+
+A search compares a window of a large sensor with simulations. What is larger than that window may look there
+like something else: of a slope along each row one end is like noise of the rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
+from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
+from pchem_pipeline.discrepancy.null import (
+    Measured,
+    NullModel,
+    as_matrix,
+    disagrees,
+    free_of_parameters,
+    without_strays,
+)
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.effects.framework.effect import Effect
+
+_REPLICATES = 12
+# beyond any doubt: a model that was fitted to other pixels is not quite right for these
+_SIGNIFICANCE = 1e-6
+_DETAILS = 0.1  # of what the effects do
+
+
+def deviation(by: Simulations, model: Sequence[Effect]) -> str:
+    """Say what of frames deviates beyond doubt from a model that was found in others; empty: nothing.
+
+    Args:
+        by: simulates the frames.
+        model: effects.
+    """
+    own = by.observed.statistics()
+    try:
+        _, vectors = by.drawn(tuple(model), _REPLICATES)
+    except NotFittedError:
+        return "hardly a pixel can be fitted with it"
+    names = tuple(name for name in own[0] if all(name in each for each in (*own[1:], *vectors)))
+    if by.observed.doubt():
+        names = tuple(np.array(names)[free_of_parameters(names, by.observed.plain.maps)].tolist())
+    if not names:
+        return ""
+    null = NullModel.from_replicates(names, without_strays(as_matrix(names, vectors)))
+    z, tolerance = Measured(*as_matrix(names, own)), _DETAILS * np.abs(null.mean)
+    if not disagrees(null, z, _SIGNIFICANCE, tolerance):
+        return ""
+    off = z.both - null.mean
+    worst = int(np.argmax(np.abs(off) / np.hypot(null.std, tolerance)))
+    return STATISTICS[names[worst]].says(float(off[worst]))
