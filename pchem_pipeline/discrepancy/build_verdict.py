@@ -457,7 +457,10 @@ def _nearest(found: Findings) -> str:
     doubtful = {e.candidates[0].effect: e.against for e in found.added.additions if not e.fits}
     doubtful = {tag: against for tag, against in doubtful.items() if tag not in named}
     nearest = [] if doubtful else [_title(tag) for tag in found.added.nearest if tag not in named]
-    words = "".join(f"; most like {_title(tag)}, which does not fit: {why}" for tag, why in doubtful.items())
+    words = ""
+    for why in dict.fromkeys(doubtful.values()):
+        alike = [_title(tag) for tag, against in doubtful.items() if against == why]
+        words += f"; most like {_and(alike)}, which {'does' if len(alike) == 1 else 'do'} not fit: {why}"
     return words + (f"; nearest known: {_and(nearest)}" if nearest else "")
 
 

@@ -109,9 +109,13 @@ def chart_picture(chart: Chart, width_mm: float) -> tuple[bytes, int, int]:
     parts: list[str] = []
     for start in range(0, len(stacks), len(shares)):
         left, tallest = 0.0, 0.0
-        for share, stack in zip(shares, stacks[start : start + len(shares)], strict=False):
-            width = whole * share / sum(shares)
-            drawn, height = _stack(stack, left, top, width)
+        row = [
+            (stack, whole * share / sum(shares))
+            for share, stack in zip(shares, stacks[start : start + len(shares)], strict=False)
+        ]
+        titles = [_title(stack, width) for stack, width in row]
+        for (stack, width), title in zip(row, titles, strict=True):
+            drawn, height = _stack(stack, title, max(map(len, titles)), left, top, width)
             parts += drawn
             left, tallest = left + width, max(tallest, height)
         top += tallest
@@ -130,16 +134,35 @@ def chart_picture(chart: Chart, width_mm: float) -> tuple[bytes, int, int]:
     return svg.encode(), round(whole), round(top)
 
 
-def _stack(stack: Stack, left: float, top: float, width: float) -> tuple[list[str], float]:
-    """Draw the panels of a stack with title and legend; return the elements and the height."""
+def _title(stack: Stack, width: float) -> list[tuple[str, bool]]:
+    """Return the lines of a title, broken where they are wider than the stack, and which are bold."""
+    most = max(12, int((width - 4.0) / _BOLD))
+    lines = [line for line in without_formulas(stack.title).split("\n") if line]
+    return [(part, i == 0) for i, line in enumerate(lines) for part in textwrap.wrap(line, most)]
+
+
+def _stack(
+    stack: Stack, lines: Sequence[tuple[str, bool]], above: int, left: float, top: float, width: float
+) -> tuple[list[str], float]:
+    """Draw the panels of a stack with title and legend; return the elements and the height.
+
+    Args:
+        stack: what is drawn.
+        lines: of its title.
+        above: lines of title in its row, at most.
+        left: of its place, px.
+        top: likewise.
+        width: likewise.
+    """
     panels = tuple(replace(panel, y=tick_rows(panel.y, width / _MM)) for panel in stack.panels)
     stack = replace(stack, panels=panels)
-    lines = [line for line in without_formulas(stack.title).split("\n") if line]
     start = left + _beside(stack)
     # a title too long to begin with the panel begins left of it
-    title = max(left + 2.0, min(start, left + width - _BOLD * max(map(len, lines), default=0)))
-    parts = [_text(title, top + 13.0 + i * 14.0, line, bold=i == 0) for i, line in enumerate(lines)]
-    at = top + 8.0 + 14.0 * len(lines)
+    title = max(
+        left + 2.0, min(start, left + width - _BOLD * max(map(len, (line for line, _ in lines)), default=0))
+    )
+    parts = [_text(title, top + 13.0 + i * 14.0, line, bold=bold) for i, (line, bold) in enumerate(lines)]
+    at = top + 8.0 + 14.0 * above
     across = left + width - _RIGHT - start - max(map(_bar_room, stack.panels), default=0.0)
     room = height_of(stack, width / _MM) * _MM - _BELOW - _BETWEEN * len(stack.panels)
     shares = sum(panel.height for panel in stack.panels)

@@ -5,6 +5,7 @@ import io
 import json
 import re
 from dataclasses import replace
+from itertools import pairwise
 from xml.etree import ElementTree
 
 import matplotlib as mpl
@@ -327,6 +328,25 @@ def test_a_title_too_long_for_its_panel_begins_left_of_it_and_is_not_cut() -> No
     third = PAGE_MM * 4.5 / 3
     assert 0 < long_one - third < short_one  # in its own column, left of its panel
     assert long_one + 7.0 * len(stacks[1].title) < 2 * third
+
+
+def test_a_title_wider_than_its_place_is_broken_and_the_panels_beside_it_stay_level() -> None:
+    """The titles of three maps of a verdict ran into each other."""
+    names = ("readout: alike", "readout follows the neighbour's charge, along x", "charge: alike")
+    stacks = [replace(map_chart(np.ones((4, 4))).stacks[0], title=name) for name in names]
+    root = ElementTree.fromstring(chart_picture(Chart(tuple(stacks), (1.0, 1.0, 1.0)), PAGE_MM)[0])
+    titles = [e for e in root.iter() if e.get("font-weight") == "600"]
+    ends = sorted((float(e.get("x", 0)), float(e.get("x", 0)) + 7.6 * len(e.text or "")) for e in titles)
+    assert [e.text for e in titles] == [
+        names[0],
+        "readout follows the neighbour's",
+        "charge, along x",
+        names[2],
+    ]
+    of_others = [one[1] <= other[0] or one[0] == other[0] for one, other in pairwise(ends)]
+    assert all(of_others)
+    maps = [e for e in root.iter() if e.tag.endswith("image") and float(e.get("height", 0)) > 20.0]
+    assert len({e.get("y") for e in maps}) == 1
 
 
 def test_axes_end_where_they_are_told_or_beyond_the_marks() -> None:
