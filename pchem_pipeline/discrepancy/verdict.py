@@ -302,6 +302,11 @@ class Elsewhere(_Part):
             f"rows {self.rows[0]} to {self.rows[1] - 1}, columns {self.columns[0]} to {self.columns[1] - 1}"
         )
 
+    def says(self) -> str:
+        """Return where the model was looked at again, and what came of it."""
+        found = f"it does not hold: {self.deviates}" if self.deviates else "it holds"
+        return f"looked at again in {self.words()}: {found}"
+
 
 class Examined(_Part):
     """What was looked at.

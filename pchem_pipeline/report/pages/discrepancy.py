@@ -215,7 +215,8 @@ def frames_text(found: Verdict) -> str:
     rest = seen.frames - seen.train - seen.test - seen.final
     over = f"; a rest of {count(rest, 'frame')}, too few to be dealt as well, is left out" if rest > 0 else ""
     words = f"{count(seen.frames, 'frame')} of {place}{share}: {dealt} that is left{over}."
-    return words + _unfitted_text(found)
+    again = "" if seen.elsewhere is None else f" The model that was found was {seen.elsewhere.says()}."
+    return words + again + _unfitted_text(found)
 
 
 def _unfitted_text(found: Verdict) -> str:

@@ -33,6 +33,8 @@ def verdict_text(found: Verdict) -> str:
     for number, step in enumerate(found.steps, 1):
         lines += _step(step, number if len(found.steps) > 1 else 0, found)
     lines += _gap(found)
+    if found.examined.elsewhere is not None:
+        lines += _wrapped(found.examined.elsewhere.says())
     if found.doubt and found.steps:
         lines += _wrapped(f"not tested, and no size in e-: {found.doubt}")
     if found.unexplained:

@@ -44,6 +44,7 @@ from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.palette import LIGHT
 from pchem_pipeline.report.style.style import Look
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays, path_arrays
+from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 
 DISCREPANCY_NAMES = [name for _, name in DISCREPANCY_FIGURES]
 QUICK = ReportSettings(figure_formats=(), dpi=72)
@@ -204,6 +205,15 @@ def test_frames_that_no_part_has_are_told() -> None:
     assert frames_text(discrepancy_data("named", examined=seen).found).endswith(words)
     whole = {**seen, "frames": 960}
     assert "rest" not in frames_text(discrepancy_data("named", examined=whole).found)
+
+
+def test_where_the_model_was_looked_at_again_is_told() -> None:
+    seen = {"frames": 960, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320,
+            "elsewhere": {"rows": [8, 16], "columns": [0, 8]}}  # fmt: skip
+    found = discrepancy_data("named", examined=seen).found
+    words = "looked at again in rows 8 to 15, columns 0 to 7: it holds"
+    assert frames_text(found).endswith(f" The model that was found was {words}.")
+    assert words in verdict_text(found)
 
 
 def test_pixels_that_are_not_compared_are_told_with_their_place() -> None:
