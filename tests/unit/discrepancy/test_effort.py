@@ -12,6 +12,8 @@ from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
+from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
+from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
 from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.region import Region
@@ -141,6 +143,15 @@ def test_a_law_that_fits_hardly_a_pixel_is_given_up_after_some():
     assert 1.0 < little.evaluations < 15.0
     with pytest.raises(NotFittedError):
         refit_maps(frames, seen.maps, [InterpixelCapacitance(coupling=0.1)], seen.covariance)
+
+
+def test_a_law_of_too_many_peaks_is_not_begun_with():
+    """A stack with noise of three kinds, strong in all, took minutes over a set that left nearly all."""
+    frames = PlainCamera(0.3, 4.0, 12.0, (16, 16), 600).frames(1)
+    seen = observe(frames, np.arange(600), n_run=600, block_frames=50)
+    wave = PeriodicPickup(amplitude_dn=1.0, cycles_per_row=0.36)
+    with pytest.raises(NotFittedError, match="would be 80"):
+        refit_maps(frames, seen.maps, [NoiseSkew(share=0.83), wave], seen.covariance)
 
 
 def test_a_fit_whose_law_teaches_no_sensor_costs_less():

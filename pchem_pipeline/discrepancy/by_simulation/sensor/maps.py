@@ -45,6 +45,8 @@ _SEARCHED = FitSettings(max_iterations=60, tolerance=1e-5)
 _PROBED, _LEAST_FITTED = 24, 0.25
 # share of them that another start must fit clearly better for all pixels to be fitted from it
 _OFTEN_BETTER = 0.05
+#: Of each electron number in a law: with as many a thousand pixels take minutes from one start.
+_MOST_COMPONENTS = 64
 # nats by which a bias an electron off must be likelier under a law that the plain fit did not know
 CLEARLY = 4.0
 # where all samples count, whatever the law expects
@@ -103,7 +105,7 @@ def refit_maps(
         New maps; the old ones where the effects cannot be fitted with.
 
     Raises:
-        NotFittedError: hardly a pixel can be fitted.
+        NotFittedError: hardly a pixel can be fitted, or each would take seconds.
     """
     shape = maps.usable.shape
     flat = maps.flat.maps
@@ -113,6 +115,8 @@ def refit_maps(
         law = sample_law(effects, pixel_maps(flat, maps.usable), added, places)
     except ConfigError:
         return Refit(maps, {}, covariance)
+    if law.components > _MOST_COMPONENTS:
+        raise NotFittedError(f"each of its peaks would be {law.components}")
     histograms = histogram_frames(frames)
     counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
     near = np.stack(flat, axis=1)
