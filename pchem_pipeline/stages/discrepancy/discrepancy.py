@@ -153,9 +153,12 @@ class _Search:
     def elsewhere(
         self, settings: DiscrepancySettings, prefix: str, window: Window, found: Discrepancy
     ) -> Elsewhere | None:
-        """Look whether effects with a name hold in another window; None: there are none, or no window."""
+        """Look whether effects that explain all hold in another window; None: there are none, or no window.
+
+        Those that are named in part leave something already.
+        """
         other = other_window(window, self.source.shape, self.roi)
-        if other is None or not found.verdict.effects:
+        if other is None or found.verdict.verdict != "named":
             return None
         self.tell("looking whether that holds elsewhere")
         frames = FrameStack.of(
