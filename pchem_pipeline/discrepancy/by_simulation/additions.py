@@ -34,6 +34,7 @@ _LEFT = 4.0  # deviations that are left of a statistic
 _MOVED = 2.0  # standard deviations by which an effect moves it
 _OF_SIGNATURE = 0.1  # of what an effect does to all statistics, in a family where its signature stands
 _MOST_RIVALS = 3
+_AS_GOOD = 0.5  # of what an effect closes, from which on an unrelated one does about as well
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,8 @@ class AddedRounds:
                 of_round.append(self._addition(this, int(member), (gap, now), against, later))
                 gap = now
             additions += without_company(of_round)
+        if still and len(additions) == 1:
+            additions = [without_better_reason(additions[0])]
         return Added(tuple(additions), after, unfinished)
 
     def _gap(self, null: NullModel) -> Gap:
@@ -243,6 +246,20 @@ class _Other:
     rest: FloatArray
     closes: bool
     error: float | None = None
+
+
+def without_better_reason(addition: Addition) -> Addition:
+    """Take the name from the only effect found if an unrelated one closes as much, or not much less.
+
+    Asked where the data disagree with the model all the same: both merely mimic what it is.
+    """
+    closed, placebo = addition.before.value - addition.after.value, addition.placebo
+    if addition.described or not addition.fits or placebo is None or closed <= 0.0:
+        return addition
+    share = (addition.before.value - max(placebo.gap_after, 0.0)) / closed
+    if share <= _AS_GOOD:
+        return addition
+    return replace(addition, against="what has nothing to do with it closes the gap nearly as far")
 
 
 def without_company(additions: Sequence[Addition]) -> list[Addition]:

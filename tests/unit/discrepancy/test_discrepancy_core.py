@@ -11,7 +11,7 @@ from scipy import stats
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings, _sentence, _sized, _still
-from pchem_pipeline.discrepancy.by_simulation.additions import without_company
+from pchem_pipeline.discrepancy.by_simulation.additions import without_better_reason, without_company
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,
@@ -62,6 +62,20 @@ def test_beside_an_effect_that_moves_more_and_does_not_fit_there_is_no_name() ->
     assert without_company([good, good]) == [good, good]
     measured = replace(good, described=True)
     assert without_company([mimic, measured])[1].verdict == "described"
+
+
+@pytest.mark.parametrize(("left", "fits"), [(0.9, True), (0.6, True), (0.4, False), (-0.1, False)])
+def test_what_something_unrelated_closes_nearly_as_well_gets_no_name(left: float, fits: bool) -> None:
+    effect, before, after = _hypothesis("row_noise", np.zeros(1)).effect, _gap_of(1.0), _gap_of(0.0)
+    placebo = Rival(effect="adc_dnl", gap_after=left, behind=-9.0, why="-")
+    one = Addition(effect, True, "", (), 0.01, before, after, (), placebo, ())
+    assert without_better_reason(one).fits is fits
+    for other in (replace(one, placebo=None), replace(one, described=True)):
+        assert without_better_reason(other) == other
+
+
+def _gap_of(value: float) -> Gap:
+    return Gap(value, 0.1, (value, value), {})
 
 
 # -- splits -----------------------------------------------------------------------------------------
