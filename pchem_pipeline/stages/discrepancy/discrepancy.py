@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from pchem_pipeline.base.errors import InputError, PchEmError, StoreError, quoted
+from pchem_pipeline.base.errors import PchEmError, StoreError, error_words, quoted
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.by_likelihood.explainer import find_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.observed import SampleHistograms
@@ -164,12 +164,15 @@ class _Search:
         frames = FrameStack.of(
             read_window(self.source, other), other.numbers, settings.block_frames, **self._taken(other)
         )
+        there = Elsewhere(rows=other.rows, columns=other.columns)
+        # a verdict that is known is not lost for pixels that cannot be used, or an effect that fails there
         try:
             observed = ObservedFrames.of(frames)
-        except InputError:
-            return None  # hardly a pixel can be used there
-        by = Simulations(observed, _Mapper(self.context, prefix), settings.seed, Effort(None))
-        return Elsewhere(rows=other.rows, columns=other.columns, deviates=deviation(by, found.model))
+            by = Simulations(observed, _Mapper(self.context, prefix), settings.seed, Effort(None))
+            return there.model_copy(update={"deviates": deviation(by, found.model)})
+        except Exception as error:
+            self.context.note(f"not looked at again in {there.words()}: {error_words(error)}")
+            return None
 
     def _taken(self, window: Window) -> dict[str, Any]:
         """Return how the frames of a window were taken."""

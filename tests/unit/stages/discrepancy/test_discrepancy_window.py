@@ -225,6 +225,28 @@ def test_another_window_of_the_same_size_lies_as_far_away_as_there_is_room(rows,
     assert (None if found is None else (found.rows, found.columns)) == other
 
 
+def test_a_verdict_is_not_lost_where_no_pixel_of_the_other_window_can_be_used():
+    """Reference columns, say."""
+    notes: list[str] = []
+    values = np.full((400, 24, 24), 7, np.uint16)
+    values[:, 12:, 12:] += np.arange(400, dtype=np.uint16)[:, None, None] % 5
+    context = SimpleNamespace(
+        config=SimpleNamespace(input=SimpleNamespace(bit_depth=12)),
+        sensor=SimpleNamespace(bit_depth=12),
+        integration_time=1.0,
+        note=notes.append,
+    )
+    seen = Survey({}, {})
+    search = discrepancy._Search(context, Stack(values), (), None, seen, lambda _: None)
+    window = Window(np.arange(400), (12, 24), (12, 24))
+    found = SimpleNamespace(verdict=verdict_of("named"), model=())
+    assert search.elsewhere(DiscrepancySettings(), "x-", window, found) is None
+    assert notes[0].startswith("not looked at again in rows 0 to 11, columns 0 to 11: ")
+    in_part = SimpleNamespace(verdict=verdict_of("named_in_part"), model=())
+    assert search.elsewhere(DiscrepancySettings(), "x-", window, in_part) is None
+    assert len(notes) == 1
+
+
 def test_a_name_that_does_not_hold_elsewhere_is_in_part():
     verdict = verdict_of("named")
     there = Elsewhere(rows=(0, 32), columns=(8, 40))
