@@ -17,7 +17,6 @@ from pchem_pipeline.discrepancy.null import (
     NullModel,
     as_matrix,
     disagrees,
-    free_of_parameters,
     without_strays,
 )
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -41,9 +40,7 @@ def deviation(by: Simulations, model: Sequence[Effect]) -> str:
         _, vectors = by.drawn(tuple(model), _REPLICATES)
     except NotFittedError:
         return "hardly a pixel can be fitted with it"
-    names = tuple(name for name in own[0] if all(name in each for each in (*own[1:], *vectors)))
-    if by.observed.doubt():
-        names = tuple(np.array(names)[free_of_parameters(names, by.observed.plain.maps)].tolist())
+    names = by.observed.names([*own, *vectors])
     if not names:
         return ""
     null = NullModel.from_replicates(names, without_strays(as_matrix(names, vectors)))

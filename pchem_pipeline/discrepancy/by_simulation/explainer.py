@@ -43,7 +43,6 @@ from pchem_pipeline.discrepancy.null import (
     Measured,
     NullModel,
     as_matrix,
-    free_of_parameters,
     suspicious,
     without_strays,
 )
@@ -171,10 +170,7 @@ class FrameExplainer:
         work = Simulations(observed, mapper, settings.seed, effort)
         vectors = work.replicates(model, work.mapped(model).sensor, "r0", settings.replicates)
         own = observed.statistics()
-        names = tuple(name for name in own[0] if all(name in each for each in (*own[1:], *vectors)))
-        if observed.doubt():
-            # where the pixels are not identified only what does not rest on their parameters counts
-            names = tuple(np.array(names)[free_of_parameters(names, observed.plain.maps)].tolist())
+        names = observed.names([*own, *vectors])
         first = NullModel.from_replicates(names, as_matrix(names, vectors))
         effort.begin()
         z, defects = Measured(*as_matrix(names, own)), dict[str, str]()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.suspects import suspected_parts
+from pchem_pipeline.discrepancy.null import free_of_parameters
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.verdict import Examined, Surveyed
 from pchem_pipeline.discrepancy.where import unfitted_place
@@ -56,6 +58,16 @@ class ObservedFrames:
         splits = self.frames.splits
         parts = splits.train, splits.test, splits.final
         return [self.frames.statistics(part, e) for part, e in zip(parts, self.parts, strict=True)]
+
+    def names(self, vectors: Sequence[Mapping[str, float]]) -> tuple[str, ...]:
+        """Return the statistics that all vectors have, in their order, as far as they can be relied upon.
+
+        Where the pixels are not identified only what does not rest on their parameters counts.
+        """
+        names = tuple(name for name in vectors[0] if all(name in each for each in vectors[1:]))
+        if self.doubt():
+            names = tuple(np.array(names)[free_of_parameters(names, self.plain.maps)].tolist())
+        return names
 
     @property
     def final_samples(self) -> int:
