@@ -84,8 +84,8 @@ class Effort:
         self.most = max(self.most, self.spent + self.for_fits)
 
     def release(self) -> None:
-        """Let what was kept be spent."""
-        self.most, self.kept = self.most + self.kept, 0.0
+        """Let what was kept be spent, all of it: what had no limit may have gone beyond."""
+        self.most, self.kept = max(self.most, self.spent) + self.kept, 0.0
 
     def simulate(self, samples: int, pixels: int, fits: int) -> None:
         """Count a simulated stack, whose pixels are fitted so many times."""

@@ -300,6 +300,7 @@ class FrameExplainer:
                 lambda best: self._left_by(best, refitter),
                 Witness(self._likelihood),
                 lambda: self._unexplained().explains_all(),
+                lambda: self._unexplained().clearest(),
             )
         except EffortSpentError as spent:
             tags = dict.fromkeys(h.tag for h in explanation.hypotheses)

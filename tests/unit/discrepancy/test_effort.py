@@ -41,6 +41,12 @@ def test_work_is_counted_and_refused_once_the_limit_is_reached():
         effort.check("c")
     effort.release()
     effort.check("d")
+    # also where what has no limit went beyond
+    effort.begin()
+    effort.spent, kept = effort.most + null, effort.kept
+    effort.release()
+    assert kept > 0.0
+    assert effort.most - effort.spent == pytest.approx(kept)
 
 
 def test_a_small_search_has_its_least_and_one_without_a_limit_none():

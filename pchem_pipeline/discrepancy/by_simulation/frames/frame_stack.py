@@ -69,6 +69,17 @@ class FrameStack:
         return cls(stack, numbers, splits, n_run, bit_depth, integration_time, window=window)
 
     @property
+    def whole_lines(self) -> set[str]:
+        """Kinds of lines of the sensor, "row" and "column", that are here from end to end."""
+        window = self.window or SensorWindow.whole(self.stack.shape)
+        ny, nx = window.shape
+        return {
+            of
+            for of, whole in (("row", window.columns == (0, nx)), ("column", window.rows == (0, ny)))
+            if whole
+        }
+
+    @property
     def seen(self) -> IntArray:
         """Positions of the train and test frames."""
         return np.sort(np.concatenate([self.splits.train, self.splits.test]))

@@ -37,6 +37,7 @@ _OVER_LEAST = 1.15
 _FEWEST_POINTS, _MOST_POINTS = 3, 6  # of a shape along a line
 _CLEAR_SHAPE = 8.0  # standard errors of a shape, the best of many
 _BETTER = 1.1  # by which it must be clearer than the same value everywhere, in squares
+_SHAPE_ERROR = 0.05  # relative, of what a shape makes of near samples: each column has its own response
 _MOST = 0.9  # of the variance of the readout, that the noise may have
 
 
@@ -211,7 +212,8 @@ def measured_noise(
         if (found := _profile(of, data, model, np.where(inside, response, np.nan))) is not None
     }
     for of, found in profiles.items():
-        found.take_off(of, left, mean_response)
+        for key, taken in found.take_off(of, left, mean_response).items():
+            error[key] = np.hypot(error[key], _SHAPE_ERROR * taken)
     clear = [key for key in left if abs(left[key]) > _CLEAR * error[key]]
     modes: list[NoiseMode] = []
     powers: list[float] = []
@@ -253,9 +255,16 @@ class _Profile(NamedTuple):
     power: float
     clear: float
 
-    def take_off(self, of: Shared, left: dict[tuple[Shared, Lag], float], response: float) -> None:
-        """Take it off from what lines share alike, which stands for it badly, and from near samples."""
+    def take_off(
+        self, of: Shared, left: dict[tuple[Shared, Lag], float], response: float
+    ) -> dict[tuple[Shared, Lag], float]:
+        """Take it off from what lines share alike, which stands for it badly, and from near samples.
+
+        Returns:
+            What was taken off from near samples.
+        """
         alike = left[of, (0, 0, 0)]
+        taken: dict[tuple[Shared, Lag], float] = {}
         for key in list(left):
             if key[0] == of:
                 left[key] = 0.0
@@ -263,7 +272,9 @@ class _Profile(NamedTuple):
             near: Lag = (0, 0, far) if of == "row" else (0, far, 0)
             if ("sample", near) in left:
                 made = self.power * response**2 * float(np.mean(self.shape[:-far] * self.shape[far:]))
-                left["sample", near] += alike - made
+                taken["sample", near] = made - alike
+                left["sample", near] -= made - alike
+        return taken
 
 
 def _profile(of: Shared, data: Covariances, model: Covariances, response: FloatArray) -> _Profile | None:

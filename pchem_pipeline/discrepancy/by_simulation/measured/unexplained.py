@@ -32,7 +32,7 @@ from pchem_pipeline.discrepancy.by_simulation.measured.response import (
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import simulate_frames
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import FEW, Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.sets.trials import leaves_little, leaves_nothing
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import CONVINCING
@@ -135,6 +135,16 @@ class Unexplained:
             return False
         found = self._alone(0)
         return found is not None and found.effects[0].unlisted and self.leaves_nothing(found)
+
+    def clearest(self) -> Refitted | None:
+        """Return the clearest of all by itself; None where that leaves more than little, or is not one thing.
+
+        One of several may be an effect that has a name.
+        """
+        if not self._of_all or self._of_all[0].measured.effect.measured_parts > 1:
+            return None
+        found = self._alone(0)
+        return found if found is not None and self._leaves_little(found) else None
 
     def _alone(self, number: int) -> Refitted | None:
         """Return one of what explains most without any effect, at its best fit; it is fitted once."""
@@ -245,7 +255,7 @@ class Unexplained:
         """Return effects with what was measured at their best fit; None where that was not gone for."""
         refitter = self.refitter
         refitter.allow(effect.tag)
-        _, vectors = refitter.draw((*(h.effect for h in kept), effect), self.replicates)
+        _, vectors = refitter.draw((*(h.effect for h in kept), effect), FEW)
         shift = vectors.mean(axis=0) - refitter.null.mean - sum(h.fingerprint for h in kept)
         found = refitter.refined((*kept, Hypothesis(effect, shift)), whole=whole)
         return None if found.short else refitter.sharpened(found, self.replicates)
@@ -268,9 +278,11 @@ class Unexplained:
         """Measure what samples of a part share beyond what effects make of them: gain or light, or noise."""
         own, model = data(part), self._made(known, beside)(part)
         inside = self.work.frames.inside(part)
-        return measured_mode(own.scores, model.scores, self.work.plain.maps, inside) or measured_noise(
-            own.covariances, model.covariances, self.work.plain, inside
+        found = (
+            measured_mode(own.scores, model.scores, self.work.plain.maps, inside),
+            measured_noise(own.covariances, model.covariances, self.work.plain, inside),
         )
+        return max(filter(None, found), key=lambda one: one.gain, default=None)
 
     def _electrons(
         self, data: SharedBy, known: dict[str, SharedBy], part: Part, _: Model, beside: Model
@@ -309,9 +321,9 @@ class Unexplained:
         def of(part: Part) -> _Shared:
             some, inside = part.frames(numbers), self.work.frames.inside(part)
             found = residual_covariances(frames[some], numbers[some], maps, inside)
-            if self.work.frames.window is not None:
-                # the shape of a line beyond the window is not known
-                found = found._replace(lines={})
+            # the shape of a line beyond the window is not known
+            lines = {of: line for of, line in found.lines.items() if of in self.work.frames.whole_lines}
+            found = Covariances(found.pairs, lines)
             electrons = electron_chances(frames[some], numbers[some], maps, self.work.plain, inside)
             responses = residual_responses(frames[some], numbers[some], maps, inside)
             return _Shared(found, common_scores(frames[some], maps, inside), electrons, responses)

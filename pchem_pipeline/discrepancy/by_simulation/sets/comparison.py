@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,7 @@ from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
 
 FloatArray = NDArray[np.float64]
+Answer = TypeVar("Answer")
 
 _MOST_SINGLES = 7
 _MOST_OF_ONE = 3  # hypotheses of the same effect
@@ -109,11 +111,12 @@ def compare(
     beside: Callable[[Refitted], Choice | None] = lambda _: None,
     witness: Witness = _SILENT,
     unlisted: Callable[[], bool] = lambda: False,
+    measured: Callable[[], Refitted | None] = lambda: None,
 ) -> Comparison | None:
     """Refit the sets worth it, and choose the simplest that leaves nothing, else the best; None: none holds.
 
     Where what no known effect makes leaves nothing by itself, only single effects and the likeliest set come
-    before it.
+    before it; and sets do not grow further where what is measured leaves little and less than they do.
 
     Args:
         refitter: fits sets.
@@ -124,6 +127,7 @@ def compare(
         beside: compares new hypotheses by what they do beside a refitted set.
         witness: brings a set near its best, and is asked about sets that the statistics tell badly apart.
         unlisted: tells whether what no known effect makes leaves nothing by itself.
+        measured: returns what is clearest of all that is measured, where that leaves little by itself.
 
     Raises:
         EffortSpentError: the work is at its limit.
@@ -147,6 +151,8 @@ def compare(
     if first > 1 and tried and not trials.complete and all(len(one) == 1 for one in trials.asked):
         trials.refit(_begun(_sets(choice, tried)[0], tried, held))
         trials.thin()
+    if not held and tried and not (trials.complete or trials.nearly):
+        trials.measured = _within(measured)
     # others in its place, dear ones last: they may be beaten by then
     for hypothesis in _dear_last(singles[first:]):
         if not trials.refit((hypothesis,)):
@@ -160,7 +166,7 @@ def compare(
         trials.refit(_begun(_sets(choice, tried)[0], tried, held))
         trials.thin()
     trials.tune()
-    if not held and not trials.complete and _within(unlisted):
+    if not held and not trials.complete and (_within(unlisted) or trials.beaten):
         return None
     if len(trials.best.hypotheses) > len(held) + 1 or not trials.complete:
         grown = [] if trials.complete else _grown(trials, beside)
@@ -184,12 +190,12 @@ def compare(
     return Comparison(chosen, tuple(tried), trials.failed, witnessed)
 
 
-def _within(asked: Callable[[], bool]) -> bool:
-    """Return an answer, False where the work is at its limit: sets that are known are not lost for it."""
+def _within(asked: Callable[[], Answer]) -> Answer | None:
+    """Return an answer, None where the work is at its limit: sets that are known are not lost for it."""
     try:
         return asked()
     except EffortSpentError:
-        return False
+        return None
 
 
 def _dear_last(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:

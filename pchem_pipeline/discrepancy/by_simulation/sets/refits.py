@@ -31,7 +31,8 @@ from pchem_pipeline.effects.framework.effect import Effect
 
 FloatArray = NDArray[np.float64]
 
-_FEW = 6  # replicates at each strength on the way
+#: Replicates at each strength on the way.
+FEW = 6
 _ENOUGH = 12  # replicates that tell a scatter
 _MOST_STEPS = 5
 _STEPS_OF_DEAR = 2
@@ -145,7 +146,7 @@ class Refitter:
         self,
         hypotheses: Sequence[Hypothesis],
         rival: float = -np.inf,
-        replicates: int = _FEW,
+        replicates: int = FEW,
         *,
         whole: bool = False,
     ) -> Refitted:

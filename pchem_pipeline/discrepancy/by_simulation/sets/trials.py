@@ -19,7 +19,7 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import FEW_PIXELS, Witness
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.effort import EffortSpentError
-from pchem_pipeline.discrepancy.null import look_elsewhere
+from pchem_pipeline.discrepancy.null import CONVINCING, look_elsewhere
 
 _MOST_DEAR = 4  # sets whose refit takes long
 #: Relative error of a fingerprint before its refit.
@@ -48,6 +48,7 @@ class Trials:
         failed: effects of which the refit failed, and why.
         settled: tags of the sets whose numbers were tuned.
         asked: sets as they were begun.
+        measured: what was measured without any of these effects, and leaves little.
     """
 
     refitter: Refitter
@@ -57,11 +58,23 @@ class Trials:
     failed: dict[str, str] = field(default_factory=dict)
     settled: set[frozenset[str]] = field(default_factory=set)
     asked: list[tuple[Hypothesis, ...]] = field(default_factory=list)
+    measured: Refitted | None = None
 
     @property
     def best(self) -> Refitted:
         """The best so far."""
         return max(self.tried, key=worth)
+
+    @property
+    def beaten(self) -> bool:
+        """Whether what was measured leaves less, and that leaves more than details."""
+        return self.measured is not None and self._bar is self.measured and not self.nearly
+
+    @property
+    def _bar(self) -> Refitted:
+        """What the next one must come near: the best, or what was measured where that is clearly better."""
+        one = self.measured
+        return self.best if one is None or one.score < self.best.score + CONVINCING else one
 
     @property
     def complete(self) -> bool:
@@ -82,7 +95,7 @@ class Trials:
         if not self._worth_it(members):
             return True
         self.asked.append(tuple(members))
-        best = max((one.score for one in self.tried), default=-np.inf)
+        best = max(max(one.score for one in self.tried), self._bar.score) if self.tried else -np.inf
         try:
             begun = self.witness.begun((*self.held, *members))
             self.tried.append(self.refitter.refined(begun, best, whole=len(members) == 1))
@@ -168,7 +181,7 @@ class Trials:
         if not (alone or self.complete):
             return True
         return not (
-            _beaten(self.refitter, (*self.held, *members), self.best)
+            _beaten(self.refitter, (*self.held, *members), self._bar)
             or (alone and self._less_likely(members))
         )
 

@@ -119,14 +119,12 @@ def test_the_shape_of_what_lines_share_is_measured(axis):
 
     found = measured(stack(7, tilted))
     assert found is not None
-    (mode,) = (mode for mode in found.modes if mode.profile)
+    (mode,) = found.modes  # near samples share it, and nothing else
     assert mode.of == ("row" if axis == 2 else "column")
     shape = mode.along(np.linspace(0.0, 1.0, slope.size))
     assert abs(np.corrcoef(shape, slope)[0, 1]) > 0.95
     power = np.mean(slope**2)
     assert found.share_of(mode) ** 2 == pytest.approx(power, rel=0.25)
-    # near samples share it, and nothing else
-    assert all(other.share < 0.2 for other in found.modes if other is not mode)
     noise = simulated(EmpiricalNoise(noise_dn=1.0, modes=(mode,)))
     size = noise.std(axis=0)
     wanted = abs(shape) if axis == 2 else abs(shape)[:, None]

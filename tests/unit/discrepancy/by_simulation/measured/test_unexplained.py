@@ -96,6 +96,46 @@ def test_by_itself_only_what_no_named_effect_makes_is_tried_and_kept_where_it_le
     assert tried == ["gain"]
 
 
+@pytest.mark.parametrize("little", [True, False])
+def test_the_clearest_stands_by_itself_where_it_leaves_little(
+    little: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing: Any = None
+    unexplained = Unexplained(*[nothing] * 4)
+    effects = Empirical.typical()[0], EmpiricalNoise.typical()[0]
+    unexplained.__dict__["_of_all"] = [_Likely(Part(), "any", Measurement(e, 9.0)) for e in effects]
+    monkeypatch.setattr(unexplained, "_tried", lambda _, one, **__: one.measured.effect)
+    monkeypatch.setattr(unexplained, "_leaves_little", lambda _: little)
+    assert unexplained.clearest() == (effects[0] if little else None)
+    both = NoiseMode(of="row", share=0.5), NoiseMode(of="frame", share=0.5)
+    several = EmpiricalNoise(noise_dn=1.0, modes=both)
+    unexplained.__dict__["_of_all"].insert(0, _Likely(Part(), "any", Measurement(several, 20.0)))
+    assert unexplained.clearest() is None  # one of them may have a name
+
+
+def test_noise_is_told_from_gain_by_which_is_clearer(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing: Any = None
+    frames: Any = SimpleNamespace(inside=lambda _: None)
+    plain: Any = SimpleNamespace(maps=None)
+    unexplained = Unexplained(SimpleNamespace(frames=frames, plain=plain), *[nothing] * 3)  # type: ignore[arg-type]
+    shared: Any = SimpleNamespace(scores=None, covariances=None)
+    monkeypatch.setattr(unexplained, "_made", lambda *_: lambda _: shared)
+    effect = EmpiricalNoise.typical()[0]
+    gains: dict[str, float | None] = {}
+    for name in ("mode", "noise"):
+
+        def measured(*_: Any, own: str = name) -> Measurement | None:
+            return None if gains[own] is None else Measurement(effect, gains[own] or 0.0)
+
+        monkeypatch.setattr(f"{Unexplained.__module__}.measured_{name}", measured)
+    for gains["mode"], gains["noise"], best in ((3.0, 9.0, 9.0), (9.0, 3.0, 9.0), (None, 3.0, 3.0)):
+        found = unexplained._noise_of_samples(lambda _: shared, {}, Part(), (), ())
+        assert found is not None
+        assert found.gain == best
+    gains.update(mode=None, noise=None)
+    assert unexplained._noise_of_samples(lambda _: shared, {}, Part(), (), ()) is None
+
+
 def test_of_what_leaves_little_by_itself_the_better_one_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     nothing: Any = None
     unexplained = Unexplained(*[nothing] * 4)

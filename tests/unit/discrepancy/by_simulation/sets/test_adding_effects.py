@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -38,7 +39,7 @@ from pchem_pipeline.discrepancy.by_simulation.sets.comparison import (
     own_signature,
 )
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Witness
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitter
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials, of_kinds
 from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
@@ -122,12 +123,13 @@ class World:
         beside: Sequence[Hypothesis] = (),
         witness: Witness | None = None,
         unlisted: Callable[[], bool] = lambda: False,
+        measured: Callable[[], Refitted | None] = lambda: None,
     ) -> Comparison | None:
         choice = self.choice(*hypotheses)
         assert choice is not None
         grown = (lambda one: self.choice(*beside, mean=one.mean)) if beside else (lambda _: None)
         return compare(
-            self.refitter(), held, hypotheses, choice, before, grown, witness or Witness(), unlisted
+            self.refitter(), held, hypotheses, choice, before, grown, witness or Witness(), unlisted, measured
         )
 
 
@@ -598,6 +600,51 @@ def test_where_what_no_effect_makes_leaves_nothing_no_set_is_grown() -> None:
 
     single = World([effect("row_noise", 0.3)]).compare(hypothesis("row_noise"), unlisted=never)
     assert single is not None
+
+
+def test_what_is_measured_and_leaves_less_than_the_likeliest_sets_ends_the_search() -> None:
+    """No set of these makes all of it, and none is grown; one that leaves nothing never asks."""
+    world = World([effect("row_noise", 0.3), effect("interpixel_capacitance", 0.2)])
+    whole = world.refitter().refined([hypothesis("row_noise"), hypothesis("interpixel_capacitance")])
+    asked: list[str] = []
+
+    def measured(one: Refitted | None) -> Refitted | None:
+        asked.append("measured")
+        return one
+
+    def beside(one: Any) -> Any:
+        asked.append("beside")
+
+    for one, wanted in ((whole, ["measured"]), (None, ["measured", "beside"])):
+        asked.clear()
+        frame = hypothesis("frame_noise", 0.05)
+        choice = world.choice(hypothesis("row_noise"), frame)
+        assert choice is not None
+        found = compare(
+            world.refitter(),
+            [],
+            [hypothesis("row_noise"), frame],
+            choice,
+            beside=beside,
+            measured=functools.partial(measured, one),
+        )
+        assert asked[: len(wanted)] == wanted
+        assert (found is None) is (one is not None)
+
+    def never() -> Refitted | None:
+        raise AssertionError("a single effect leaves nothing")
+
+    single = World([effect("row_noise", 0.3)]).compare(hypothesis("row_noise"), measured=never)
+    assert single is not None
+
+
+def test_a_set_that_leaves_less_than_what_is_measured_stays() -> None:
+    world = World([effect("row_noise", 0.3), effect("frame_noise", 0.3)])
+    poor = world.refitter().refined([hypothesis("row_noise")])
+    both = hypothesis("row_noise"), hypothesis("frame_noise")
+    found = world.compare(*both, measured=lambda: poor)
+    assert found is not None
+    assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
 def test_a_signature_is_asked_of_the_same_kind_of_the_others() -> None:
