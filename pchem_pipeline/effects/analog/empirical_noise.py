@@ -41,8 +41,14 @@ _POINTS = 8  # of the spectrum's grid along an axis, for each unit of the larges
 _REACH = 3  # of the moving average along an axis, for each of them
 _MOST_TAPS, _SMALLEST_TAP = 200, 0.01  # of the moving average; of the largest weight
 _NODES, _NARROWEST = 5, 0.05  # of the law of noise of changing size; relative, to be a law
+_NYQUIST = 0.5  # cycles
 _FEW = 4  # distances that are told in words
 _CHANGED = {"gain": "gain", "light": "light", "noise": "read noise"}
+
+
+def root_mean_square(wave: tuple[float, float]) -> float:
+    """Return that of a sine of amplitude 1, by its cycles per frame and line."""
+    return 1.0 if all(2.0 * cycles % 1.0 == 0.0 for cycles in wave) else 0.5**0.5
 
 
 class NoiseMode(Section):
@@ -86,6 +92,12 @@ class NoiseMode(Section):
         "pixel; none: alike",
     )
 
+    wave: tuple[float, float] | None = Field(
+        default=None,
+        description="of a frame, row or column: cycles per frame and per row (column) of a sine whose phase "
+        "runs on; null: it is noise",
+    )
+
     @model_validator(mode="after")
     def _of_its_axes(self) -> Self:
         if len(self.lags) != len(self.correlation):
@@ -101,6 +113,10 @@ class NoiseMode(Section):
             raise ValueError("shape: of a frame, rows of equally many blocks")
         if self.burst is not None and self.lags:
             raise ValueError("burst: each by itself; leave lags out")
+        if self.wave is not None and (
+            self.of == "sample" or self.lags or self.burst is not None or max(map(abs, self.wave)) > _NYQUIST
+        ):
+            raise ValueError("wave: of a frame, row or column, at most half a cycle; no lags, no burst")
         return self
 
     def words(self, rms: float) -> str:
@@ -123,15 +139,31 @@ class NoiseMode(Section):
             form = ".2g" if abs(share) < 100.0 else ".0f"
             form = form if self.burst is None else f"+{form}"
             what = f"{share:{form}} % of the {of}, {what} {at}of {self.signal_dn:.3g} DN"
+        if self.wave is not None:
+            per_line = "" if self.of == "frame" else f" and {self.wave[1]:.3g} per {self.of}"
+            shared = f"a wave of {self.wave[0]:.4g} cycles per frame{per_line}"
         burst = "" if self.burst is None else f"in {per_cent(self.burst)} of the {self.of}s only"
         return ", ".join(part for part in (what, whole, burst, shared) if part)
 
     def values(self, number: int, context: EffectContext) -> FloatArray:
         """Return its values, of mean square 1, in a shape that fits (frame, y, x)."""
+        if self.wave is not None:
+            return self._on_the_wave(self.wave, number, context)
         if self.burst is None:
             return _field(self, number, context)
         some = context.random.uniform(_DIMS[self.of], number) < self.burst
         return np.asarray(some * (-1.0 if self.negative else 1.0) / np.sqrt(self.burst))
+
+    def _on_the_wave(self, wave: tuple[float, float], number: int, context: EffectContext) -> FloatArray:
+        """Return a sine of any phase; at half a cycle (or none) both ways there is one phase only."""
+        rms = root_mean_square(wave)
+        turns = wave[0] * context.frames[:, None, None]
+        if self.of == "row":
+            turns = turns + wave[1] * context.rows[:, None]
+        elif self.of == "column":
+            turns = turns + wave[1] * np.arange(context.shape[1])
+        phase = context.random.uniform((), number) if rms < 1.0 else 0.0
+        return np.asarray(np.cos(2.0 * np.pi * (turns + phase)) / rms)
 
     def widths(self, rms: float) -> tuple[FloatArray, FloatArray]:
         """Return how often the read noise is so many times as large, where it changes by ``rms``."""

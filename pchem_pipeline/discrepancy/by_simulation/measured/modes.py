@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement, shares_of
-from pchem_pipeline.effects.analog.empirical_noise import Changed, EmpiricalNoise, Lag, NoiseMode, Shared
+from pchem_pipeline.effects.analog.empirical_noise import (
+    Changed,
+    EmpiricalNoise,
+    Lag,
+    NoiseMode,
+    Shared,
+    root_mean_square,
+)
+from pchem_pipeline.effects.estimators.lines import Line, coherent_line
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 FloatArray = NDArray[np.float64]
@@ -39,6 +47,9 @@ _CERTAIN = 4.0  # standard errors of a correlation
 _SIZES = (0.02, 0.03, 0.05, 0.08, 0.12, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.0)  # relative changes in bursts
 _BETWEEN = (0.7, 0.8, 0.9, 1.1, 1.2, 1.35)  # of the likeliest of them
 _MOST_IN_BURSTS = 0.3
+_WAVES: tuple[Changed, ...] = ("gain", "light")  # one of the offset is periodic pickup
+_SAME_PHASE = 0.25  # cycles from end to end, below which all lines of a frame share a wave
+_MOST_OF_POWER = 0.5  # of the power of a change, for it to be a wave
 
 
 class Sums(NamedTuple):
@@ -47,11 +58,13 @@ class Sums(NamedTuple):
     Attributes:
         sums: (frame, line).
         information: of each line, (line,).
+        numbers: of the frames in the run, increasing, (frame,).
         blocks: of frames, the same by blocks of the sensor, (frame, y', x') and (y', x'); None: of lines.
     """
 
     sums: FloatArray
     information: FloatArray
+    numbers: IntArray
     blocks: tuple[FloatArray, FloatArray] | None = None
 
     @property
@@ -67,12 +80,13 @@ class Sums(NamedTuple):
 
 
 def common_scores(
-    frames: NDArray[np.unsignedinteger], maps: PixelMaps, inside: BoolArray
+    frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps, inside: BoolArray
 ) -> dict[tuple[Shared, Changed], Sums]:
     """Sum the scores of the samples over frames, rows and columns, for each kind of change.
 
     Args:
         frames: (frame, y, x), DN.
+        numbers: of the frames in the run, increasing, shape (frame,).
         maps: parameters of the pixels.
         inside: pixels that are looked at, shape (y, x).
     """
@@ -97,9 +111,9 @@ def common_scores(
         power = np.maximum(square - mean**2, 0.0)
         frame, row, column, block = (np.concatenate(parts) for parts in zip(*gathered, strict=True))
         blocks = block - _in_blocks(mean[None]), _in_blocks(power[None])[0]
-        found["frame", changed] = Sums(frame - mean.sum(), power.sum(keepdims=True)[0], blocks)
-        found["row", changed] = Sums(row - mean.sum(axis=1), power.sum(axis=1))
-        found["column", changed] = Sums(column - mean.sum(axis=0), power.sum(axis=0))
+        found["frame", changed] = Sums(frame - mean.sum(), power.sum(keepdims=True)[0], numbers, blocks)
+        found["row", changed] = Sums(row - mean.sum(axis=1), power.sum(axis=1), numbers)
+        found["column", changed] = Sums(column - mean.sum(axis=0), power.sum(axis=0), numbers)
     return found
 
 
@@ -173,53 +187,84 @@ def measured_mode(
         maps: parameters of the pixels.
         inside: pixels that were looked at, shape (y, x).
     """
-    found: list[tuple[float, Shared, Changed]] = []
-    for (of, changed), sums in data.items():
-        one, _ = _shaped(sums)
-        ratio = max(one.ratio / max(model[of, changed].ratio, 1.0), 1.0)
-        found.append((0.5 * one.number * (ratio - 1.0 - np.log(ratio)), of, changed))
-    found.sort(key=lambda one: -one[0])
-    if not found or found[0][0] <= _CLEAR or found[0][2] == "offset":
+    found = [_Change.of(key, sums, model[key]) for key, sums in data.items()]
+    found.sort(key=lambda one: -one.gain)
+    if not found or found[0].gain <= _CLEAR or found[0].changed == "offset":
         return None
-    most, of, _ = found[0]
+    best = found[0]
     # a strong change has spoilt the fit of the pixels by which they are told apart
-    near = [
-        changed
-        for gain, where, changed in found
-        if where == of and changed != "offset" and gain > max(_CLEAR, _NEARLY * most)
-    ]
     first, *others = (
-        _of_change(data[of, changed], model[of, changed], (of, changed), maps, inside, most)
-        for changed in near
+        one.effect(maps, inside, best.gain)
+        for one in found
+        if one.shared == best.shared
+        and one.changed != "offset"
+        and one.gain > max(_CLEAR, _NEARLY * best.gain)
     )
-    return Measurement(first, float(most), tuple(others))
+    return Measurement(first, best.gain, tuple(others))
 
 
-def _of_change(
-    data: Sums,
-    model: Sums,
-    what: tuple[Shared, Changed],
-    maps: PixelMaps,
-    inside: BoolArray,
-    gain: float,
-) -> EmpiricalNoise:
-    """Return a common change of a kind at the size that it has beyond a model."""
-    one, blocks = _shaped(data)
-    power = (one.ratio - max(model.ratio, 1.0)) / float(np.mean(one.information[one.information > 0.0]))
-    inside = inside & maps.usable
-    of_noise = what[1] == "noise"
-    scale = maps.read_noise_dn if of_noise else maps.quanta_exposure / maps.conversion_gain
-    signal = float(np.median(scale[inside]))
-    burst, size = _bursts(_from_quiet(one) if of_noise else one, gain)
-    if of_noise and size > 0.0:
-        size = np.sqrt(1.0 + 2.0 * size) - 1.0  # the score of a variance goes with the square
-    lags, correlation = ((), ()) if burst else _correlation(one, power)
-    mode = NoiseMode(
-        of=what[0], share=1.0, changes=what[1], signal_dn=round(signal, 3), lags=lags,
-        correlation=correlation, burst=burst, negative=size < 0.0, shape=blocks,
-    )  # fmt: skip
-    rms = abs(size) * np.sqrt(burst) if burst else np.sqrt(power)
-    return EmpiricalNoise(noise_dn=float(rms * signal), modes=(mode,))
+class _Change(NamedTuple):
+    """A common change of a kind.
+
+    Attributes:
+        shared, changed: who shares it, and what it changes.
+        sums: of its scores, weighted by its shape.
+        shape: over the sensor, in blocks; none: even.
+        power: mean square of it, beyond a model's, no unit.
+        gain: by how much likelier the sums are with it, nats.
+        wave: cycles per frame and line, and rms; None: it is noise for the most part.
+    """
+
+    shared: Shared
+    changed: Changed
+    sums: Sums
+    shape: tuple[tuple[float, ...], ...]
+    power: float
+    gain: float
+    wave: tuple[tuple[float, float], float] | None
+
+    @classmethod
+    def of(cls, key: tuple[Shared, Changed], data: Sums, model: Sums) -> _Change:
+        """Measure it in sums beyond those of frames simulated with a model."""
+        sums, shape = _shaped(data)
+        expected = max(model.ratio, 1.0)
+        known = sums.information[sums.information > 0.0]
+        power = (sums.ratio - expected) / float(np.mean(known)) if known.size else 0.0
+        ratio = max(sums.ratio / expected, 1.0)
+        gain = 0.5 * sums.number * (ratio - 1.0 - float(np.log(ratio)))
+        line = _line(sums, power) if key[1] in _WAVES else None
+        if line is None:
+            return cls(*key, sums, shape, power, gain, None)
+        wave = round(line.per_frame, 7), round(line.along, 6)
+        gain = max(gain, line.excess)
+        return cls(*key, sums, shape, power, gain, (wave, line.amplitude * root_mean_square(wave)))
+
+    def effect(self, maps: PixelMaps, inside: BoolArray, gain: float) -> EmpiricalNoise:
+        """Return it as an effect at its size.
+
+        Args:
+            maps: parameters of the pixels.
+            inside: pixels that were looked at, shape (y, x).
+            gain: of the clearest, nats.
+        """
+        of_noise = self.changed == "noise"
+        scale = maps.read_noise_dn if of_noise else maps.quanta_exposure / maps.conversion_gain
+        signal = float(np.median(scale[inside & maps.usable]))
+        mode = NoiseMode(
+            of=self.shared, share=1.0, changes=self.changed, signal_dn=round(signal, 3), shape=self.shape
+        )
+        if self.wave is not None:
+            wave, rms = self.wave
+            return EmpiricalNoise(noise_dn=rms * signal, modes=(mode.model_copy(update={"wave": wave}),))
+        burst, size = _bursts(_from_quiet(self.sums) if of_noise else self.sums, gain)
+        if burst is None:
+            lags, correlation = _correlation(self.sums, self.power)
+            mode = mode.model_copy(update={"lags": lags, "correlation": correlation})
+            return EmpiricalNoise(noise_dn=float(np.sqrt(self.power) * signal), modes=(mode,))
+        if of_noise and size > 0.0:
+            size = np.sqrt(1.0 + 2.0 * size) - 1.0  # the score of a variance goes with the square
+        mode = mode.model_copy(update={"burst": burst, "negative": size < 0.0})
+        return EmpiricalNoise(noise_dn=float(abs(size) * np.sqrt(burst) * signal), modes=(mode,))
 
 
 def _shaped(one: Sums) -> tuple[Sums, tuple[tuple[float, ...], ...]]:
@@ -244,7 +289,17 @@ def _shaped(one: Sums) -> tuple[Sums, tuple[tuple[float, ...], ...]]:
     # as strong in the mean as a change that is the same everywhere, and mostly positive
     shape *= np.sign(shape.sum()) / np.sqrt(float(information @ shape**2) / information.sum())
     blocks = tuple(tuple(np.round(row, 3).tolist()) for row in shape.reshape(one.blocks[1].shape))
-    return Sums((sums @ shape)[:, None], np.array([information @ shape**2])), blocks
+    return Sums((sums @ shape)[:, None], np.array([information @ shape**2]), one.numbers), blocks
+
+
+def _line(one: Sums, power: float) -> Line | None:
+    """Return the wave that a change is for the most part; what whole frames share is told of those."""
+    known = one.information > 0.0
+    means = np.where(known, one.sums / np.where(known, one.information, 1.0), np.nan)
+    line = coherent_line(means, one.numbers, int(one.numbers[-1]) + 1)
+    if line is None or (known.size > 1 and abs(line.along) * known.size < _SAME_PHASE):
+        return None
+    return line if 0.5 * line.amplitude**2 > _MOST_OF_POWER * power else None
 
 
 def _correlation(one: Sums, power: float) -> tuple[tuple[Lag, ...], tuple[float, ...]]:
@@ -253,7 +308,11 @@ def _correlation(one: Sums, power: float) -> tuple[tuple[Lag, ...], tuple[float,
     lags: list[Lag] = []
     found: list[float] = []
     for step in range(1, _FARTHEST + 1):
-        products = (scaled[step:] * scaled[:-step])[:, one.information > 0.0]
+        later = np.searchsorted(one.numbers, one.numbers + step).clip(max=len(scaled) - 1)
+        first = np.flatnonzero(one.numbers[later] == one.numbers + step)
+        if not first.size:
+            continue
+        products = (scaled[first] * scaled[later[first]])[:, one.information > 0.0]
         value, error = float(products.mean()), float(products.std() / np.sqrt(products.size))
         if abs(value) > _CERTAIN * error:
             lags.append((step, 0, 0))

@@ -326,6 +326,8 @@ class Unexplained:
             found = Covariances(found.pairs, lines)
             electrons = electron_chances(frames[some], numbers[some], maps, self.work.plain, inside)
             responses = residual_responses(frames[some], numbers[some], maps, inside)
-            return _Shared(found, common_scores(frames[some], maps, inside), electrons, responses)
+            return _Shared(
+                found, common_scores(frames[some], numbers[some], maps, inside), electrons, responses
+            )
 
         return of

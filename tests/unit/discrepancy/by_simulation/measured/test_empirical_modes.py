@@ -41,10 +41,14 @@ def frames(
 
 def measured(stack: tuple[np.ndarray, PixelMaps], inside: np.ndarray = EVERYWHERE) -> EmpiricalNoise | None:
     """Return what is measured beside a model without common changes."""
-    data = common_scores(*stack, inside)
-    nothing = {key: Sums(np.ones((1, 1)), np.ones(1)) for key in data}
-    found = measured_mode(data, nothing, stack[1], inside)
+    data = common_scores(stack[0], np.arange(len(stack[0])), stack[1], inside)
+    found = measured_mode(data, nothing(data), stack[1], inside)
     return None if found is None else found.effect
+
+
+def nothing(data: dict[Any, Sums]) -> dict[Any, Sums]:
+    """Return the sums of a model that makes none of them."""
+    return dict.fromkeys(data, Sums(np.ones((1, 1)), np.ones(1), np.arange(1)))
 
 
 def drawn(*shape: int) -> np.ndarray:
@@ -107,20 +111,20 @@ def test_bursts_are_told_however_strong_they_are(size: float) -> None:
     some = rng.random((FRAMES, 1)) < 0.03
     data = {
         ("frame", "noise"): Sums(
-            rng.standard_normal((FRAMES, 1)) * 10.0 + 100.0 * size * some, np.full(1, 100.0)
+            rng.standard_normal((FRAMES, 1)) * 10.0 + 100.0 * size * some,
+            np.full(1, 100.0),
+            np.arange(FRAMES),
         )
     }
-    nothing = {key: Sums(np.ones((1, 1)), np.ones(1)) for key in data}
-    found = measured_mode(data, nothing, frames(1)[1], EVERYWHERE)
+    found = measured_mode(data, nothing(data), frames(1)[1], EVERYWHERE)
     assert found is not None
     assert found.effect.modes[0].burst == pytest.approx(some.mean(), rel=0.2)
 
 
 def test_a_strong_gaussian_change_is_no_burst() -> None:
     sums = np.random.default_rng(8).standard_normal((FRAMES, 1))
-    data = {("frame", "noise"): Sums(80.0 * sums, np.full(1, 100.0))}
-    nothing = {key: Sums(np.ones((1, 1)), np.ones(1)) for key in data}
-    found = measured_mode(data, nothing, frames(1)[1], EVERYWHERE)
+    data = {("frame", "noise"): Sums(80.0 * sums, np.full(1, 100.0), np.arange(FRAMES))}
+    found = measured_mode(data, nothing(data), frames(1)[1], EVERYWHERE)
     assert found is not None
     assert found.effect.modes[0].burst is None
 
@@ -148,6 +152,71 @@ def test_a_change_that_has_a_memory_is_told_with_it() -> None:
     assert found.modes[0].correlation[0] == pytest.approx(0.47, abs=0.13)
 
 
+def test_frames_that_are_left_out_are_no_neighbours() -> None:
+    """Every other pair of frames is left out: those before and behind it do not follow each other."""
+    white = drawn(FRAMES + 1)
+    power = white[1:] + 0.7 * white[:-1]
+    sums = 80.0 * power[:, None] + 10.0 * np.random.default_rng(3).standard_normal((FRAMES, 1))
+    seen = np.flatnonzero(np.arange(FRAMES) % 4 < 2)
+    for numbers, known in ((seen, True), (np.arange(seen.size), False)):  # and as if none were missing
+        data = {("frame", "gain"): Sums(sums[seen], np.full(1, 100.0), numbers)}
+        found = measured_mode(data, nothing(data), frames(1)[1], EVERYWHERE)
+        assert found is not None
+        [correlation] = found.effect.modes[0].correlation
+        # half of the pairs that are taken for neighbours without the numbers are none
+        assert bool(abs(correlation - 0.47) < 4 / np.sqrt(seen.size / 2)) is known
+
+
+@pytest.mark.parametrize(
+    ("of", "per_frame", "per_line", "changes"),
+    [("row", 0.163, 0.21, "gain"), ("column", -0.31, 0.12, "light"), ("frame", 0.07, 0.0, "gain")],
+)
+def test_a_wave_of_gain_or_light_is_told_by_its_frequencies(
+    of: Any, per_frame: float, per_line: float, changes: str
+) -> None:
+    frame, row, column = np.ogrid[:FRAMES, : SHAPE[0], : SHAPE[1]]
+    line = {"row": row, "column": column, "frame": 0}[of]
+    amplitude = 0.03
+    sine = amplitude * np.sin(2.0 * np.pi * (per_frame * frame + per_line * line) + 0.4)
+    stack = frames(11, gain=1.0 + sine) if changes == "gain" else frames(11, light=1.0 + sine)
+    found = measured(stack)
+    assert found is not None
+    assert found.unlisted
+    (mode,) = found.modes
+    assert (mode.of, mode.changes, mode.lags, mode.burst) == (of, changes, (), None)
+    assert mode.wave is not None
+    known = mode.wave if np.sign(mode.wave[0]) == np.sign(per_frame) else (-mode.wave[0], -mode.wave[1])
+    # of a sine of amplitude a in n values of which each holds the information i (Rife and Boorstyn 1974)
+    sums = common_scores(stack[0], np.arange(FRAMES), stack[1], EVERYWHERE)[of, changes]
+    error = np.sqrt(24.0 / (amplitude**2 * sums.information.sum() * FRAMES)) / (2.0 * np.pi)
+    assert abs(known[0] - per_frame) < 4.0 * error / FRAMES
+    assert abs(known[1] - per_line) < 4.0 * error / max(sums.information.size, 2)
+    # the scores see a little less where the peaks overlap
+    assert found.noise_dn / SIGNAL == pytest.approx(amplitude / np.sqrt(2.0), rel=0.15)
+    assert "a wave of" in found.words()
+
+
+@pytest.mark.parametrize("wave", [(0.163, 0.21), (0.5, 0.5)])
+def test_the_simulated_wave_has_its_frequencies_and_its_size(wave: tuple[float, float]) -> None:
+    """At half a cycle both ways the phase is 0: another one would be another size."""
+    mode = NoiseMode(of="row", share=1.0, changes="gain", signal_dn=4 * STEP, wave=wave)
+    means = simulated(mode, 0.05 * 4 * STEP).mean(axis=2) / (4 * STEP) - 1.0
+    frame, row = np.ogrid[:FRAMES, : SHAPE[0]]
+    part = abs(np.mean(means * np.exp(-2j * np.pi * (wave[0] * frame + wave[1] * row))))
+    rms = part if wave == (0.5, 0.5) else part * np.sqrt(2.0)
+    # a mean of a row has the scatter of 20 samples of 4 electrons
+    assert abs(rms - 0.05) < 5 * np.sqrt(1.05 / (4 * SHAPE[0] * SHAPE[1] * FRAMES))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"of": "sample"}, {"wave": (0.6, 0.0)}, {"burst": 0.1}, {"lags": ((1, 0, 0),), "correlation": (0.1,)}],
+)
+def test_a_wave_is_of_lines_below_half_a_cycle_and_nothing_else(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match="wave"):
+        NoiseMode(**{"of": "row", "share": 1.0, "changes": "gain", "wave": (0.1, 0.2), **wrong})
+
+
 def test_neither_nothing_nor_an_offset_is_taken_for_gain_or_light() -> None:
     assert [measured(frames(seed)) for seed in range(10, 14)] == [None] * 4
     assert measured(frames(5, offset=0.5 * drawn(FRAMES, 1, 1))) is None
@@ -155,7 +224,7 @@ def test_neither_nothing_nor_an_offset_is_taken_for_gain_or_light() -> None:
 
 def test_what_a_model_makes_is_taken_off() -> None:
     stack = frames(6, gain=1.0 + 0.03 * drawn(FRAMES, 1, 1))
-    data = common_scores(*stack, EVERYWHERE)
+    data = common_scores(stack[0], np.arange(FRAMES), stack[1], EVERYWHERE)
     assert measured_mode(data, data, stack[1], EVERYWHERE) is None
 
 
