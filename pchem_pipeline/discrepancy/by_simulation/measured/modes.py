@@ -9,6 +9,7 @@ test).
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -179,7 +180,7 @@ def measured_mode(
     maps: PixelMaps,
     inside: BoolArray,
 ) -> Measurement | None:
-    """Return the common change of gain, light or noise beyond a model's; None where an offset is clearer.
+    """Return the change of gain, light or noise beyond a model's; None where a steady offset is clearer.
 
     Args:
         data: sums of the frames.
@@ -189,18 +190,18 @@ def measured_mode(
     """
     found = [_Change.of(key, sums, model[key]) for key, sums in data.items()]
     found.sort(key=lambda one: -one.gain)
-    if not found or found[0].gain <= _CLEAR or found[0].changed == "offset":
+    if not found or found[0].gain <= _CLEAR:
         return None
     best = found[0]
     # a strong change has spoilt the fit of the pixels by which they are told apart
-    first, *others = (
+    effects = [
         one.effect(maps, inside, best.gain)
         for one in found
-        if one.shared == best.shared
-        and one.changed != "offset"
-        and one.gain > max(_CLEAR, _NEARLY * best.gain)
-    )
-    return Measurement(first, best.gain, tuple(others))
+        if one.shared == best.shared and one.gain > max(_CLEAR, _NEARLY * best.gain)
+    ]
+    # of an offset that all lines have the covariance tells more
+    told = [e for e in effects if e.modes[0].changes != "offset" or e.modes[0].burst is not None]
+    return Measurement(told[0], best.gain, tuple(told[1:])) if told and told[0] is effects[0] else None
 
 
 class _Change(NamedTuple):
@@ -247,24 +248,30 @@ class _Change(NamedTuple):
             inside: pixels that were looked at, shape (y, x).
             gain: of the clearest, nats.
         """
-        of_noise = self.changed == "noise"
-        scale = maps.read_noise_dn if of_noise else maps.quanta_exposure / maps.conversion_gain
-        signal = float(np.median(scale[inside & maps.usable]))
-        mode = NoiseMode(
-            of=self.shared, share=1.0, changes=self.changed, signal_dn=round(signal, 3), shape=self.shape
+        of_noise, signal = self.changed == "noise", 1.0  # of an offset the scores are by DN
+        if self.changed != "offset":
+            scale = maps.read_noise_dn if of_noise else maps.quanta_exposure / maps.conversion_gain
+            signal = float(np.median(scale[inside & maps.usable]))
+        mode = functools.partial(
+            NoiseMode,
+            of=self.shared,
+            share=1.0,
+            changes=self.changed,
+            signal_dn=round(signal, 3),
+            shape=self.shape,
         )
         if self.wave is not None:
             wave, rms = self.wave
-            return EmpiricalNoise(noise_dn=rms * signal, modes=(mode.model_copy(update={"wave": wave}),))
+            return EmpiricalNoise(noise_dn=rms * signal, modes=(mode(wave=wave),))
         burst, size = _bursts(_from_quiet(self.sums) if of_noise else self.sums, gain)
         if burst is None:
             lags, correlation = _correlation(self.sums, self.power)
-            mode = mode.model_copy(update={"lags": lags, "correlation": correlation})
-            return EmpiricalNoise(noise_dn=float(np.sqrt(self.power) * signal), modes=(mode,))
+            rms = float(np.sqrt(self.power))
+            return EmpiricalNoise(noise_dn=rms * signal, modes=(mode(lags=lags, correlation=correlation),))
         if of_noise and size > 0.0:
             size = np.sqrt(1.0 + 2.0 * size) - 1.0  # the score of a variance goes with the square
-        mode = mode.model_copy(update={"burst": burst, "negative": size < 0.0})
-        return EmpiricalNoise(noise_dn=float(abs(size) * np.sqrt(burst) * signal), modes=(mode,))
+        rms = abs(float(size)) * burst**0.5
+        return EmpiricalNoise(noise_dn=rms * signal, modes=(mode(burst=burst, negative=size < 0.0),))
 
 
 def _shaped(one: Sums) -> tuple[Sums, tuple[tuple[float, ...], ...]]:

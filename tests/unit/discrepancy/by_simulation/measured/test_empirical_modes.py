@@ -222,6 +222,18 @@ def test_neither_nothing_nor_an_offset_is_taken_for_gain_or_light() -> None:
     assert measured(frames(5, offset=0.5 * drawn(FRAMES, 1, 1))) is None
 
 
+def test_an_offset_in_bursts_is_told_with_how_often_and_how_large() -> None:
+    some = np.random.default_rng(4).random((FRAMES, 1, 1)) < 0.05
+    found = measured(frames(12, offset=1.5 * some))
+    assert found is not None
+    (mode,) = found.modes
+    assert (mode.of, mode.changes, mode.negative) == ("frame", "offset", False)
+    assert mode.burst == pytest.approx(some.mean(), rel=0.05)  # a frame of 320 samples tells it
+    # the scores see a little less where the peaks overlap
+    assert found.noise_dn == pytest.approx(1.5 * np.sqrt(some.mean()), rel=0.15)
+    assert "of the frames only" in found.words()
+
+
 def test_what_a_model_makes_is_taken_off() -> None:
     stack = frames(6, gain=1.0 + 0.03 * drawn(FRAMES, 1, 1))
     data = common_scores(stack[0], np.arange(FRAMES), stack[1], EVERYWHERE)
