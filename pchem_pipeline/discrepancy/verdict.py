@@ -516,6 +516,10 @@ class Verdict(_Part):
             return ""
         return f"nearest: {rivals[0]}" if step.verdict == "unexplained" else " or ".join(rivals)
 
+    def costing(self, work: float) -> Verdict:
+        """Return it with the CPU seconds, by count, of all that led to it."""
+        return self.model_copy(update={"work": round(work, 1)})
+
     def checked(self, elsewhere: Elsewhere) -> Verdict:
         """Return it with what another window of the sensor says of the model that was found."""
         changes: dict[str, Any] = {"examined": self.examined.model_copy(update={"elsewhere": elsewhere})}

@@ -110,13 +110,13 @@ def _run_frames(
         window, found = search.found(whole, "whole-")
         elsewhere = search.elsewhere(whole, "whole-elsewhere-", window, found)
     verdict = found.verdict.on_sensor(source.shape[1:], window.rows, window.columns, window.pixel)
-    verdict = seen.told(verdict, window.share(source.shape))
+    verdict = seen.told(verdict, window.share(source.shape)).costing(search.work)
     found = replace(found, verdict=verdict if elsewhere is None else verdict.checked(elsewhere))
     _write(context, found)
     write_added_exposure(context.store, _STAGE, found.added, found.model, window.rows, window.columns)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Search:
     """Compares windows of the frames with simulations.
 
@@ -127,6 +127,7 @@ class _Search:
         roi: rows and columns that the user asked for.
         seen: what was seen of the whole sensor.
         tell: hears what is done next.
+        work: CPU seconds of all of it, by count.
     """
 
     context: StageContext
@@ -135,6 +136,7 @@ class _Search:
     roi: tuple[int, ...] | None
     seen: Survey
     tell: Callable[[str], None]
+    work: float = 0.0
 
     def found(self, settings: DiscrepancySettings, prefix: str) -> tuple[Window, Discrepancy]:
         """Search for what the model is missing in the window of the settings; ``prefix`` begins its units."""
@@ -148,6 +150,7 @@ class _Search:
             mapper=_Mapper(self.context, prefix),
             tell=self.tell,
         )
+        self.work += found.verdict.work
         return window, found
 
     def elsewhere(
@@ -165,14 +168,17 @@ class _Search:
             read_window(self.source, other), other.numbers, settings.block_frames, **self._taken(other)
         )
         there = Elsewhere(rows=other.rows, columns=other.columns)
+        effort = Effort(None)
         # a verdict that is known is not lost for pixels that cannot be used, or an effect that fails there
         try:
             observed = ObservedFrames.of(frames)
-            by = Simulations(observed, _Mapper(self.context, prefix), settings.seed, Effort(None))
+            by = Simulations(observed, _Mapper(self.context, prefix), settings.seed, effort)
             return there.model_copy(update={"deviates": deviation(by, found.model)})
         except Exception as error:
             self.context.note(f"not looked at again in {there.words()}: {error_words(error)}")
             return None
+        finally:
+            self.work += effort.spent
 
     def _taken(self, window: Window) -> dict[str, Any]:
         """Return how the frames of a window were taken."""

@@ -225,6 +225,32 @@ def test_another_window_of_the_same_size_lies_as_far_away_as_there_is_room(rows,
     assert (None if found is None else (found.rows, found.columns)) == other
 
 
+def test_the_work_is_that_of_all_searches_and_looks(monkeypatch):
+    rng = np.random.default_rng(2)
+    light = 11.0 * (rng.poisson(2.0, (400, 32, 32)) + 0.3 * rng.standard_normal((400, 32, 32)))
+    values = np.rint(100.0 + light).astype(np.uint16)
+    context = SimpleNamespace(
+        config=SimpleNamespace(input=SimpleNamespace(bit_depth=12)),
+        sensor=SimpleNamespace(bit_depth=12),
+        integration_time=1.0,
+    )
+    search = discrepancy._Search(context, Stack(values), (), None, Survey({}, {}), lambda _: None)
+    named = SimpleNamespace(verdict=verdict_of("named").costing(30.04), model=())
+    monkeypatch.setattr(discrepancy, "find_discrepancies", lambda *_, **__: named)
+
+    def deviation(by, model):
+        by.effort.spent += 5.0
+        return ""
+
+    monkeypatch.setattr(discrepancy, "deviation", deviation)
+    settings = DiscrepancySettings(max_samples=1 << 16, max_pixels=256)
+    window, found = search.found(settings, "")
+    assert search.work == 30.0
+    assert search.elsewhere(settings, "elsewhere-", window, found) is not None
+    search.found(settings, "whole-")
+    assert search.work == pytest.approx(65.0)
+
+
 def test_a_verdict_is_not_lost_where_no_pixel_of_the_other_window_can_be_used():
     """Reference columns, say."""
     notes: list[str] = []
