@@ -9,7 +9,7 @@ Nothing is said about why.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
@@ -19,6 +19,7 @@ from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.shared_offset import add_offset
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 #: A distance: frames, rows, columns.
 Lag = tuple[int, int, int]
@@ -92,6 +94,10 @@ class NoiseMode(Section):
         "pixel; none: alike",
     )
 
+    extent: tuple[Span, Span] | None = Field(
+        default=None,
+        description="shape, profile: rows and columns over which it reaches, first and end; null: all",
+    )
     wave: tuple[float, float] | None = Field(
         default=None,
         description="of a frame, row or column: cycles per frame and per row (column) of a sine whose phase "
@@ -111,6 +117,8 @@ class NoiseMode(Section):
             raise ValueError("profile: of a row or column, two points or more, not all 0")
         if self.shape and (self.of != "frame" or len({len(row) for row in self.shape}) != 1):
             raise ValueError("shape: of a frame, rows of equally many blocks")
+        if self.extent is not None and any(first >= end for first, end in self.extent):
+            raise ValueError("extent: rows and columns, the first below the end")
         if self.burst is not None and self.lags:
             raise ValueError("burst: each by itself; leave lags out")
         if self.wave is not None and (
@@ -123,7 +131,7 @@ class NoiseMode(Section):
         """Return in words what varies by so many DN, and who shares it."""
         whole = "" if self.of == "sample" and self.lags else f"the same in a whole {self.of}"
         order = np.argsort(-np.abs(self.correlation))[:_FEW]
-        apart = [f"{self.correlation[i]:.2g} {_lag_words(self.lags[i])}" for i in order]
+        apart = [f"{self.correlation[i]:.2g} ({_lag_words(self.lags[i])})" for i in order]
         more = f" and {len(self.lags) - _FEW} other distances" if len(self.lags) > _FEW else ""
         shared = f"correlated by {', '.join(apart)}{more}" if apart else ""
         if self.profile:
@@ -179,24 +187,65 @@ class NoiseMode(Section):
         found = []
         for axis, lines in enumerate(("rows", "columns")):
             some = np.flatnonzero((blocks > 0.5 * blocks.max()).any(axis=1 - axis))
-            low, high = 100.0 * some[0] / blocks.shape[axis], 100.0 * (some[-1] + 1) / blocks.shape[axis]
-            found.append(f"the {lines} from {low:.0f} to {high:.0f} %")
+            low, high = (edge / blocks.shape[axis] for edge in (some[0], some[-1] + 1))
+            if self.extent is None:
+                found.append(f"the {lines} from {100.0 * low:.0f} to {100.0 * high:.0f} %")
+            else:
+                first, end = self.extent[axis]
+                first, last = (round(first + part * (end - first)) for part in (low, high))
+                found.append(f"{lines} {first} to {last - 1}")
         return " and ".join(found)
 
+    def relative(self, rows: IntArray, columns: IntArray, shape: tuple[int, int]) -> FloatArray:
+        """Return the size relative to others in pixels of a sensor, in a shape that fits (y, x).
+
+        Its mean square is 1 where shape and profile reach; beyond there is none.
+
+        Args:
+            rows: of the pixels, shape (y,).
+            columns: likewise, shape (x,).
+            shape: rows and columns of the sensor.
+        """
+        (top, bottom), (left, right) = self.extent or ((0, shape[0]), (0, shape[1]))
+        if self.shape:
+            return self.across((rows - top) / (bottom - top), (columns - left) / (right - left))
+        if self.profile and self.of == "row":
+            return self.along((columns - left) / max(right - left - 1, 1))
+        if self.profile:
+            return self.along((rows - top) / max(bottom - top - 1, 1))[:, None]
+        return np.ones((1, 1))
+
     def across(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
-        """Return the size at positions from 0 to 1 across the sensor, (y, x); its mean square is 1."""
+        """Return the size at positions from 0 to 1 across the blocks, (y, x); none beyond."""
         blocks = np.asarray(self.shape)
+        scaled = [p * size for p, size in zip((rows, columns), blocks.shape, strict=True)]
         y, x = (
-            np.minimum(position * size, size - 1).astype(np.int64)
-            for position, size in zip((rows, columns), blocks.shape, strict=True)
+            np.clip(p, 0, size - 1).astype(np.int64) for p, size in zip(scaled, blocks.shape, strict=True)
         )
-        return np.asarray(blocks[y][:, x] / np.sqrt(np.mean(blocks**2)))
+        inside = [(p >= 0.0) & (p < size) for p, size in zip(scaled, blocks.shape, strict=True)]
+        return np.asarray(blocks[y][:, x] * np.outer(*inside) / np.sqrt(np.mean(blocks**2)))
 
     def along(self, position: FloatArray) -> FloatArray:
-        """Return the size at positions from 0, the first pixel of a line, to 1; its mean square is 1."""
+        """Return the size at positions from 0, the first pixel of a line, to 1; none beyond."""
         points = np.linspace(0.0, 1.0, len(self.profile))
         fine = np.interp(np.linspace(0.0, 1.0, 1001), points, self.profile)
-        return np.asarray(np.interp(position, points, self.profile) / np.sqrt(np.mean(fine**2)))
+        found = np.interp(position, points, self.profile, left=0.0, right=0.0)
+        return np.asarray(found / np.sqrt(np.mean(fine**2)))
+
+    def reaching(self, extent: tuple[Span, Span], by: tuple[int, int], whole: tuple[int, int]) -> NoiseMode:
+        """Return it on pixels that are counted differently.
+
+        Args:
+            extent: rows and columns that it reaches over where it says nothing of that.
+            by: how much higher the rows and columns are.
+            whole: rows and columns that there are then.
+        """
+        if not (self.shape or self.profile):
+            return self
+        (top, bottom), (left, right) = self.extent or extent
+        found = (top + by[0], bottom + by[0]), (left + by[1], right + by[1])
+        every = found == ((0, whole[0]), (0, whole[1]))
+        return self.model_copy(update={"extent": None if every else found})
 
 
 def _lag_words(lag: Lag) -> str:
@@ -239,13 +288,8 @@ class EmpiricalNoise(Effect):
         electrons: Any = 0.0
         for number, mode in enumerate(self.modes):
             field = self.share_of(mode) * mode.values(number, context)
-            if mode.profile:
-                columns = np.arange(values.shape[2]) / max(context.shape[1] - 1, 1)
-                rows = context.rows[:, None] / max(context.shape[0] - 1, 1)
-                field = field * mode.along(columns if mode.of == "row" else rows)
-            if mode.shape:
-                places = context.rows / context.shape[0], np.arange(values.shape[2]) / context.shape[1]
-                field = field * mode.across(*places)
+            if mode.shape or mode.profile:
+                field = field * mode.relative(context.rows, np.arange(values.shape[2]), context.shape)
             if mode.changes == "offset":
                 total = total + field
             elif mode.changes == "gain":
@@ -286,6 +330,19 @@ class EmpiricalNoise(Effect):
     def measured_parts(self) -> int:
         """How many modes there are."""
         return len(self.modes)
+
+    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with shapes and profiles that reach as far in a window."""
+        whole, size = ((0, shape[0]), (0, shape[1])), (rows[1] - rows[0], columns[1] - columns[0])
+        return self._with(each.reaching(whole, (-rows[0], -columns[0]), size) for each in self.modes)
+
+    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with shapes and profiles that reach over the window in which they were found."""
+        window = (0, rows[1] - rows[0]), (0, columns[1] - columns[0])
+        return self._with(each.reaching(window, (rows[0], columns[0]), shape) for each in self.modes)
+
+    def _with(self, modes: Iterable[NoiseMode]) -> Self:
+        return self.model_copy(update={"modes": tuple(modes)})
 
     def halo(self) -> int:
         """Return how far the moving averages reach across rows, px."""

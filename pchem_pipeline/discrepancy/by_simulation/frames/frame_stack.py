@@ -149,6 +149,10 @@ class FrameStack:
         """Return the effects of a model as they act on these pixels, row 0 being the first of these."""
         return tuple(model) if self.window is None else self.window.effects(model)
 
+    def on_sensor(self, effect: Effect) -> Effect:
+        """Return an effect that was found in these pixels as one of the sensor."""
+        return effect if self.window is None else self.window.found(effect)
+
     def statistics(self, part: IntArray, evidence: Evidence) -> dict[str, float]:
         """Return the statistics of some frames, those of the parts included, as replicates have them."""
         apart = part_statistics(

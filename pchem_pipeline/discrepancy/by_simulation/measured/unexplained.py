@@ -234,7 +234,9 @@ class Unexplained:
             seen = measure(part, refitter.model((*effects, *measured[:1])), refitter.model(effects))
             if seen is None:
                 return None
-            measured = tuple(e.at_place(part.region, part.when) for e in (seen.effect, *seen.others))
+            # what is measured has its places in the window; those of parts are on the sensor
+            on_sensor = (self.work.frames.on_sensor(e) for e in (seen.effect, *seen.others))
+            measured = tuple(e.at_place(part.region, part.when) for e in on_sensor)
         best: Refitted | None = None
         for effect in measured:
             found = self._fitted(kept, effect, whole)

@@ -293,3 +293,43 @@ def test_a_hit_by_a_particle_needs_no_tables_of_its_codes_and_outweighs_no_other
     assert usual is not None
     assert found.modes[0].changes == usual.modes[0].changes
     assert found.noise_dn == pytest.approx(usual.noise_dn, rel=0.1)
+
+
+@pytest.mark.parametrize("of", ["frame", "row", "column"])
+def test_a_shape_that_was_found_in_a_window_is_there_on_the_sensor_and_nowhere_else(of: Any) -> None:
+    """And as it was in the window, or in another one that shows a part of it."""
+    sensor, window = (40, 60), ((10, 26), (20, 40))
+    form: dict[str, Any] = (
+        {"shape": ((0.5, 1.0), (1.5, 0.2))} if of == "frame" else {"profile": (1.0, -0.5, 2.0)}
+    )
+    found = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of=of, share=1.0, **form),))
+    of_sensor = found.found_in(*window, sensor)
+    size = (16, 20)
+    assert of_sensor.seen_in(*window, sensor) == found
+
+    def relative(effect: EmpiricalNoise, shape: tuple[int, int]) -> np.ndarray:
+        rows, columns = np.arange(shape[0]), np.arange(shape[1])
+        return np.broadcast_to(effect.modes[0].relative(rows, columns, shape), shape)
+
+    whole, inside = relative(of_sensor, sensor), relative(found, size)
+    np.testing.assert_allclose(whole[10:26, 20:40], inside)
+    assert np.mean(inside**2) == pytest.approx(1.0, abs=0.2)  # of a few pixels, not of a line
+    beyond = np.ones(sensor, bool)
+    beyond[
+        slice(10, 26) if of != "row" else slice(None), slice(20, 40) if of != "column" else slice(None)
+    ] = False
+    assert not whole[beyond].any()
+    other = relative(of_sensor.seen_in((0, 20), (30, 60), sensor), (20, 30))
+    np.testing.assert_allclose(other, whole[:20, 30:])
+    if of == "frame":
+        assert "strongest in rows 10 to 25 and columns 20 to 39" in of_sensor.words()
+
+
+def test_an_effect_without_a_shape_is_the_same_in_every_window() -> None:
+    effect = EmpiricalNoise.typical()[0]
+    assert effect.seen_in((3, 9), (2, 8), (20, 20)) == effect == effect.found_in((3, 9), (2, 8), (20, 20))
+
+
+def test_an_extent_without_pixels_is_refused() -> None:
+    with pytest.raises(ValidationError, match="extent"):
+        NoiseMode(of="frame", share=1.0, shape=((1.0,),), extent=((4, 4), (0, 2)))
