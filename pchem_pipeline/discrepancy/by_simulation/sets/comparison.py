@@ -46,7 +46,7 @@ from pchem_pipeline.effects.framework.effect import Effect
 FloatArray = NDArray[np.float64]
 Answer = TypeVar("Answer")
 
-_MOST_SINGLES = 7
+_MOST_SINGLES, _FIRST_SINGLES = 7, 3
 _MOST_OF_ONE = 3  # hypotheses of the same effect
 _MOST_SETS = 5
 # single effects that sets are grown from, and share of what the best one explains within which another one is
@@ -116,7 +116,8 @@ def compare(
     """Refit the sets worth it, and choose the simplest that leaves nothing, else the best; None: none holds.
 
     Where what no known effect makes leaves nothing by itself, only single effects and the likeliest set come
-    before it; and sets do not grow further where what is measured leaves little and less than they do.
+    before it. What is measured, is one thing and leaves little stands before sets that do not explain more by
+    more than their effects cost, and these do not grow further.
 
     Args:
         refitter: fits sets.
@@ -142,7 +143,7 @@ def compare(
     if trials.nearly:
         # a strong effect that is not quite this one leaves as little: what stands out beside it is in vain
         for hypothesis in _look_alikes(choice):
-            trials.refit((hypothesis,))
+            trials.refit((hypothesis,), whatever=True)
         # fingerprints on top of pixels that were fitted without it show its details, not what is beside it
         trials.tune()
         if not held and not trials.complete and _within(unlisted):
@@ -151,10 +152,14 @@ def compare(
     if first > 1 and tried and not trials.complete and all(len(one) == 1 for one in trials.asked):
         trials.refit(_begun(_sets(choice, tried)[0], tried, held))
         trials.thin()
+    # the likeliest in its place, whatever was spent until here: one of them may be all there is
+    ahead = max(first, _FIRST_SINGLES)
+    for hypothesis in _dear_last(singles[first:ahead]):
+        trials.refit((hypothesis,), whatever=True)
     if not held and tried and not (trials.complete or trials.nearly):
         trials.measured = _within(measured)
-    # others in its place, dear ones last: they may be beaten by then
-    for hypothesis in _dear_last(singles[first:]):
+    # the others, dear ones last: they may be beaten by then
+    for hypothesis in _dear_last(singles[ahead:]):
         if not trials.refit((hypothesis,)):
             break
     if not tried:
@@ -179,6 +184,11 @@ def compare(
     chosen = _chosen(to_choose, tried, [] if before is None else [before])
     if chosen is None:
         return None
+    if not held and len(chosen.hypotheses) > 1:
+        # one thing that explains as much as several is the simpler answer
+        one = trials.measured or _within(measured)
+        if one is not None and worth(one) > worth(chosen):
+            return None
     witnessed = _witnessed(chosen, tried, witness)
     best = max(tried, key=lambda one: witnessed.get(one.tags, (0.0, 0.0))[0])
     if witnessed.get(best.tags, (0.0, 0.0))[0] > 0.0 and _all_seen(to_choose, best, tried):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -86,8 +86,12 @@ class Trials:
         """Whether that leaves little, but something."""
         return bool(self.tried) and not self.complete and leaves_little(self.refitter, self.best)
 
-    def refit(self, members: Sequence[Hypothesis]) -> bool:
+    def refit(self, members: Sequence[Hypothesis], *, whatever: bool = False) -> bool:
         """Refit a set unless it is in vain; return False at the limit of the work, where sets are known.
+
+        Args:
+            members: effects of the set.
+            whatever: fit it where it stands whatever was spent, unless that takes long.
 
         Raises:
             EffortSpentError: at that limit, no set of several has been refitted.
@@ -98,7 +102,10 @@ class Trials:
         best = max(max(one.score for one in self.tried), self._bar.score) if self.tried else -np.inf
         try:
             begun = self.witness.begun((*self.held, *members))
-            self.tried.append(self.refitter.refined(begun, best, whole=len(members) == 1))
+            refitter = self.refitter
+            if whatever and not is_dear(h.effect for h in begun):
+                refitter = replace(refitter, allow=_but_once(refitter.allow))
+            self.tried.append(refitter.refined(begun, best, whole=len(members) == 1))
         except EffortSpentError:
             if all(len(one.hypotheses) <= len(self.held) + 1 for one in self.tried):
                 raise
@@ -193,6 +200,21 @@ class Trials:
         effects = [h.effect for h in (*self.held, *members)]
         answer = self.witness.behind(effects, self.best.effects, FEW_PIXELS)
         return answer is not None and answer[0] < -FAR - _CLEARLY * answer[1]
+
+
+def _but_once(allow: Callable[[str], None]) -> Callable[[str], None]:
+    """Return the same, to which what is asked first is no matter of the limit."""
+    asked: list[str] = []
+
+    def allowed(words: str) -> None:
+        asked.append(words)
+        try:
+            allow(words)
+        except EffortSpentError:
+            if len(asked) > 1:
+                raise
+
+    return allowed
 
 
 def leaves_nothing(refitter: Refitter, one: Refitted) -> bool:

@@ -20,6 +20,7 @@ from pchem_pipeline.discrepancy.by_simulation.additions import (
 )
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import ReplicateSimulator
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    PRICE_OF_MORE,
     Choice,
     Hypothesis,
     choose,
@@ -638,6 +639,40 @@ def test_what_is_measured_and_leaves_less_than_the_likeliest_sets_ends_the_searc
     assert single is not None
 
 
+def test_one_thing_that_is_measured_stands_before_several_that_explain_as_much() -> None:
+    one = World([effect("exposure_drift", 0.3)])
+    whole = one.refitter().refined([hypothesis("exposure_drift", 0.3)])
+    both = [effect("row_noise", 0.3), effect("frame_noise", 0.3)]
+    world = World(both)
+    row, frame = hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.3)
+    best = world.compare(row, frame)
+    assert best is not None
+    for behind, wins in ((PRICE_OF_MORE - 1.0, True), (PRICE_OF_MORE + 1.0, False)):
+        measured = replace(whole, score=best.chosen.score - behind)
+        found = world.compare(row, frame, measured=functools.partial(replace, measured))
+        assert (found is None) is wins
+
+
+def test_the_likeliest_effects_are_fitted_whatever_was_spent() -> None:
+    """Fitting what seemed likeliest took all of it, and what was there came second."""
+    world = World([effect("frame_noise", 0.3)])
+    row, frame = hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.3)
+    plain, spent = world.refitter(), []
+
+    def allow(words: str) -> None:
+        if spent:
+            raise EffortSpentError(words)
+        spent.append(words)
+
+    world.refitter = lambda: replace(plain, allow=allow)  # type: ignore[method-assign]
+    noise = plain.noise(world.null.covariance, 40)
+    shifts = (world.z.train - world.null.mean, world.z.test - world.null.mean)
+    tried = tuple(score_set([h], shifts, noise) for h in (row, frame))
+    found = compare(world.refitter(), [], [row, frame], Choice(tried[0], ((),) * 2, (1.0,) * 2, tried, 100.0))
+    assert found is not None
+    assert found.chosen.tags == {"frame_noise"}
+
+
 def test_a_set_that_leaves_less_than_what_is_measured_stays() -> None:
     world = World([effect("row_noise", 0.3), effect("frame_noise", 0.3)])
     poor = world.refitter().refined([hypothesis("row_noise")])
@@ -842,6 +877,9 @@ def add(
     monkeypatch.setattr(search, "_refitter", lambda: world.refitter())
     monkeypatch.setattr(search, "_left_by", lambda *_: None)
     monkeypatch.setattr(search, "_likelihood", lambda *_: None)
+    monkeypatch.setattr(
+        search, "_unexplained", lambda: SimpleNamespace(explains_all=lambda: False, clearest=lambda: None)
+    )
     shifts = (z.train - world.null.mean, z.test - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
     assert choice is not None
