@@ -113,6 +113,21 @@ def test_the_clearest_stands_by_itself_where_it_leaves_little(
     assert unexplained.clearest() is None  # one of them may have a name
 
 
+def test_what_is_measured_is_fitted_where_it_is_on_the_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing: Any = None
+    frames: Any = SimpleNamespace(on_sensor=lambda effect: effect.found_in((8, 16), (4, 12), (32, 32)))
+    refitter: Any = SimpleNamespace(model=lambda effects: effects)
+    unexplained = Unexplained(SimpleNamespace(frames=frames), refitter, nothing, 0)  # type: ignore[arg-type]
+    effect = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(0, 0, -1), columns=(0, 2)),))
+    fitted: list[Any] = []
+    monkeypatch.setattr(unexplained, "_fitted", lambda _, one, __: fitted.append(one))
+    found = unexplained._described((), TAP, lambda *_: Measurement(effect, 9.0), whole=False)
+    assert found is None
+    [one] = fitted
+    assert one.terms[0].columns == (4, 6)
+    assert one.region == TAP.region
+
+
 def test_noise_is_told_from_gain_by_which_is_clearer(monkeypatch: pytest.MonkeyPatch) -> None:
     nothing: Any = None
     frames: Any = SimpleNamespace(inside=lambda _: None)
