@@ -3,7 +3,7 @@
 Where no known effect explains how samples vary together, it can still be told: a stationary Gaussian noise
 is its covariance by distance in frames, rows and columns, and no more (Wold 1938; Priestley 1981). It is
 drawn as a moving average of white noise whose weights are the Fourier transform of the root of the spectrum.
-Nothing is said about why.
+A single line of the spectrum is drawn as a wave, what comes now and then in bursts. Nothing is said about why.
 """
 
 from __future__ import annotations
@@ -261,7 +261,7 @@ def _lag_words(lag: Lag) -> str:
 
 @register_effect
 class EmpiricalNoise(Effect):
-    """Gaussian noise with a measured correlation over frames, rows and columns.
+    """Noise with a measured correlation over frames, rows and columns, a wave, or bursts.
 
     Signature: none of its own; it is measured where the data disagree with all that is known, and describes
     how samples vary together without a name for what makes them so.
