@@ -3,7 +3,7 @@
 Where no known effect explains how samples vary together, it can still be told: a stationary Gaussian noise
 is its covariance by distance in frames, rows and columns, and no more (Wold 1938; Priestley 1981). It is
 drawn as a moving average of white noise whose weights are the Fourier transform of the root of the spectrum.
-A single line of the spectrum is drawn as a wave, what comes now and then in bursts. Nothing is said about why.
+A single line of the spectrum is drawn as a wave, what comes now and then as bursts. Nothing is said of why.
 """
 
 from __future__ import annotations
