@@ -179,12 +179,24 @@ def compare(
             if not (trials.refit(_begun(members, tried, held)) and trials.thin()):
                 break
             trials.tune()
+    return _concluded(trials, [] if before is None else [before], hypotheses, witness, measured)
+
+
+def _concluded(
+    trials: Trials,
+    before: Sequence[Refitted],
+    hypotheses: Sequence[Hypothesis],
+    witness: Witness,
+    measured: Callable[[], Refitted | None],
+) -> Comparison | None:
+    """Choose among the sets that were tried, and fit placebos in the place of its effects; see `compare`."""
+    tried = trials.tried
     # the work that led here must not be lost for the little that is left: no limit
-    to_choose = replace(refitter, allow=lambda _: None)
-    chosen = _chosen(to_choose, tried, [] if before is None else [before])
+    to_choose = replace(trials.refitter, allow=lambda _: None)
+    chosen = _chosen(to_choose, tried, before)
     if chosen is None:
         return None
-    if not held and len(chosen.hypotheses) > 1:
+    if not trials.held and len(chosen.hypotheses) > 1:
         # one thing that explains as much as several is the simpler answer
         one = trials.measured or _within(measured)
         if one is not None and worth(one) > worth(chosen):
@@ -193,10 +205,10 @@ def compare(
     best = max(tried, key=lambda one: witnessed.get(one.tags, (0.0, 0.0))[0])
     if witnessed.get(best.tags, (0.0, 0.0))[0] > 0.0 and _all_seen(to_choose, best, tried):
         chosen, witnessed = best, _witnessed(best, tried, witness)
-    known = {h.tag for h in held}
+    known = {h.tag for h in trials.held}
     for member in chosen.hypotheses:
         if member.tag not in known:
-            tried += _placebo(refitter, hypotheses, chosen, member, tried)
+            tried += _placebo(trials.refitter, hypotheses, chosen, member, tried)
     return Comparison(chosen, tuple(tried), trials.failed, witnessed)
 
 
