@@ -50,6 +50,7 @@ _BETWEEN = (0.7, 0.8, 0.9, 1.1, 1.2, 1.35)  # of the likeliest of them
 _MOST_IN_BURSTS = 0.3
 _WAVES: tuple[Changed, ...] = ("gain", "light")  # one of the offset is periodic pickup
 _SAME_PHASE = 0.25  # cycles from end to end, below which all lines of a frame share a wave
+_MADE = 0.5  # of the amplitude of a wave, from which on a model that makes one makes this
 _MOST_OF_POWER = 0.5  # of the power of a change, for it to be a wave
 
 
@@ -233,7 +234,7 @@ class _Change(NamedTuple):
         power = (sums.ratio - expected) / float(np.mean(known)) if known.size else 0.0
         ratio = max(sums.ratio / expected, 1.0)
         gain = 0.5 * sums.number * (ratio - 1.0 - float(np.log(ratio)))
-        line = _line(sums, power) if key[1] in _WAVES else None
+        line = _line(sums, power, model) if key[1] in _WAVES else None
         if line is None:
             return cls(*key, sums, shape, power, gain, None)
         wave = round(line.per_frame, 7), round(line.along, 6)
@@ -299,14 +300,25 @@ def _shaped(one: Sums) -> tuple[Sums, tuple[tuple[float, ...], ...]]:
     return Sums((sums @ shape)[:, None], np.array([information @ shape**2]), one.numbers), blocks
 
 
-def _line(one: Sums, power: float) -> Line | None:
-    """Return the wave that a change is for the most part; what whole frames share is told of those."""
-    known = one.information > 0.0
-    means = np.where(known, one.sums / np.where(known, one.information, 1.0), np.nan)
-    line = coherent_line(means, one.numbers, int(one.numbers[-1]) + 1)
-    if line is None or (known.size > 1 and abs(line.along) * known.size < _SAME_PHASE):
+def _line(one: Sums, power: float, model: Sums) -> Line | None:
+    """Return the wave that a change is for the most part; none that a model makes.
+
+    What whole frames share is told of those.
+    """
+    line, known = _highest_line(one), int(np.count_nonzero(one.information))
+    if line is None or (one.information.size > 1 and abs(line.along) * known < _SAME_PHASE):
+        return None
+    made = _highest_line(model)
+    if made is not None and made.amplitude > _MADE * line.amplitude:
         return None
     return line if 0.5 * line.amplitude**2 > _MOST_OF_POWER * power else None
+
+
+def _highest_line(one: Sums) -> Line | None:
+    """Return the highest line of the changes that scores tell, over frames and lines."""
+    known = one.information > 0.0
+    means = np.where(known, one.sums / np.where(known, one.information, 1.0), np.nan)
+    return coherent_line(means, one.numbers, int(one.numbers[-1]) + 1)
 
 
 def _correlation(one: Sums, power: float) -> tuple[tuple[Lag, ...], tuple[float, ...]]:

@@ -196,6 +196,18 @@ def test_a_wave_of_gain_or_light_is_told_by_its_frequencies(
     assert "a wave of" in found.words()
 
 
+def test_a_wave_that_a_model_makes_is_not_measured_again() -> None:
+    """In frames simulated with it its phase is another, and chance is another."""
+    frame, row, _ = np.ogrid[:FRAMES, : SHAPE[0], : SHAPE[1]]
+    sine = [0.03 * np.sin(2.0 * np.pi * (0.163 * frame + 0.21 * row) + phase) for phase in (0.4, 2.0)]
+    scores = []
+    for seed, each in enumerate(sine):
+        values, maps = frames(20 + seed, gain=1.0 + each)
+        scores.append(common_scores(values, np.arange(FRAMES), maps, EVERYWHERE))
+    assert measured_mode(scores[0], nothing(scores[0]), maps, EVERYWHERE) is not None
+    assert measured_mode(scores[0], scores[1], maps, EVERYWHERE) is None
+
+
 @pytest.mark.parametrize("wave", [(0.163, 0.21), (0.5, 0.5)])
 def test_the_simulated_wave_has_its_frequencies_and_its_size(wave: tuple[float, float]) -> None:
     """At half a cycle both ways the phase is 0: another one would be another size."""
