@@ -21,7 +21,9 @@ def _all_of(module) -> dict[str, type[Hidden]]:
 
 LIBRARY = _all_of(effects_light) | _all_of(effects_noise) | _all_of(effects_readout)
 UNTESTABLE = ("charge_lag", "charge_diffusion", "spurious_charge")
-OUTSIDE = tuple(tag for tag in _all_of(effects_other) if tag not in UNTESTABLE)
+#: of effects of the library, with the name that they are to be given
+VARIANTS = {"herring_bone": "periodic_pickup"}
+OUTSIDE = tuple(tag for tag in _all_of(effects_other) if tag not in {*UNTESTABLE, *VARIANTS})
 DECOYS = _all_of(effects_decoys)
 ALL = LIBRARY | _all_of(effects_other) | DECOYS
 

@@ -104,3 +104,26 @@ class CheckerboardOffset(Hidden):
 
     def voltage(self, t, dn):
         return dn + (self.strength if t % 2 == 0 else -self.strength) * self.colour
+
+
+class HerringBone(Hidden):
+    """A sine picked up sample by sample, by one converter for all of them; strength: amplitude, DN.
+
+    Its phase runs on from frame to frame, or is new in each. To be told as periodic pickup.
+    """
+
+    tag: ClassVar[str] = "herring_bone"
+    s95: ClassVar[float] = 0.025
+
+    def draw(self):
+        per_column = self.between("cycles_per_column", 0.03, 0.47)
+        per_row = self.between("cycles_per_row", -0.47, 0.47)
+        per_frame = self.between("cycles_per_frame", -0.47, 0.47)
+        anew = self.pick("phase", "runs on", "new in each frame") == "new in each frame"
+        frames = np.arange(self.sensor.n_frames)
+        self.turns = self.rng.random(frames.size) if anew else per_frame * frames
+        y, x = np.indices(self.sensor.shape)
+        self.place = 2 * np.pi * (per_row * y + per_column * x)
+
+    def voltage(self, t, dn):
+        return dn + self.strength * np.sin(self.place + 2 * np.pi * self.turns[t])

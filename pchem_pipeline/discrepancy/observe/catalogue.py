@@ -243,6 +243,10 @@ def _lines() -> list[Statistic]:
     found += [
         Statistic("space.row.readout.line", "readout", "the rows of a frame hold a periodic component"),
         Statistic("space.column.readout.line", "readout", "the columns of a frame hold a periodic component"),
+        Statistic("space.sample.readout.line", "readout", "a wave runs across rows, columns and frames"),
+        Statistic(
+            "space.sample.readout.spectrum", "readout", "samples of a frame resemble others at some distance"
+        ),
     ]
     return found
 

@@ -37,6 +37,7 @@ from pchem_pipeline.discrepancy.observe.vector_frames import (
     space_statistics,
     time_statistics,
 )
+from pchem_pipeline.discrepancy.observe.waves import waves_across
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals, Evidence, PixelMaps, TimeSeries
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
@@ -114,6 +115,7 @@ def observe(
     spread = np.sqrt(maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2)
     bits = previous_bits(frames, edges, maps.usable, np.where(maps.usable, spread, 1.0))
     lines, squares = repeated_lines(frames), equal_squares(frames)
+    waves = waves_across(frames, numbers, laws, maps)
     misplaced_z, misplaced = misplaced_lines(frames, counts, origin, maps.usable)
     z = {
         **evidence.z,
@@ -128,10 +130,16 @@ def observe(
         **line_statistics(lines, alike, len(frames)),
         **square_statistics(squares, counts, origin, maps.usable, int(frames.max())),
         **misplaced_z,
+        **waves.z,
     }
     time = _time_series(view, lags, n_run)
     time = replace(
-        time, predicted=predicted, previous_bits=bits, repeated_lines=lines, misplaced_lines=misplaced
+        time,
+        predicted=predicted,
+        previous_bits=bits,
+        repeated_lines=lines,
+        misplaced_lines=misplaced,
+        waves=waves.found,
     )
     return replace(evidence, time=time, z=in_order(z))
 

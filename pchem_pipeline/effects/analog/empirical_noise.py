@@ -34,6 +34,8 @@ IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 #: A distance: frames, rows, columns.
 Lag = tuple[int, int, int]
+#: Of a wave: per frame, row, column.
+Cycles = tuple[float, float, float]
 Shared = Literal["sample", "row", "column", "frame"]
 Changed = Literal["offset", "gain", "light", "noise"]
 _DIMS: dict[Shared, tuple[Dim, ...]] = {
@@ -42,14 +44,15 @@ _DIMS: dict[Shared, tuple[Dim, ...]] = {
 _POINTS = 8  # of the spectrum's grid along an axis, for each unit of the largest distance
 _REACH = 3  # of the moving average along an axis, for each of them
 _MOST_TAPS, _SMALLEST_TAP = 200, 0.01  # of the moving average; of the largest weight
+_LINE: dict[Dim, str] = {"frame": "frame", "y": "row", "x": "column"}
 _NODES, _NARROWEST = 5, 0.05  # of the law of noise of changing size; relative, to be a law
 _NYQUIST = 0.5  # cycles
 _FEW = 4  # distances that are told in words
 _CHANGED = {"gain": "gain", "light": "light", "noise": "read noise"}
 
 
-def root_mean_square(wave: tuple[float, float]) -> float:
-    """Return that of a sine of amplitude 1, by its cycles per frame and line."""
+def root_mean_square(wave: Cycles) -> float:
+    """Return that of a sine of amplitude 1, by its cycles per frame, row and column."""
     return 1.0 if all(2.0 * cycles % 1.0 == 0.0 for cycles in wave) else 0.5**0.5
 
 
@@ -98,10 +101,9 @@ class NoiseMode(Section):
         default=None,
         description="shape, profile: rows and columns over which it reaches, first and end; null: all",
     )
-    wave: tuple[float, float] | None = Field(
+    wave: Cycles | None = Field(
         default=None,
-        description="of a frame, row or column: cycles per frame and per row (column) of a sine whose phase "
-        "runs on; null: it is noise",
+        description="cycles per frame, row and column of a sine whose phase runs on; null: it is noise",
     )
 
     @model_validator(mode="after")
@@ -122,14 +124,23 @@ class NoiseMode(Section):
         if self.burst is not None and self.lags:
             raise ValueError("burst: each by itself; leave lags out")
         if self.wave is not None and (
-            self.of == "sample" or self.lags or self.burst is not None or max(map(abs, self.wave)) > _NYQUIST
+            self.lags
+            or self.burst is not None
+            or max(map(abs, self.wave)) > _NYQUIST
+            or any(self.wave[axis] for axis in fixed)
         ):
-            raise ValueError("wave: of a frame, row or column, at most half a cycle; no lags, no burst")
+            raise ValueError(f"wave: at most half a cycle, and 0 within a {self.of}; no lags, no burst")
         return self
+
+    @property
+    def takes_turns(self) -> bool:
+        """Whether it is an offset that changes its sign from sample to sample and frame to frame."""
+        return self.of == "sample" and self.wave is not None and root_mean_square(self.wave) == 1.0
 
     def words(self, rms: float) -> str:
         """Return in words what varies by so many DN, and who shares it."""
-        whole = "" if self.of == "sample" and self.lags else f"the same in a whole {self.of}"
+        own = self.of == "sample" and (self.lags or self.wave is not None)
+        whole = "" if own else f"the same in a whole {self.of}"
         order = np.argsort(-np.abs(self.correlation))[:_FEW]
         apart = [f"{self.correlation[i]:.2g} ({_lag_words(self.lags[i])})" for i in order]
         more = f" and {len(self.lags) - _FEW} other distances" if len(self.lags) > _FEW else ""
@@ -148,10 +159,18 @@ class NoiseMode(Section):
             form = form if self.burst is None else f"+{form}"
             what = f"{share:{form}} % of the {of}, {what} {at}of {self.signal_dn:.3g} DN"
         if self.wave is not None:
-            per_line = "" if self.of == "frame" else f" and {self.wave[1]:.3g} per {self.of}"
-            shared = f"a wave of {self.wave[0]:.4g} cycles per frame{per_line}"
+            shared = self._wave_words(self.wave)
         burst = "" if self.burst is None else f"in {per_cent(self.burst)} of the {self.of}s only"
         return ", ".join(part for part in (what, whole, burst, shared) if part)
+
+    def _wave_words(self, wave: Cycles) -> str:
+        lines = [(each, _LINE[dim]) for each, dim in zip(wave, _LINE, strict=True) if dim in _DIMS[self.of]]
+        if root_mean_square(wave) == 1.0 and any(wave):
+            return (
+                f"changing its sign from {', from '.join(f'{one} to {one}' for each, one in lines if each)}"
+            )
+        cycles = [f"{each:{'.4g' if one == 'frame' else '.3g'}} per {one}" for each, one in lines]
+        return f"a wave of {' and '.join(cycles).replace(' per', ' cycles per', 1)}"
 
     def values(self, number: int, context: EffectContext) -> FloatArray:
         """Return its values, of mean square 1, in a shape that fits (frame, y, x)."""
@@ -162,14 +181,13 @@ class NoiseMode(Section):
         some = context.random.uniform(_DIMS[self.of], number) < self.burst
         return np.asarray(some * (-1.0 if self.negative else 1.0) / np.sqrt(self.burst))
 
-    def _on_the_wave(self, wave: tuple[float, float], number: int, context: EffectContext) -> FloatArray:
-        """Return a sine of any phase; at half a cycle (or none) both ways there is one phase only."""
+    def _on_the_wave(self, wave: Cycles, number: int, context: EffectContext) -> FloatArray:
+        """Return a sine of any phase; at half a cycle (or none) each way there is one phase only."""
         rms = root_mean_square(wave)
-        turns = wave[0] * context.frames[:, None, None]
-        if self.of == "row":
-            turns = turns + wave[1] * context.rows[:, None]
-        elif self.of == "column":
-            turns = turns + wave[1] * np.arange(context.shape[1])
+        turns: Any = wave[0] * context.frames[:, None, None]
+        places: dict[Dim, Any] = {"y": context.rows[:, None], "x": np.arange(context.shape[1])}
+        for dim, cycles in zip(("y", "x"), wave[1:], strict=True):
+            turns = turns + cycles * places[dim] if dim in _DIMS[self.of] else turns
         phase = context.random.uniform((), number) if rms < 1.0 else 0.0
         return np.asarray(np.cos(2.0 * np.pi * (turns + phase)) / rms)
 
@@ -319,10 +337,13 @@ class EmpiricalNoise(Effect):
 
     @property
     def unlisted(self) -> bool:
-        """Whether it is a gain or a size of the noise without a memory, or light that a line shares."""
+        """Whether it is a gain or noise without a memory, light that a line shares, or an offset in turns."""
         return all(
-            not mode.lags
-            and (mode.changes in ("gain", "noise") or (mode.changes == "light" and mode.of != "frame"))
+            mode.takes_turns
+            or (
+                not mode.lags
+                and (mode.changes in ("gain", "noise") or (mode.changes == "light" and mode.of != "frame"))
+            )
             for mode in self.modes
         )
 

@@ -16,6 +16,7 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.common_modes import (
     chebyshev_nodes,
+    mean_response,
     responsivity,
     with_offsets,
 )
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, Wave
+    from pchem_pipeline.effects.framework.region import Span
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
 Pickup = TypeVar("Pickup", bound="PeriodicPickup")
@@ -40,7 +42,8 @@ class PeriodicPickup(Effect):
     """Sine along rows, columns and frames.
 
     Signature: the spectrum of the row means (over frames and rows) of the readout residual has one line, and
-    frame means have one where the phase does not advance along the rows; the charge has none. A pixel's own
+    frame means have one where the phase does not advance along the rows; the charge has none. Where samples
+    are read one after the other, only the spectrum over rows, columns and frames has it. A pixel's own
     histogram is smeared by the arcsine law of a sine at random phase.
     """
 
@@ -54,6 +57,8 @@ class PeriodicPickup(Effect):
         "space.row.readout.line",
         "frame.readout.line",
         "space.column.readout.line",
+        "space.sample.readout.line",
+        "space.sample.readout.spectrum",
         "space.row.readout.variance",
     )
     strength: ClassVar[str] = "amplitude_dn"
@@ -105,9 +110,10 @@ class PeriodicPickup(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the highest lines of the periodograms of the row and of the column means.
+        """Return the highest lines of the periodograms of the row and the column means, and of all samples.
 
-        Over frames and lines together (the phase runs on), and within frames (random phase).
+        Over frames and lines together (the phase runs on), and within frames (random phase). What alternates
+        from row to row, column to column and frame to frame is no pickup.
         """
         if evidence.time is None:
             return ()
@@ -123,7 +129,34 @@ class PeriodicPickup(Effect):
             if loose is not None and (line is None or line.amplitude < 0.7 * loose.amplitude):
                 fields = {name: loose.along, "amplitude_dn": loose.amplitude / alpha, "random_phase": True}
                 found.append((loose.excess, cls(**fields)))
+        found += [(wave.excess, cls._of_wave(wave, evidence)) for wave in time.waves if not wave.alternates]
         return _without_doubles(found)
+
+    @classmethod
+    def _of_wave(cls, wave: Wave, evidence: Evidence) -> Self:
+        """Return the pickup that makes a wave across rows and columns."""
+        steady = wave.per_frame is not None
+        return cls(
+            amplitude_dn=wave.amplitude / mean_response(evidence),
+            cycles_per_row=wave.per_row,
+            cycles_per_column=wave.per_column,
+            cycles_per_frame=wave.per_frame or 0.0,
+            phase=wave.phase if steady else 0.0,
+            random_phase=not steady,
+        )
+
+    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with the phase at the first row and column of a window."""
+        return self._begun(rows[0], columns[0])
+
+    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with the phase at the first row and column of the sensor."""
+        return self._begun(-rows[0], -columns[0])
+
+    def _begun(self, row: int, column: int) -> Self:
+        turns = self.cycles_per_row * row + self.cycles_per_column * column
+        phase = (self.phase + 2.0 * np.pi * turns) % (2.0 * np.pi)
+        return self.model_copy(update={"phase": 0.0 if self.random_phase else float(phase)})
 
     def shared_offset(self) -> SharedOffset:
         """Return the wave: in other frames its phase is another one."""

@@ -48,6 +48,18 @@ def responsivity(evidence: Evidence, inside: NDArray[np.bool_] | None = None) ->
     return float(np.clip(ratio.mean(), 0.02, 1.0)) if ratio.size else 1.0
 
 
+def mean_response(evidence: Evidence, inside: NDArray[np.bool_] | None = None) -> float:
+    """Return the mean change of r over its standard deviation per DN of a common offset, 1/DN.
+
+    Args:
+        evidence: of some pixels.
+        inside: those that count, (y, x); None: all.
+    """
+    maps = evidence.maps
+    some = maps.usable if inside is None else maps.usable & inside
+    return float(np.mean((evidence.readout_std / maps.read_noise_dn**2)[some]))
+
+
 def mean_variance(evidence: Evidence, axis: int | tuple[int, int] = (0, 1)) -> NDArray[np.float64]:
     """Return the variance, DN^2, that the pixels' own noise gives to means of r over usable pixels.
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -113,6 +113,32 @@ class PreviousBits:
     variance: float
 
 
+class Wave(NamedTuple):
+    """A wave over frames, rows and columns.
+
+    Attributes:
+        amplitude: of the sine in standardised residuals, no unit.
+        per_frame: cycles per frame; None: its phase is new in every frame.
+        per_row, per_column: cycles.
+        phase: of the sine at row, column and frame 0, rad.
+        excess: log of the inverse chance of such a power, less the log of the number of places where it could
+            have been.
+    """
+
+    amplitude: float
+    per_frame: float | None
+    per_row: float
+    per_column: float
+    phase: float
+    excess: float
+
+    @property
+    def alternates(self) -> bool:
+        """Whether it repeats itself after two frames, rows and columns, as circuits that take turns do."""
+        cycles = self.per_frame, self.per_row, self.per_column
+        return all(each is not None and 2.0 * each % 1.0 == 0.0 for each in cycles)
+
+
 @dataclass(frozen=True)
 class TimeSeries:
     """What is kept along time; None of it exists for ready-made histograms.
@@ -160,6 +186,7 @@ class TimeSeries:
             :data:`PLACES`, shape (6,); none where chance explains them.
         frame_noise: by how much the squares of r of each frame exceed their mean, over their standard
             deviation by chance, shape (n,); None: not known.
+        waves: across rows and columns, in the readout residuals over their standard deviation.
         hits: samples above a pixel's support: columns frame, y, x, DN; int64, shape (n_hits, 4), at most
             20,000.
         low_hits: the same below it.
@@ -196,6 +223,7 @@ class TimeSeries:
     previous_bits: PreviousBits | None = None
     repeated_lines: Mapping[str, int] = field(default_factory=dict)
     misplaced_lines: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    waves: tuple[Wave, ...] = ()
     low_hits: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 4), np.int64))
 
 

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.places import TESTS
-from hidden.chain import ALL, DECOYS, LIBRARY, OUTSIDE, UNTESTABLE, hide
+from hidden.chain import ALL, DECOYS, LIBRARY, OUTSIDE, UNTESTABLE, VARIANTS, hide
 
 HIDDEN = TESTS / "hidden"
 SHAPE, FRAMES = (24, 20), 500
@@ -137,6 +137,9 @@ ESTIMATES = {
         v, np.array([e.voltage(t, np.zeros(SHAPE)) for t in range(FRAMES)]) / v.step, e.strength
     ),
     "checkerboard_offset": lambda v, e: regress(
+        v, np.array([e.voltage(t, np.zeros(SHAPE)) for t in range(FRAMES)]) / v.step, e.strength
+    ),
+    "herring_bone": lambda v, e: regress(
         v, np.array([e.voltage(t, np.zeros(SHAPE)) for t in range(FRAMES)]) / v.step, e.strength
     ),
     "output_crosstalk": amplifier,
@@ -421,7 +424,7 @@ def test_every_effect_is_there_and_checked():
     }
     assert set(LIBRARY) == set(" ".join(named).split())
     assert len(OUTSIDE) >= 3
-    assert set(ALL) == set(LIBRARY) | set(UNTESTABLE) | set(OUTSIDE) | set(DECOYS)
+    assert set(ALL) == set(LIBRARY) | set(UNTESTABLE) | set(VARIANTS) | set(OUTSIDE) | set(DECOYS)
     assert len(DECOYS) >= 20
 
 

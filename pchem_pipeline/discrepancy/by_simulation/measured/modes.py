@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement, shares_of
 from pchem_pipeline.effects.analog.empirical_noise import (
     Changed,
+    Cycles,
     EmpiricalNoise,
     Lag,
     NoiseMode,
@@ -214,7 +215,7 @@ class _Change(NamedTuple):
         shape: over the sensor, in blocks; none: even.
         power: mean square of it, beyond a model's, no unit.
         gain: by how much likelier the sums are with it, nats.
-        wave: cycles per frame and line, and rms; None: it is noise for the most part.
+        wave: its cycles, and rms; None: it is noise for the most part.
     """
 
     shared: Shared
@@ -223,7 +224,7 @@ class _Change(NamedTuple):
     shape: tuple[tuple[float, ...], ...]
     power: float
     gain: float
-    wave: tuple[tuple[float, float], float] | None
+    wave: tuple[Cycles, float] | None
 
     @classmethod
     def of(cls, key: tuple[Shared, Changed], data: Sums, model: Sums) -> _Change:
@@ -237,7 +238,8 @@ class _Change(NamedTuple):
         line = _line(sums, power, model) if key[1] in _WAVES else None
         if line is None:
             return cls(*key, sums, shape, power, gain, None)
-        wave = round(line.per_frame, 7), round(line.along, 6)
+        along = round(line.along, 6)
+        wave = round(line.per_frame, 7), along * (key[0] == "row"), along * (key[0] == "column")
         gain = max(gain, line.excess)
         return cls(*key, sums, shape, power, gain, (wave, line.amplitude * root_mean_square(wave)))
 

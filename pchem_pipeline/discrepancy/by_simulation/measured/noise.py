@@ -19,6 +19,7 @@ from scipy import fft
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
 from pchem_pipeline.discrepancy.observe.pairs import Samples
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, Lag, NoiseMode, Shared, spectrum
+from pchem_pipeline.effects.estimators.common_modes import mean_response
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
 FloatArray = NDArray[np.float64]
@@ -205,14 +206,14 @@ def measured_noise(
     left = {key: one.value - own.get(key, none).value for key, one in data.pairs.items()}
     error = {key: np.hypot(one.error, own.get(key, none).error) for key, one in data.pairs.items()}
     response = evidence.readout_std / evidence.maps.read_noise_dn**2
-    mean_response = float(np.mean(response[inside]))
+    of_offset = mean_response(evidence, inside)
     profiles: dict[Shared, _Profile] = {
         of: found
         for of in _LINES
         if (found := _profile(of, data, model, np.where(inside, response, np.nan))) is not None
     }
     for of, found in profiles.items():
-        for key, taken in found.take_off(of, left, mean_response).items():
+        for key, taken in found.take_off(of, left, of_offset).items():
             error[key] = np.hypot(error[key], _SHAPE_ERROR * taken)
     clear = [key for key in left if abs(left[key]) > _CLEAR * error[key]]
     modes: list[NoiseMode] = []
@@ -227,7 +228,7 @@ def measured_noise(
         if power > 0.0:
             correlation = tuple(round(value / power, 4) for value in values)
             modes.append(NoiseMode(of=shared, share=1.0, lags=tuple(lags), correlation=correlation))
-            powers.append(power / mean_response**2)
+            powers.append(power / of_offset**2)
     for of, found in profiles.items():
         modes.append(NoiseMode(of=of, share=1.0, profile=tuple(np.round(found.points, 3).tolist())))
         powers.append(found.power)

@@ -30,6 +30,7 @@ from pchem_pipeline.discrepancy.by_simulation.measured.response import (
     measured_response,
     residual_responses,
 )
+from pchem_pipeline.discrepancy.by_simulation.measured.waves import measured_wave
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import simulate_frames
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import FEW, Refitted, Refitter
@@ -37,7 +38,9 @@ from pchem_pipeline.discrepancy.by_simulation.sets.trials import leaves_little, 
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import CONVINCING
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
+from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.observe.places import Part
+from pchem_pipeline.discrepancy.observe.waves import Waves, waves_across
 from pchem_pipeline.effects.analog.empirical_noise import Changed, Shared
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -52,9 +55,10 @@ _MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
 
 
 class _Shared(NamedTuple):
-    """How samples vary together: products of residuals, sums of scores, chances of electrons, responses."""
+    """How samples vary together: products and waves of residuals, sums of scores, electrons, responses."""
 
     covariances: Covariances
+    waves: Waves
     scores: dict[tuple[Shared, Changed], Sums]
     electrons: Electrons
     responses: Responses | None
@@ -277,14 +281,19 @@ class Unexplained:
     def _noise_of_samples(
         self, data: SharedBy, known: dict[str, SharedBy], part: Part, _: Model, beside: Model
     ) -> Measurement | None:
-        """Measure what samples of a part share beyond what effects make of them: gain or light, or noise."""
+        """Measure what samples of a part share beyond what effects make of them."""
         own, model = data(part), self._made(known, beside)(part)
         inside = self.work.frames.inside(part)
         found = (
             measured_mode(own.scores, model.scores, self.work.plain.maps, inside),
             measured_noise(own.covariances, model.covariances, self.work.plain, inside),
         )
-        return max(filter(None, found), key=lambda one: one.gain, default=None)
+        best = max(filter(None, found), key=lambda one: one.gain, default=None)
+        wave = measured_wave(own.waves, model.waves, self.work.plain, inside)
+        if wave is None or best is None:
+            return wave or best
+        # a wave is in the covariances of all distances, each of which counts by itself
+        return Measurement(wave.effect, max(wave.gain, best.gain), (best.effect, *best.others))
 
     def _electrons(
         self, data: SharedBy, known: dict[str, SharedBy], part: Part, _: Model, beside: Model
@@ -328,8 +337,10 @@ class Unexplained:
             found = Covariances(found.pairs, lines)
             electrons = electron_chances(frames[some], numbers[some], maps, self.work.plain, inside)
             responses = residual_responses(frames[some], numbers[some], maps, inside)
-            return _Shared(
-                found, common_scores(frames[some], numbers[some], maps, inside), electrons, responses
+            scores = common_scores(frames[some], numbers[some], maps, inside)
+            waves = waves_across(
+                frames[some], numbers[some], laws_of_frames(frames[some], maps), maps, inside
             )
+            return _Shared(found, waves, scores, electrons, responses)
 
         return of

@@ -185,7 +185,8 @@ def test_a_wave_of_gain_or_light_is_told_by_its_frequencies(
     (mode,) = found.modes
     assert (mode.of, mode.changes, mode.lags, mode.burst) == (of, changes, (), None)
     assert mode.wave is not None
-    known = mode.wave if np.sign(mode.wave[0]) == np.sign(per_frame) else (-mode.wave[0], -mode.wave[1])
+    told = mode.wave[0], mode.wave[2 if of == "column" else 1]
+    known = told if np.sign(told[0]) == np.sign(per_frame) else (-told[0], -told[1])
     # of a sine of amplitude a in n values of which each holds the information i (Rife and Boorstyn 1974)
     sums = common_scores(stack[0], np.arange(FRAMES), stack[1], EVERYWHERE)[of, changes]
     error = np.sqrt(24.0 / (amplitude**2 * sums.information.sum() * FRAMES)) / (2.0 * np.pi)
@@ -208,25 +209,42 @@ def test_a_wave_that_a_model_makes_is_not_measured_again() -> None:
     assert measured_mode(scores[0], scores[1], maps, EVERYWHERE) is None
 
 
-@pytest.mark.parametrize("wave", [(0.163, 0.21), (0.5, 0.5)])
-def test_the_simulated_wave_has_its_frequencies_and_its_size(wave: tuple[float, float]) -> None:
+@pytest.mark.parametrize("wave", [(0.163, 0.21, 0.0), (0.5, 0.5, 0.0)])
+def test_the_simulated_wave_has_its_frequencies_and_its_size(wave: tuple[float, float, float]) -> None:
     """At half a cycle both ways the phase is 0: another one would be another size."""
     mode = NoiseMode(of="row", share=1.0, changes="gain", signal_dn=4 * STEP, wave=wave)
     means = simulated(mode, 0.05 * 4 * STEP).mean(axis=2) / (4 * STEP) - 1.0
     frame, row = np.ogrid[:FRAMES, : SHAPE[0]]
     part = abs(np.mean(means * np.exp(-2j * np.pi * (wave[0] * frame + wave[1] * row))))
-    rms = part if wave == (0.5, 0.5) else part * np.sqrt(2.0)
+    rms = part if wave[0] == 0.5 else part * np.sqrt(2.0)
     # a mean of a row has the scatter of 20 samples of 4 electrons
     assert abs(rms - 0.05) < 5 * np.sqrt(1.05 / (4 * SHAPE[0] * SHAPE[1] * FRAMES))
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"of": "sample"}, {"wave": (0.6, 0.0)}, {"burst": 0.1}, {"lags": ((1, 0, 0),), "correlation": (0.1,)}],
+    [
+        {"of": "frame"},
+        {"wave": (0.6, 0.0, 0.0)},
+        {"wave": (0.1, 0.2, 0.1)},
+        {"burst": 0.1},
+        {"lags": ((1, 0, 0),), "correlation": (0.1,)},
+    ],
 )
-def test_a_wave_is_of_lines_below_half_a_cycle_and_nothing_else(wrong: dict[str, Any]) -> None:
+def test_a_wave_is_below_half_a_cycle_along_its_own_axes_and_nothing_else(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match="wave"):
-        NoiseMode(**{"of": "row", "share": 1.0, "changes": "gain", "wave": (0.1, 0.2), **wrong})
+        NoiseMode(**{"of": "row", "share": 1.0, "changes": "gain", "wave": (0.1, 0.2, 0.0), **wrong})
+
+
+def test_an_offset_that_takes_turns_is_told_as_that() -> None:
+    mode = NoiseMode(of="sample", share=1.0, wave=(0.5, 0.5, -0.5))
+    assert mode.takes_turns
+    assert mode.words(0.3) == (
+        "0.3 DN, changing its sign from frame to frame, from row to row, from column to column"
+    )
+    assert NoiseMode(of="column", share=1.0, wave=(0.1, 0.0, 0.25)).words(0.3) == (
+        "0.3 DN, the same in a whole column, a wave of 0.1 cycles per frame and 0.25 per column"
+    )
 
 
 def test_neither_nothing_nor_an_offset_is_taken_for_gain_or_light() -> None:

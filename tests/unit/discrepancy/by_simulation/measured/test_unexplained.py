@@ -128,16 +128,18 @@ def test_what_is_measured_is_fitted_where_it_is_on_the_sensor(monkeypatch: pytes
     assert one.region == TAP.region
 
 
-def test_noise_is_told_from_gain_by_which_is_clearer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_clearer_of_noise_and_gain_is_told_and_a_wave_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     nothing: Any = None
     frames: Any = SimpleNamespace(inside=lambda _: None)
     plain: Any = SimpleNamespace(maps=None)
     unexplained = Unexplained(SimpleNamespace(frames=frames, plain=plain), *[nothing] * 3)  # type: ignore[arg-type]
-    shared: Any = SimpleNamespace(scores=None, covariances=None)
+    shared: Any = SimpleNamespace(scores=None, covariances=None, waves=None)
     monkeypatch.setattr(unexplained, "_made", lambda *_: lambda _: shared)
     effect = EmpiricalNoise.typical()[0]
-    gains: dict[str, float | None] = {}
-    for name in ("mode", "noise"):
+    gains: dict[str, float | None] = {"wave": None}
+    for name in ("mode", "noise", "wave"):
 
         def measured(*_: Any, own: str = name) -> Measurement | None:
             return None if gains[own] is None else Measurement(effect, gains[own] or 0.0)
@@ -147,7 +149,12 @@ def test_noise_is_told_from_gain_by_which_is_clearer(monkeypatch: pytest.MonkeyP
         found = unexplained._noise_of_samples(lambda _: shared, {}, Part(), (), ())
         assert found is not None
         assert found.gain == best
-    gains.update(mode=None, noise=None)
+    # a wave is in the covariances of all distances: it is tried first, however many nats these have
+    gains["wave"] = 2.0
+    found = unexplained._noise_of_samples(lambda _: shared, {}, Part(), (), ())
+    assert found is not None
+    assert (found.gain, len(found.others)) == (3.0, 1)
+    gains.update(mode=None, noise=None, wave=None)
     assert unexplained._noise_of_samples(lambda _: shared, {}, Part(), (), ()) is None
 
 

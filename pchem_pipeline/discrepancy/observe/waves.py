@@ -1,0 +1,224 @@
+"""Waves across rows and columns in the readout residuals: their spectrum over frames, rows and columns.
+
+Means of rows and of columns show a wave that runs along one of them. Where samples are read one after the
+other, what is picked up advances from sample to sample too, and leaves these means alone. Given the
+histograms, frames without an effect are in random order, so that each power of the spectrum is nearly an
+exponential number of mean 1, and their means over frames likewise (Fisher 1929).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from pchem_pipeline.discrepancy.observe import laws as laws_of
+from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
+from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.effects.framework.evidence import PixelMaps, Wave
+
+Float32Array = NDArray[np.float32]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+_MOST_SAMPLES = 1 << 22
+_FEWEST_FRAMES, _FEWEST_LINES = 64, 8
+_RAISED = 5.0  # standard errors by which the noise at some frequency must exceed white noise, to be no line
+_ALL_OF_IT = 0.7  # of the amplitude of a wave at any phase, for one whose phase runs on
+_FALSE_ALARM = 0.02  # probability of any wave where there is none
+_ROUNDS, _STEPS = 8, 9
+_NARROWER = 2.5  # from round to round
+_AROUND = 7  # frequencies along rows and columns whose median is the noise of the one in their middle
+
+
+@dataclass(frozen=True)
+class Waves:
+    """Waves across rows and columns.
+
+    Attributes:
+        found: those that stand out, the one whose phase runs on first.
+        z: of the spectrum.
+    """
+
+    found: tuple[Wave, ...]
+    z: dict[str, float]
+
+    @property
+    def steady(self) -> Wave | None:
+        """The one whose phase runs on from frame to frame."""
+        return next((wave for wave in self.found if wave.per_frame is not None), None)
+
+
+def waves_across(
+    frames: NDArray[np.unsignedinteger[Any]],
+    numbers: IntArray,
+    laws: PixelLaws,
+    maps: PixelMaps,
+    inside: BoolArray | None = None,
+) -> Waves:
+    """Look for waves in the residuals of frames.
+
+    Args:
+        frames: codes (frame, y, x), DN.
+        numbers: of the frames in the run, increasing, (frame,).
+        laws: of the pixels' samples.
+        maps: parameters of the pixels.
+        inside: pixels that are looked at, (y, x); None: all.
+    """
+    ny, nx = maps.usable.shape
+    some = numbers - numbers[0] < max(_MOST_SAMPLES // maps.usable.size, 1)
+    numbers = numbers[some] - numbers[0]
+    samples = Samples.by_laws(Stack(frames[: numbers.size]), laws, maps)
+    samples = samples if inside is None else samples.without(~inside)
+    pixels = int(np.count_nonzero(samples.usable))
+    if numbers.size < _FEWEST_FRAMES or min(ny, nx) < _FEWEST_LINES or not pixels:
+        return Waves((), {})
+    u = np.concatenate([chunk for (chunk,) in samples.chunks((1,))])
+    spectra = fft.rfft2(u)[:, 1:, 1:]
+    mean = _halved((np.abs(spectra) ** 2).mean(axis=0) / pixels, nx)
+    over_time = np.zeros((int(numbers[-1]) + 1, *mean.shape), np.complex64)
+    over_time[numbers] = spectra
+    power = np.abs(fft.fft(over_time, axis=0, overwrite_x=True)) ** 2 / (pixels * numbers.size)
+    for when in (0, len(power) // 2) if len(power) % 2 == 0 else (0,):
+        power[when] = _halved(power[when], nx)
+    ratio = power / _level(power)
+    z = {
+        "space.sample.readout.line": laws_of.largest_power(ratio.astype(np.float64), 1),
+        "space.sample.readout.spectrum": laws_of.largest_power(mean.astype(np.float64), numbers.size),
+    }
+    steady, loose = _steady(u, numbers, ratio, (ny, nx)), _loose(u, mean)
+    if steady is not None and loose is not None and steady.amplitude > _ALL_OF_IT * loose.amplitude:
+        loose = None
+    return Waves(tuple(wave for wave in (steady, loose) if wave is not None), z)
+
+
+def _halved(power: Float32Array, columns: int) -> Float32Array:
+    """Return powers with those of real waves halved: they have one phase, and twice the mean power."""
+    power = power.copy()
+    rows = power.shape[0] + 1
+    if rows % 2 == 0 and columns % 2 == 0:
+        power[rows // 2 - 1, columns // 2 - 1] /= 2.0
+    return power
+
+
+def _level(power: Float32Array) -> Float32Array:
+    """Return the noise power around each place, at least that of white noise, so that humps are no lines."""
+    of_place, of_time = (np.median(power, axis=axes, keepdims=True) / np.log(2.0) for axes in (0, (1, 2)))
+    level = np.ones((1, 1, 1), np.float32)
+    for found, number in ((of_place, power.shape[0]), (of_time, power[0].size)):
+        level = level * np.where(found > 1.0 + _RAISED / np.sqrt(number), found, 1.0)
+    return level.astype(np.float32)
+
+
+def _steady(u: Float32Array, numbers: IntArray, ratio: Float32Array, shape: tuple[int, int]) -> Wave | None:
+    """Return the wave whose phase runs on from frame to frame, if one stands out."""
+    place = np.unravel_index(int(ratio.argmax()), ratio.shape)
+    excess = float(ratio[place]) - float(np.log(ratio.size))
+    if excess < -np.log(_FALSE_ALARM):
+        return None
+    start = (int(place[0]) / ratio.shape[0], (int(place[1]) + 1) / shape[0], (int(place[2]) + 1) / shape[1])
+    width = (1.0 / ratio.shape[0], 1.0 / shape[0], 1.0 / shape[1])
+    return _steady_wave(u, numbers, start, width, excess)
+
+
+def _loose(u: Float32Array, mean: Float32Array) -> Wave | None:
+    """Return the wave whose phase is new in every frame, if one stands out of the noise around it."""
+    n, *shape = u.shape
+    around = ndimage.median_filter(mean, _AROUND, mode="nearest")
+    y, x = (int(i) for i in np.unravel_index(int((mean / around).argmax()), mean.shape))
+    noise = float(around[y, x])
+    sigma = (float(mean[y, x]) / noise - 1.0) * n**0.5
+    excess = sigma**2 / 2.0 - float(np.log(mean.size))
+    if sigma < 0.0 or excess < -np.log(_FALSE_ALARM):
+        return None
+    start, width = ((y + 1) / shape[0], (x + 1) / shape[1]), (1.0 / shape[0], 1.0 / shape[1])
+    return _loose_wave(u, start, width, noise, excess)
+
+
+def _steady_wave(
+    u: Float32Array,
+    numbers: IntArray,
+    start: tuple[float, float, float],
+    width: tuple[float, float, float],
+    excess: float,
+) -> Wave:
+    """Return the wave near a peak of the spectrum whose phase runs on from frame to frame.
+
+    Args:
+        u: standardised residuals (frame, y, x), 0 where there are none.
+        numbers: of the frames, (frame,).
+        start: cycles per frame, row and column of the peak.
+        width: of the peak, likewise.
+        excess: see :class:`Wave`.
+    """
+    places = {"t": numbers, "y": np.arange(u.shape[1]), "x": np.arange(u.shape[2])}
+    cycles, sums = _climbed(u, places, start, width)
+    best = complex(sums[0])
+    amplitude = _waves_of_sine(cycles) * abs(best) / (_pixels(u) * len(u))
+    return Wave(amplitude, cycles["t"], cycles["y"], cycles["x"], float(np.angle(best) + np.pi / 2.0), excess)
+
+
+def _loose_wave(
+    u: Float32Array,
+    start: tuple[float, float],
+    width: tuple[float, float],
+    noise: float,
+    excess: float,
+) -> Wave:
+    """Return the wave near a peak of the mean spectrum of frames, in each of which its phase is another one.
+
+    Args:
+        u: standardised residuals (frame, y, x), 0 where there are none.
+        start: cycles per row and column of the peak.
+        width: of the peak, likewise.
+        noise: power around the peak, 1 where it is white.
+        excess: see :class:`Wave`.
+    """
+    places = {"y": np.arange(u.shape[1]), "x": np.arange(u.shape[2])}
+    cycles, sums = _climbed(u, places, start, width)
+    power = float(np.mean(np.abs(sums) ** 2)) - noise * _pixels(u)
+    amplitude = _waves_of_sine(cycles) * max(power, 0.0) ** 0.5 / _pixels(u)
+    return Wave(amplitude, None, cycles["y"], cycles["x"], 0.0, excess)
+
+
+def _waves_of_sine(cycles: Mapping[str, float]) -> float:
+    """Return how many waves make up a sine: two, which are one where the phase is the same both ways."""
+    return 1.0 if all(2.0 * each % 1.0 == 0.0 for each in cycles.values()) else 2.0
+
+
+def _climbed(
+    u: Float32Array,
+    places: Mapping[str, IntArray],
+    start: tuple[float, ...],
+    width: tuple[float, ...],
+) -> tuple[dict[str, float], NDArray[np.complexfloating]]:
+    """Return the frequencies near a peak, each in turn by ever finer steps, and the sums of samples there.
+
+    There is a sum for each place along an axis that is not in ``places``.
+    """
+    kept = "".join(letter for letter in "tyx" if letter not in places)
+    steps = np.linspace(-1.0, 1.0, _STEPS)
+    cycles = dict(zip(places, start, strict=True))
+    size = {letter: _NARROWER * each for letter, each in zip(places, width, strict=True)}
+    best: NDArray[np.complexfloating] = np.zeros(1, np.complex128)
+    for _, letter in itertools.product(range(_ROUNDS), places):
+        others = [each for each in places if each != letter]
+        turned = [np.exp(-2j * np.pi * cycles[each] * places[each]).astype(np.complex64) for each in others]
+        of = ",".join(("tyx", *others))
+        along = np.einsum(f"{of}->{kept}{letter}", u, *turned, optimize=True)
+        tried = cycles[letter] + size[letter] * steps
+        sums = np.atleast_2d(along @ np.exp(-2j * np.pi * np.outer(places[letter], tried)))
+        at = int((np.abs(sums) ** 2).sum(axis=0).argmax())
+        cycles[letter], best = float(tried[at]), sums[:, at]
+        size[letter] /= _NARROWER
+    return {letter: (each + 0.5) % 1.0 - 0.5 for letter, each in cycles.items()}, best
+
+
+def _pixels(u: Float32Array) -> float:
+    """Return how many pixels have samples."""
+    return max(float(np.count_nonzero(u.any(axis=0))), 1.0)
