@@ -447,8 +447,8 @@ def _described(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size 
 def _alike(found: Findings) -> str:
     """Return in words whether a measured component is alike in all that it is said of."""
     if found.still or not found.added.after.at_floor:
-        return "whether all pixels and frames have it alike is not known"
-    return "as far as these statistics show, its pixels and frames have it alike"
+        return "whether it is like that throughout is not known"
+    return "as far as these statistics show, it is like that throughout"
 
 
 def _nearest(found: Findings) -> str:

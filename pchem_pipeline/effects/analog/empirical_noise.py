@@ -137,8 +137,8 @@ class NoiseMode(Section):
         """Whether it is an offset that changes its sign from sample to sample and frame to frame."""
         return self.of == "sample" and self.wave is not None and root_mean_square(self.wave) == 1.0
 
-    def words(self, rms: float) -> str:
-        """Return in words what varies by so many DN, and who shares it."""
+    def words(self, rms: float | None) -> str:
+        """Return in words what varies by so many DN (None: that is said elsewhere), and who shares it."""
         own = self.of == "sample" and (self.lags or self.wave is not None)
         whole = "" if own else f"the same in a whole {self.of}"
         order = np.argsort(-np.abs(self.correlation))[:_FEW]
@@ -149,19 +149,22 @@ class NoiseMode(Section):
             whole = f"of one shape in each {self.of} ({', '.join(f'{p:+.2g}' for p in self.profile)})"
         if self.shape:
             whole += f", strongest in {self.strongest()}"
-        # of bursts their size, not that of all the time
-        size = rms if self.burst is None else rms * (-1.0 if self.negative else 1.0) / np.sqrt(self.burst)
-        what = f"{size:.2g} DN"
-        if self.changes != "offset":
-            share, of = 100.0 * size / self.signal_dn, _CHANGED[self.changes]
-            at = "" if self.changes == "noise" else "at a signal "
-            form = ".2g" if abs(share) < 100.0 else ".0f"
-            form = form if self.burst is None else f"+{form}"
-            what = f"{share:{form}} % of the {of}, {what} {at}of {self.signal_dn:.3g} DN"
+        what = "" if rms is None else self._size_words(rms)
         if self.wave is not None:
             shared = self._wave_words(self.wave)
         burst = "" if self.burst is None else f"in {per_cent(self.burst)} of the {self.of}s only"
         return ", ".join(part for part in (what, whole, burst, shared) if part)
+
+    def _size_words(self, rms: float) -> str:
+        # of bursts their size, not that of all the time
+        size = rms if self.burst is None else rms * (-1.0 if self.negative else 1.0) / np.sqrt(self.burst)
+        if self.changes == "offset":
+            return f"{size:.2g} DN"
+        share, of = 100.0 * size / self.signal_dn, _CHANGED[self.changes]
+        at = "" if self.changes == "noise" else "at a signal "
+        form = ".2g" if abs(share) < 100.0 else ".0f"
+        form = form if self.burst is None else f"+{form}"
+        return f"{share:{form}} % of the {of}, {size:.2g} DN {at}of {self.signal_dn:.3g} DN"
 
     def _wave_words(self, wave: Cycles) -> str:
         lines = [(each, _LINE[dim]) for each, dim in zip(wave, _LINE, strict=True) if dim in _DIMS[self.of]]
@@ -392,7 +395,8 @@ class EmpiricalNoise(Effect):
     def words(self) -> str:
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
-        parts = "; ".join(mode.words(self.share_of(mode)) for mode in self.modes)
+        of_all = len(self.modes) == 1 and self.modes[0].changes == "offset" and self.modes[0].burst is None
+        parts = "; ".join(mode.words(None if of_all else self.share_of(mode)) for mode in self.modes)
         if all(mode.changes == "offset" for mode in self.modes):
             return f"noise of {self.noise_dn:.2g} DN{place} that samples share before the converter ({parts})"
         changed = dict.fromkeys(_CHANGED.get(mode.changes, "offset") for mode in self.modes)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 Source = Literal["sample", "row", "column", "frame"]
 _ALONG: dict[Source, tuple[int, ...]] = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}
 _ALL_ROWS = 1 << 20
-_FEW = 4  # terms that are told in words
+_FEW = 4  # that are told in words, of terms that follow the same and of others
 
 
 class ResponseTerm(Section):
@@ -58,16 +58,22 @@ class ResponseTerm(Section):
             raise ValueError("place: a sample does not follow itself")
         return self
 
-    def words(self, response: float) -> str:
-        """Return in words what follows with a response."""
+    @property
+    def source(self) -> int | None:
+        """The column that a single one follows across rows or frames; None where it is told by distance."""
+        if self.of != "sample" or self.columns is None or self.columns[1] - self.columns[0] > 1:
+            return None
+        return self.columns[0] + self.place[2] if any(self.place[:2]) and self.place[2] else None
+
+    def words(self) -> str:
+        """Return in words what is followed."""
+        if self.source is not None:
+            return f"{neighbour_words((*self.place[:2], 0))} in column {self.source}"
         if self.of == "sample":
-            what = neighbour_words(self.place)
-        else:
-            where = neighbour_words(self.place).removeprefix("the sample ").strip()
-            what = f"each {'other ' if not any(self.place) else ''}sample of the {self.of}"
-            what += f" {where}" if any(self.place) else ""
-        only = f" (in {Region(columns=(self.columns,)).words()})" if self.columns else ""
-        return f"{100.0 * response:+.2g} % of {what}{only}"
+            return neighbour_words(self.place)
+        where = neighbour_words(self.place).removeprefix("the sample ").strip()
+        what = f"each {'other ' if not any(self.place) else ''}sample of the {self.of}"
+        return what + (f" {where}" if any(self.place) else "")
 
     def seen(self, charge: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the charge that each sample follows (frame, y, x), e-, of charges about their means."""
@@ -174,7 +180,18 @@ class EmpiricalResponse(Effect):
     def words(self) -> str:
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
-        order = sorted(self.terms, key=lambda term: -abs(term.weight))
-        told = [term.words(self.response * term.weight) for term in order[:_FEW]]
-        more = f", and {len(order) - _FEW} more" if len(order) > _FEW else ""
+        followed: dict[str, list[str]] = {}
+        for term in sorted(self.terms, key=lambda term: -abs(term.weight)):
+            only = f" in {Region(columns=(term.columns,)).words()}" if term.columns else ""
+            followed.setdefault(term.words(), []).append(
+                f"{100.0 * self.response * term.weight:+.2g} %{only}"
+            )
+        told = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:_FEW]]
+        more = f", and {len(followed) - _FEW} more" if len(followed) > _FEW else ""
         return f"samples{place} that follow the charge of others (by {', '.join(told)}{more})"
+
+
+def _few(parts: Sequence[str]) -> str:
+    """Return the first of some parts in words, and how many more there are."""
+    more = f" and {len(parts) - _FEW} more" if len(parts) > _FEW else ""
+    return f"{', '.join(parts[:_FEW])}{more}"

@@ -262,5 +262,5 @@ def test_a_described_sensor_is_said_so_and_keeps_the_component_in_its_model() ->
     from pchem_pipeline.discrepancy.build_verdict import _sentence
 
     assert "0.4 % of the samples are moved after the converter by -8 DN" in _sentence(found, {})
-    assert "have it alike" in _sentence(found, {})
+    assert "it is like that throughout" in _sentence(found, {})
     assert "not known" in _sentence(replace(found, still=True), {})
