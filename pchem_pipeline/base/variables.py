@@ -139,6 +139,7 @@ def _discrepancy() -> list[Variable]:
         ("frame_number", ("frame",), "int64", "1", "frame number in the run"),
         ("frame_charge", ("frame",), "float64", "1", "relative deviation of the exposure of each frame"),
         ("frame_readout", ("frame",), "float64", "DN", "mean readout residual of each frame"),
+        ("frame_noise", ("frame",), "float64", "1", "squares of the residuals of each frame, N(0, 1)"),
         ("frame_sd", ("channel",), "float64", "1", "sd by chance of frame_charge and frame_readout (DN)"),
         ("frame_charge_model", ("frame",), "float64", "1", "path of frame_charge under the named effects"),
         ("frame_readout_model", ("frame",), "float64", "DN", "path of frame_readout under the named effects"),

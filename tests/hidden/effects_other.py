@@ -113,7 +113,7 @@ class HerringBone(Hidden):
     """
 
     tag: ClassVar[str] = "herring_bone"
-    s95: ClassVar[float] = 0.025
+    s95: ClassVar[float] = 0.05
 
     def draw(self):
         per_column = self.between("cycles_per_column", 0.03, 0.47)

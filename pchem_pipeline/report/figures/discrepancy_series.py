@@ -35,8 +35,14 @@ FloatArray = NDArray[np.float64]
 _LINEAR = 8.0
 #: Number of stretches of the run over which frames are averaged.
 _STRETCHES = 24
-#: Factor and unit in which the means of the frames are shown, by channel.
-_SCALES = {"charge": (100.0, "%"), "readout": (1.0, "DN")}
+#: Factor and unit in which frames are shown, by what is shown of them, and the label of the axis.
+_SCALES = {"charge": (100.0, "%"), "readout": (1.0, "DN"), "noise": (1.0, "sd of chance")}
+_LABELS = {
+    "charge": "charge: exposure (%)",
+    "readout": "readout: mean residual (DN)",
+    "noise": "noise: squares (sd of chance)",
+}
+_PANEL_MM, _AXIS_MM = 42.0, 12.0
 
 _CODES_CAPTION = (
     "All usable pixels together. Top: samples at each DN (gray) and those that the fitted PCDs lead to "
@@ -46,7 +52,8 @@ _CODES_CAPTION = (
     "nonlinearity. Yellow: what the verdict points to."
 )
 _FRAMES_CAPTION = (
-    "Dots: means of the frames over all usable pixels. Blue: means over stretches of the run; the gray "
+    "Dots: means of the frames over all usable pixels, and how far the squares of their residuals lie above "
+    "those of other frames. Blue: means over stretches of the run; the gray "
     "band is two standard deviations of these by chance. Dashed: path of the named effects, if it does "
     "not depend on chance. Yellow: frames that the verdict points to."
 )
@@ -90,13 +97,15 @@ def frame_figures(data: DiscrepancyData) -> list[Figure]:
     if not _has(data, "frame_number", "frame_charge", "frame_readout"):
         return []
     frames, stretches = frame_tables(data.arrays)
-    sds = np.asarray(data.arrays.get("frame_sd", np.full(2, np.nan)), dtype=np.float64)
+    by_channel = np.asarray(data.arrays.get("frame_sd", np.full(2, np.nan)), dtype=np.float64)
+    sds = {**dict(zip(CHANNELS, by_channel.tolist(), strict=True)), "noise": 1.0}
+    sds = {shown: sd for shown, sd in sds.items() if shown in frames}
     words = []
-    for channel, sd in zip(CHANNELS, sds, strict=True):
+    for channel, sd in sds.items():
         (scale, unit), values = _SCALES[channel], frames[channel]
         centre, mean = stretches["frame"], stretches[channel]
         drift = float(np.polyfit(centre, mean, 1)[0] * np.ptp(centre)) if centre.size > 2 else math.nan
-        chance = f" (by chance {short(scale * float(sd))})" if np.isfinite(sd) else ""
+        chance = f" (by chance {short(scale * sd)})" if np.isfinite(sd) else ""
         words.append(
             f"{channel}: standard deviation {short(float(values.std()))} {unit}{chance}, change "
             f"along the run {short(drift)} {unit}"
@@ -110,7 +119,7 @@ def frame_figures(data: DiscrepancyData) -> list[Figure]:
             _FRAMES_CAPTION,
             f"Means of {count(int(frames['frame'].size), 'frame')}. {'; '.join(words)}{path}.",
             (frames, stretches),
-            frames_chart(frames, stretches, sds.tolist(), data.found.where),
+            frames_chart(frames, stretches, sds, data.found.where),
             PAGE_MM,
         )
     ]
@@ -146,16 +155,18 @@ _NAMED = "expected with what was added"
 
 
 def frame_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, DataTable]:
-    """Return the means of the frames in both channels, and their means over stretches of the run.
+    """Return the means of the frames in both channels and their noise, and means over stretches of the run.
 
     Args:
-        arrays: ``frame_number``, ``frame_charge``, ``frame_readout`` and, where there is a path of the named
-            effects, ``frame_charge_model`` and ``frame_readout_model``.
+        arrays: ``frame_number``, ``frame_charge``, ``frame_readout``, ``frame_noise`` if it is known and,
+            where there is a path of the named effects, ``frame_charge_model`` and ``frame_readout_model``.
     """
     number = np.asarray(arrays["frame_number"], dtype=np.float64)
     columns, means = {"frame": number}, dict[str, FloatArray]()
     units: dict[str, str] = {}
     for channel, (scale, unit) in _SCALES.items():
+        if f"frame_{channel}" not in arrays:
+            continue
         columns[channel] = scale * np.asarray(arrays[f"frame_{channel}"], dtype=np.float64)
         centre, means[channel], n = trends(number, columns[channel])
         path = arrays.get(f"frame_{channel}_model")
@@ -260,29 +271,30 @@ def parity_difference(number: NDArray[Any], values: FloatArray, sd: float) -> fl
 
 
 def frames_chart(
-    frames: DataTable, stretches: DataTable, sds: Sequence[float], marked: Sequence[Place] = ()
+    frames: DataTable, stretches: DataTable, sds: Mapping[str, float], marked: Sequence[Place] = ()
 ) -> Chart:
-    """Return the chart of the means of the frames in both channels, with the path of the named effects.
+    """Return the chart of the frames in both channels and of their noise, with the path of named effects.
 
     Args:
         frames: of :func:`frame_tables`.
         stretches: likewise.
-        sds: standard deviation of a frame's mean by chance, in the stored unit, by channel.
+        sds: standard deviation of a frame by chance, in the stored unit, by what is shown.
         marked: places whose frames are shaded.
     """
-    labels = {"charge": "charge: exposure (%)", "readout": "readout: mean residual (DN)"}
     panels = []
-    for sd, (channel, label) in zip(sds, labels.items(), strict=True):
+    for channel, sd in sds.items():
         shaded = [
             span
             for place in marked
-            if place.channel in (channel, "cross", "")
+            if place.channel in ("readout" if channel == "noise" else channel, "cross", "")
             for span in _marked(place.frames, frames["frame"])
         ]
         marks, ends, note = _channel(frames, stretches, channel, _SCALES[channel][0] * sd)
-        panel = Panel(Axis(label, *ends), (*shaded, *marks), note=note, corner="lower right")
+        panel = Panel(Axis(_LABELS[channel], *ends), (*shaded, *marks), note=note, corner="lower right")
         panels.append(panel)
-    return Chart((Stack(tuple(panels), Axis("frame"), height_mm=96.0),), legend=(5, 2))
+    return Chart(
+        (Stack(tuple(panels), Axis("frame"), height_mm=len(panels) * _PANEL_MM + _AXIS_MM),), legend=(5, 2)
+    )
 
 
 def _channel(

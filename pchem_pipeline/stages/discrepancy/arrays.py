@@ -99,6 +99,8 @@ def _time_arrays(evidence: Evidence, time: TimeSeries) -> dict[str, NDArray[Any]
         "lag1": _single(np.stack([time.lag_charge[0], time.lag_readout[0]]) * np.sqrt(time.n_pairs)),
         "block_spread": _block_spread(evidence, time),
     }
+    if time.frame_noise is not None:
+        found["frame_noise"] = np.asarray(time.frame_noise, dtype=np.float64)
     maps = pixel_maps(evidence)
     found["trend"] = _single(np.stack([maps["trend.charge"], maps["trend.readout"]]))
     if time.neighbour_maps:

@@ -405,6 +405,17 @@ def test_the_largest_maps_are_those_with_structure() -> None:
     assert largest_maps({}) == []
 
 
+def test_noisy_frames_are_seen_where_their_noise_is_known() -> None:
+    data = discrepancy_data()
+    number = data.arrays["frame_number"]
+    noisy = np.where(number == number[7], 9.0, 0.0)
+    known = replace(data, arrays=data.arrays | {"frame_noise": noisy})
+    (before,), (after,) = (discrepancy_series.frame_figures(each) for each in (data, known))
+    assert [len(each.chart.stacks[0].panels) for each in (before, after)] == [2, 3]
+    assert after.tables[0]["noise"].max() == 9.0
+    assert "noise: standard deviation" in after.alt
+
+
 def test_a_comb_a_pile_up_and_an_alternation_are_in_the_numbers() -> None:
     arrays = discrepancy_data().arrays
     table = discrepancy_series.code_table(arrays)
