@@ -96,12 +96,15 @@ class FollowingSamples:
         inside: pixels whose residuals count, (y, x).
         mixed: correlation of charge and residual of a sample, (y, x).
         scale: of what the residual leaves of the charge, 0 where too little, (y, x).
+        exposure, spread: mean and standard deviation of the charge, e-, (y, x).
     """
 
     samples: Samples
     inside: BoolArray
     mixed: Float32Array
     scale: Float32Array
+    exposure: Float32Array
+    spread: Float32Array
 
     @classmethod
     def of(
@@ -128,7 +131,7 @@ class FollowingSamples:
             return None
         samples = replace(Samples.by_laws(_Groups(frames, first), laws, maps), most=_AT_ONCE)
         inside = samples.usable if inside is None else samples.usable & inside
-        return cls(samples, inside, *_held_by_residual(laws, maps))
+        return cls(samples, inside, *_charge_of(laws, maps))
 
     @property
     def groups(self) -> int:
@@ -160,6 +163,49 @@ class FollowingSamples:
         wider = np.sqrt(np.maximum(ratio.prod(axis=0), 1e-300))
         return Follows(products, pairs, dict(zip(SOURCES, wider.tolist(), strict=True)))
 
+    def by_excess(
+        self, place: tuple[int, int, int], columns: tuple[int, int] | None, above: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return sums of products with what the charge at a place has above some numbers, and of its squares.
+
+        Args:
+            place: frames, rows and columns from the residual to the charge.
+            columns: first column of residuals that count, and the one behind; None: all.
+            above: electrons, (n,).
+
+        Returns:
+            ``sum u f`` and ``sum f^2`` of residuals u, in their standard deviation, and f, e-, (n,) each.
+        """
+        step, (ny, nx) = -place[0], self.inside.shape
+        here, there = self._pairs(place)
+        some = np.zeros(nx, np.bool_)
+        some[slice(*columns) if columns else slice(None)] = True
+        products, squares = np.zeros(above.size), np.zeros(above.size)
+        for charge, residual in self.samples.chunks():
+            u = (residual * (self.inside & some)).reshape(-1, GROUP, ny, nx)[:, step:, *here]
+            for number, least in enumerate(above):
+                f = np.maximum(self.exposure + self.spread * charge - np.float32(least), 0.0)
+                f = (f - f.mean(axis=0)) * (self.scale > 0.0)
+                # noise that samples share moves both the charge and the residual of each
+                held = (f * residual).sum(axis=0) / np.maximum((residual**2).sum(axis=0), 1.0)
+                f = (f - held * residual).reshape(-1, GROUP, ny, nx)[:, : GROUP - step, *there]
+                products[number] += np.einsum("gtyx,gtyx->", u, f, dtype=np.float64)
+                squares[number] += np.einsum(
+                    "gtyx,gtyx,yx->", f, f, (self.inside & some)[here], dtype=np.float64
+                )
+        return products, squares
+
+    def _pairs(self, place: tuple[int, int, int]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+        """Return the rows and columns of residuals with a sample at a place, and those of the samples."""
+        here, there = (
+            tuple(
+                slice(max(-sign * d, 0), n - max(sign * d, 0))
+                for d, n in zip(place[1:], self.inside.shape, strict=True)
+            )
+            for sign in (1, -1)
+        )
+        return here, there
+
     def by_column(self, place: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]:
         """Return the sums of products with the sample at a place, and how many, by the residual's column.
 
@@ -167,13 +213,7 @@ class FollowingSamples:
             place: frames, rows and columns from the residual to the charge.
         """
         step, (ny, nx) = -place[0], self.inside.shape
-        here, there = (
-            tuple(
-                slice(max(-sign * d, 0), n - max(sign * d, 0))
-                for d, n in zip(place[1:], (ny, nx), strict=True)
-            )
-            for sign in (1, -1)
-        )
+        here, there = self._pairs(place)
         products, pairs = np.zeros(nx), np.zeros(nx)
         for one, two in self.chunks():
             residual = one.reshape(-1, GROUP, ny, nx)[:, step:, *here]
@@ -184,8 +224,10 @@ class FollowingSamples:
         return products, pairs
 
 
-def _held_by_residual(laws: PixelLaws, maps: PixelMaps) -> tuple[Float32Array, Float32Array]:
-    """Return the correlation of charge and residual of a sample, and the scale of what it leaves, (y, x)."""
+def _charge_of(
+    laws: PixelLaws, maps: PixelMaps
+) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array]:
+    """Return the correlation of charge and residual, the scale of what it leaves, mean and spread, (y, x)."""
     shape = maps.usable.shape
     pixels = pixel_statistics(
         laws, maps.quanta_exposure.ravel(), maps.conversion_gain.ravel(), (shape[0], shape[1])
@@ -195,7 +237,9 @@ def _held_by_residual(laws: PixelLaws, maps: PixelMaps) -> tuple[Float32Array, F
     left = 1.0 - correlation**2
     resolved = usable & (left > _RESOLVED)
     scale = np.where(resolved, 1.0 / np.sqrt(np.where(resolved, left, 1.0)), 0.0)
-    return correlation.astype(np.float32), scale.astype(np.float32)
+    mean = np.where(usable, maps.quanta_exposure, 0.0)
+    spread = np.sqrt(np.where(usable, pixels.charge, 0.0))
+    return tuple(each.astype(np.float32) for each in (correlation, scale, mean, spread))  # type: ignore[return-value]
 
 
 def _scatter(u: Float32Array) -> FloatArray:

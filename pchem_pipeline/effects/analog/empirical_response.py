@@ -7,6 +7,7 @@ distance, of each other sample of the row, of the frame before. Nothing is said 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 Source = Literal["sample", "row", "column", "frame"]
 _ALONG: dict[Source, tuple[int, ...]] = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}
 _ALL_ROWS = 1 << 20
+_FAR = 8.0  # standard deviations of the charge, and electrons, beyond which there is none
 _FEW = 4  # that are told in words, of terms that follow the same and of others
 
 
@@ -46,6 +48,11 @@ class ResponseTerm(Section):
     number: int = Field(
         default=1, ge=1, description="how many samples a row, column or frame has, for the law of the pixels"
     )
+    above: float = Field(
+        default=0.0,
+        ge=0,
+        description="charge of a sample up to which it is not followed, e-; 0: all of it is",
+    )
     columns: tuple[int, int] | None = Field(
         default=None, description="first column of those that follow, and the one behind; null: all"
     )
@@ -56,6 +63,8 @@ class ResponseTerm(Section):
             raise ValueError("place: of this frame or before it; 0 along what is followed as a whole")
         if self.of == "sample" and not any(self.place):
             raise ValueError("place: a sample does not follow itself")
+        if self.of != "sample" and self.above:
+            raise ValueError("above: of single samples only")
         return self
 
     @property
@@ -67,22 +76,50 @@ class ResponseTerm(Section):
 
     def words(self) -> str:
         """Return in words what is followed."""
-        if self.source is not None:
-            return f"{neighbour_words((*self.place[:2], 0))} in column {self.source}"
         if self.of == "sample":
-            return neighbour_words(self.place)
+            what = f"what exceeds {self.above:g} e- in " if self.above else ""
+            if self.source is not None:
+                return f"{what}{neighbour_words((*self.place[:2], 0))} in column {self.source}"
+            return f"{what}{neighbour_words(self.place)}"
         where = neighbour_words(self.place).removeprefix("the sample ").strip()
         what = f"each {'other ' if not any(self.place) else ''}sample of the {self.of}"
         return what + (f" {where}" if any(self.place) else "")
 
-    def seen(self, charge: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the charge that each sample follows (frame, y, x), e-, of charges about their means."""
+    def seen(self, charge: NDArray[np.float64], exposure: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the charge that each sample follows, about its mean (frame, y, x), e-.
+
+        Args:
+            charge: electrons of the samples (frame, y, x).
+            exposure: mean number of electrons (y, x).
+        """
+        charge = np.maximum(charge - self.above, 0.0) - excess_moments(exposure, self.above)[0]
         axes = _ALONG[self.of]
         sums = np.broadcast_to(charge.sum(axis=axes, keepdims=True), charge.shape) if axes else charge
         if not any(self.place):
             return np.asarray(sums - charge)
         found, known = neighbours(np.ascontiguousarray(sums), self.place)
         return np.where(known, found, 0.0)
+
+
+def excess_moments(
+    exposure: NDArray[np.float64], above: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the mean and the variance of what Poisson counts have above a number, e- and e-^2.
+
+    Args:
+        exposure: mean counts, any shape.
+        above: the number, 0 or more.
+    """
+    if above == 0.0:
+        return exposure, exposure
+    largest = float(np.max(np.nan_to_num(exposure), initial=0.0))
+    chance, mean, square = np.exp(-exposure), np.zeros(exposure.shape), np.zeros(exposure.shape)
+    for k in range(1, math.ceil(largest + _FAR * largest**0.5 + _FAR)):
+        chance = chance * exposure / k
+        excess = max(k - above, 0.0)
+        mean += excess * chance
+        square += excess**2 * chance
+    return mean, square - mean**2
 
 
 @register_effect
@@ -126,11 +163,12 @@ class EmpiricalResponse(Effect):
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the signal (frame, y, x), e-, with parts of the charge of other samples about its mean."""
-        charge = np.asarray(context.charge, np.float64) - context.truth["quanta_exposure"]
+        charge = np.asarray(context.charge, np.float64)
+        exposure = np.asarray(context.truth["quanta_exposure"], np.float64)
         found = np.array(values, np.float64)
         for term in self.terms:
             columns = slice(*term.columns) if term.columns else slice(None)
-            found[..., columns] += self.response * term.weight * term.seen(charge)[..., columns]
+            found[..., columns] += self.response * term.weight * term.seen(charge, exposure)[..., columns]
         return found
 
     @classmethod
@@ -166,8 +204,12 @@ class EmpiricalResponse(Effect):
         Terms of some columns count as their mean over the columns of the region; without one they are left
         out, since the pixels of other columns have none of it.
         """
-        power = sum(term.number * term.weight**2 * self._part(term) for term in self.terms)
-        return model.with_variance(e2=self.response**2 * power * np.nan_to_num(maps.quanta_exposure))
+        exposure = np.nan_to_num(maps.quanta_exposure)
+        power: Any = sum(
+            term.number * term.weight**2 * self._part(term) * excess_moments(exposure, term.above)[1]
+            for term in self.terms
+        )
+        return model.with_variance(e2=self.response**2 * power)
 
     def _part(self, term: ResponseTerm) -> float:
         """Return the part of the pixels that follow by a term."""

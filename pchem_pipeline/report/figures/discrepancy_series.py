@@ -39,8 +39,8 @@ _STRETCHES = 24
 _SCALES = {"charge": (100.0, "%"), "readout": (1.0, "DN"), "noise": (1.0, "sd of chance")}
 _LABELS = {
     "charge": "charge: exposure (%)",
-    "readout": "readout: mean residual (DN)",
-    "noise": "noise: squares (sd of chance)",
+    "readout": "readout: mean (DN)",
+    "noise": "noise (sd of chance)",
 }
 _PANEL_MM, _AXIS_MM = 42.0, 12.0
 

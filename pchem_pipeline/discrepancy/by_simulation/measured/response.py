@@ -32,6 +32,8 @@ _CERTAIN = 3.0  # standard errors of a model's, in simulated frames: less is tak
 _DETAIL = 1e-3  # of the nats of the first term: less may be how the pixels differ in it
 _MOST_TERMS = 16
 _NEARLY_ALL = 0.7  # of the columns
+_BEYOND = 10.0  # nats by which what exceeds some electrons must be followed more clearly than all of them
+_HIGHEST, _FAR = 30, 3.0  # electrons, and standard deviations of the charge: more are hardly ever exceeded
 
 
 class Responses(NamedTuple):
@@ -63,13 +65,22 @@ def residual_responses(
 
 
 class _Term(NamedTuple):
-    """What is followed, the mean product, what it is worth, nats, and the columns that follow; None: all."""
+    """What is followed, and by which columns.
+
+    Attributes:
+        of, place: see `ResponseTerm`.
+        value: the mean product; of what exceeds a number of electrons the slope, 1/e-.
+        gain: what it is worth, nats.
+        columns: that follow; None: all.
+        above: electrons.
+    """
 
     of: Source
     place: Place
     value: float
     gain: float
     columns: tuple[int, int] | None = None
+    above: int = 0
 
 
 def measured_response(
@@ -92,7 +103,7 @@ def measured_response(
         if term is None or (terms and term.gain < _DETAIL * terms[0].gain):
             break
         left.take_off(term)
-        terms.append(_in_columns(data.samples, term))
+        terms.append(_beyond(data.samples, _in_columns(data.samples, term)))
     if not terms:
         return None
     responses = [term.value / _response_of_one(evidence, inside, term) for term in terms]
@@ -106,6 +117,7 @@ def measured_response(
                 weight=round(response / largest, 4),
                 number=_number(term.of, inside.shape),
                 columns=term.columns,
+                above=float(term.above),
             )
             for term, response in zip(terms, responses, strict=True)
         ),
@@ -173,6 +185,20 @@ def _in_columns(samples: FollowingSamples, term: _Term) -> _Term:
     )
 
 
+def _beyond(samples: FollowingSamples, term: _Term) -> _Term:
+    """Return a term by what the charge exceeds, where that is followed far more clearly than all of it."""
+    if term.of != "sample":
+        return term
+    most = int(np.max(samples.exposure + _FAR * np.sqrt(samples.exposure)))
+    above = np.arange(min(most, _HIGHEST) + 1)
+    products, squares = samples.by_excess(term.place, term.columns, above)
+    gains = 0.5 * products**2 / np.maximum(squares, np.finfo(np.float64).tiny)
+    best = int(np.argmax(np.where(squares > 0.0, gains, 0.0)))
+    if best == 0 or gains[best] < gains[0] + _BEYOND:
+        return term
+    return term._replace(value=float(products[best] / squares[best]), gain=float(gains[best]), above=best)
+
+
 def _response_of_one(evidence: Evidence, inside: BoolArray, term: _Term) -> float:
     """Return the mean product where samples follow by all of the charge.
 
@@ -185,6 +211,8 @@ def _response_of_one(evidence: Evidence, inside: BoolArray, term: _Term) -> floa
     readout, charge = (evidence.readout_std * gain) ** 2, evidence.charge_std**2
     mixed = (maps.quanta_exposure + noise - readout - charge) / 2.0
     shift = np.where(inside, np.sqrt(readout) / noise, np.nan)
+    if term.above:
+        return float(np.nanmean(shift[:, slice(*term.columns) if term.columns else slice(None)]))
     apart = np.sqrt(np.maximum(charge - mixed**2 / readout, 0.0))
     columns = slice(*term.columns) if term.columns else slice(None)
     if term.of != "sample":

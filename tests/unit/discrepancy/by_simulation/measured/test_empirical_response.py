@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from scipy import stats
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
@@ -17,7 +18,11 @@ from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.size import size_of
-from pchem_pipeline.effects.analog.empirical_response import EmpiricalResponse, ResponseTerm
+from pchem_pipeline.effects.analog.empirical_response import (
+    EmpiricalResponse,
+    ResponseTerm,
+    excess_moments,
+)
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
@@ -63,6 +68,13 @@ def settling(v: np.ndarray, _: np.random.Generator) -> np.ndarray:
     return found
 
 
+def ghost(v: np.ndarray, _: np.random.Generator) -> np.ndarray:
+    """Return signals less 5 % of what the one of the frame before has above three electrons."""
+    found = v.copy()
+    found[1:] -= 0.05 * np.maximum(v[:-1] - 3.0, 0.0)
+    return found
+
+
 def noisy(v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return signals with noise of their row and of their frame."""
     rows, frames = ((FRAMES, size, 1) for size in (SHAPE[0], 1))
@@ -105,6 +117,27 @@ def test_what_samples_follow_is_told_with_its_part(
     # to first order; refits make it exact
     assert found.effect.response * term.weight == pytest.approx(part, rel=0.3)
     assert found.unlisted
+
+
+def test_what_only_large_charge_does_is_told_with_how_large() -> None:
+    found = measured(drawn(ghost, 3))
+    assert found is not None
+    assert isinstance(found.effect, EmpiricalResponse)
+    (term,) = found.effect.terms
+    assert (term.of, term.place, term.above) == ("sample", (-1, 0, 0), 3.0)
+    assert found.effect.response * term.weight == pytest.approx(-0.05, rel=0.3)
+    assert "what exceeds 3 e- in the sample one frame earlier" in found.effect.words()
+
+
+@pytest.mark.parametrize("above", [0.0, 1.0, 2.5])
+def test_the_excess_of_poisson_counts_has_its_moments(above: float) -> None:
+    exposure = np.array([0.05, 1.3, 9.0])
+    mean, variance = excess_moments(exposure, above)
+    k = np.arange(80)
+    for number, each in enumerate(exposure):
+        excess, chance = np.maximum(k - above, 0.0), stats.poisson.pmf(k, each)
+        assert mean[number] == pytest.approx(excess @ chance, rel=1e-9)
+        assert variance[number] == pytest.approx(excess**2 @ chance - (excess @ chance) ** 2, rel=1e-9)
 
 
 def test_what_only_some_columns_follow_is_told_with_these() -> None:
@@ -178,18 +211,19 @@ def simulated(*terms: ResponseTerm, response: float, region: Any = None) -> np.n
     [
         (ResponseTerm(place=(0, 0, -3)), 1),
         (ResponseTerm(place=(-2, 1, 0), weight=-1.0), 1),
+        (ResponseTerm(place=(-1, 0, 0), above=2.0), excess_moments(np.array([2.0]), 2.0)[1].item() / 2.0),
         (ResponseTerm(of="row", number=SHAPE[1]), SHAPE[1] - 1),
         (ResponseTerm(of="column", place=(0, 0, 1), number=SHAPE[0]), SHAPE[0]),
         (ResponseTerm(of="frame", place=(-1, 0, 0), number=SHAPE[0] * SHAPE[1]), SHAPE[0] * SHAPE[1]),
     ],
 )
-def test_simulated_samples_follow_what_is_told(term: ResponseTerm, power: int) -> None:
+def test_simulated_samples_follow_what_is_told(term: ResponseTerm, power: float) -> None:
     plain, found = (simulated(term, response=part) for part in (0.0, 0.02))
     change = found - plain
-    charge = np.rint(plain) - 2.0
+    charge = np.rint(plain)
     # where a frame, row and column before it exist
     inner = np.s_[2:, 1:-1, 4:-1]
-    followed = term.seen(charge)[inner]
+    followed = term.seen(charge, np.full(charge.shape[1:], 2.0))[inner]
     rounding = 2.0 / STEP / np.sqrt(12.0)
     np.testing.assert_allclose(change[inner], 0.02 * term.weight * followed, atol=1.01 / STEP)
     assert change[inner].std() == pytest.approx(
