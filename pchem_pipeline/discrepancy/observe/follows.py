@@ -239,7 +239,8 @@ def _charge_of(
     scale = np.where(resolved, 1.0 / np.sqrt(np.where(resolved, left, 1.0)), 0.0)
     mean = np.where(usable, maps.quanta_exposure, 0.0)
     spread = np.sqrt(np.where(usable, pixels.charge, 0.0))
-    return tuple(each.astype(np.float32) for each in (correlation, scale, mean, spread))  # type: ignore[return-value]
+    single = np.float32
+    return correlation.astype(single), scale.astype(single), mean.astype(single), spread.astype(single)
 
 
 def _scatter(u: Float32Array) -> FloatArray:

@@ -8,6 +8,7 @@ electrons of different samples are independent, so that what is found first does
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -34,6 +35,7 @@ _MOST_TERMS = 16
 _NEARLY_ALL = 0.7  # of the columns
 _BEYOND = 10.0  # nats by which what exceeds some electrons must be followed more clearly than all of them
 _HIGHEST, _FAR = 30, 3.0  # electrons, and standard deviations of the charge: more are hardly ever exceeded
+_STEPS = 8  # up to that, before all numbers near the clearest are tried
 
 
 class Responses(NamedTuple):
@@ -103,7 +105,9 @@ def measured_response(
         if term is None or (terms and term.gain < _DETAIL * terms[0].gain):
             break
         left.take_off(term)
-        terms.append(_beyond(data.samples, _in_columns(data.samples, term)))
+        found = _in_columns(data.samples, term)
+        # details of the clearest one would be told as terms of their own
+        terms.append(found if terms else _beyond(data.samples, found))
     if not terms:
         return None
     responses = [term.value / _response_of_one(evidence, inside, term) for term in terms]
@@ -189,14 +193,25 @@ def _beyond(samples: FollowingSamples, term: _Term) -> _Term:
     """Return a term by what the charge exceeds, where that is followed far more clearly than all of it."""
     if term.of != "sample":
         return term
-    most = int(np.max(samples.exposure + _FAR * np.sqrt(samples.exposure)))
-    above = np.arange(min(most, _HIGHEST) + 1)
-    products, squares = samples.by_excess(term.place, term.columns, above)
-    gains = 0.5 * products**2 / np.maximum(squares, np.finfo(np.float64).tiny)
-    best = int(np.argmax(np.where(squares > 0.0, gains, 0.0)))
-    if best == 0 or gains[best] < gains[0] + _BEYOND:
+    most = min(int(np.max(samples.exposure + _FAR * np.sqrt(samples.exposure))), _HIGHEST)
+    step = max(-(-most // _STEPS), 1)
+    found: dict[int, tuple[float, float]] = {}  # nats and slope
+
+    def clearest_of(numbers: Iterable[int]) -> int:
+        tried = sorted({*numbers} - {*found})
+        products, squares = samples.by_excess(term.place, term.columns, np.array(tried, np.int64))
+        for number, product, square in zip(tried, products.tolist(), squares.tolist(), strict=True):
+            if square > 0.0:
+                found[number] = 0.5 * product**2 / square, product / square
+        return max(found, default=0, key=lambda number: found[number][0])
+
+    best = clearest_of(range(0, most + 1, step))
+    if step > 1:
+        best = clearest_of(range(max(best - step + 1, 0), best + step))
+    if best == 0 or found[best][0] < found.get(0, (0.0, 0.0))[0] + _BEYOND:
         return term
-    return term._replace(value=float(products[best] / squares[best]), gain=float(gains[best]), above=best)
+    gain, slope = found[best]
+    return term._replace(value=slope, gain=gain, above=best)
 
 
 def _response_of_one(evidence: Evidence, inside: BoolArray, term: _Term) -> float:
