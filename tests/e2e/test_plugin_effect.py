@@ -95,4 +95,7 @@ def test_without_the_plug_in_nobody_else_is_blamed(shell, stack):
     shell.ok("discrepancy", "run.yaml")
     found = json.loads((shell.folder / "run.zarr" / "discrepancy.json").read_text())
     assert found["effects"] == []
-    assert found["verdict"] == "unexplained"
+    assert found["verdict"] == "described"
+    assert (
+        "changing its sign from frame to frame, from row to row, from column to column" in found["sentence"]
+    )

@@ -87,6 +87,7 @@ def time_series(
         frame_charge=rng.normal(0, sd_k, n) + 0.004 * position,
         frame_readout=rng.normal(0, sd_r, n) + 0.12 * position,
         frame_gain=rng.normal(0, 1e-3, n),
+        frame_noise=np.random.default_rng(8).standard_normal(n),
         quadrant_charge=rng.normal(0, 2 * sd_k, (n, 4)),
         quadrant_readout=rng.normal(0, 2 * sd_r, (n, 4)),
         row_charge=(row_k * rng.standard_normal((n, ny))).astype(np.float32),

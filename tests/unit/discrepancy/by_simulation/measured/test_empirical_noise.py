@@ -249,7 +249,7 @@ model:
     (effect,) = parse_config(text).model.effects
     assert effect.words() == (
         "noise of 0.7 DN that samples share before the converter "
-        "(0.7 DN, the same in a whole row, correlated by 0.48 (1 row apart))"
+        "(the same in a whole row, correlated by 0.48 (1 row apart))"
     )
 
 
