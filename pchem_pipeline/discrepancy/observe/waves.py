@@ -72,7 +72,7 @@ def waves_across(
     """
     ny, nx = maps.usable.shape
     some = numbers - numbers[0] < max(_MOST_SAMPLES // maps.usable.size, 1)
-    numbers = numbers[some] - numbers[0]
+    numbers = numbers[some]
     samples = Samples.by_laws(Stack(frames[: numbers.size]), laws, maps)
     samples = samples if inside is None else samples.without(~inside)
     pixels = int(np.count_nonzero(samples.usable))
@@ -81,8 +81,8 @@ def waves_across(
     u = np.concatenate([chunk for (chunk,) in samples.chunks((1,))])
     spectra = fft.rfft2(u)[:, 1:, 1:]
     mean = _halved((np.abs(spectra) ** 2).mean(axis=0) / pixels, nx)
-    over_time = np.zeros((int(numbers[-1]) + 1, *mean.shape), np.complex64)
-    over_time[numbers] = spectra
+    over_time = np.zeros((int(numbers[-1] - numbers[0]) + 1, *mean.shape), np.complex64)
+    over_time[numbers - numbers[0]] = spectra
     power = np.abs(fft.fft(over_time, axis=0, overwrite_x=True)) ** 2 / (pixels * numbers.size)
     for when in (0, len(power) // 2) if len(power) % 2 == 0 else (0,):
         power[when] = _halved(power[when], nx)
