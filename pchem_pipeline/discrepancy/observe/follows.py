@@ -97,6 +97,7 @@ class FollowingSamples:
         mixed: correlation of charge and residual of a sample, (y, x).
         scale: of what the residual leaves of the charge, 0 where too little, (y, x).
         exposure, spread: mean and standard deviation of the charge, e-, (y, x).
+        mirrored: axes of (frame, y, x) along which the charge is counted from the other end.
     """
 
     samples: Samples
@@ -105,6 +106,7 @@ class FollowingSamples:
     scale: Float32Array
     exposure: Float32Array
     spread: Float32Array
+    mirrored: tuple[int, ...] = ()
 
     @classmethod
     def of(
@@ -138,10 +140,19 @@ class FollowingSamples:
         """Number of groups of frames."""
         return self.samples.n_frames // GROUP
 
+    @property
+    def told(self) -> BoolArray:
+        """Pixels whose charge counts, as they are counted, (y, x)."""
+        return self.turned(self.scale > 0.0)
+
+    def turned(self, charge: NDArray[Any]) -> NDArray[Any]:
+        """Return what belongs to the charge, (..., y, x), with its mirrored axes from the other end."""
+        return np.flip(charge, tuple(axis - 3 for axis in self.mirrored))
+
     def chunks(self) -> Iterator[tuple[Float32Array, Float32Array]]:
         """Yield residuals and charge of some groups at a time, (frame, y, x), 0 where they do not count."""
         for charge, residual in self.samples.chunks():
-            yield residual * self.inside, (charge - self.mixed * residual) * self.scale
+            yield residual * self.inside, self.turned((charge - self.mixed * residual) * self.scale)
 
     def by_distance(self) -> Follows:
         """Sum the products of residuals with the charge of other samples."""
@@ -154,11 +165,12 @@ class FollowingSamples:
             one, two = (fft.rfftn(u, size, axes=(1, 2)).reshape(-1, GROUP, *sums.shape[1:]) for u in chunk)
             for step in range(STEPS):
                 sums[step] += np.einsum("gtyx,gtyx->yx", one[:, step:].conj(), two[:, : GROUP - step])
-        to, source = (fft.rfftn(mask.astype(np.float64), size) for mask in (self.inside, self.scale > 0.0))
+        to, source = (fft.rfftn(mask.astype(np.float64), size) for mask in (self.inside, self.told))
         number = (self.groups * (GROUP - np.arange(STEPS))).astype(np.float64)
         products = _centred(sums, size, (ny, nx))
         pairs = np.rint(_centred((to.conj() * source)[None], size, (ny, nx))) * number[:, None, None]
-        products[0, ny - 1, nx - 1] = pairs[0, ny - 1, nx - 1] = 0.0
+        if not self.mirrored:
+            products[0, ny - 1, nx - 1] = pairs[0, ny - 1, nx - 1] = 0.0
         ratio = scatter / np.maximum(scatter[:, :1], 1e-300)
         wider = np.sqrt(np.maximum(ratio.prod(axis=0), 1e-300))
         return Follows(products, pairs, dict(zip(SOURCES, wider.tolist(), strict=True)))
@@ -188,7 +200,7 @@ class FollowingSamples:
                 f = (f - f.mean(axis=0)) * (self.scale > 0.0)
                 # noise that samples share moves both the charge and the residual of each
                 held = (f * residual).sum(axis=0) / np.maximum((residual**2).sum(axis=0), 1.0)
-                f = (f - held * residual).reshape(-1, GROUP, ny, nx)[:, : GROUP - step, *there]
+                f = self.turned(f - held * residual).reshape(-1, GROUP, ny, nx)[:, : GROUP - step, *there]
                 products[number] += np.einsum("gtyx,gtyx->", u, f, dtype=np.float64)
                 squares[number] += np.einsum(
                     "gtyx,gtyx,yx->", f, f, (self.inside & some)[here], dtype=np.float64
@@ -219,7 +231,7 @@ class FollowingSamples:
             residual = one.reshape(-1, GROUP, ny, nx)[:, step:, *here]
             charge = two.reshape(-1, GROUP, ny, nx)[:, : GROUP - step, *there]
             products[here[1]] += np.einsum("gtyx,gtyx->x", residual, charge)
-        both = self.inside[here] & (self.scale > 0.0)[there]
+        both = self.inside[here] & self.told[there]
         pairs[here[1]] = both.sum(axis=0) * self.groups * (GROUP - step)
         return products, pairs
 

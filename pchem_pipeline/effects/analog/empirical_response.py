@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 #: What a sample follows: another one, or each other one of a row, a column or a frame.
 Source = Literal["sample", "row", "column", "frame"]
+#: Along the rows the columns are counted from the other end, and along the columns the rows.
+Axis = Literal["rows", "columns"]
+AXES: dict[Axis, int] = {"rows": 2, "columns": 1}
 _ALONG: dict[Source, tuple[int, ...]] = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}
 _ALL_ROWS = 1 << 20
 _FAR = 8.0  # standard deviations of the charge, and electrons, beyond which there is none
@@ -48,6 +51,11 @@ class ResponseTerm(Section):
     number: int = Field(
         default=1, ge=1, description="how many samples a row, column or frame has, for the law of the pixels"
     )
+    mirrored: tuple[Axis, ...] = Field(
+        default=(),
+        max_length=2,
+        description="along what the sensor is mirrored: the place is then from the sample's mirror image",
+    )
     above: float = Field(
         default=0.0,
         ge=0,
@@ -61,16 +69,18 @@ class ResponseTerm(Section):
     def _of_the_past(self) -> Self:
         if self.place[0] > 0 or any(self.place[axis] for axis in _ALONG[self.of]):
             raise ValueError("place: of this frame or before it; 0 along what is followed as a whole")
-        if self.of == "sample" and not any(self.place):
+        if self.of == "sample" and not any(self.place) and not self.mirrored:
             raise ValueError("place: a sample does not follow itself")
-        if self.of != "sample" and self.above:
-            raise ValueError("above: of single samples only")
+        if self.of != "sample" and (self.above or self.mirrored):
+            raise ValueError("above, mirrored: of single samples only")
         return self
 
     @property
     def source(self) -> int | None:
         """The column that a single one follows across rows or frames; None where it is told by distance."""
-        if self.of != "sample" or self.columns is None or self.columns[1] - self.columns[0] > 1:
+        if self.of != "sample" or self.mirrored or self.columns is None:
+            return None
+        if self.columns[1] - self.columns[0] > 1:
             return None
         return self.columns[0] + self.place[2] if any(self.place[:2]) and self.place[2] else None
 
@@ -78,6 +88,10 @@ class ResponseTerm(Section):
         """Return in words what is followed."""
         if self.of == "sample":
             what = f"what exceeds {self.above:g} e- in " if self.above else ""
+            if self.mirrored:
+                beside = neighbour_words(self.place).removeprefix("the sample ").strip()
+                along = " and ".join(self.mirrored)
+                return f"{what}its mirror image along the {along}{f', {beside}' if beside else ''}"
             if self.source is not None:
                 return f"{what}{neighbour_words((*self.place[:2], 0))} in column {self.source}"
             return f"{what}{neighbour_words(self.place)}"
@@ -95,8 +109,9 @@ class ResponseTerm(Section):
         charge = np.maximum(charge - self.above, 0.0) - excess_moments(exposure, self.above)[0]
         axes = _ALONG[self.of]
         sums = np.broadcast_to(charge.sum(axis=axes, keepdims=True), charge.shape) if axes else charge
-        if not any(self.place):
+        if not any(self.place) and not self.mirrored:
             return np.asarray(sums - charge)
+        sums = np.flip(sums, tuple(AXES[each] for each in self.mirrored))
         found, known = neighbours(np.ascontiguousarray(sums), self.place)
         return np.where(known, found, 0.0)
 
@@ -150,7 +165,10 @@ class EmpiricalResponse(Effect):
 
     def halo(self) -> int:
         """Return how far across rows samples follow others, px."""
-        return max(_ALL_ROWS if 1 in _ALONG[term.of] else abs(term.place[1]) for term in self.terms)
+        return max(
+            _ALL_ROWS if 1 in _ALONG[term.of] or "columns" in term.mirrored else abs(term.place[1])
+            for term in self.terms
+        )
 
     def history(self) -> int:
         """Return how many frames before it matter."""
@@ -159,7 +177,9 @@ class EmpiricalResponse(Effect):
     @property
     def unlisted(self) -> bool:
         """Whether samples follow others than their neighbours and their own one frame before."""
-        return any(term.of != "sample" or sum(map(abs, term.place)) > 1 for term in self.terms)
+        return any(
+            term.of != "sample" or term.mirrored or sum(map(abs, term.place)) > 1 for term in self.terms
+        )
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the signal (frame, y, x), e-, with parts of the charge of other samples about its mean."""
@@ -182,19 +202,28 @@ class EmpiricalResponse(Effect):
         return ()
 
     def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it with the columns of its terms counted from the first one of a window."""
-        return self._moved(-columns[0], columns[1] - columns[0])
+        """Return it with the columns of its terms, and the places of mirror images, as a window has them."""
+        return self._moved((rows, columns), shape, -1)
 
     def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it with the columns of its terms counted on the sensor."""
-        return self._moved(columns[0], shape[1])
+        """Return it with the columns of its terms, and places of mirror images, as the sensor has them."""
+        return self._moved((rows, columns), shape, 1)
 
-    def _moved(self, by: int, end: int) -> Self:
+    def _moved(self, window: tuple[Span, Span], shape: tuple[int, int], way: int) -> Self:
+        # of what is mirrored in the middle of the window the image in that of the sensor lies elsewhere
+        middle = [size - first - end for size, (first, end) in zip(shape, window, strict=True)]
+        by = way * window[1][0]
+        last = shape[1] if way > 0 else window[1][1] - window[1][0]
+
         def moved(term: ResponseTerm) -> ResponseTerm:
+            frames, *place = term.place
+            for number, along in enumerate(("columns", "rows")):
+                place[number] += way * middle[number] if along in term.mirrored else 0
+            found = term.model_copy(update={"place": (frames, *place)})
             if term.columns is None:
-                return term
-            first, last = (min(max(edge + by, 0), end) for edge in term.columns)
-            return term.model_copy(update={"columns": (first, last)})
+                return found
+            ends = tuple(min(max(edge + by, 0), last) for edge in term.columns)
+            return found.model_copy(update={"columns": ends})
 
         return self.model_copy(update={"terms": tuple(moved(term) for term in self.terms)})
 

@@ -8,18 +8,25 @@ electrons of different samples are independent, so that what is found first does
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
+from pchem_pipeline.discrepancy.observe.digital.predicted import GROUP
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples, Follows
 from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
-from pchem_pipeline.effects.analog.empirical_response import EmpiricalResponse, ResponseTerm, Source
+from pchem_pipeline.effects.analog.empirical_response import (
+    AXES,
+    Axis,
+    EmpiricalResponse,
+    ResponseTerm,
+    Source,
+)
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.neighbours import neighbours
 
@@ -27,7 +34,9 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 Place = tuple[int, int, int]
+Mirrored = tuple[Axis, ...]
 
+_MIRRORED: tuple[Mirrored, ...] = ((), ("rows",), ("columns",), ("rows", "columns"))
 _CLEAR = 20.0  # nats that a term must be worth beyond the number of those that are tried
 _CERTAIN = 3.0  # standard errors of a model's, in simulated frames: less is taken for none
 _DETAIL = 1e-3  # of the nats of the first term: less may be how the pixels differ in it
@@ -42,12 +51,12 @@ class Responses(NamedTuple):
     """How the residuals of frames follow the charge of other samples.
 
     Attributes:
-        samples: the frames.
-        follows: sums of products of all of them.
+        views: the frames, as they are and with their charge mirrored, by along what.
+        follows: sums of products of all of them, likewise.
     """
 
-    samples: FollowingSamples
-    follows: Follows
+    views: Mapping[Mirrored, FollowingSamples]
+    follows: Mapping[Mirrored, Follows]
 
 
 def residual_responses(
@@ -63,7 +72,10 @@ def residual_responses(
     """
     edges = blocks_of(numbers, numbers.size)
     samples = FollowingSamples.of(frames, edges, laws_of_frames(frames, maps), maps, inside)
-    return None if samples is None else Responses(samples, samples.by_distance())
+    if samples is None:
+        return None
+    views = {along: replace(samples, mirrored=tuple(AXES[each] for each in along)) for along in _MIRRORED}
+    return Responses(views, {along: view.by_distance() for along, view in views.items()})
 
 
 class _Term(NamedTuple):
@@ -75,6 +87,7 @@ class _Term(NamedTuple):
         gain: what it is worth, nats.
         columns: that follow; None: all.
         above: electrons.
+        mirrored: along what; see `ResponseTerm`.
     """
 
     of: Source
@@ -83,6 +96,7 @@ class _Term(NamedTuple):
     gain: float
     columns: tuple[int, int] | None = None
     above: int = 0
+    mirrored: Mirrored = ()
 
 
 def measured_response(
@@ -98,16 +112,31 @@ def measured_response(
     """
     if data is None:
         return None
-    left = _Left.of(data.follows, None if model is None else model.follows)
+    left = {
+        along: _Left.of(follows, None if model is None else model.follows[along])
+        for along, follows in data.follows.items()
+    }
     terms: list[_Term] = []
     while len(terms) < _MOST_TERMS:
-        term = left.clearest()
+        seen = [
+            one._replace(mirrored=along)
+            for along, each in left.items()
+            if (one := each.clearest(bool(along)))
+        ]
+        term = max(seen, key=lambda one: one.gain, default=None)
         if term is None or (terms and term.gain < _DETAIL * terms[0].gain):
             break
-        left.take_off(term)
-        found = _in_columns(data.samples, term)
+        view = data.views[term.mirrored]
+        found = _in_columns(view, term)
+        left[term.mirrored].take_off(term)
+        if term.of != "sample":
+            # whole lines are in all mirror images, too
+            left = {along: each for along, each in left.items() if not along}
+        for along, other in left.items():
+            if along != term.mirrored:
+                other.take_off_pairs(data.views[along], view, found)
         # details of the clearest one would be told as terms of their own
-        terms.append(found if terms else _beyond(data.samples, found))
+        terms.append(found if terms else _beyond(view, found))
     if not terms:
         return None
     responses = [term.value / _response_of_one(evidence, inside, term) for term in terms]
@@ -122,6 +151,7 @@ def measured_response(
                 number=_number(term.of, inside.shape),
                 columns=term.columns,
                 above=float(term.above),
+                mirrored=term.mirrored,
             )
             for term, response in zip(terms, responses, strict=True)
         ),
@@ -146,11 +176,11 @@ class _Left:
             products -= np.where(sure, model.products / np.maximum(model.pairs, 1.0) * data.pairs, 0.0)
         return cls(products, data.pairs, data.wider)
 
-    def clearest(self) -> _Term | None:
-        """Return what is followed most clearly, if anything is."""
+    def clearest(self, mirrored: bool) -> _Term | None:
+        """Return what is followed most clearly, if anything is; of what is mirrored single samples only."""
         best: _Term | None = None
         now = Follows(self.products, self.pairs, self.wider)
-        for source in SOURCES:
+        for source in SOURCES[:1] if mirrored else SOURCES:
             z: FloatArray = np.nan_to_num(now.z(source))
             at = tuple(int(i) for i in np.unravel_index(int(np.argmax(np.abs(z))), z.shape))
             gain = 0.5 * float(z[at]) ** 2 - math.log(max(int(np.count_nonzero(z)), 1))
@@ -167,6 +197,28 @@ class _Left:
         columns = slice(None) if term.of in ("row", "frame") else x + term.place[2]
         here = -term.place[0], rows, columns
         self.products[here] -= term.value * self.pairs[here]
+
+    def take_off_pairs(self, own: FollowingSamples, view: FollowingSamples, term: _Term) -> None:
+        """Take off what single samples that are told in another view make of the distances of the own one."""
+        y, x = np.nonzero(view.inside)
+        columns = slice(*term.columns) if term.columns else slice(None)
+        some = np.isin(x, np.arange(view.inside.shape[1])[columns])
+        y, x = y[some], x[some]
+        there = y + term.place[1], x + term.place[2]
+        known = np.ones(y.size, np.bool_)
+        for at, size in zip(there, view.inside.shape, strict=True):
+            known &= (at >= 0) & (at < size)
+        y, x = y[known], x[known]
+        there = there[0][known], there[1][known]
+        known = view.told[there]
+        # mirrored twice is as it was
+        distances = []
+        for axis, (here, at) in enumerate(zip((y, x), there, strict=True), 1):
+            turned = (axis in own.mirrored) != (axis in view.mirrored)
+            at = view.inside.shape[axis - 1] - 1 - at if turned else at
+            distances.append((at - here)[known] + self.products.shape[axis] // 2)
+        number = view.groups * (GROUP + term.place[0])
+        np.subtract.at(self.products, (-term.place[0], *distances), term.value * number)
 
 
 def _in_columns(samples: FollowingSamples, term: _Term) -> _Term:
@@ -232,7 +284,8 @@ def _response_of_one(evidence: Evidence, inside: BoolArray, term: _Term) -> floa
     columns = slice(*term.columns) if term.columns else slice(None)
     if term.of != "sample":
         return float(np.nanmean(shift) * np.nanmean(apart))
-    source, known = neighbours(apart[None], (0, *term.place[1:]))
+    turned = np.flip(apart[None], tuple(AXES[each] for each in term.mirrored))
+    source, known = neighbours(np.ascontiguousarray(turned), (0, *term.place[1:]))
     pairs = np.where(known[0], source[0], np.nan) * shift
     return float(np.nanmean(pairs[:, columns]))
 

@@ -75,6 +75,13 @@ def ghost(v: np.ndarray, _: np.random.Generator) -> np.ndarray:
     return found
 
 
+def opposite(v: np.ndarray, _: np.random.Generator) -> np.ndarray:
+    """Return signals whose right half has 5 % of its mirror image in the left one, as of two outputs."""
+    found, half = v.copy(), v.shape[2] // 2
+    found[..., half:] += 0.05 * v[..., half - 1 :: -1]
+    return found
+
+
 def noisy(v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return signals with noise of their row and of their frame."""
     rows, frames = ((FRAMES, size, 1) for size in (SHAPE[0], 1))
@@ -127,6 +134,33 @@ def test_what_only_large_charge_does_is_told_with_how_large() -> None:
     assert (term.of, term.place, term.above) == ("sample", (-1, 0, 0), 3.0)
     assert found.effect.response * term.weight == pytest.approx(-0.05, rel=0.3)
     assert "what exceeds 3 e- in the sample one frame earlier" in found.effect.words()
+
+
+def test_what_follows_its_mirror_image_is_told_in_one() -> None:
+    found = measured(drawn(opposite, 4))
+    assert found is not None
+    assert isinstance(found.effect, EmpiricalResponse)
+    (term,) = found.effect.terms
+    assert (term.of, term.place, term.mirrored) == ("sample", (0, 0, 0), ("rows",))
+    assert term.columns == (SHAPE[1] // 2, SHAPE[1])
+    assert found.effect.response == pytest.approx(0.05, rel=0.3)
+    assert found.unlisted
+    assert "% in columns 9 to 17 of its mirror image along the rows)" in found.effect.words()
+
+
+@pytest.mark.parametrize("along", [("rows",), ("columns",), ("rows", "columns")])
+def test_a_mirror_image_in_a_window_is_where_it_is_on_the_sensor(along: Any) -> None:
+    charge = np.random.default_rng(5).poisson(2.0, (3, 20, 24)).astype(float)
+    exposure, window = np.full((20, 24), 2.0), ((3, 15), (2, 18))
+    here = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(0, 1, -2), mirrored=along),))
+    there = here.found_in(*window, (20, 24))
+    assert there.seen_in(*window, (20, 24)) == here
+    box = np.s_[:, 3:15, 2:18]
+    seen = here.terms[0].seen(charge[box], exposure[box[1:]])
+    on_sensor = there.terms[0].seen(charge, exposure)[box]
+    # beyond the window there is none
+    np.testing.assert_array_equal(seen[seen != 0.0], on_sensor[seen != 0.0])
+    assert np.count_nonzero(seen) > 0.5 * seen.size
 
 
 @pytest.mark.parametrize("above", [0.0, 1.0, 2.5])
