@@ -9,7 +9,8 @@ variance N. The largest of all distances counts, by how many there are.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, get_args
 
@@ -29,8 +30,11 @@ FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+Spectra = NDArray[np.complexfloating]
+Axes = tuple[int, ...]  # of (frame, y, x)
 
 SOURCES: tuple[Source, ...] = get_args(Source)
+_COLUMNS = 2  # the axis whose spectrum has one half only
 STEPS = 2  # the same frame, and the one before
 _MOST_SAMPLES = 1 << 18
 _AT_ONCE = 1 << 18  # samples that are transformed together
@@ -106,7 +110,7 @@ class FollowingSamples:
     scale: Float32Array
     exposure: Float32Array
     spread: Float32Array
-    mirrored: tuple[int, ...] = ()
+    mirrored: Axes = ()
 
     @classmethod
     def of(
@@ -154,26 +158,35 @@ class FollowingSamples:
         for charge, residual in self.samples.chunks():
             yield residual * self.inside, self.turned((charge - self.mixed * residual) * self.scale)
 
-    def by_distance(self) -> Follows:
-        """Sum the products of residuals with the charge of other samples."""
+    def by_distance(self, views: Sequence[Axes] = ((),)) -> list[Follows]:
+        """Sum the products of residuals with the charge of other samples, mirrored along some axes.
+
+        All views come of the same transforms: that of what is mirrored is the one of opposite frequency.
+        """
         ny, nx = self.inside.shape
         size = fft.next_fast_len(2 * ny - 1, real=True), fft.next_fast_len(2 * nx - 1, real=True)
-        sums = np.zeros((STEPS, size[0], size[1] // 2 + 1), np.complex128)
+        sums = np.zeros((len(views), STEPS, size[0], size[1] // 2 + 1), np.complex128)
         scatter = np.zeros((2, len(SOURCES)))
         for chunk in self.chunks():
             scatter += [_scatter(u) for u in chunk]
-            one, two = (fft.rfftn(u, size, axes=(1, 2)).reshape(-1, GROUP, *sums.shape[1:]) for u in chunk)
-            for step in range(STEPS):
-                sums[step] += np.einsum("gtyx,gtyx->yx", one[:, step:].conj(), two[:, : GROUP - step])
-        to, source = (fft.rfftn(mask.astype(np.float64), size) for mask in (self.inside, self.told))
-        number = (self.groups * (GROUP - np.arange(STEPS))).astype(np.float64)
-        products = _centred(sums, size, (ny, nx))
-        pairs = np.rint(_centred((to.conj() * source)[None], size, (ny, nx))) * number[:, None, None]
-        if not self.mirrored:
-            products[0, ny - 1, nx - 1] = pairs[0, ny - 1, nx - 1] = 0.0
+            one, two = (fft.rfftn(u, size, axes=(1, 2)).reshape(-1, GROUP, *sums.shape[2:]) for u in chunk)
+            for number, axes in enumerate(views):
+                this, other = _of_view(one, two, axes)
+                for step in range(STEPS):
+                    sums[number, step] += np.einsum("gtyx,gtyx->yx", this[:, step:], other[:, : GROUP - step])
         ratio = scatter / np.maximum(scatter[:, :1], 1e-300)
         wider = np.sqrt(np.maximum(ratio.prod(axis=0), 1e-300))
-        return Follows(products, pairs, dict(zip(SOURCES, wider.tolist(), strict=True)))
+        number = (self.groups * (GROUP - np.arange(STEPS))).astype(np.float64)
+        found = []
+        for axes, total in zip(views, sums, strict=True):
+            told = np.flip(self.scale > 0.0, tuple(axis - 1 for axis in axes))
+            to, source = (fft.rfftn(mask.astype(np.float64), size) for mask in (self.inside, told))
+            products = _centred(_seen_in_view(total, axes, size, (ny, nx)), size, (ny, nx))
+            pairs = np.rint(_centred((to.conj() * source)[None], size, (ny, nx))) * number[:, None, None]
+            if not axes:
+                products[0, ny - 1, nx - 1] = pairs[0, ny - 1, nx - 1] = 0.0
+            found.append(Follows(products, pairs, dict(zip(SOURCES, wider.tolist(), strict=True))))
+        return found
 
     def by_excess(
         self, place: tuple[int, int, int], columns: tuple[int, int] | None, above: IntArray
@@ -266,9 +279,27 @@ def _scatter(u: Float32Array) -> FloatArray:
     )
 
 
-def _centred(
-    spectra: NDArray[np.complexfloating], size: tuple[int, int], shape: tuple[int, int]
-) -> FloatArray:
+def _of_view(residual: Spectra, charge: Spectra, axes: Axes) -> tuple[Spectra, Spectra]:
+    """Return factors whose product is that with mirrored charge but for `_seen_in_view`, (..., y, x half).
+
+    The spectrum of what is mirrored is that of the opposite frequency, up to where it begins, and with
+    real values the conjugate where both are.
+    """
+    if len(axes) == 1:
+        charge = charge[..., -np.arange(charge.shape[-2]), :]
+    return residual if _COLUMNS in axes else residual.conj(), charge
+
+
+def _seen_in_view(products: Spectra, axes: Axes, size: tuple[int, int], shape: tuple[int, int]) -> Spectra:
+    """Return sums of products of `_of_view` as those with the mirrored charge, (n, y, x half)."""
+    found = products.conj() if _COLUMNS in axes else products
+    for axis in axes:
+        turns = np.arange(found.shape[axis]) * (shape[axis - 1] - 1) / size[axis - 1]
+        found = found * np.exp(-2j * math.pi * (turns if axis == _COLUMNS else turns[:, None]))
+    return found
+
+
+def _centred(spectra: Spectra, size: tuple[int, int], shape: tuple[int, int]) -> FloatArray:
     """Return the sums by distance, that of 0 in the middle, (n, 2 y - 1, 2 x - 1)."""
     found = fft.irfftn(spectra, size, axes=(1, 2))
     rows, columns = (np.arange(1 - n, n) for n in shape)
@@ -286,7 +317,7 @@ def follow_statistics(
     prepared = FollowingSamples.of(frames, edges, laws, maps, most=_MOST_SAMPLES)
     if prepared is None:
         return {}
-    found = prepared.by_distance()
+    (found,) = prepared.by_distance()
     y, x = (size // 2 for size in found.products.shape[1:])
     of_samples = found.z("sample")
     of_samples[0, y, x - 1 : x + 2] = of_samples[0, y - 1 : y + 2, x] = of_samples[1, y, x] = np.nan

@@ -75,7 +75,8 @@ def residual_responses(
     if samples is None:
         return None
     views = {along: replace(samples, mirrored=tuple(AXES[each] for each in along)) for along in _MIRRORED}
-    return Responses(views, {along: view.by_distance() for along, view in views.items()})
+    follows = samples.by_distance([view.mirrored for view in views.values()])
+    return Responses(views, dict(zip(views, follows, strict=True)))
 
 
 class _Term(NamedTuple):

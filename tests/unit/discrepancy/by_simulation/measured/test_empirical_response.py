@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -203,15 +204,17 @@ def test_what_a_model_makes_is_not_measured_again() -> None:
     assert measured_response(data, model, evidence[0], EVERYWHERE) is None
 
 
-def test_sums_by_distance_are_those_of_all_pairs() -> None:
+@pytest.mark.parametrize("axes", [(), (2,), (1,), (2, 1)])
+def test_sums_by_distance_are_those_of_all_pairs(axes: tuple[int, ...]) -> None:
     frames = drawn(distant, 7)[:24, :5, :6]
     evidence = observe(drawn(distant, 7)[:, :5, :6], np.arange(FRAMES), n_run=FRAMES, block_frames=100)
     laws, edges = laws_of_frames(frames, evidence.maps), np.array([0, 24])
     inside = np.ones((5, 6), bool)
     inside[1, 2] = False
-    prepared = FollowingSamples.of(frames, edges, laws, evidence.maps, inside)
-    assert prepared is not None
-    found = prepared.by_distance()
+    plain = FollowingSamples.of(frames, edges, laws, evidence.maps, inside)
+    assert plain is not None
+    found = plain.by_distance([(1,), (2,), (1, 2), (), axes])[-1]
+    prepared = replace(plain, mirrored=axes)
     residual, charge = (np.concatenate(parts).astype(float) for parts in zip(*prepared.chunks(), strict=True))
     groups = [u.reshape(-1, 4, 5, 6) for u in (residual, charge)]
     for step, dy, dx in ((0, 0, 1), (0, -2, 3), (1, 0, 0), (1, 4, -5), (1, -1, 2)):
@@ -226,7 +229,7 @@ def test_sums_by_distance_are_those_of_all_pairs() -> None:
         products, many = prepared.by_column((-step, dy, dx))
         np.testing.assert_allclose(products, total, atol=1e-3)
         np.testing.assert_array_equal(many, number)
-    assert found.pairs[0, 4, 5] == 0.0  # no sample follows itself
+    assert (found.pairs[0, 4, 5] == 0.0) == (not axes)  # no sample follows itself
     for source in SOURCES:
         assert found.of(source)[0].sum() == pytest.approx(found.products.sum())
 
