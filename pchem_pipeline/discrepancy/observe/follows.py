@@ -170,10 +170,10 @@ class FollowingSamples:
         for chunk in self.chunks():
             scatter += [_scatter(u) for u in chunk]
             one, two = (fft.rfftn(u, size, axes=(1, 2)).reshape(-1, GROUP, *sums.shape[2:]) for u in chunk)
-            for number, axes in enumerate(views):
+            for view, axes in enumerate(views):
                 this, other = _of_view(one, two, axes)
                 for step in range(STEPS):
-                    sums[number, step] += np.einsum("gtyx,gtyx->yx", this[:, step:], other[:, : GROUP - step])
+                    sums[view, step] += np.einsum("gtyx,gtyx->yx", this[:, step:], other[:, : GROUP - step])
         ratio = scatter / np.maximum(scatter[:, :1], 1e-300)
         wider = np.sqrt(np.maximum(ratio.prod(axis=0), 1e-300))
         number = (self.groups * (GROUP - np.arange(STEPS))).astype(np.float64)

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.measured.modes import codes_within_reach, score_tables
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
-from pchem_pipeline.discrepancy.observe.pairs import Samples
+from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
+from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons, Fate
 from pchem_pipeline.effects.estimators.count_scores import charlier_information
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
@@ -70,6 +71,7 @@ class Electrons(NamedTuple):
 def electron_chances(
     frames: NDArray[np.unsignedinteger],
     numbers: IntArray,
+    laws: PixelLaws,
     maps: PixelMaps,
     evidence: Evidence,
     inside: BoolArray,
@@ -79,6 +81,7 @@ def electron_chances(
     Args:
         frames: (frame, y, x), DN.
         numbers: of the frames in the run, increasing, shape (frame,).
+        laws: of the pixels' samples in these frames.
         maps: plain fit of these frames.
         evidence: of the frames of the data, which says how well their electrons are told.
         inside: pixels that are looked at, shape (y, x).
@@ -86,7 +89,8 @@ def electron_chances(
     inside = inside & maps.usable & evidence.maps.usable & (maps.quanta_exposure > 0)
     if not inside.any():
         return Electrons(_NOTHING, {})
-    u = np.concatenate([chunk for (chunk,) in Samples.of(frames, maps).without(~inside).chunks((0,))])
+    samples = Samples.by_laws(Stack(frames), laws, maps).without(~inside)
+    u = np.concatenate([chunk for (chunk,) in samples.chunks((0,))])
     # what a whole frame shares is another thing
     u -= np.where(inside, u.sum(axis=(1, 2), keepdims=True) / inside.sum(), 0.0)
     exposure = np.where(inside, maps.quanta_exposure, 1.0)

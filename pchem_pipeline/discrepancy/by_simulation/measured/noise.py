@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
-from pchem_pipeline.discrepancy.observe.pairs import Samples
+from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
+from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, Lag, NoiseMode, Shared, spectrum
 from pchem_pipeline.effects.estimators.common_modes import mean_response
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
@@ -69,13 +70,18 @@ class Covariances(NamedTuple):
 
 
 def residual_covariances(
-    frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps, inside: BoolArray
+    frames: NDArray[np.unsignedinteger],
+    numbers: IntArray,
+    laws: PixelLaws,
+    maps: PixelMaps,
+    inside: BoolArray,
 ) -> Covariances:
     """Measure how the readout residuals of near and far samples vary together.
 
     Args:
         frames: (frame, y, x), DN.
         numbers: of the frames in the run, increasing, shape (frame,).
+        laws: of the pixels' samples in these frames.
         maps: plain fit of these frames, or of more of the same pixels.
         inside: pixels that are looked at, shape (y, x).
     """
@@ -84,7 +90,7 @@ def residual_covariances(
     if not rows.size:
         return Covariances({}, {})
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    samples = Samples.of(frames, maps).without(~inside)
+    samples = Samples.by_laws(Stack(frames), laws, maps).without(~inside)
     u = np.concatenate([chunk for (chunk,) in samples.chunks((1,), *box)])
     found: dict[tuple[Shared, Lag], Covariance] = {}
     for step in range(_FARTHEST + 1):

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
 from pchem_pipeline.discrepancy.observe.digital.predicted import GROUP
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples, Follows
-from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
+from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.effects.analog.empirical_response import (
     AXES,
     Axis,
@@ -60,18 +60,23 @@ class Responses(NamedTuple):
 
 
 def residual_responses(
-    frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps, inside: BoolArray
+    frames: NDArray[np.unsignedinteger],
+    numbers: IntArray,
+    laws: PixelLaws,
+    maps: PixelMaps,
+    inside: BoolArray,
 ) -> Responses | None:
     """Measure how the residuals of samples follow the charge of others; None where frames are too few.
 
     Args:
         frames: (frame, y, x), DN.
         numbers: of the frames in the run, increasing, shape (frame,).
+        laws: of the pixels' samples in these frames.
         maps: plain fit of these frames.
         inside: pixels whose residuals are looked at, shape (y, x).
     """
     edges = blocks_of(numbers, numbers.size)
-    samples = FollowingSamples.of(frames, edges, laws_of_frames(frames, maps), maps, inside)
+    samples = FollowingSamples.of(frames, edges, laws, maps, inside)
     if samples is None:
         return None
     views = {along: replace(samples, mirrored=tuple(AXES[each] for each in along)) for along in _MIRRORED}

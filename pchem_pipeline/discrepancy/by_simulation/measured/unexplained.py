@@ -331,16 +331,15 @@ class Unexplained:
         @functools.cache
         def of(part: Part) -> _Shared:
             some, inside = part.frames(numbers), self.work.frames.inside(part)
-            found = residual_covariances(frames[some], numbers[some], maps, inside)
+            laws = laws_of_frames(frames[some], maps)
+            found = residual_covariances(frames[some], numbers[some], laws, maps, inside)
             # the shape of a line beyond the window is not known
             lines = {of: line for of, line in found.lines.items() if of in self.work.frames.whole_lines}
             found = Covariances(found.pairs, lines)
-            electrons = electron_chances(frames[some], numbers[some], maps, self.work.plain, inside)
-            responses = residual_responses(frames[some], numbers[some], maps, inside)
+            electrons = electron_chances(frames[some], numbers[some], laws, maps, self.work.plain, inside)
+            responses = residual_responses(frames[some], numbers[some], laws, maps, inside)
             scores = common_scores(frames[some], numbers[some], maps, inside)
-            waves = waves_across(
-                frames[some], numbers[some], laws_of_frames(frames[some], maps), maps, inside
-            )
+            waves = waves_across(frames[some], numbers[some], laws, maps, inside)
             return _Shared(found, waves, scores, electrons, responses)
 
         return of

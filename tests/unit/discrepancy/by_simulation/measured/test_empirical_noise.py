@@ -18,6 +18,7 @@ from pchem_pipeline.discrepancy.by_simulation.measured.noise import (
     residual_covariances,
 )
 from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode, spectrum
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -73,7 +74,9 @@ def measured(frames: np.ndarray, inside: np.ndarray | None = None) -> EmpiricalN
     numbers = np.arange(FRAMES)
     inside = np.ones(SHAPE, bool) if inside is None else inside
     evidence = observe(frames, numbers, n_run=FRAMES, block_frames=30)
-    found = residual_covariances(frames, numbers, evidence.maps, inside)
+    found = residual_covariances(
+        frames, numbers, laws_of_frames(frames, evidence.maps), evidence.maps, inside
+    )
     noise = measured_noise(found, NOTHING, evidence, inside)
     return None if noise is None else noise.effect
 
@@ -151,7 +154,9 @@ def test_what_a_model_makes_is_taken_off():
     frames = stack(6, of_whole_rows)
     evidence = observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=30)
     inside = np.ones(SHAPE, bool)
-    data = residual_covariances(frames, np.arange(FRAMES), evidence.maps, inside)
+    data = residual_covariances(
+        frames, np.arange(FRAMES), laws_of_frames(frames, evidence.maps), evidence.maps, inside
+    )
     assert measured_noise(data, data, evidence, inside) is None
     by_chance = {key: Covariance(2.0 * one.error, one.error) for key, one in data.pairs.items()}
     assert measured_noise(data, Covariances(by_chance, {}), evidence, inside) == measured_noise(

@@ -101,7 +101,9 @@ def measured(frames: np.ndarray) -> Measurement | None:
     """Return what is measured of frames beside no effect."""
     numbers = np.arange(len(frames))
     evidence = observe(frames, numbers, n_run=len(frames), block_frames=100)
-    data = residual_responses(frames, numbers, evidence.maps, EVERYWHERE)
+    data = residual_responses(
+        frames, numbers, laws_of_frames(frames, evidence.maps), evidence.maps, EVERYWHERE
+    )
     return measured_response(data, None, evidence, EVERYWHERE)
 
 
@@ -197,7 +199,7 @@ def test_what_a_model_makes_is_not_measured_again() -> None:
     first, second = (drawn(distant, seed) for seed in (5, 6))
     evidence = [observe(f, numbers, n_run=FRAMES, block_frames=100) for f in (first, second)]
     data, model = (
-        residual_responses(frames, numbers, each.maps, EVERYWHERE)
+        residual_responses(frames, numbers, laws_of_frames(frames, each.maps), each.maps, EVERYWHERE)
         for frames, each in zip((first, second), evidence, strict=True)
     )
     assert measured_response(data, None, evidence[0], EVERYWHERE) is not None
