@@ -7,6 +7,7 @@ distance, of each other sample of the row, of the frame before. Nothing is said 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
@@ -227,26 +228,38 @@ class EmpiricalResponse(Effect):
 
         return self.model_copy(update={"terms": tuple(moved(term) for term in self.terms)})
 
+    def by_law(self, shape: tuple[int, int]) -> Sequence[Self]:
+        """Return it in columns that follow by the same terms."""
+        if all(term.columns is None for term in self.terms):
+            return (self,)
+        ends = {0, shape[1]}.union(*(term.columns for term in self.terms if term.columns))
+        own = (self.region and self.region.columns) or ((0, shape[1]),)
+        found = []
+        for first, end in itertools.pairwise(sorted(end for end in ends if end <= shape[1])):
+            terms = tuple(
+                term.model_copy(update={"columns": None})
+                for term in self.terms
+                if term.columns is None or term.columns[0] <= first < term.columns[1]
+            )
+            columns = tuple((max(first, a), min(end, b)) for a, b in own if max(first, a) < min(end, b))
+            if terms and columns:
+                place = {} if self.region is None else self.region.numbers()
+                region = Region.model_validate({**place, "columns": columns})
+                found.append(self.model_copy(update={"terms": terms, "region": region}))
+        return found
+
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the variance of what samples follow, of electrons as many as the pixel's own.
 
-        Terms of some columns count as their mean over the columns of the region; without one they are left
-        out, since the pixels of other columns have none of it.
+        Terms of some columns are left out: see `by_law`.
         """
         exposure = np.nan_to_num(maps.quanta_exposure)
         power: Any = sum(
-            term.number * term.weight**2 * self._part(term) * excess_moments(exposure, term.above)[1]
+            term.number * term.weight**2 * excess_moments(exposure, term.above)[1]
             for term in self.terms
+            if term.columns is None
         )
         return model.with_variance(e2=self.response**2 * power)
-
-    def _part(self, term: ResponseTerm) -> float:
-        """Return the part of the pixels that follow by a term."""
-        if term.columns is None:
-            return 1.0
-        if self.region is None or not self.region.columns:
-            return 0.0
-        return (term.columns[1] - term.columns[0]) / sum(end - first for first, end in self.region.columns)
 
     def words(self) -> str:
         """Return what is known of it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -120,7 +121,8 @@ def sample_law(
     """
     n = maps.bias.size
     groups = [(np.arange(n), SampleLaw())]
-    for effect in effects:
+    apart = (effect.by_law(places.shape) if places is not None else (effect,) for effect in effects)
+    for effect in itertools.chain.from_iterable(apart):
         # effects may come from other packages: whatever they raise is told with their name
         try:
             groups = [part for group in groups for part in _with_effect(effect, *group, maps, places)]

@@ -239,6 +239,16 @@ class Effect(Section):
         """Return what is known of it, for people."""
         return self.title or self.tag
 
+    def by_law(self, shape: tuple[int, int]) -> Sequence[Effect]:
+        """Return effects of one law each for all of their pixels that together are this one.
+
+        For effects with places among their parameters.
+
+        Args:
+            shape: rows and columns of the sensor.
+        """
+        return (self,)
+
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law of the pixels' samples with this effect: its place in the fit.
 

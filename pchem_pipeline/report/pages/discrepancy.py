@@ -339,7 +339,8 @@ def remarks(data: DiscrepancyData) -> list[Flag]:
     extended = [step for step in found.steps if step.effect]
     if found.doubt:
         words = "What rests on the parameters of the pixels was not tested, and no size is given in e⁻"
-        flags.append(Flag("caution", f"{words}: {typeset(found.doubt)}."))
+        why = "" if found.doubt in found.sentence else f": {typeset(found.doubt)}"
+        flags.append(Flag("caution", f"{words}{why}."))
     if extended:
         flags += _closing(found)
         flags += [flag for step in extended for flag in _compared(step, data)]

@@ -24,7 +24,7 @@ from pchem_pipeline.effects.analog.empirical_response import (
     ResponseTerm,
     excess_moments,
 )
-from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
+from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.simulate.chain import simulate_block
@@ -271,16 +271,23 @@ def test_simulated_samples_follow_what_is_told(term: ResponseTerm, power: float)
 
 
 def test_the_law_has_the_variance_of_the_pixels_that_follow() -> None:
-    maps = pixel_maps(tuple(np.full(3, v) for v in (2.0, 1 / STEP, 100.0, 4.0)), np.ones(3, bool))
-    row, few = ResponseTerm(of="row", number=18), ResponseTerm(place=(0, -1, 17), columns=(0, 1))
+    maps = pixel_maps(tuple(np.full(8, v) for v in (2.0, 1 / STEP, 100.0, 4.0)), np.ones(8, bool))
+    places = PixelPlaces.of_block(None, (2, 4), np.arange(0))
+    row = ResponseTerm(of="row", number=18)
+    few, all_but_one = (ResponseTerm(place=(0, -1, 7), columns=each) for each in ((0, 1), (0, 3)))
+    upper = Region(rows=((0, 1),), columns=((0, 1), (2, 4)))
     for terms, region, power in (
-        ((row,), None, 18.0),
-        ((few,), None, 0.0),
-        ((few,), Region(columns=((0, 4),)), 0.25),
+        ((row,), None, [18.0] * 8),
+        ((few,), None, [1.0, 0.0, 0.0, 0.0] * 2),
+        ((few, all_but_one), None, [2.0, 1.0, 1.0, 0.0] * 2),
+        ((row, few), upper, [19.0, 0.0, 18.0, 18.0] + [0.0] * 4),
     ):
         effect = EmpiricalResponse(response=0.1, terms=terms, region=region)
-        law = effect.sample_law(sample_law((), maps), maps)
-        np.testing.assert_allclose(law.extra_variance_e2, 0.01 * power * 2.0, rtol=1e-12)
+        law = sample_law((effect,), maps, places=places)
+        np.testing.assert_allclose(law.extra_variance_e2, 0.02 * np.array(power), rtol=1e-12)
+    # of pixels that lie anywhere, none of some columns
+    law = sample_law((EmpiricalResponse(response=0.1, terms=(row, few)),), maps)
+    np.testing.assert_allclose(law.extra_variance_e2, 0.02 * 18.0, rtol=1e-12)
 
 
 def test_its_size_is_that_of_all_the_sensor() -> None:
