@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from statistics import median
 from typing import Any
 
 from discrepancy_cases import EFFECTS, twins_of
@@ -317,9 +318,3 @@ def _times(records: Sequence[Record]) -> None:
     failed = Counter(error[:110] for error in errors if error)
     for error, n in failed.most_common(8):
         print(f"failed x{n}: {error}")
-
-
-def median(values: Sequence[float]) -> float:
-    """Return the median of increasing values."""
-    n = len(values)
-    return (values[n // 2] + values[(n - 1) // 2]) / 2

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from statistics import median
 from typing import Any
 
 import numpy as np
-from discrepancy_figures import Answer, at_floor, median, pulls, wilson
+from discrepancy_figures import Answer, at_floor, pulls, wilson
 from discrepancy_null import RIGHT
 
 Record = dict[str, Any]
