@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -175,11 +175,15 @@ class Added:
 
 @dataclass(frozen=True)
 class Fitted:
-    """The pixels under the final model; see :class:`~pchem_pipeline.discrepancy.verdict.Discrepancy`."""
+    """The pixels under the final model; see :class:`~pchem_pipeline.discrepancy.verdict.Discrepancy`.
+
+    ``seen`` returns an effect as it acts on these pixels, for themselves a sensor.
+    """
 
     maps: PixelMaps
     code_extended: FloatArray | None = None
     added: AddedExposure | None = None
+    seen: Callable[[Effect], Effect] = lambda effect: effect
 
 
 @dataclass(frozen=True)
@@ -269,7 +273,9 @@ def build_verdict(
     """
     # e-, and the share of the read noise, of pixels whose gain and read noise are open would be made up
     sizes = {
-        each.effect.tag: None if found.doubt else size_of(each.effect, fitted.maps, looked_at[1].frames)
+        each.effect.tag: None
+        if found.doubt
+        else size_of(fitted.seen(each.effect), fitted.maps, looked_at[1].frames)
         for each in found.added.additions
     }
     both = found.z.both

@@ -37,7 +37,7 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
     """Return the size of an effect where and when it acts; None where its samples cannot be simulated.
 
     Args:
-        effect: with its strength.
+        effect: with its strength, as it acts on these pixels, for themselves a sensor.
         maps: fitted parameters, (y, x) each.
         n_frames: of the run.
     """
@@ -61,12 +61,16 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
         drawn = [_change(effect, maps, n_frames, blocks, _SEED + i) for i in range(stacks)]
     except PchEmError:
         return None
-    changes = [change for change in drawn if change is not None]
+    inside = np.ones_like(maps.usable)
+    if effect.far_reaching and effect.region is not None:
+        ny, nx = maps.usable.shape
+        inside = effect.region.mask((ny, nx))
+    changes = [change[:, inside] for change in drawn if change is not None]
     if not changes:
         return None
     share = float(np.mean([np.mean(np.abs(change) > _CHANGED) for change in changes]))
     gain = np.where(maps.usable, maps.conversion_gain, np.median(maps.conversion_gain[maps.usable]))
-    in_dn = effect.plane in _IN_DN
+    gain, in_dn = gain[inside], effect.plane in _IN_DN
     dn = _spread([change if in_dn else change / gain for change in changes], share)
     return Size(
         electrons=_spread([change * gain if in_dn else change for change in changes], share),

@@ -463,4 +463,4 @@ class FrameExplainer:
         if added is not None:
             own = frames.seen_stack, plain.maps, model, plain.covariance, added, frames.seen_numbers
             maps = refit_maps(*own).maps
-        return Fitted(maps, expected, added)
+        return Fitted(maps, expected, added, lambda effect: next(iter(frames.effects([effect])), effect))

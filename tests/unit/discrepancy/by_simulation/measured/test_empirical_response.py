@@ -299,6 +299,15 @@ def test_its_size_is_that_of_all_the_sensor() -> None:
     assert size.electrons == pytest.approx(0.1 * 2.1**0.5, rel=0.1)
 
 
+def test_its_size_in_a_place_is_that_of_the_place() -> None:
+    maps = PixelMaps.known((np.full(SHAPE, v) for v in (2.1, 1 / STEP, 100.0, 4.0)), EVERYWHERE)
+    term, place = ResponseTerm(place=(0, 0, -1), columns=(7, 8)), Region(columns=((6, 8),))
+    size = size_of(EmpiricalResponse(response=0.1, terms=(term,), region=place), maps, FRAMES)
+    assert size is not None
+    assert size.samples == pytest.approx(0.5, abs=0.02)
+    assert size.electrons == pytest.approx(0.1 * (2.1 / 2) ** 0.5, rel=0.1)
+
+
 def test_it_is_no_candidate_and_says_what_follows() -> None:
     assert "empirical_response" not in candidate_classes(DiscrepancySettings())
     terms = ResponseTerm(place=(0, 0, -16)), ResponseTerm(of="row", weight=-0.5, number=32)
