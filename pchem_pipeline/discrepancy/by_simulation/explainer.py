@@ -300,7 +300,7 @@ class FrameExplainer:
                 lambda best: self._left_by(best, refitter),
                 Witness(self._likelihood),
                 lambda: self._unexplained().explains_all(),
-                lambda: self._unexplained().clearest(),
+                lambda unlisted: self._unexplained().clearest(unlisted),
             )
         except EffortSpentError as spent:
             tags = dict.fromkeys(h.tag for h in explanation.hypotheses)

@@ -177,9 +177,10 @@ class EmpiricalResponse(Effect):
 
     @property
     def unlisted(self) -> bool:
-        """Whether samples follow others than their neighbours and their own one frame before."""
+        """Whether samples follow others than neighbours and their own one frame before, or a part of it."""
         return any(
-            term.of != "sample" or term.mirrored or sum(map(abs, term.place)) > 1 for term in self.terms
+            term.of != "sample" or term.mirrored or term.above or sum(map(abs, term.place)) > 1
+            for term in self.terms
         )
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:

@@ -105,7 +105,9 @@ def residual_covariances(
 
 def _line(u: NDArray[np.float32], inside: BoolArray) -> Line:
     """Return the mean products of two columns in the same row."""
-    products = sum(np.matmul(block.T, block) for block in u.swapaxes(0, 1))
+    # a fast product needs the samples of a line side by side
+    lines = (np.ascontiguousarray(block) for block in u.swapaxes(0, 1))
+    products = sum(np.matmul(line.T, line) for line in lines)
     counts = len(u) * (inside.T.astype(np.float64) @ inside)
     return Line(np.asarray(products / np.maximum(counts, 1.0), np.float64), counts)
 

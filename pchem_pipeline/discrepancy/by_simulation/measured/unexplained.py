@@ -50,6 +50,7 @@ Model = tuple[Effect, ...]
 Measure = Callable[[Part, Model, Model], Measurement | None]
 
 _WORTHWHILE = 0.25  # of the nats of what is clearest: less cannot be all there is
+_AS_CLEAR = 0.5  # of these nats, which are not of the same statistics
 _MOST_TRIED = 3  # of all forms and parts
 _MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
 
@@ -140,15 +141,23 @@ class Unexplained:
         found = self._alone(0)
         return found is not None and found.effects[0].unlisted and self.leaves_nothing(found)
 
-    def clearest(self) -> Refitted | None:
-        """Return the clearest of all by itself; None where that leaves more than little, or is not one thing.
+    def clearest(self, unlisted: bool = False) -> Refitted | None:
+        """Return the clearest by itself, or another that is as clear; None where they leave more than little.
 
-        One of several may be an effect that has a name.
+        Several things together are left out: one of them may be an effect that has a name.
+
+        Args:
+            unlisted: only what no known effect makes.
         """
-        if not self._of_all or self._of_all[0].measured.effect.measured_parts > 1:
-            return None
-        found = self._alone(0)
-        return found if found is not None and self._leaves_little(found) else None
+        for number, likely in enumerate(self._of_all):
+            one, effect = likely.measured, likely.measured.effect
+            as_clear = one.gain > _AS_CLEAR * self._of_all[0].measured.gain
+            if not as_clear or effect.measured_parts > 1 or (unlisted and not one.unlisted):
+                continue
+            found = self._alone(number)
+            if found is not None and self._leaves_little(found):
+                return found
+        return None
 
     def _alone(self, number: int) -> Refitted | None:
         """Return one of what explains most without any effect, at its best fit; it is fitted once."""

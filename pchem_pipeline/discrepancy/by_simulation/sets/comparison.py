@@ -111,7 +111,7 @@ def compare(
     beside: Callable[[Refitted], Choice | None] = lambda _: None,
     witness: Witness = _SILENT,
     unlisted: Callable[[], bool] = lambda: False,
-    measured: Callable[[], Refitted | None] = lambda: None,
+    measured: Callable[[bool], Refitted | None] = lambda _: None,
 ) -> Comparison | None:
     """Refit the sets worth it, and choose the simplest that leaves nothing, else the best; None: none holds.
 
@@ -128,7 +128,8 @@ def compare(
         beside: compares new hypotheses by what they do beside a refitted set.
         witness: brings a set near its best, and is asked about sets that the statistics tell badly apart.
         unlisted: tells whether what no known effect makes leaves nothing by itself.
-        measured: returns what is clearest of all that is measured, where that leaves little by itself.
+        measured: returns what is clearest of all that is measured, or of what no known effect makes (True),
+            where that leaves little by itself.
 
     Raises:
         EffortSpentError: the work is at its limit.
@@ -150,14 +151,16 @@ def compare(
             return None
         _grow(trials, beside)
     if first > 1 and tried and not trials.complete and all(len(one) == 1 for one in trials.asked):
+        if not (held or trials.nearly):
+            trials.measured = _within(lambda: measured(True))
         trials.refit(_begun(_sets(choice, tried)[0], tried, held))
         trials.thin()
     # the likeliest in its place, whatever was spent until here: one of them may be all there is
     ahead = max(first, _FIRST_SINGLES)
     for hypothesis in _dear_last(singles[first:ahead]):
         trials.refit((hypothesis,), whatever=True)
-    if not held and tried and not (trials.complete or trials.nearly):
-        trials.measured = _within(measured)
+    if not held and tried and not (trials.complete or trials.nearly or trials.measured):
+        trials.measured = _within(lambda: measured(False))
     # the others, dear ones last: they may be beaten by then
     for hypothesis in _dear_last(singles[ahead:]):
         if not trials.refit((hypothesis,)):
@@ -187,7 +190,7 @@ def _concluded(
     before: Sequence[Refitted],
     hypotheses: Sequence[Hypothesis],
     witness: Witness,
-    measured: Callable[[], Refitted | None],
+    measured: Callable[[bool], Refitted | None],
 ) -> Comparison | None:
     """Choose among the sets that were tried, and fit placebos in the place of its effects; see `compare`."""
     tried = trials.tried
@@ -198,7 +201,7 @@ def _concluded(
         return None
     if not trials.held and len(chosen.hypotheses) > 1:
         # one thing that explains as much as several is the simpler answer
-        one = trials.measured or _within(measured)
+        one = trials.measured or _within(lambda: measured(False))
         if one is not None and worth(one) > worth(chosen):
             return None
     witnessed = _witnessed(chosen, tried, witness)

@@ -111,6 +111,12 @@ def test_the_clearest_stands_by_itself_where_it_leaves_little(
     several = EmpiricalNoise(noise_dn=1.0, modes=both)
     unexplained.__dict__["_of_all"].insert(0, _Likely(Part(), "any", Measurement(several, 20.0)))
     assert unexplained.clearest() is None  # one of them may have a name
+    unexplained.__dict__["_of_all"][0] = _Likely(Part(), "any", Measurement(several, 17.0))
+    assert unexplained.clearest() == (effects[0] if little else None)  # another one is as clear
+    assert unexplained.clearest(unlisted=True) is None
+    ghost = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(-1, 0, 0), above=4.0),))
+    unexplained.__dict__["_of_all"].append(_Likely(Part(), "any", Measurement(ghost, 9.0)))
+    assert unexplained.clearest(unlisted=True) == (ghost if little else None)
 
 
 def test_what_is_measured_is_fitted_where_it_is_on_the_sensor(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -124,7 +124,7 @@ class World:
         beside: Sequence[Hypothesis] = (),
         witness: Witness | None = None,
         unlisted: Callable[[], bool] = lambda: False,
-        measured: Callable[[], Refitted | None] = lambda: None,
+        measured: Callable[[bool], Refitted | None] = lambda _: None,
     ) -> Comparison | None:
         choice = self.choice(*hypotheses)
         assert choice is not None
@@ -609,9 +609,9 @@ def test_what_is_measured_and_leaves_less_than_the_likeliest_sets_ends_the_searc
     whole = world.refitter().refined([hypothesis("row_noise"), hypothesis("interpixel_capacitance")])
     asked: list[str] = []
 
-    def measured(one: Refitted | None) -> Refitted | None:
-        asked.append("measured")
-        return one
+    def measured(one: Refitted | None, unlisted: bool) -> Refitted | None:
+        asked.extend([] if unlisted else ["measured"])
+        return None if unlisted else one
 
     def beside(one: Any) -> Any:
         asked.append("beside")
@@ -632,7 +632,7 @@ def test_what_is_measured_and_leaves_less_than_the_likeliest_sets_ends_the_searc
         assert asked[: len(wanted)] == wanted
         assert (found is None) is (one is not None)
 
-    def never() -> Refitted | None:
+    def never(unlisted: bool) -> Refitted | None:
         raise AssertionError("a single effect leaves nothing")
 
     single = World([effect("row_noise", 0.3)]).compare(hypothesis("row_noise"), measured=never)
@@ -649,8 +649,26 @@ def test_one_thing_that_is_measured_stands_before_several_that_explain_as_much()
     assert best is not None
     for behind, wins in ((PRICE_OF_MORE - 1.0, True), (PRICE_OF_MORE + 1.0, False)):
         measured = replace(whole, score=best.chosen.score - behind)
-        found = world.compare(row, frame, measured=functools.partial(replace, measured))
+        found = world.compare(row, frame, measured=lambda _, one=measured: one)
         assert (found is None) is wins
+
+
+def test_what_no_effect_makes_is_asked_for_before_sets() -> None:
+    """Of it sets must come near, which are not fitted to the end in vain then."""
+    world = World([effect(tag, 0.3) for tag in ("exposure_drift", "row_noise", "frame_noise")])
+    row, frame, drift = (hypothesis(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift"))
+    whole = world.refitter().refined([row, frame, drift])
+    asked: list[bool] = []
+
+    def measured(one: Refitted | None, unlisted: bool) -> Refitted | None:
+        asked.append(unlisted)
+        return one
+
+    for one, wanted in ((whole, [True]), (None, [True, False])):
+        asked.clear()
+        found = world.compare(row, frame, measured=functools.partial(measured, one))
+        assert (found is None) is (one is not None)
+        assert asked[:2] == wanted
 
 
 def test_the_likeliest_effects_are_fitted_whatever_was_spent() -> None:
@@ -677,7 +695,7 @@ def test_a_set_that_leaves_less_than_what_is_measured_stays() -> None:
     world = World([effect("row_noise", 0.3), effect("frame_noise", 0.3)])
     poor = world.refitter().refined([hypothesis("row_noise")])
     both = hypothesis("row_noise"), hypothesis("frame_noise")
-    found = world.compare(*both, measured=lambda: poor)
+    found = world.compare(*both, measured=lambda _: poor)
     assert found is not None
     assert found.chosen.tags == {"row_noise", "frame_noise"}
 
@@ -878,7 +896,9 @@ def add(
     monkeypatch.setattr(search, "_left_by", lambda *_: None)
     monkeypatch.setattr(search, "_likelihood", lambda *_: None)
     monkeypatch.setattr(
-        search, "_unexplained", lambda: SimpleNamespace(explains_all=lambda: False, clearest=lambda: None)
+        search,
+        "_unexplained",
+        lambda: SimpleNamespace(explains_all=lambda: False, clearest=lambda unlisted: None),
     )
     shifts = (z.train - world.null.mean, z.test - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
