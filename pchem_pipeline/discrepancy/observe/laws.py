@@ -74,7 +74,7 @@ def largest_normal(values: FloatArray) -> float:
     return _of_many(log_tail, values.size)
 
 
-def largest_power(power: FloatArray, averaged: int) -> float:
+def largest_power(power: NDArray[np.floating], averaged: int) -> float:
     """Return the normal quantile of the largest of many powers.
 
     Args:

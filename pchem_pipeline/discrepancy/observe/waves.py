@@ -79,22 +79,42 @@ def waves_across(
     if numbers.size < _FEWEST_FRAMES or min(ny, nx) < _FEWEST_LINES or not pixels:
         return Waves((), {})
     u = np.concatenate([chunk for (chunk,) in samples.chunks((1,))])
-    spectra = fft.rfft2(u)[:, 1:, 1:]
-    mean = _halved((np.abs(spectra) ** 2).mean(axis=0) / pixels, nx)
-    over_time = np.zeros((int(numbers[-1] - numbers[0]) + 1, *mean.shape), np.complex64)
-    over_time[numbers - numbers[0]] = spectra
-    power = np.abs(fft.fft(over_time, axis=0, overwrite_x=True)) ** 2 / (pixels * numbers.size)
-    for when in (0, len(power) // 2) if len(power) % 2 == 0 else (0,):
-        power[when] = _halved(power[when], nx)
-    ratio = power / _level(power)
+    mean, ratio = _spectrum(u, numbers, pixels)
     z = {
-        "space.sample.readout.line": laws_of.largest_power(ratio.astype(np.float64), 1),
-        "space.sample.readout.spectrum": laws_of.largest_power(mean.astype(np.float64), numbers.size),
+        "space.sample.readout.line": laws_of.largest_power(ratio, 1),
+        "space.sample.readout.spectrum": laws_of.largest_power(mean, numbers.size),
     }
     steady, loose = _steady(u, numbers, ratio, (ny, nx)), _loose(u, mean)
     if steady is not None and loose is not None and steady.amplitude > _ALL_OF_IT * loose.amplitude:
         loose = None
     return Waves(tuple(wave for wave in (steady, loose) if wave is not None), z)
+
+
+def _spectrum(u: Float32Array, numbers: IntArray, pixels: int) -> tuple[Float32Array, Float32Array]:
+    """Return powers over the noise's: the mean of the frames', (y, x), and along these, (frame, y, x)."""
+    _, ny, nx = u.shape
+    # spectra are larger than the frames: no more than these are kept at a time
+    over_time = np.zeros((int(numbers[-1] - numbers[0]) + 1, ny - 1, nx // 2), np.complex64)
+    for at, frame in zip(numbers - numbers[0], u, strict=True):
+        over_time[at] = fft.rfft2(frame)[1:, 1:]
+    power = _squared(over_time)
+    mean = _halved(power.sum(axis=0) / (pixels * numbers.size), nx)
+    for row in range(ny - 1):
+        power[:, row] = _squared(fft.fft(over_time[:, row], axis=0))
+    del over_time
+    power /= pixels * numbers.size
+    for when in (0, len(power) // 2) if len(power) % 2 == 0 else (0,):
+        power[when] = _halved(power[when], nx)
+    for level in _levels(power):
+        power /= level
+    return mean, power
+
+
+def _squared(values: NDArray[np.complex64]) -> Float32Array:
+    """Return the squares of absolute values."""
+    found = np.square(values.real)
+    found += np.square(values.imag)
+    return found
 
 
 def _halved(power: Float32Array, columns: int) -> Float32Array:
@@ -106,13 +126,16 @@ def _halved(power: Float32Array, columns: int) -> Float32Array:
     return power
 
 
-def _level(power: Float32Array) -> Float32Array:
-    """Return the noise power around each place, at least that of white noise, so that humps are no lines."""
+def _levels(power: Float32Array) -> list[Float32Array]:
+    """Return the noise power of each place and of each time, at least that of white noise.
+
+    So humps are no lines.
+    """
     of_place, of_time = (np.median(power, axis=axes, keepdims=True) / np.log(2.0) for axes in (0, (1, 2)))
-    level = np.ones((1, 1, 1), np.float32)
-    for found, number in ((of_place, power.shape[0]), (of_time, power[0].size)):
-        level = level * np.where(found > 1.0 + _RAISED / np.sqrt(number), found, 1.0)
-    return level.astype(np.float32)
+    return [
+        np.where(found > 1.0 + _RAISED / np.sqrt(number), found, 1.0).astype(np.float32)
+        for found, number in ((of_place, power.shape[0]), (of_time, power[0].size))
+    ]
 
 
 def _steady(u: Float32Array, numbers: IntArray, ratio: Float32Array, shape: tuple[int, int]) -> Wave | None:
