@@ -20,6 +20,7 @@ from scipy import special
 from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.observe.pairs import CHANNELS, MODES, PERIOD, Pairs, Samples, pairs_of
 from pchem_pipeline.discrepancy.scan import Suspect
+from pchem_pipeline.discrepancy.scan_edges import Side, sharpened
 from pchem_pipeline.effects.framework.region import Region, Taps
 
 FloatArray = NDArray[np.float64]
@@ -124,9 +125,16 @@ def _most_significant(samples: Samples, log_limit: float, limits: Limits) -> Sha
         if region is None:
             continue
         place = _measured(samples, channel, pairs.mode, region, best)
-        if place.log_p <= log_limit and abs(place.outside) < limits.contrast * place.inside:
+        if _holds(place, log_limit, limits):
+            sharper = _with_ends(samples, channel, pairs, best, place)
+            place = sharper if _holds(sharper, log_limit, limits) else place
             return Shared(place, channel, pairs.mode)
     return None
+
+
+def _holds(place: Suspect, log_limit: float, limits: Limits) -> bool:
+    """Tell whether a place is significant, and little of it is elsewhere."""
+    return place.log_p <= log_limit and abs(place.outside) < limits.contrast * place.inside
 
 
 def _log_p(z: float, places: float) -> float:
@@ -171,6 +179,19 @@ def _measured(samples: Samples, channel: int, mode: str, region: Region, best: _
     z = float(chi_square(max(freedom + z * math.sqrt(2.0 * freedom), 0.0), freedom))
     rest = (float(total.sum()) - float(energy.sum())) / max(n * (every - own), 1.0)
     return Suspect(region, best.family, z, _log_p(z, best.places), float(energy.sum()) / (n * own), rest)
+
+
+def _with_ends(samples: Samples, channel: int, pairs: Pairs, best: _Best, place: Suspect) -> Suspect:
+    """Return the place of a box with its ends told line by line."""
+    lines, across = Side.of(pairs.lines, best.lines), Side.of(pairs.across, best.across)
+    if best.taps is not None or best.scattered or (lines.exact and across.exact):
+        return place
+    ends = [slice(*each) for each in sharpened(samples, channel, pairs.mode, lines, across)]
+    mask = np.zeros((samples.usable.shape[0], samples.usable.shape[1]), np.bool_)
+    mask[tuple(ends[::-1] if pairs.mode == "column" else ends)] = True
+    if mask.all():
+        return place
+    return _measured(samples, channel, pairs.mode, Region.of_mask(mask), best)
 
 
 def _number_of_pairs(pixels: BoolArray, mode: str) -> float:
