@@ -18,7 +18,9 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
-_CERTAIN = 4.0  # standard errors of a line's share that the share of the lines inside must exceed
+#: Standard errors of a line's share that the share of the lines inside must exceed; where pairs count twice,
+#: so much over the square root of two.
+_CERTAIN = 6.0
 _HALF = 0.5
 
 
@@ -127,9 +129,7 @@ def _ends(side: Side, sums: FloatArray, pairs: FloatArray) -> tuple[int, int]:
     known = pairs > 0
     share = np.where(known, sums / np.where(known, pairs, 1.0), 0.0)
     inside = total / max(number, 1.0)
-    error = 1.0 / np.sqrt(np.maximum(pairs, 1.0))
-    some = known & np.isfinite(share)
-    if side.exact or not some.any() or inside < _CERTAIN * float(np.median(error[some])):
+    if side.exact or not known.any() or inside < _CERTAIN / float(np.median(pairs[known])) ** 0.5:
         return side.first, side.last
     apart = np.flatnonzero(known & (share <= _HALF * inside))
     most = inner.start + int(np.argmax(share[inner]))
