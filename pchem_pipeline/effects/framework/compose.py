@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -121,11 +120,11 @@ def sample_law(
     """
     n = maps.bias.size
     groups = [(np.arange(n), SampleLaw())]
-    apart = (effect.by_law(places.shape) if places is not None else (effect,) for effect in effects)
-    for effect in itertools.chain.from_iterable(apart):
+    for effect in effects:
         # effects may come from other packages: whatever they raise is told with their name
         try:
-            groups = [part for group in groups for part in _with_effect(effect, *group, maps, places)]
+            for each in (effect,) if places is None else effect.by_law(places.shape):
+                groups = [part for group in groups for part in _with_effect(each, *group, maps, places)]
         except Exception as error:
             raise ConfigError(
                 f"model.effects: {effect_words(effect)} ({type(effect).__module__}) cannot be fitted with: "

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from unit.discrepancy.observe.test_pairs import samples_of
+from helpers.standardised import samples_of
 
 from pchem_pipeline.discrepancy.scan_edges import Side, sharpened
 from pchem_pipeline.discrepancy.scan_pairs import scan_pairs

@@ -6,24 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.standardised import samples_of
 
-from pchem_pipeline.discrepancy.observe.pairs import PERIOD, Samples, Stack, pairs_of
+from pchem_pipeline.discrepancy.observe.pairs import PERIOD, pairs_of
 from pchem_pipeline.discrepancy.scan import scan_series
 from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
 from pchem_pipeline.effects.framework.region import Region
 
-Floats = np.ndarray[Any, np.dtype[np.float64]]
 SHAPE, FRAMES = (32, 32), 1000
-
-
-def samples_of(values: Floats, usable: np.ndarray[Any, np.dtype[np.bool_]] | None = None) -> Samples:
-    """Return deviations (frame, y, x) as samples of both channels, to a hundredth of a standard deviation."""
-    shape = values.shape[1:]
-    zero = np.zeros(shape, np.int32)
-    table = np.tile(((np.arange(1201) - 600) / 100.0).astype(np.float32), (2, 1))
-    codes = np.rint(100.0 * values + 600.0).astype(np.uint16)
-    every = np.ones(shape, np.bool_) if usable is None else usable
-    return Samples(Stack(codes), zero, zero + 1200, zero, table, every)
 
 
 @pytest.mark.parametrize("shape", [(6, 9), (70, 40), (40, 33)])

@@ -1,0 +1,21 @@
+"""Frames as standardised deviations, without a sensor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
+
+Floats = np.ndarray[Any, np.dtype[np.float64]]
+
+
+def samples_of(values: Floats, usable: np.ndarray[Any, np.dtype[np.bool_]] | None = None) -> Samples:
+    """Return deviations (frame, y, x) as samples of both channels, to a hundredth of a standard deviation."""
+    shape = values.shape[1:]
+    zero = np.zeros(shape, np.int32)
+    table = np.tile(((np.arange(1201) - 600) / 100.0).astype(np.float32), (2, 1))
+    codes = np.rint(100.0 * values + 600.0).astype(np.uint16)
+    every = np.ones(shape, np.bool_) if usable is None else usable
+    return Samples(Stack(codes), zero, zero + 1200, zero, table, every)
