@@ -14,7 +14,7 @@ from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.fisher import observed_covariance
 from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_may_matter
 from pchem_pipeline.model.fit import engine, guard_numba, profile, profile_numba, search_numba, tile_numba
-from pchem_pipeline.model.fit.climb_numba import Limits
+from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, FEW_STEP, Limits
 from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
 from pchem_pipeline.model.fit.guard import fit_guarded
 from pchem_pipeline.model.fit.result import FitResult, quantile_of
@@ -37,6 +37,7 @@ _CLEAR_GAP = search_numba.CLEAR_GAP
 # what the parameters know: it is half a degree of freedom or so.
 _FEW_FRAMES, _FEW_GROUPS = 5000, 40
 _FEWEST_CODES = 5
+_EXCLUDED = 5.0  # standard errors
 #: Nats below which a rival an electron away counts in the moments, and the distance that holds it, e-.
 _RIVAL_GAP, _RIVAL_REACH = 10.0, 1.5
 _LOOSE = 0.1  # relative standard error of the gain beyond which several samples do not determine it
@@ -458,6 +459,7 @@ class _Batch:
         """Tell in which pixels rounding biases the density's estimates, of any sample, or may deny them."""
         columns, words = plain.columns, plain.fit_status
         found = (words & int(FitStatus.COARSE_STEPS | FitStatus.NOT_CONVERGED)) != 0
+        found |= self._aliased(plain)
         denied = (words & int(FAILED & ~_NO_FIT)) != 0
         variance = plain.variance.reshape(self.n, -1)
         fewer = np.flatnonzero(plain.outlier_share > 0)
@@ -469,6 +471,23 @@ class _Batch:
             found |= biased_by_rounding([columns[:, j], *columns[:, self.n_samples :].T], frames)
             found |= denied & rounding_may_matter(variance[:, j], frames)
         return np.asarray(found)
+
+    def _aliased(self, plain: FitResult) -> NDArray[np.bool_]:
+        """Tell in which pixels the comb of frequency ``1 - g`` may be the right one, for whole numbers show it at g.
+
+        Between 1.2 and 6 DN per electron there is such a comb. With the same variance V its skewness is at most
+        ``1 / (sqrt(V) (1 - g))``; where that of the fit, ``H / (g^3 V^1.5)``, is higher by five of its standard errors,
+        ``sqrt(6 / N)`` and more of a skewed sample, it is not.
+        """
+        if self.n_samples > 1:
+            return np.zeros(self.n, np.bool_)
+        gain, deviation = plain.conversion_gain, np.sqrt(plain.variance.reshape(self.n))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            skewness = plain.quanta_exposure.reshape(self.n) / (gain * deviation) ** 3
+            error = np.sqrt(6.0 / self.given.counts.sum(axis=1, dtype=np.int64)) * (1.0 + 3.0 * skewness)
+            aliased = skewness < 1.0 / (deviation * (1.0 - gain)) + _EXCLUDED * error
+            aliased |= (plain.fit_status & int(FitStatus.POOR_FIT)) != 0
+            return np.asarray((gain > 1.0 / FEW_STEP) | ((gain > 1.0 / ALIASED_STEP) & aliased))
 
     # -- what they found
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.fit.climb_numba import CONVERGED, same_place, sensible
+from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, FEW_STEP, same_place, sensible
 from pchem_pipeline.model.fit.satellites_numba import fill_core, search_satellites
 from pchem_pipeline.model.fit.search_numba import (
     AMPLITUDE,
@@ -23,19 +23,23 @@ from pchem_pipeline.model.fit.search_numba import (
     Found,
     Task,
     Tools,
+    above_blurred,
     climb_neighbours,
     climb_on,
     examine,
     from_start,
     judge,
     loglik_without_gain,
+    next_start,
+    plus,
     score_of,
+    settled,
 )
 from pchem_pipeline.model.fit.starts_numba import (
     add_line_starts,
-    add_scan_starts,
+    alias_of_step,
     fill_starts,
-    scaled_start,
+    scan_steps,
     start_cumulants,
     start_peak,
     start_regression,
@@ -51,14 +55,11 @@ from pchem_pipeline.model.law.pixel_numba import (
     EXTRA_E2,
     FIRST,
     FIXED,
-    HEIGHTS,
     HERE,
-    KEPT_STARTS,
     LOG_VARIANCE,
     MASS,
     N_BINS,
     N_FRAMES,
-    N_KEPT,
     N_PEAKS,
     OTHER,
     PER_ELECTRON,
@@ -73,7 +74,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     Histogram,
     Pixel,
     copy,
-    histogram_of,
 )
 
 FloatArray = NDArray[np.float64]
@@ -82,11 +82,6 @@ _LEAST_VARIANCE = 0.01  # DN^2, of the analog read noise at a start
 _LEAST_SHARE = (
     0.1  # of the variance and the exposure of the density's fit, left to the pixel itself at the start
 )
-_FEW_STEP = 3.0  # DN per electron, below which the starts of the density may miss the right maximum
-# DN per electron and standard normal: a single sample's fit above the one and below the other stands all the
-# same. Of pixels with 1.9 to 3 DN per electron 0.8 % have a likelier comb then, the right one in 1 of 7 of
-# those; with 1.3 to 2 DN per electron 0.5 % have one, the right one in 4 of 5.
-_SOUND_STEP, _SOUND = 2.0, 0.8416
 _POOR = 3.0902  # standard normal: a pixel at a limit is started anew
 # what calls for other starts of free satellites: a bad fit (standard normal), or one without resolved peaks,
 # e-
@@ -94,8 +89,6 @@ _SUSPICIOUS = 2.3
 _UNRESOLVED = 0.45
 _LIMIT_EXPOSURES = (0.3, 0.5, 0.8, 1.2, 1.8, 2.5, 3.3, 4.2, 5.3, 6.8, 9.0)
 _LIMIT_NOISE_E = 0.28
-_SCALES = (1.2, 0.83, 1.4, 0.71, 1.1, 0.91)  # of 1/g, where a bias is ambiguous
-_SHARP_NOISE2 = 0.1225  # e-^2: maxima at other gains are found from resolved peaks
 _STEPS = 4  # biases per electron
 _AROUND = 6  # steps from the exposure to the median, at most
 _LEAST_MASS = 1e-9  # of a sample that must not decide between starts
@@ -238,39 +231,23 @@ def _limit_start(pixel: Pixel, tools: Tools, theta: FloatArray) -> bool:
 
 
 @kernel(borrows=True)
-def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, found: Found) -> Found:
-    """Climb from starts ranked by the cells, where a DN is no small part of an electron; see `_better`."""
-    scratch = tools.scratch
-    trial, heights_of = scratch.small[HERE], scratch.small[HEIGHTS]
-    for i in range(N_KEPT):
-        heights_of[i] = -math.inf
-    if pixel.facts.shape[0] == 1:
-        used = add_scan_starts(pixel, tools.evaluate, scratch)
-    else:
-        _, used = fill_starts(np.int64(1), pixel, tools.basis, tools.evaluate, best, scratch)
-        used += add_line_starts(pixel, tools.evaluate, np.bool_(True), np.bool_(True), scratch)
-    for i in range(N_KEPT):
-        if heights_of[i] > -math.inf:
-            copy(scratch.small[KEPT_STARTS + i], trial)
-            found = _better(pixel, tools, trial, best, found)
-    return Found(found.loglik, found.runner_up, found.used + used, found.degenerate)
+def _climb_kept(pixel: Pixel, tools: Tools, best: FloatArray, found: Found) -> Found:
+    """Climb from the starts that are kept; see `_better`."""
+    while next_start(tools.scratch, tools.scratch.small[HERE]):
+        found = _better(pixel, tools, tools.scratch.small[HERE], best, found)
+    return found
 
 
 @kernel(borrows=True)
-def _climb_scaled(pixel: Pixel, tools: Tools, best: FloatArray, found: Found) -> Found:
-    """Climb from the best of a single sample with other gains, mean and variance kept; see `_better`.
-
-    Where a bias is ambiguous, the density's likelihood and this one rank the maxima differently, and those at
-    other gains are as near as the neighbours.
-    """
-    trial, start = tools.scratch.small[HERE], tools.scratch.small[KEPT_STARTS]
-    histogram = histogram_of(pixel, np.int64(0))
-    for scale in _SCALES:
-        start[1 + SATELLITE] = 0.0
-        if scaled_start(histogram, best, scale, _SHARP_NOISE2, start):
-            _from_density(pixel, np.bool_(False), start, trial)
-            found = _better(pixel, tools, trial, best, found)
-    return found
+def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, found: Found) -> Found:
+    """Climb from starts ranked by the cells, where a DN is no small part of an electron; see `_better`."""
+    scratch = tools.scratch
+    if pixel.facts.shape[0] == 1:
+        used = scan_steps(pixel, tools.evaluate, np.bool_(True), scratch)
+    else:
+        _, used = fill_starts(np.int64(1), pixel, tools.basis, tools.evaluate, scratch)
+        used += add_line_starts(pixel, tools.evaluate, np.bool_(True), np.bool_(True), scratch)
+    return _climb_kept(pixel, tools, best, plus(found, used))
 
 
 @kernel(borrows=True)
@@ -289,23 +266,26 @@ def _climb_known(pixel: Pixel, tools: Tools, near: FloatArray, best: FloatArray)
 
 @kernel(inline=True)
 def _start_anew(
-    pixel: Pixel, tools: Tools, known: bool, score: float, sound: bool, best: FloatArray, found: Found
+    pixel: Pixel, tools: Tools, known: bool, score: float, settled: bool, best: FloatArray, found: Found
 ) -> Found:
     """Climb from other starts in pixels that the density may have led astray.
 
-    These are pixels at the limits of the codes, those of few DN per electron unless their fit is sound,
-    several samples, and those whose climb did not arrive.
+    These are pixels at the limits of the codes, those of few DN per electron, those whose gain is not settled, and
+    those whose climb did not arrive.
     """
     n, limits, trial = pixel.facts.shape[0], tools.limits, tools.scratch.small[HERE]
     place = n + STEP
     if not limits.warm and (not best[place] > 0.0 or score > _POOR) and _limit_start(pixel, tools, trial):
         found = _better(pixel, tools, trial, best, found)
+    few = not best[place] > FEW_STEP
     # several samples, some of them cut, may have led the density astray
-    astray = n > 1 and score > SUSPICIOUS
+    astray = not settled if n == 1 else score > SUSPICIOUS
     lost = known and not best[place] > 0.0
-    hidden = not best[place] > _FEW_STEP and not (sound and n == 1 and best[place] > _SOUND_STEP)
-    if lost or (limits.scan and (astray or hidden)):
+    if lost or (limits.scan and (astray or few)):
         found = _climb_few(pixel, tools, best, found)
+    elif limits.scan and n == 1 and best[place] < ALIASED_STEP:
+        used = alias_of_step(pixel, tools.evaluate, best, tools.scratch)
+        found = _climb_kept(pixel, tools, best, plus(found, used))
     return found
 
 
@@ -348,7 +328,7 @@ def search_cells(
     """
     n, limits, null = pixel.facts.shape[0], tools.limits, loglik_without_gain(pixel)
     known = task.near[n + STEP] > 0.0
-    gap, score, sound = task.gap if known else math.inf, math.inf, np.bool_(False)
+    gap, score, sure = task.gap if known else math.inf, math.inf, np.bool_(False)
     best[n + STEP] = 0.0
     tools.scratch.flags[FIXED, n + SATELLITE] = True
     out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
@@ -364,21 +344,24 @@ def search_cells(
                 gap = math.inf  # that of another law
         examine(pixel, tools, best, out)
         score = score_of(out)
-        sound = np.bool_(out[DEGREES] > 0.0 and score < _SOUND)
+        sure = np.bool_(not settled(pixel, best, np.bool_(False), loglik - null, out)[1])
         found = Found(loglik, runner_up, used + 1, found.degenerate)
     before = found.loglik
-    found = _start_anew(pixel, tools, known, score, sound, best, found)
+    found = _start_anew(pixel, tools, known, score, sure, best, found)
     if not best[n + STEP] > 0.0:
         return FIT_NOT_CONVERGED, found.used, 0
     if n == 1 and not limits.warm and min(gap, found.loglik - found.runner_up) < limits.gap:
-        found = _climb_scaled(pixel, tools, best, found)
+        found = _climb_few(pixel, tools, best, found)
     if found.loglik > before:
         examine(pixel, tools, best, out)
     bias_gap = min(gap, found.loglik - found.runner_up)
-    gap = min(bias_gap, found.loglik - null)
+    blurred = math.inf
+    if n == 1 and not (limits.warm or limits.reshapes):
+        blurred = min(found.loglik - null, above_blurred(pixel, tools, best, found.loglik))
+    gap = min(bias_gap, found.loglik - null, blurred)
     if task.amplitudes.size > 0:
         found = _try_satellites(pixel, tools, task, gap < CLEAR_GAP, best, out, found)
     out[LOG_LIKELIHOOD], out[GAP] = found.loglik, gap
     # the density has told whether there is a gain: it knows no other law than one Gaussian does
     above_null = math.inf if known else found.loglik - null
-    return judge(pixel, limits, best, above_null, bias_gap), found.used, int(out[DEGREES])
+    return judge(pixel, limits, best, above_null, blurred, bias_gap), found.used, int(out[DEGREES])

@@ -60,6 +60,10 @@ _GOING, _AT_KNOWN = 4, 5  # within a climb: not there yet; heading for the maxim
 MIN_LOG_VARIANCE = math.log(QUANTISATION_VARIANCE)
 MIN_ELECTRON_NOISE = 0.03  # of the density: below it the polynomials of the E-step overflow
 MAX_ELECTRON_NOISE = 3.0  # above it there is one Gaussian to all intents
+FEW_STEP = 3.0  # DN per electron, below which a DN is no small part of an electron
+ALIASED_STEP = (
+    6.0  # DN per electron: whole numbers do not tell 1/a from 1 - 1/a, and MIN_STEP is the alias of 6
+)
 MIN_STEP = 1.2  # DN per electron, of the density: a comb with a tooth at each DN would fit any whole numbers
 LEAST_STEP, LEAST_NOISE_DN, LEAST_NOISE_E = 0.6, 0.05, 0.02  # of the cells
 MAX_LOG_EXPOSURE = math.log(1e5)
@@ -185,14 +189,15 @@ def same_place(left: FloatArray, right: FloatArray, cells: bool) -> bool:
     """Tell whether two points belong to one maximum.
 
     The bias is the same within 0.3 e-, and so is the mean of the brightest sample; with the density of one
-    sample the step within 10 %.
+    sample the step within 10 %. Of cells of few DN per electron maxima are closer: a third of that.
     """
     n = left.size - N_BLOCK + 1
     a, most = left[n + STEP], _BRIGHT
+    reach = (0.1 if cells and a < FEW_STEP else 0.3) * a
     if n > 1 or cells:
         most = max(math.exp(brightest(left)), _BRIGHT)
-    near = abs(left[n + BIAS] - right[n + BIAS]) < 0.3 * a
-    return bool(near and abs(a - right[n + STEP]) * most < 0.3 * a)
+    near = abs(left[n + BIAS] - right[n + BIAS]) < reach
+    return bool(near and abs(a - right[n + STEP]) * most < reach)
 
 
 @kernel(borrows=True)

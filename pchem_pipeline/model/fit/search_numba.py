@@ -13,28 +13,35 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit.climb_numba import (
     CONVERGED,
     DEGENERATE,
+    FEW_STEP,
     Goal,
     Limits,
     same_place,
 )
-from pchem_pipeline.model.fit.starts_numba import fill_starts, n_attempts
+from pchem_pipeline.model.fit.starts_numba import N_ATTEMPTS, fill_starts, longer_steps
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.density_numba import LOG_2PI
 from pchem_pipeline.model.law.pixel_numba import (
+    AT,
     AT_BEST,
     BIAS,
     DARK,
     EXPECTATIONS,
     EXPECTED,
+    FIRST,
     HEIGHTS,
     HERE,
     KEPT_STARTS,
     LOG_VARIANCE,
+    LOGLIK_ALONE,
+    MEAN,
     N_BINS,
     N_FRAMES,
     N_KEPT,
+    OCCUPIED,
     OTHER,
+    SATELLITE,
     STEP,
     VARIANCE,
     WEIGHT,
@@ -49,6 +56,7 @@ NO_DATA, TOO_FEW_BINS = int(FitStatus.NO_DATA), int(FitStatus.TOO_FEW_BINS)
 FIT_NOT_CONVERGED, GAIN_NOT_IDENTIFIED = int(FitStatus.NOT_CONVERGED), int(FitStatus.GAIN_NOT_IDENTIFIED)
 EXPOSURE_AT_BOUND, BIAS_AMBIGUOUS = int(FitStatus.EXPOSURE_AT_BOUND), int(FitStatus.BIAS_AMBIGUOUS)
 NOT_INFORMATIVE, COARSE_STEPS = int(FitStatus.NOT_INFORMATIVE), int(FitStatus.COARSE_STEPS)
+WEAKLY_IDENTIFIED = int(FitStatus.WEAKLY_IDENTIFIED)
 
 # columns of a row of results
 LOG_LIKELIHOOD, GAP, CHI2, DEGREES, OUTLYING, AMPLITUDE, SATELLITE_WEIGHT = range(7)
@@ -58,12 +66,15 @@ CLEAR_GAP = 30.0  # nats: a neighbour this far below is not climbed to the end
 SUSPICIOUS = 3.0  # standard normal: a goodness of fit that calls for the other starts
 _SURE_GAP = 80.0  # nats: where so much is expected, and the fit is good, it is surely more than those 30 ...
 _SURE_THRESHOLDS = 4.0  # ... and, so many times the gap that counts as ambiguous, more than that, too
-_FEW_STEP = 3.0  # DN per electron
 _FINE_STEP = 5.0  # DN per electron: below it climbs from a neighbour also meet combs that fit whole numbers
 _CLEAR_LOBE = 3.0  # standard errors: a side lobe of the characteristic function that settles the gain
 _SURE_LOBE = 5.0  # the same where the model does not fit: other starts have only helped below 3
 _MOST_MOVES = 40
 _LEAST_BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains apart
+_BLURRED2, _LEAST_SKEWNESS = 0.64, 0.02  # e-^2: read noise without peaks; a skewness of H = 2500 e-
+_SURELY_SEEN = 40.0  # nats: where so much is expected of the peaks alone, they are no chance
+_LOCKED_NOISE = 0.15  # DN: below it each electron number has one code, and many combs have these codes
+_FEWEST_CODES = 7.0  # of which the four parameters leave two free shares
 _COARSE_NOISE = 0.6  # DN: below it, or below so many DN per electron, rounding is more than additive noise
 _COARSE_STEP = 2.5
 _SAME_COMB = 1e-3  # nats: two maxima of one comb, farther apart in height than climbs to one of them
@@ -193,7 +204,7 @@ def climb_neighbours(
     trial, runner_up = tools.scratch.small[OTHER], -math.inf
     # combs of few DN per electron, too, differ in their gains
     n = pixel.facts.shape[0]
-    n_neighbours = 2 if n == 1 and (not tools.limits.cells or best[n + STEP] > _FEW_STEP) else 4
+    n_neighbours = 2 if n == 1 and (not tools.limits.cells or best[n + STEP] > FEW_STEP) else 4
     came_from, used, moves, which = -1, 0, 0, int(np.int64(0))
     while which < n_neighbours:
         if which == came_from or not _neighbour(which, pixel, best, trial):
@@ -231,6 +242,33 @@ def loglik_without_gain(pixel: Pixel) -> float:
     return -0.5 * n * (LOG_2PI + 1.0 + math.log(max(square / n, QUANTISATION_VARIANCE)))
 
 
+@kernel(borrows=True)
+def loglik_without_ripple(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> float:
+    """Return the log-likelihood of a single sample's shape without its peaks: the rival of combs seen by chance.
+
+    Mean, variance and skewness are those of the sample, the read noise is 0.8 e-, whose peaks have a contrast of
+    ``2 exp(-2 pi^2 0.8^2) = 7e-6``: ``H / (H + 0.8^2)^(3/2)`` is the skewness, or as near to it as that read noise lets it.
+    """
+    facts, weights, trial = pixel.facts[0], pixel.bins[0, WEIGHT], scratch.small[HERE]
+    third = 0.0
+    for i in range(int(facts[N_BINS])):
+        third += weights[i] * (facts[FIRST] + i - facts[MEAN]) ** 3
+    skewness = max(third / facts[N_FRAMES] / facts[VARIANCE] ** 1.5, _LEAST_SKEWNESS)
+    low, high = 2.0 * _BLURRED2, 4.0 / skewness**2 + 10.0
+    while high > 1.001 * low:
+        middle = math.sqrt(low * high)
+        if middle > skewness * (middle + _BLURRED2) ** 1.5:
+            low = middle
+        else:
+            high = middle
+    a = math.sqrt(facts[VARIANCE] / (low + _BLURRED2))
+    rounding = QUANTISATION_VARIANCE if cells else 0.0
+    trial[0], trial[1 + STEP], trial[1 + BIAS] = math.log(low), a, facts[MEAN] - low * a
+    trial[1 + LOG_VARIANCE], trial[1 + SATELLITE] = math.log(max(_BLURRED2 * a * a - rounding, 0.01)), 0.0
+    loglik: float = evaluate(pixel, trial, LOGLIK_ALONE, scratch, scratch.evaluations[AT])
+    return loglik
+
+
 @kernel(inline=True)
 def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
     """Return the height exp(-2 pi^2 s_e^2) of the side lobe in units of its noise, 1/sqrt(N) at most.
@@ -247,20 +285,25 @@ def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
 
 
 @kernel(inline=True)
-def _settled(pixel: Pixel, theta: FloatArray, clear: bool, out: FloatArray) -> tuple[bool, bool]:
-    """Tell whether a maximum fits well, its gain settled, and whether other starts have a chance at all.
+def settled(
+    pixel: Pixel, theta: FloatArray, clear: bool, above_null: float, out: FloatArray
+) -> tuple[bool, bool]:
+    """Tell whether a maximum fits well, its gain settled, and whether other starts may lead to a higher one.
 
-    They have none where the fit is good, nor where it is poor and the side lobe all the same far out of the
-    noise, which a misfit raises by sqrt(chi2 / freedom): then the model is wrong, and not the start.
+    They do not where the fit is good and far above one Gaussian, nor where it is poor and the side lobe all the
+    same far out of the noise, which a misfit raises by sqrt(chi2 / freedom): then the model is wrong, and not the
+    start.
 
     Args:
         pixel: its samples.
         theta: the maximum.
         clear: a side lobe of one of several samples stands clear of the noise.
+        above_null: nats above the likelihood without a gain.
         out: with the goodness of fit.
     """
     n, lobe = pixel.facts.shape[0], side_lobe(pixel, theta)
     good = score_of(out) < SUSPICIOUS and ((n > 1 and not clear) or lobe > _CLEAR_LOBE)
+    good = good and (n > 1 or above_null > CLEAR_GAP)
     misfit = math.sqrt(out[CHI2] / max(out[DEGREES], 1.0))
     of_the_model = n == 1 and out[DEGREES] > 0.0 and lobe > _SURE_LOBE * misfit
     return good, not (good or of_the_model)
@@ -377,7 +420,9 @@ def score_of(out: FloatArray) -> float:
 
 
 @kernel(borrows=True)
-def judge(pixel: Pixel, limits: Limits, best: FloatArray, above_null: float, gap: float) -> int:
+def judge(
+    pixel: Pixel, limits: Limits, best: FloatArray, above_null: float, above_blurred: float, gap: float
+) -> int:
     """Return the status word of a converged pixel.
 
     Args:
@@ -385,6 +430,8 @@ def judge(pixel: Pixel, limits: Limits, best: FloatArray, above_null: float, gap
         limits: bounds and limits.
         best: the maximum.
         above_null: nats above the likelihood without a gain.
+        above_blurred: nats above the likelihood without peaks; twice the smallest gap is asked of both, since combs of
+            many steps had the chance to come out higher.
         gap: nats above the runner-up, that likelihood aside.
     """
     n, status = pixel.facts.shape[0], 0
@@ -396,11 +443,15 @@ def judge(pixel: Pixel, limits: Limits, best: FloatArray, above_null: float, gap
         status |= GAIN_NOT_IDENTIFIED
     if gap < limits.gap:
         status |= BIAS_AMBIGUOUS
+    if n == 1 and min(above_null, above_blurred) < 2.0 * limits.gap:
+        status |= WEAKLY_IDENTIFIED
     if at_bound:
         status |= EXPOSURE_AT_BOUND
     if not limits.cells and (sigma < _COARSE_NOISE or a < _COARSE_STEP):
         status |= COARSE_STEPS
     if n == 1:
+        if limits.cells and (sigma < _LOCKED_NOISE or pixel.facts[0, OCCUPIED] < _FEWEST_CODES):
+            status |= WEAKLY_IDENTIFIED
         if limits.cells:
             sigma = math.sqrt(sigma * sigma + QUANTISATION_VARIANCE)
         if sigma / a > limits.noise:
@@ -409,7 +460,19 @@ def judge(pixel: Pixel, limits: Limits, best: FloatArray, above_null: float, gap
 
 
 @kernel(inline=True)
-def _next_start(scratch: Scratch, theta: FloatArray) -> bool:
+def above_blurred(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -> float:
+    """Return by how many nats a maximum is above the likelihood without peaks; infinite where that is sure.
+
+    Peaks of contrast ``2 r``, ``r = exp(-2 pi^2 s_e^2)``, bring ``N r^2`` nats.
+    """
+    facts, noise2 = pixel.facts[0], math.exp(best[1 + LOG_VARIANCE]) / best[1 + STEP] ** 2
+    if pixel.facts.shape[0] > 1 or facts[N_FRAMES] * math.exp(-4.0 * math.pi**2 * noise2) > _SURELY_SEEN:
+        return math.inf
+    return loglik - loglik_without_ripple(pixel, tools.evaluate, tools.limits.cells, tools.scratch)
+
+
+@kernel(inline=True)
+def next_start(scratch: Scratch, theta: FloatArray) -> bool:
     """Take the highest of the starts; False where none is left."""
     heights, which = scratch.small[HEIGHTS], 0
     for i in range(1, N_KEPT):
@@ -432,7 +495,7 @@ def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArr
     n, loglik, runner_up, used = pixel.facts.shape[0], found.loglik, found.runner_up, found.used + 1
     at_best = examine(pixel, tools, best, out)
     if n == 1:
-        good, _ = _settled(pixel, best, clear, out)
+        good, _ = settled(pixel, best, clear, math.inf, out)
         expected = expected_gap(pixel.facts[0, N_FRAMES], best)
         sure = max(_SURE_GAP, _SURE_THRESHOLDS * tools.limits.gap)
         if good and out[DEGREES] > 0.0 and expected > sure and best[n + STEP] > _FINE_STEP:
@@ -476,6 +539,39 @@ def _climb_start(
 
 
 @kernel(inline=True)
+def plus(found: Found, count: int) -> Found:
+    """Count evaluations."""
+    return Found(found.loglik, found.runner_up, found.used + count, found.degenerate)
+
+
+@kernel(inline=True)
+def _keep_highest(heights: FloatArray) -> None:
+    """Drop all starts but the highest."""
+    most = heights[0]
+    for i in range(1, N_KEPT):
+        most = max(most, heights[i])
+    for i in range(N_KEPT):
+        if heights[i] < most:
+            heights[i] = -math.inf
+
+
+@kernel(borrows=True)
+def _climb_starts(
+    pixel: Pixel,
+    tools: Tools,
+    clear: bool,
+    found: Found,
+    trial: FloatArray,
+    best: FloatArray,
+    out: FloatArray,
+) -> Found:
+    """Climb from the starts, the highest first; see `_climb_start`."""
+    while next_start(tools.scratch, trial):
+        found = _climb_start(pixel, tools, clear, found, trial, best, out)
+    return found
+
+
+@kernel(inline=True)
 def _stay_near(
     pixel: Pixel, tools: Tools, task: Task, trial: FloatArray, out: FloatArray
 ) -> tuple[bool, float, int]:
@@ -515,23 +611,28 @@ def search_density(
         if fits:
             copy(trial, best)
             out[LOG_LIKELIHOOD], out[GAP] = loglik, min(task.gap, loglik - null)
-            return judge(pixel, limits, best, loglik - null, math.inf), used + 1, int(out[DEGREES])
+            word = judge(pixel, limits, best, loglik - null, math.inf, math.inf)
+            return word, used + 1, int(out[DEGREES])
     found = Found(-math.inf, -math.inf, used, np.bool_(False))
-    for attempt in range(n_attempts(n)):
-        clear, count = fill_starts(attempt, pixel, tools.basis, tools.evaluate, best, tools.scratch)
+    for attempt in range(N_ATTEMPTS):
+        clear, count = fill_starts(attempt, pixel, tools.basis, tools.evaluate, tools.scratch)
         before = found.loglik
-        found = Found(found.loglik, found.runner_up, found.used + count, found.degenerate)
-        for _ in range(1 if n == 1 or (clear and attempt == 0) else N_KEPT):
-            if not _next_start(tools.scratch, trial):
-                break
-            found = _climb_start(pixel, tools, clear, found, trial, best, out)
-        if found.loglik > before and not _settled(pixel, best, clear, out)[1]:
+        if clear and attempt == 0:
+            _keep_highest(tools.scratch.small[HEIGHTS])
+        found = _climb_starts(pixel, tools, clear, plus(found, count), trial, best, out)
+        if n == 1 and attempt == 0 and best[n + STEP] > 0.0:
+            count = longer_steps(
+                pixel, tools.evaluate, np.bool_(False), best, found.loglik - CLEAR_GAP, tools.scratch
+            )
+            found = _climb_starts(pixel, tools, clear, plus(found, count), trial, best, out)
+        if found.loglik > before and not settled(pixel, best, clear, found.loglik - null, out)[1]:
             break
         if limits.quick and found.loglik - null > limits.gap:
             break
     if not best[n + STEP] > 0.0:
         return GAIN_NOT_IDENTIFIED if found.degenerate else FIT_NOT_CONVERGED, found.used, 0
     out[LOG_LIKELIHOOD] = found.loglik
-    out[GAP] = found.loglik - max(found.runner_up, null)
-    word = judge(pixel, limits, best, found.loglik - null, found.loglik - found.runner_up)
+    blurred = above_blurred(pixel, tools, best, found.loglik)
+    out[GAP] = min(found.loglik - max(found.runner_up, null), blurred)
+    word = judge(pixel, limits, best, found.loglik - null, blurred, found.loglik - found.runner_up)
     return word, found.used, int(out[DEGREES])

@@ -21,6 +21,8 @@ from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, counting, fused, simd_load, simd_store
 from pchem_pipeline.model.fit.climb_numba import (
+    FEW_STEP,
+    LEAST_STEP,
     MIN_STEP,
     min_log_variance,
     same_place,
@@ -42,6 +44,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     OCCUPIED,
     OTHER,
     SATELLITE,
+    SCANNED,
     STEP,
     VARIANCE,
     Histogram,
@@ -65,26 +68,23 @@ _HIGHEST_FREQUENCY = 0.5  # cycles/DN: whole numbers cannot tell f from 1 - f
 
 _TWO_PI = 2.0 * math.pi
 
-#  Attempts at one sample: its first start, and those of a suspicious pixel: side lobe, cumulants, scan, and
-# the
-#: best with its gain scaled; at several samples: the likeliest of some, and of all.
-_GAIN_SCALES = (2.0, 0.5, 1.5, 0.67, 1.22, 0.82)
-_N_ATTEMPTS_SINGLE, _N_ATTEMPTS_JOINT = 4 + len(_GAIN_SCALES), 2
-_N_GAINS = 25  # of the scan over the gain, from a fifth of the sd to 2.5 sd
-_GAIN_COLUMNS = 48  # at the end of `Scratch.rows`, where no evaluation comes
-_GAIN_NOISE = 0.1225  # e-^2
+N_ATTEMPTS = 2  # the first start, then all steps of the comb; at several samples some starts, then all
+#: Frequencies of the scan over the step of the comb: the first is 1 over the range of the sample, each is larger
+#: than the one before by a share of itself, half the width of a narrow peak, or by a third of the width of a
+#: side lobe, 0.16/sd, if that is less; the last is that of H = 66 e-.
+_SCAN_SHARE, _SCAN_STEP, _SCAN_END = 0.06, 0.05, 8.2
+_CLEAR = 3.0  # standard errors of the modulus of the ECF, 1 / sqrt(N)
+_UNRESOLVED = 1.1  # ratio of frequencies whose lobes are in the noise
+_CENTRAL_LOBE = 0.75  # 1/sd: the central lobe of any sample has ended there
+_SPARSE = 0.56  # e-^2, of a sample's variance: nine times 1/16, below which the regression finds no step
+_FILLED = 0.25  # share of the samples of a peak
+_FEW_NOISES = (0.07, 0.12, 0.2, 0.36)  # e-
+_DIM = 0.7  # log H: aliases are lower by exp(-2 H) at least, 2 % of the lobe at H = 2 e-
 
 _LINE_NOISES = (0.15, 0.22, 0.3, 0.38, 0.46, 0.55, 0.65, 0.8, 0.95, 1.15)  # e-
 _LINE_SCALES = (1.0, 0.85, 1.18, 0.7, 1.4)  # of the slope of the line
 _N_CLOSED = 3  # starts of each sample
 _SMALLEST_EXPOSURE = 0.02
-_SMALL_STEP = 2.0  # DN per electron, below which starts are ranked by the cells
-_N_STEPS, _FIRST_STEP, _STEP_RATIO = (
-    50,
-    0.62,
-    1.035,
-)  # of a scan at few DN per electron, finer than a maximum in g
-_STEP_NOISES = (0.2, 0.36)  # e-
 
 
 def regression_basis() -> NDArray[np.float64]:
@@ -260,14 +260,15 @@ def _on_lobe(
     """Fill a start from modulus (unnormalised) and phase of the ECF at 1/a; tell whether it stands clear."""
     _, _, _, _, n, mean, variance = histogram
     modulus, phase = lobe[0] / n, lobe[1]
-    s2 = max(variance - exposure * a * a, 0.16 * a * a)
+    least = _CLEAR / math.sqrt(n)
+    clear = modulus > least
+    noise2 = -math.log(min(max(modulus, least), 0.999)) / (2.0 * math.pi * math.pi)
+    if not clear:  # the lobe is in the noise: s_e is at least so large
+        noise2 = min(max(variance / (a * a) - exposure, noise2), variance / (a * a))
+    s2 = noise2 * a * a
+    exposure = max((variance - s2) / (a * a), 1e-3)
     bias = mean - exposure * a
-    clear = modulus > 3.0 / math.sqrt(n)
     if clear:
-        s2 = -math.log(min(modulus, 0.999)) * a * a / (2.0 * math.pi * math.pi)
-        from_variance = (variance - s2) / (a * a)
-        if from_variance > 0.0:
-            exposure = from_variance
         anchor = phase * a / _TWO_PI
         bias = anchor + a * math.floor((mean - exposure * a - anchor) / a + 0.5)
         if bias > mean - 0.01 * a:
@@ -367,12 +368,6 @@ def start_cumulants(
     return math.isfinite(theta[1])
 
 
-@kernel(inline=True)
-def n_attempts(n_samples: int) -> int:
-    """Return how many times :func:`fill_starts` has something to say."""
-    return _N_ATTEMPTS_SINGLE if n_samples == 1 else _N_ATTEMPTS_JOINT
-
-
 @kernel(borrows=True)
 def _likeliest(
     pixel: Pixel, evaluate: Any, scratch: Scratch, height: float, theta: NDArray[np.float64]
@@ -409,90 +404,123 @@ def _first_start(
     return best > -math.inf
 
 
-@kernel(inline=True)
-def _scan_gains(pixel: Pixel, evaluate: Any, scratch: Scratch, theta: NDArray[np.float64]) -> bool:
-    """Fill ``theta`` with the likeliest of a row of gains, the read noise taken as 0.35 e-."""
-    trial, work = scratch.small[HERE], scratch.rows
-    histogram = histogram_of(pixel, np.int64(0))
-    first, best = work.shape[1] - _GAIN_COLUMNS, -math.inf
-    end = first + _N_GAINS
-    shortest = 0.2 * math.sqrt(histogram.variance)
-    for m in range(first, work.shape[1]):
-        work[4, m] = a = shortest * 12.5 ** ((m - first) / (_N_GAINS - 1.0))
-        work[1, m] = 2.0 * math.cos(_TWO_PI / a)
-    _clenshaw(histogram, first, end, work)
-    for m in range(first, end):
-        a = work[4, m]
-        exposure = histogram.variance / (a * a) - _GAIN_NOISE
-        if exposure > 0.0 and a > MIN_STEP:
-            angle = _TWO_PI / a
-            real = work[2, m] - 0.5 * work[3, m] * work[1, m]
-            imaginary = work[3, m] * math.sin(angle)
-            lobe = math.hypot(real, imaginary), math.atan2(imaginary, real) + angle * histogram.first
-            _on_lobe(histogram, a, exposure, lobe, trial)
-            trial[3] = math.log(max(_GAIN_NOISE * a * a, QUANTISATION_VARIANCE))
-            best = _likeliest(pixel, evaluate, scratch, best, theta)
-    return best > -math.inf
+@kernel(borrows=True)
+def _keep_lobe(
+    pixel: Pixel, evaluate: Any, cells: bool, a: float, lobe: tuple[float, float], scratch: Scratch
+) -> int:
+    """Put the comb of a step among the starts, see `_on_lobe` and `_keep`; return the evaluations.
+
+    Of few DN per electron, what is left of other frequencies adds to the lobe where H is low; there mean and variance
+    alone give bias and H, for some read noises.
+    """
+    histogram, trial = histogram_of(pixel, np.int64(0)), scratch.small[HERE]
+    trial[1 + SATELLITE] = 0.0
+    _on_lobe(histogram, a, math.inf, lobe, trial)
+    if cells:
+        analog = max(math.exp(trial[1 + LOG_VARIANCE]) - QUANTISATION_VARIANCE, 1e-6)
+        trial[1 + LOG_VARIANCE] = max(math.log(analog), min_log_variance(a, cells))
+    used = _keep(pixel, evaluate, cells, scratch)
+    if cells and a < FEW_STEP and trial[0] < _DIM:
+        for noise in _FEW_NOISES:
+            exposure = (histogram.variance - QUANTISATION_VARIANCE) / (a * a) - noise * noise
+            if exposure > 1e-3:
+                trial[0], trial[1 + STEP] = math.log(exposure), a
+                trial[1 + BIAS] = histogram.mean - exposure * a
+                trial[1 + LOG_VARIANCE] = max(2.0 * math.log(noise * a), min_log_variance(a, cells))
+                used += _keep(pixel, evaluate, cells, scratch)
+    return used
 
 
 @kernel(borrows=True)
-def scaled_start(
-    histogram: Histogram,
-    best: NDArray[np.float64],
-    scale: float,
-    most_noise2: float,
-    theta: NDArray[np.float64],
-) -> bool:
-    """Fill ``theta`` with ``best``, 1/g scaled; tell whether that makes sense.
+def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> int:
+    """Put the likeliest combs of any step among the starts of a single sample; return the evaluations.
 
-    The read noise in e- is kept, up to ``most_noise2`` (e-^2); the exposure takes up the rest of the
-    variance.
+    ``phi(1/a) = exp(-2 pi^2 s^2) exp(2 pi i mu / a)`` for a comb of step a and read noise s (e-), whatever H is: modulus and
+    phase give s and mu, mean and variance H. A step of more than the range of the sample leaves no second peak, one
+    of less than ``sd / 8`` has H > 60 e-; between them the frequencies are closer than the likelihood's maxima. Past the
+    central lobe those that stay in the noise, ``3 / sqrt(N)``, are no comb's and are left out.
     """
-    a = best[1] * scale
-    noise2 = min(math.exp(best[3]) / (best[1] * best[1]), most_noise2)
-    exposure = histogram.variance / (a * a) - noise2
-    if exposure < 0.03 or a < MIN_STEP:
-        return False
-    assemble(histogram, a, exposure, theta)
-    theta[3] = math.log(max(noise2 * a * a, QUANTISATION_VARIANCE))
-    return True
+    histogram, work, used = histogram_of(pixel, np.int64(0)), scratch.rows, 0
+    _no_starts(scratch.small[HEIGHTS])
+    first, sd = work.shape[1] - SCANNED, math.sqrt(histogram.variance)
+    highest = min(_SCAN_END / sd, 1.0 / (LEAST_STEP if cells else MIN_STEP))
+    end, frequency = first, 1.0 / (histogram.n_bins + 1.0)
+    while frequency < highest and end < work.shape[1] - _SIDE_BY_SIDE * SIMD_WIDTH:
+        work[0, end], work[1, end] = frequency, 2.0 * math.cos(_TWO_PI * frequency)
+        frequency += min(_SCAN_SHARE * frequency, _SCAN_STEP / sd)
+        end += 1
+    for m in range(end, work.shape[1]):
+        work[1, m] = 0.0
+    _clenshaw(histogram, first, end, work)
+    last = 0.0
+    for m in range(first, end):
+        frequency = work[0, m]
+        real = work[2, m] - 0.5 * work[3, m] * work[1, m]
+        imaginary = work[3, m] * math.sin(_TWO_PI * frequency)
+        lobe = (
+            math.hypot(real, imaginary),
+            math.atan2(imaginary, real) + _TWO_PI * frequency * histogram.first,
+        )
+        central, clear = frequency * sd < _CENTRAL_LOBE, lobe[0] > _CLEAR * math.sqrt(histogram.n)
+        if central or clear or frequency > _UNRESOLVED * last:
+            last = frequency
+            used += _keep_lobe(pixel, evaluate, cells, 1.0 / frequency, lobe, scratch)
+    return used
 
 
 @kernel(inline=True)
-def _other_start(
-    which: int,
-    pixel: Pixel,
-    best: NDArray[np.float64],
-    evaluate: Any,
-    scratch: Scratch,
-    theta: NDArray[np.float64],
-) -> bool:
-    """Fill ``theta`` with one of the starts kept for a suspicious pixel; tell whether there is one.
+def _no_starts(heights: NDArray[np.float64]) -> None:
+    """Forget all starts."""
+    for i in range(N_KEPT):
+        heights[i] = -math.inf
 
-    Args:
-        which: 0 side lobe, 1 cumulants, 2 scan over the gain, further ones the best with 1/g scaled, the
-            mean and the variance of the signal kept.
-        pixel: of one sample.
-        best: best maximum so far; its step is 0 where there is none.
-        evaluate: the density.
-        scratch: room to work in.
-        theta: out, the start.
+
+@kernel(borrows=True)
+def alias_of_step(pixel: Pixel, evaluate: Any, best: NDArray[np.float64], scratch: Scratch) -> int:
+    """Put the comb of frequency ``1 - 1/a`` among the starts, which whole numbers show at 1/a; return the evaluations."""
+    _no_starts(scratch.small[HEIGHTS])
+    a = 1.0 / (1.0 - 1.0 / best[1 + STEP])
+    return _keep_lobe(
+        pixel, evaluate, np.bool_(True), a, ecf_at(histogram_of(pixel, np.int64(0)), 1.0 / a), scratch
+    )
+
+
+@kernel(inline=True)
+def _peak_of_one(histogram: Histogram, theta: NDArray[np.float64]) -> float:
+    """Return the samples within a fourth of a step of the peak of one electron, over those expected in that peak."""
+    exposure, a = math.exp(theta[0]), theta[1]
+    middle = theta[2] + a - histogram.first
+    low = min(max(int(middle - 0.25 * a + 1.0), 0), histogram.n_bins)
+    high = min(max(int(middle + 0.25 * a + 1.0), low), histogram.n_bins)
+    seen = histogram.cumulative[high] - histogram.cumulative[low]
+    return seen / (histogram.n * exposure * math.exp(-exposure))
+
+
+@kernel(borrows=True)
+def longer_steps(
+    pixel: Pixel, evaluate: Any, cells: bool, best: NDArray[np.float64], least: float, scratch: Scratch
+) -> int:
+    """Put combs of longer steps than a maximum's among the starts; return the evaluations.
+
+    Where H and read noise are low, the sample is one peak and some electrons apart, and the comb of half the step fits
+    them with no sample at each second peak: so none are needed where the first peak above the bias holds a fourth of
+    its ``N H exp(-H)`` samples. Starts below ``least`` are left out.
     """
-    histogram = histogram_of(pixel, np.int64(0))
-    found: bool
-    if which == 0:
-        found = start_peak(histogram, scratch.rows, theta)
-        return found
-    if which == 1:
-        found = start_cumulants(histogram, theta)
-        return found
-    if which == 2:
-        found = _scan_gains(pixel, evaluate, scratch, theta)
-        return found
-    if not best[1] > 0.0:
-        return False
-    found = scaled_start(histogram, best, _GAIN_SCALES[which - 3], 0.25, theta)
-    return found
+    histogram, heights, used = histogram_of(pixel, np.int64(0)), scratch.small[HEIGHTS], 0
+    _no_starts(heights)
+    a = best[1 + STEP]
+    if not histogram.variance < _SPARSE * a * a or _peak_of_one(histogram, best) > _FILLED:
+        return used
+    for multiple in (2.0, 3.0):
+        if multiple * a < histogram.n_bins:
+            lobe = ecf_at(histogram, 1.0 / (multiple * a))
+            used += _keep_lobe(pixel, evaluate, cells, multiple * a, lobe, scratch)
+    if start_cumulants(histogram, scratch.small[HERE]) and scratch.small[HERE, STEP + 1] > 1.2 * a:
+        used += _keep(pixel, evaluate, cells, scratch)
+    for i in range(N_KEPT):
+        if heights[i] < least:
+            heights[i] = -math.inf
+    return used
 
 
 @kernel(borrows=True)
@@ -627,9 +655,9 @@ def _keep(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> int:
     if not sensible(trial, pixel.longest_step, cells):
         return 0
     loglik: float = evaluate(pixel, trial, LOGLIK_ALONE, scratch, scratch.evaluations[AT])
-    place = -1
+    place, few = -1, np.bool_(cells and trial[pixel.facts.shape[0] + STEP] < FEW_STEP)
     for i in range(N_KEPT):
-        if heights[i] > -math.inf and same_place(kept[i], trial, cells):
+        if heights[i] > -math.inf and same_place(kept[i], trial, few):
             if loglik <= heights[i]:
                 return 1
             place = i
@@ -652,17 +680,15 @@ def fill_starts(
     pixel: Pixel,
     basis: NDArray[np.float64],
     evaluate: Any,
-    best: NDArray[np.float64],
     scratch: Scratch,
 ) -> tuple[bool, int]:
     """Fill the starts of an attempt, and their heights: -inf where there are fewer.
 
     Args:
-        attempt: 0 ... n_attempts - 1.
+        attempt: 0 ... N_ATTEMPTS - 1.
         pixel: its samples.
         basis: from `regression_basis`.
         evaluate: the density.
-        best: best maximum so far; its step is 0 where there is none.
         scratch: room to work in; out: in its ``small`` the starts from `KEPT_STARTS` on, and `HEIGHTS`.
 
     Returns:
@@ -670,16 +696,13 @@ def fill_starts(
     """
     n_samples = pixel.facts.shape[0]
     trial, heights = scratch.small[HERE], scratch.small[HEIGHTS]
-    for i in range(N_KEPT):
-        heights[i] = -math.inf
+    _no_starts(heights)
     if n_samples == 1:
         start = scratch.small[KEPT_STARTS]
         start[1 + SATELLITE] = trial[1 + SATELLITE] = 0.0
-        if attempt == 0:
-            found = _first_start(pixel, basis, evaluate, scratch, start)
-        else:
-            found = _other_start(attempt - 1, pixel, best, evaluate, scratch, start)
-        if found:
+        if attempt > 0:
+            return False, scan_steps(pixel, evaluate, np.bool_(False), scratch)
+        if _first_start(pixel, basis, evaluate, scratch, start):
             heights[0] = 0.0
         return False, 0
     any_clear, used = False, 0
@@ -705,27 +728,6 @@ def add_line_starts(pixel: Pixel, evaluate: Any, cells: bool, thorough: bool, sc
         for place in range(len(_LINE_NOISES)):
             if _line_start(scale, _LINE_NOISES[place], place == 0, pixel, line, cells, trial):
                 used += _keep(pixel, evaluate, cells, scratch)
-    return used
-
-
-@kernel(inline=True)
-def add_scan_starts(pixel: Pixel, evaluate: Any, scratch: Scratch) -> int:
-    """Put starts of a single sample at few DN per electron among the likeliest; return the evaluations.
-
-    Whole numbers hide the side lobes of its characteristic function there. Mean and variance leave a curve
-    in (H, mu) for each step and read noise.
-    """
-    used, trial = 0, scratch.small[HERE]
-    facts = pixel.facts[0]
-    for place in range(_N_STEPS):
-        a = _FIRST_STEP * _STEP_RATIO**place
-        for noise in _STEP_NOISES:
-            exposure = (facts[VARIANCE] - QUANTISATION_VARIANCE) / (a * a) - noise * noise
-            if exposure < 0.03:
-                continue
-            bias = facts[CENTRE] + facts[MEAN] - exposure * a
-            if fill_theta(pixel, a, bias, (noise * a) ** 2, np.bool_(True), trial):
-                used += _keep(pixel, evaluate, np.bool_(True), scratch)
     return used
 
 

@@ -80,7 +80,7 @@ COUNTED, LEFT_OUT, SET_ASIDE = range(3)
 # search: room for parameters, and starts with their heights
 OWN, TRIAL, STEPS, RIGHT, SCHUR, LOWER = 0, 1, 2, 3, 4, 4 + N_BLOCK
 HERE, OTHER, KEPT_STARTS = 4 + 2 * N_BLOCK, 5 + 2 * N_BLOCK, 6 + 2 * N_BLOCK
-N_KEPT = 4
+N_KEPT = 6
 HEIGHTS = KEPT_STARTS + N_KEPT
 N_SMALL = HEIGHTS + 1
 # rows of `Scratch.flags`: parameters that stay in a step, and all the time
@@ -90,7 +90,8 @@ AT, AHEAD, AT_BEST = range(3)
 N_DENSITY_ROWS = 10
 MAX_COMPONENTS = 201  # of which a value may be a mixture
 N_NEGATIVE, _NO_FACTORIAL = 128, 1e5  # numbers below 0 of which a factorial is asked, and its logarithm
-_MIN_COLUMNS = 384  # the frequencies of the starting points, a value's components
+SCANNED = 384  # last columns of `Scratch.rows`, where no evaluation comes: frequencies of a scan
+_MIN_COLUMNS = 384 + SCANNED  # a value's components
 # rows of `Scratch.cells` of a sample: mass, its inverse, counts over mass, slopes in theta
 MASS, PER_MASS, RATIO, SLOPES = range(4)
 N_CELL_ROWS = 3 + N_BLOCK
