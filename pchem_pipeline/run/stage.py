@@ -214,9 +214,12 @@ class StageContext:
 
     @property
     def adc_limits(self) -> tuple[int, int] | None:
-        """First and last code of the ADC, or None where the bit depth is not known."""
+        """First and last code of the ADC; of the type of the samples where the bit depth is not known."""
         depth = self.config.input.bit_depth or self.sensor.bit_depth
-        return None if depth is None else (0, 2**depth - 1)
+        kind = np.dtype(self.sensor.dtype)
+        if depth is None and kind.kind != "u":
+            return None
+        return 0, 2 ** (depth or 8 * kind.itemsize) - 1
 
     @property
     def tile(self) -> tuple[int, int]:

@@ -295,7 +295,8 @@ class _Batch:
         elif self.settings.likelihood == "exact":
             pixels = np.flatnonzero((plain.fit_status & int(_NO_FIT)) == 0)
         elif self.settings.likelihood == "auto":
-            pixels = np.flatnonzero(self._coarse(plain))
+            cut = self._at_limits(self.neutral()) & ((plain.fit_status & int(_NO_FIT)) == 0)
+            pixels = np.flatnonzero(self._coarse(plain) | cut)
         else:
             pixels = np.empty(0, np.intp)
         if pixels.size == 0:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, FEW_STEP, same_place, sensible
-from pchem_pipeline.model.fit.satellites_numba import fill_core, search_satellites
+from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, FEW_STEP, LEAST_STEP, same_place
+from pchem_pipeline.model.fit.satellites_numba import search_satellites
 from pchem_pipeline.model.fit.search_numba import (
     AMPLITUDE,
     CLEAR_GAP,
@@ -39,10 +39,8 @@ from pchem_pipeline.model.fit.starts_numba import (
     add_line_starts,
     alias_of_step,
     fill_starts,
+    keep_start,
     scan_steps,
-    start_cumulants,
-    start_peak,
-    start_regression,
 )
 from pchem_pipeline.model.law.pixel_numba import (
     ADDED_EXPOSURE,
@@ -55,23 +53,22 @@ from pchem_pipeline.model.law.pixel_numba import (
     EXTRA_E2,
     FIRST,
     FIXED,
+    HEIGHTS,
     HERE,
     LOG_VARIANCE,
-    MASS,
     N_BINS,
     N_FRAMES,
+    N_KEPT,
     N_PEAKS,
-    OTHER,
     PER_ELECTRON,
     PER_ELECTRON2,
-    RATIO,
     SATELLITE,
     SHARE,
     STEP,
     TOP,
+    VARIANCE,
     WEIGHT,
     WIDTH,
-    Histogram,
     Pixel,
     copy,
 )
@@ -87,11 +84,10 @@ _POOR = 3.0902  # standard normal: a pixel at a limit is started anew
 # e-
 _SUSPICIOUS = 2.3
 _UNRESOLVED = 0.45
-_LIMIT_EXPOSURES = (0.3, 0.5, 0.8, 1.2, 1.8, 2.5, 3.3, 4.2, 5.3, 6.8, 9.0)
-_LIMIT_NOISE_E = 0.28
-_STEPS = 4  # biases per electron
-_AROUND = 6  # steps from the exposure to the median, at most
-_LEAST_MASS = 1e-9  # of a sample that must not decide between starts
+_CUT_SHARE = 0.005  # of a sample at a limit, beyond which the starts of the whole sample mislead
+_CUT_EXPOSURES = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.8, 1.2, 1.8, 2.5, 3.3, 4.2, 5.3, 6.8, 9.0)  # e-
+_CUT_NOISE_E, _CUT_RATIO = 0.28, 1.2
+_STEPS, _AROUND = 3, 3  # biases per electron, and to either side
 
 
 @kernel(inline=True)
@@ -157,77 +153,41 @@ def _better(pixel: Pixel, tools: Tools, trial: FloatArray, best: FloatArray, fou
     return Found(higher, runner_up, used + count, found.degenerate)
 
 
-@kernel(inline=True)
-def _inside_limits(pixel: Pixel, weights: FloatArray) -> Histogram:
-    """Return the histogram of a single sample without the codes that hold what lies beyond the limits."""
-    facts = pixel.facts[0]
-    n_bins, first = int(facts[N_BINS]), facts[FIRST]
-    n = mean = square = 0.0
-    for i in range(n_bins):
-        beyond = i <= facts[BOTTOM] or i + 1 >= facts[TOP]
-        weights[i] = 0.0 if beyond else pixel.bins[0, WEIGHT, i]
-        n += weights[i]
-        mean += weights[i] * (first + i)
-    mean /= max(n, 1.0)
-    for i in range(n_bins):
-        square += weights[i] * (first + i - mean) ** 2
-    return Histogram(weights, pixel.bins[0, CUMULATIVE], n_bins, first, n, mean, square / max(n, 1.0))
+@kernel(borrows=True)
+def _share_at_limits(pixel: Pixel) -> float:
+    """Return the share of a single sample in the codes that hold what lies beyond the limits."""
+    facts, found = pixel.facts[0], 0.0
+    for i in range(int(facts[N_BINS])):
+        if i <= facts[BOTTOM] or i + 1 >= facts[TOP]:
+            found += pixel.bins[0, WEIGHT, i]
+    return found / facts[N_FRAMES]
 
 
-@kernel(inline=True)
-def _scan_from_limit(pixel: Pixel, tools: Tools, a: float, height: float, theta: FloatArray) -> float:
-    """Fill ``theta`` with the likeliest exposure and bias for a step if it beats a height; return the larger.
+@kernel(borrows=True)
+def _scan_cut(pixel: Pixel, tools: Tools) -> int:
+    """Put the likeliest combs of a cut sample among the starts; return the evaluations.
 
-    Mean and variance of a cut histogram say little. Its peaks are where they were: the step comes from their
-    comb. What is left is scanned around the median.
+    Mean and variance of a cut histogram say little, and its characteristic function has a phase of its own; but its
+    median is where it was, as long as less than half is cut. So steps from the range of the sample down, exposures, and
+    biases around the one that has the median right are all tried.
     """
-    trial, place = tools.scratch.small[OTHER], 0
-    histogram_n = pixel.facts[0, N_FRAMES]
-    while pixel.bins[0, CUMULATIVE, place + 1] < 0.5 * histogram_n:
+    trial, place, used = tools.scratch.small[HERE], 0, 0
+    facts, cumulative = pixel.facts[0], pixel.bins[0, CUMULATIVE]
+    for i in range(N_KEPT):
+        tools.scratch.small[HEIGHTS, i] = -math.inf
+    while cumulative[place + 1] < 0.5 * facts[N_FRAMES]:
         place += 1
-    median = pixel.facts[0, FIRST] + place
-    trial[1 + STEP] = a
-    trial[1 + LOG_VARIANCE] = 2.0 * math.log(_LIMIT_NOISE_E * a)
-    trial[1 + SATELLITE] = trial[0] = 0.0
-    if not sensible(trial, pixel.longest_step, np.bool_(True)):
-        return height
-    for exposure in _LIMIT_EXPOSURES:
-        trial[0] = math.log(exposure)
-        for around in range(-_AROUND, _AROUND + 1):
-            trial[1 + BIAS] = median - a * (exposure + around / _STEPS)
-            fill_core(pixel, trial, tools.scratch)
-            loglik = 0.0
-            for i in range(int(pixel.facts[0, N_BINS])):
-                if pixel.bins[0, WEIGHT, i] > 0.0:
-                    mass = max(tools.scratch.cells[0, MASS, i], _LEAST_MASS)
-                    loglik += pixel.bins[0, WEIGHT, i] * math.log(mass)
-            if loglik > height:
-                height = loglik
-                copy(trial, theta)
-    return height
-
-
-@kernel(inline=True)
-def _limit_start(pixel: Pixel, tools: Tools, theta: FloatArray) -> bool:
-    """Fill ``theta`` with a start of a single sample with codes at a limit; False where there is none."""
-    rows, own = tools.scratch.rows, np.empty(4)
-    histogram = _inside_limits(pixel, tools.scratch.cells[0, RATIO])
-    if pixel.facts.shape[0] > 1 or histogram.n == pixel.facts[0, N_FRAMES] or not histogram.variance > 0.0:
-        return False
-    steps = np.zeros(3)
-    for which in range(3):
-        if which == 0:
-            found, _ = start_regression(histogram, tools.basis, rows, own)
-        elif which == 1:
-            found = start_peak(histogram, rows, own)
-        else:
-            found = start_cumulants(histogram, own)
-        steps[which] = own[1] if found else 0.0
-    height = -math.inf
-    for a in steps:
-        if a > 0.0:
-            height = _scan_from_limit(pixel, tools, a, height, theta)
-    return height > -math.inf
+    a, least = facts[N_BINS] + 1.0, max(0.25 * math.sqrt(facts[VARIANCE]), LEAST_STEP)
+    while a > least:
+        for exposure in _CUT_EXPOSURES:
+            middle = max(exposure - 0.3, 0.0)  # e-: the median of the electrons, to a third
+            for around in range(-_AROUND, _AROUND + 1):
+                trial[0], trial[1 + STEP], trial[1 + SATELLITE] = math.log(exposure), a, 0.0
+                trial[1 + BIAS] = facts[FIRST] + place - a * (middle + around / _STEPS)
+                trial[1 + LOG_VARIANCE] = 2.0 * math.log(max(_CUT_NOISE_E * a, 0.3))
+                used += keep_start(pixel, tools.evaluate, np.bool_(True), tools.scratch)
+        a /= _CUT_RATIO
+    return used
 
 
 @kernel(borrows=True)
@@ -273,17 +233,18 @@ def _start_anew(
     These are pixels at the limits of the codes, those of few DN per electron, those whose gain is not settled, and
     those whose climb did not arrive.
     """
-    n, limits, trial = pixel.facts.shape[0], tools.limits, tools.scratch.small[HERE]
+    n, limits = pixel.facts.shape[0], tools.limits
     place = n + STEP
-    if not limits.warm and (not best[place] > 0.0 or score > _POOR) and _limit_start(pixel, tools, trial):
-        found = _better(pixel, tools, trial, best, found)
+    cut = n == 1 and not limits.warm and _share_at_limits(pixel) > _CUT_SHARE
+    if cut and (limits.scan or not best[place] > 0.0 or score > _POOR):
+        found = _climb_kept(pixel, tools, best, plus(found, _scan_cut(pixel, tools)))
     few = not best[place] > FEW_STEP
     # several samples, some of them cut, may have led the density astray
     astray = not settled if n == 1 else score > SUSPICIOUS
     lost = known and not best[place] > 0.0
     if lost or (limits.scan and (astray or few)):
         found = _climb_few(pixel, tools, best, found)
-    elif limits.scan and n == 1 and best[place] < ALIASED_STEP:
+    if limits.scan and n == 1 and best[place] < ALIASED_STEP:
         used = alias_of_step(pixel, tools.evaluate, best, tools.scratch)
         found = _climb_kept(pixel, tools, best, plus(found, used))
     return found
@@ -347,6 +308,8 @@ def search_cells(
         sure = np.bool_(not settled(pixel, best, np.bool_(False), loglik - null, out)[1])
         found = Found(loglik, runner_up, used + 1, found.degenerate)
     before = found.loglik
+    if n == 1 and limits.scan and _share_at_limits(pixel) > _CUT_SHARE:
+        gap = math.inf  # that of a sample that nothing cuts
     found = _start_anew(pixel, tools, known, score, sure, best, found)
     if not best[n + STEP] > 0.0:
         return FIT_NOT_CONVERGED, found.used, 0

@@ -189,11 +189,11 @@ def same_place(left: FloatArray, right: FloatArray, cells: bool) -> bool:
     """Tell whether two points belong to one maximum.
 
     The bias is the same within 0.3 e-, and so is the mean of the brightest sample; with the density of one
-    sample the step within 10 %. Of cells of few DN per electron maxima are closer: a third of that.
+    sample the step within 10 %. Of cells of few DN per electron maxima are closer: a tenth of that.
     """
     n = left.size - N_BLOCK + 1
     a, most = left[n + STEP], _BRIGHT
-    reach = (0.1 if cells and a < FEW_STEP else 0.3) * a
+    reach = (0.03 if cells and a < FEW_STEP else 0.3) * a
     if n > 1 or cells:
         most = max(math.exp(brightest(left)), _BRIGHT)
     near = abs(left[n + BIAS] - right[n + BIAS]) < reach

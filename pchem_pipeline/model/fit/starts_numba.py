@@ -77,7 +77,7 @@ _CLEAR = 3.0  # standard errors of the modulus of the ECF, 1 / sqrt(N)
 _UNRESOLVED = 1.1  # ratio of frequencies whose lobes are in the noise
 _CENTRAL_LOBE = 0.75  # 1/sd: the central lobe of any sample has ended there
 _SPARSE = 0.56  # e-^2, of a sample's variance: nine times 1/16, below which the regression finds no step
-_FILLED = 0.25  # share of the samples of a peak
+_COUNTED, _HELD = 20.0, 0.4  # samples of a peak
 _FEW_NOISES = (0.07, 0.12, 0.2, 0.36)  # e-
 _DIM = 0.7  # log H: aliases are lower by exp(-2 H) at least, 2 % of the lobe at H = 2 e-
 
@@ -408,7 +408,7 @@ def _first_start(
 def _keep_lobe(
     pixel: Pixel, evaluate: Any, cells: bool, a: float, lobe: tuple[float, float], scratch: Scratch
 ) -> int:
-    """Put the comb of a step among the starts, see `_on_lobe` and `_keep`; return the evaluations.
+    """Put the comb of a step among the starts, see `_on_lobe` and `keep_start`; return the evaluations.
 
     Of few DN per electron, what is left of other frequencies adds to the lobe where H is low; there mean and variance
     alone give bias and H, for some read noises.
@@ -419,7 +419,7 @@ def _keep_lobe(
     if cells:
         analog = max(math.exp(trial[1 + LOG_VARIANCE]) - QUANTISATION_VARIANCE, 1e-6)
         trial[1 + LOG_VARIANCE] = max(math.log(analog), min_log_variance(a, cells))
-    used = _keep(pixel, evaluate, cells, scratch)
+    used = keep_start(pixel, evaluate, cells, scratch)
     if cells and a < FEW_STEP and trial[0] < _DIM:
         for noise in _FEW_NOISES:
             exposure = (histogram.variance - QUANTISATION_VARIANCE) / (a * a) - noise * noise
@@ -427,7 +427,7 @@ def _keep_lobe(
                 trial[0], trial[1 + STEP] = math.log(exposure), a
                 trial[1 + BIAS] = histogram.mean - exposure * a
                 trial[1 + LOG_VARIANCE] = max(2.0 * math.log(noise * a), min_log_variance(a, cells))
-                used += _keep(pixel, evaluate, cells, scratch)
+                used += keep_start(pixel, evaluate, cells, scratch)
     return used
 
 
@@ -486,14 +486,19 @@ def alias_of_step(pixel: Pixel, evaluate: Any, best: NDArray[np.float64], scratc
 
 
 @kernel(inline=True)
-def _peak_of_one(histogram: Histogram, theta: NDArray[np.float64]) -> float:
-    """Return the samples within a fourth of a step of the peak of one electron, over those expected in that peak."""
-    exposure, a = math.exp(theta[0]), theta[1]
+def _holds_one(histogram: Histogram, theta: NDArray[np.float64]) -> bool:
+    """Tell whether the peak of one electron is there: a comb of half the step has nothing where this has it.
+
+    Within a fourth of a step of it are more than 0.4 of its ``N H exp(-H)`` samples, the tail of the bias peak taken off.
+    """
+    exposure, a, noise = math.exp(theta[0]), theta[1], math.exp(0.5 * theta[3])
+    empty = histogram.n * math.exp(-exposure)
     middle = theta[2] + a - histogram.first
     low = min(max(int(middle - 0.25 * a + 1.0), 0), histogram.n_bins)
     high = min(max(int(middle + 0.25 * a + 1.0), low), histogram.n_bins)
-    seen = histogram.cumulative[high] - histogram.cumulative[low]
-    return seen / (histogram.n * exposure * math.exp(-exposure))
+    tail = 0.5 * empty * math.erfc(0.75 * a / noise / math.sqrt(2.0))
+    seen = histogram.cumulative[high] - histogram.cumulative[low] - tail
+    return empty * exposure > _COUNTED and seen > _HELD * empty * exposure
 
 
 @kernel(borrows=True)
@@ -503,20 +508,19 @@ def longer_steps(
     """Put combs of longer steps than a maximum's among the starts; return the evaluations.
 
     Where H and read noise are low, the sample is one peak and some electrons apart, and the comb of half the step fits
-    them with no sample at each second peak: so none are needed where the first peak above the bias holds a fourth of
-    its ``N H exp(-H)`` samples. Starts below ``least`` are left out.
+    them with no sample at each second peak; none are needed where the peak of one electron is there. Starts below ``least`` are left out.
     """
     histogram, heights, used = histogram_of(pixel, np.int64(0)), scratch.small[HEIGHTS], 0
     _no_starts(heights)
     a = best[1 + STEP]
-    if not histogram.variance < _SPARSE * a * a or _peak_of_one(histogram, best) > _FILLED:
+    if not histogram.variance < _SPARSE * a * a or _holds_one(histogram, best):
         return used
     for multiple in (2.0, 3.0):
         if multiple * a < histogram.n_bins:
             lobe = ecf_at(histogram, 1.0 / (multiple * a))
             used += _keep_lobe(pixel, evaluate, cells, multiple * a, lobe, scratch)
     if start_cumulants(histogram, scratch.small[HERE]) and scratch.small[HERE, STEP + 1] > 1.2 * a:
-        used += _keep(pixel, evaluate, cells, scratch)
+        used += keep_start(pixel, evaluate, cells, scratch)
     for i in range(N_KEPT):
         if heights[i] < least:
             heights[i] = -math.inf
@@ -649,7 +653,7 @@ def _closed_start(
 
 
 @kernel(borrows=True)
-def _keep(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> int:
+def keep_start(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> int:
     """Put the start `HERE` among the likeliest, which lie apart; return 1 if it was evaluated."""
     trial, kept, heights = scratch.small[HERE], scratch.small[KEPT_STARTS:HEIGHTS], scratch.small[HEIGHTS]
     if not sensible(trial, pixel.longest_step, cells):
@@ -711,7 +715,7 @@ def fill_starts(
             found, clear = _closed_start(which, j, pixel, basis, scratch, trial)
             any_clear = any_clear or (found and clear)
             if found:
-                used += _keep(pixel, evaluate, np.bool_(False), scratch)
+                used += keep_start(pixel, evaluate, np.bool_(False), scratch)
     if attempt > 0 or not any_clear:
         no = np.bool_(False)
         used += add_line_starts(pixel, evaluate, no, attempt > 0, scratch)
@@ -727,7 +731,7 @@ def add_line_starts(pixel: Pixel, evaluate: Any, cells: bool, thorough: bool, sc
             break
         for place in range(len(_LINE_NOISES)):
             if _line_start(scale, _LINE_NOISES[place], place == 0, pixel, line, cells, trial):
-                used += _keep(pixel, evaluate, cells, scratch)
+                used += keep_start(pixel, evaluate, cells, scratch)
     return used
 
 
