@@ -226,7 +226,14 @@ def _climb_known(pixel: Pixel, tools: Tools, near: FloatArray, best: FloatArray)
 
 @kernel(inline=True)
 def _start_anew(
-    pixel: Pixel, tools: Tools, known: bool, score: float, settled: bool, best: FloatArray, found: Found
+    pixel: Pixel,
+    tools: Tools,
+    known: bool,
+    cut: bool,
+    score: float,
+    settled: bool,
+    best: FloatArray,
+    found: Found,
 ) -> Found:
     """Climb from other starts in pixels that the density may have led astray.
 
@@ -235,7 +242,6 @@ def _start_anew(
     """
     n, limits = pixel.facts.shape[0], tools.limits
     place = n + STEP
-    cut = n == 1 and not limits.warm and _share_at_limits(pixel) > _CUT_SHARE
     if cut and (limits.scan or not best[place] > 0.0 or score > _POOR):
         found = _climb_kept(pixel, tools, best, plus(found, _scan_cut(pixel, tools)))
     few = not best[place] > FEW_STEP
@@ -294,23 +300,22 @@ def search_cells(
     tools.scratch.flags[FIXED, n + SATELLITE] = True
     out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
     found = Found(-math.inf, -math.inf, 0, np.bool_(False))
+    cut = n == 1 and not limits.warm and _share_at_limits(pixel) > _CUT_SHARE
     if known:
         found = _climb_known(pixel, tools, task.near, best)
     if best[n + STEP] > 0.0:
         loglik, runner_up, used = found.loglik, found.runner_up, found.used
-        if gap < CLEAR_GAP or (limits.reshapes and not limits.warm):
+        if cut or gap < CLEAR_GAP or (limits.reshapes and not limits.warm):
             loglik, runner_up, count = climb_neighbours(pixel, tools, best, loglik)
             used += count
-            if runner_up > -math.inf and not limits.scan:
-                gap = math.inf  # that of another law
+            if runner_up > -math.inf and (cut or not limits.scan):
+                gap = math.inf  # that of another law, or of a sample that nothing cuts
         examine(pixel, tools, best, out)
         score = score_of(out)
         sure = np.bool_(not settled(pixel, best, np.bool_(False), loglik - null, out)[1])
         found = Found(loglik, runner_up, used + 1, found.degenerate)
     before = found.loglik
-    if n == 1 and limits.scan and _share_at_limits(pixel) > _CUT_SHARE:
-        gap = math.inf  # that of a sample that nothing cuts
-    found = _start_anew(pixel, tools, known, score, sure, best, found)
+    found = _start_anew(pixel, tools, known, cut, score, sure, best, found)
     if not best[n + STEP] > 0.0:
         return FIT_NOT_CONVERGED, found.used, 0
     if n == 1 and not limits.warm and min(gap, found.loglik - found.runner_up) < limits.gap:

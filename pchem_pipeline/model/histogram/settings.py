@@ -23,11 +23,12 @@ class HistogramSettings(Section):
         description="frames that are read at a time; the first of them decide the number of bins",
     )
     max_bins: int = Field(
-        default=1024,
+        default=16384,
         ge=32,
         le=65536,
         multiple_of=16,
-        description="largest number of bins of a pixel, DN; what lies outside is counted as under or over",
+        description="largest number of bins of a pixel, DN; fewer where the first frames need fewer. What lies "
+        "outside is counted as under or over",
     )
     summaries: bool = Field(
         default=True,

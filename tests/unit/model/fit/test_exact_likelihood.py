@@ -165,17 +165,6 @@ def test_few_dn_per_electron_have_their_own_starts():
     assert abs(before[known].mean()) * np.sqrt(known.sum()) > 5  # rounding biases the density
 
 
-def test_sound_fits_of_few_dn_are_not_started_anew():
-    """Other starts are a hundred evaluations, and find combs of whole numbers where none is called for."""
-    counts, step = few_electrons(9, 300, 600, (2.3, 2.7), 0.3)
-    found = fit_histograms(counts, np.full(300, 85))
-    sound = (found.goodness_p > 0.6) & (found.conversion_gain < 1 / 2.05)
-    assert 100 < sound.sum() < 290
-    assert np.median(found.n_iterations[sound]) < 60
-    assert np.median(found.n_iterations[found.goodness_p < 0.1]) > 100
-    assert (abs((found.conversion_gain * step)[sound] - 1) < 0.25).mean() > 0.97
-
-
 def test_nothing_to_fit_stays_nothing():
     counts = np.zeros((2, 9), np.uint32)
     counts[1, 3] = 50

@@ -1,0 +1,114 @@
+"""The search finds the comb whatever its step: dark and clean pixels, few DN per electron, samples at a limit."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm, poisson
+
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus
+
+
+def samples(rng, exposure, step, noise, frames, bias, pixels):
+    """Return whole DN of equal pixels, shape (pixel, frame)."""
+    electrons = rng.poisson(exposure, (pixels, frames)) + noise * rng.standard_normal((pixels, frames))
+    return np.rint(electrons * step + bias).astype(np.int64)
+
+
+def fitted(dn, **options):
+    """Return the fit of samples of shape (pixel, frame)."""
+    first = int(dn.min())
+    counts = np.stack([np.bincount(row - first, minlength=np.ptp(dn) + 1) for row in dn])
+    return fit_histograms(counts, np.full(len(dn), first), **options)
+
+
+def good(found):
+    """Return which pixels have values that are neither missing nor flagged."""
+    return (found.fit_status & int(FAILED | FLAGGED)) == 0
+
+
+def log_likelihood(dn, exposure, step, bias, noise_dn):
+    """Return the log-likelihood of one pixel's whole DN: a Poisson comb of Gaussians, integrated over cells."""
+    codes, counts = np.unique(dn, return_counts=True)
+    k = np.arange(int(exposure + 10 * np.sqrt(exposure) + 14))
+    ends = (codes[:, None] + np.array([-0.5, 0.5])[:, None, None] - bias - k * step) / noise_dn
+    cells = np.where(ends[0] > 0, norm.sf(ends[0]) - norm.sf(ends[1]), norm.cdf(ends[1]) - norm.cdf(ends[0]))
+    return counts @ np.log(np.maximum(cells @ poisson.pmf(k, exposure), 1e-300))
+
+
+@pytest.mark.parametrize(
+    ("exposure", "noise", "frames", "step"),
+    [
+        (0.02, 0.05, 1000, 11.0),
+        (0.01, 0.09, 1000, 11.0),
+        (0.006, 0.13, 1000, 11.0),
+        (0.01, 0.09, 6000, 11.0),
+        (0.012, 0.08, 1000, 15.4),
+    ],
+)
+def test_dark_and_clean_pixels_have_the_right_gain(exposure, noise, frames, step):
+    """A comb of half the step has no sample at each second peak: its gain, H and read noise are twice too large."""
+    found = fitted(samples(np.random.default_rng(5), exposure, step, noise, frames, 100.3, 150))
+    ratio = found.conversion_gain[good(found)] * step
+    assert good(found).mean() > 0.9
+    # n electrons give the step to s / sqrt(n); a share exp(-N H) of few of them is no fault
+    few = 0.2 + 5.0 * noise / np.sqrt(exposure * frames)
+    assert (np.abs(ratio - 1.0) > min(few, 0.6)).sum() == 0
+
+
+@pytest.mark.parametrize("exposure", [0.06, 1.0])
+@pytest.mark.parametrize("bias", [3, 6, 9])
+def test_samples_at_a_limit_are_censored(exposure, bias):
+    """Of 1 to 26 % of the samples it is only known that they are 0 DN at most."""
+    dn = samples(np.random.default_rng(6), exposure, 14.0, 0.3, 5000, bias, 40).clip(0, 4095)
+    found = fitted(dn, adc_limits=(0, 4095))
+    used = good(found)
+    assert used.mean() > 0.9
+    errors = np.sqrt(np.stack([found.covariance[used, i, i] for i in range(4)]))
+    values = np.stack([found.quanta_exposure, found.conversion_gain, found.bias, found.read_noise_dn])[
+        :, used
+    ]
+    truth = np.array([exposure, 1 / 14.0, bias, np.hypot(0.3 * 14.0, 12**-0.5)])
+    pulls = (values - truth[:, None]) / errors
+    assert (np.abs(pulls) < 5.0).all()
+    assert (np.abs(pulls.mean(axis=1)) < 5.0 / np.sqrt(used.sum())).all()
+
+
+def test_two_combs_with_the_same_codes_are_flagged():
+    """Whole numbers do not tell ``1/a`` from ``1 - 1/a``: near 2 DN per electron both combs fit."""
+    found = fitted(samples(np.random.default_rng(7), 5.0, 1.97, 0.15, 6000, 100.3, 60))
+    pulls = np.abs(found.conversion_gain * 1.97 - 1.0) / (1.97 * np.sqrt(found.covariance[:, 1, 1]))
+    assert (pulls > 5.0).any()  # some are wrong ...
+    assert ((pulls > 5.0) & good(found)).sum() <= 1  # ... and say so
+
+
+def test_a_comb_seen_by_chance_is_flagged():
+    """1,000 samples with 0.43 e- of read noise have peaks of 1.6 % contrast: chance makes as much at other steps."""
+    found = fitted(samples(np.random.default_rng(8), 8.0, 9.3, 0.43, 1000, 100.3, 100))
+    assert good(found).mean() < 0.1
+    assert (found.fit_status & int(FitStatus.WEAKLY_IDENTIFIED | FitStatus.BIAS_AMBIGUOUS) != 0).mean() > 0.8
+
+
+def test_no_good_pixel_of_any_sensor_is_far_below_the_truth():
+    """Random sensors: where a fit is called good, its likelihood is that of the truth or higher."""
+    below = []
+    for seed in range(300):
+        rng = np.random.default_rng([11, seed])
+        exposure, noise = (
+            np.exp(rng.uniform(np.log(0.001), np.log(30.0))),
+            np.exp(rng.uniform(np.log(0.05), np.log(0.6))),
+        )
+        step, frames = (
+            np.exp(rng.uniform(np.log(1.2), np.log(200.0))),
+            int(np.exp(rng.uniform(np.log(100), np.log(10_000)))),
+        )
+        bias = 1000.0 + rng.uniform(-0.5, 0.5)
+        dn = samples(rng, exposure, step, noise, frames, bias, 1)
+        found = fitted(dn)
+        if not good(found)[0]:
+            continue
+        own = [float(each[0]) for each in (found.quanta_exposure, 1 / found.conversion_gain, found.bias)]
+        noise_dn = np.sqrt(max(found.read_noise_dn[0] ** 2 - 1 / 12, 0.0025))
+        truth = log_likelihood(dn[0], exposure, step, bias, noise * step)
+        below.append(truth - log_likelihood(dn[0], *own, noise_dn))
+    assert len(below) > 100
+    assert max(below) < 3.0
