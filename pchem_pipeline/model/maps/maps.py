@@ -15,6 +15,7 @@ from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.ordered import Ordered
 
 GOOD, CAUTION, NO_VALUE = 0, 1, 2
+_MOST_OFF = 24  # electrons
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,43 @@ def _delta(by_gain: FloatArray, by_sigma: FloatArray, covariance: FloatArray) ->
 def _root(variance: FloatArray) -> FloatArray:
     with np.errstate(invalid="ignore"):
         return np.sqrt(np.where(variance >= 0, variance, np.nan))
+
+
+def electrons_off(quanta_exposure: FloatArray, likelihood_gap: FloatArray, n_frames: int) -> FloatArray:
+    """Return the mean square of the electrons by which an estimate of H, and of the bias, is off, e-^2.
+
+    The peaks say nothing of which of them is that of no electron; the width of the law of the electron number
+    does, to a standard error of ``s = H sqrt(2 / N)``. The likelihood of being m electrons off is
+    ``exp(-(m - d)^2 / (2 s^2))``, and ``(1 - 2 d) / (2 s^2)`` is the likelihood gap, whence d.
+
+    Args:
+        quanta_exposure: H of one sample, e-, any shape.
+        likelihood_gap: nats, same shape.
+        n_frames: N.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        square = np.minimum(2.0 * quanta_exposure**2 / n_frames, 0.5 / likelihood_gap)
+    found = np.nan_to_num(square)
+    some = (found > 0) & (found < _MOST_OFF**2 / 32)  # above it the sum is the variance
+    half, gap = found[some, None], likelihood_gap[some, None]
+    m = np.arange(-_MOST_OFF, _MOST_OFF + 1)
+    weight = np.exp(np.minimum(m * (0.5 - half * gap) / half - 0.5 * m**2 / half, 0.0))
+    found[some] = (weight * m**2).sum(axis=1) / weight.sum(axis=1)
+    return np.asarray(found)
+
+
+def hot_pixels(quanta_exposure: FloatArray, flagged: NDArray[np.bool_], sigmas: float) -> NDArray[np.bool_]:
+    """Tell which pixels are hot: H above the median by more than so many ``1.4826 MAD`` of unflagged pixels.
+
+    A flagged pixel may be hot, whatever electrons it is open by.
+
+    Args:
+        quanta_exposure: H, e-; NaN where there is no value.
+        flagged: pixels that do not count for median and MAD, same shape.
+        sigmas: ``maps.outlier_sigmas``.
+    """
+    counted = Ordered.of(quanta_exposure, flagged)
+    return np.asarray(quanta_exposure > counted.median + sigmas * counted.robust_sd)
 
 
 def quality_map(fit_status: NDArray[np.integer[Any]], conversion_gain: FloatArray) -> NDArray[np.uint8]:
