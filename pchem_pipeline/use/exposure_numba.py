@@ -23,6 +23,7 @@ _LEAST_MASS = 1e-300
 _LEAST_WEIGHT = 1e-6  # of a rival: less moves no standard error
 _MOST_STEPS = 200
 _PRECISION = 1e-9
+_DEPTH, _NODES, _FARTHEST = 12.0, 64, 1e4  # nats down to which a likelihood is summed, places, e-
 _OUTSIDE = 0.05  # part of a standard error by which a parameter is moved to find its slope
 
 
@@ -116,6 +117,34 @@ def _climb(start: float, cells: Cells, levels: Levels, counts: FloatArray, sums:
 
 
 @kernel
+def _at_border(
+    height: float, total: float, cells: Cells, levels: Levels, counts: FloatArray, sums: FloatArray
+) -> float:
+    """Return one over the mean square of H over its likelihood, of which the maximum is at 0.
+
+    The curvature there says nothing: the likelihood falls as an exponential does, or as half a normal law.
+
+    Args:
+        height: log-likelihood at 0.
+        total: number of samples.
+        cells: of the pixel.
+        levels: of the pixel.
+        counts: samples at each code.
+        sums: room, shape (3, codes).
+    """
+    reach = _DEPTH / total  # it falls by one a sample and electron at most
+    while reach < _FARTHEST and height - _evaluate(reach, cells, levels, counts, sums)[0] < _DEPTH:
+        reach *= 2.0
+    mass = square = 0.0
+    for i in range(_NODES):
+        exposure = reach * (i + 0.5) / _NODES
+        weight = math.exp(min(_evaluate(exposure, cells, levels, counts, sums)[0] - height, 0.0))
+        mass += weight
+        square += weight * exposure * exposure
+    return mass / square
+
+
+@kernel
 def _score_at(exposure: float, parameters: FloatArray, samples: _Samples) -> float:
     """Return the slope of the log-likelihood in H under other parameters."""
     codes, pixel, weight, theta, counts, sums = samples
@@ -179,8 +208,10 @@ def estimate_exposures(
         start = (codes.first + moment / total / parts - theta[2]) / theta[1]
         exposure = _climb(start, cells, levels, seen, sums)
         near = max(exposure, _LEAST_EXPOSURE)
-        _, score, information = _evaluate(near, cells, levels, seen, sums)
+        height, score, information = _evaluate(near, cells, levels, seen, sums)
         curvature = (information + score) / (near * near)
+        if exposure == 0.0:
+            curvature = _at_border(height, total, cells, levels, seen, sums)
         out[index, 0] = exposure
         if not curvature > 0.0:
             continue
