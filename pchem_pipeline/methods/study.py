@@ -104,8 +104,9 @@ def study_point(point: StudyPoint, settings: Settings) -> dict[str, Any]:
 def _gain_bounds(point: StudyPoint) -> dict[str, float | None]:
     """Return the smallest relative errors of g: one sample, dark and bright, and photon transfer's own."""
     exposure, noise, n = point.quanta_exposure, point.read_noise_e, float(point.n_frames)
-    one = inverse_information(expected_information(exposure, noise) * n)[1, 1]
-    two = shared_information(exposure, noise) + shared_information(0.0, noise)
+    gain = point.conversion_gain
+    one = inverse_information(expected_information(exposure, noise, gain) * n)[1, 1]
+    two = shared_information(exposure, noise, gain) + shared_information(0.0, noise, gain)
     both = inverse_information(two * (n / 2))[0, 0]
     transfer = gain_variance(exposure, 0.0, noise, n / 2, n / 2)
     found = {"one sample": one, "a dark and a bright sample": both, "photon_transfer": transfer}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.fit.status import FAILED, flags_of
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.targets import Target
@@ -47,14 +49,14 @@ class Verification:
         n_frames: frames of each pixel.
         n_pixels: simulated pixels.
         n_failed: of them without a value.
-        n_ambiguous: of them flagged as ambiguous in the bias.
+        n_flagged: of them flagged in what was wanted.
         checks: one a target.
     """
 
     n_frames: int
     n_pixels: int
     n_failed: int
-    n_ambiguous: int
+    n_flagged: int
     checks: tuple[Check, ...]
 
 
@@ -86,11 +88,12 @@ def _outcome(
     n_frames: int,
 ) -> Verification:
     """Return what the errors of the fitted pixels say about the targets."""
+    bits = functools.reduce(operator.or_, (int(flags_of(target.name)) for target in targets))
     return Verification(
         n_frames,
         words.size,
         int(np.count_nonzero(words & int(FAILED))),
-        int(np.count_nonzero(words & int(FitStatus.BIAS_AMBIGUOUS))),
+        int(np.count_nonzero(words & bits)),
         tuple(_check(target, point, errors) for target in targets),
     )
 
