@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.methods.moments import SampleMoments, sample_moments
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.model.law.pcd import log_pcd
 
 FloatArray = NDArray[np.float64]
@@ -108,6 +109,18 @@ class Estimates:
 
     parameters: FloatArray
     reasons: Mapping[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def where(cls, parameters: FloatArray, reasons: Mapping[str, NDArray[np.bool_]]) -> Estimates:
+        """Return estimates with the number of pixels for which each reason holds."""
+        counted = {words: int(np.count_nonzero(pixels)) for words, pixels in reasons.items()}
+        return cls(parameters, {words: n for words, n in counted.items() if n})
+
+    @classmethod
+    def of_fit(cls, parameters: FloatArray, words: NDArray[np.uint16]) -> Estimates:
+        """Return the estimates of this package's fit, with the reasons of its status words."""
+        failed = words & int(FAILED)
+        return cls.where(parameters, {MEANINGS[bit]: (failed & int(bit)) != 0 for bit in FAILED})
 
 
 def no_estimates(n_pixels: int) -> FloatArray:

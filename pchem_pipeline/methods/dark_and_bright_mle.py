@@ -48,5 +48,5 @@ class DarkAndBrightMle(Method):
         best = sample.likeliest(np.stack(ends, axis=1))
         with np.errstate(invalid="ignore"):
             best[:, 0] = best[:, 1] * (pixels.samples[0].moments().mean - best[:, 2])
-        bad = int(np.count_nonzero(~np.isfinite(best[:, 1])))
-        return Estimates(best, {"no electrons seen above the dark sample": bad} if bad else {})
+        bad = ~np.isfinite(best[:, 1])
+        return Estimates.where(best, {"no electrons seen above the dark sample": bad})

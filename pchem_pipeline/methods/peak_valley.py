@@ -61,9 +61,8 @@ class PeakValley(Method):
             variance = (read_noise_of_valley(valley) * step) ** 2 - width**2
             noisy = resolved & (variance > 0)
         out[noisy, 3] = np.sqrt(variance[noisy])
-        fewer, flat = int(np.count_nonzero(~resolved)), int(np.count_nonzero(resolved & ~noisy))
-        reasons = {"fewer than two peaks": fewer, "no valley between the peaks": flat}
-        return Estimates(out, {words: n for words, n in reasons.items() if n})
+        flat = resolved & ~noisy
+        return Estimates.where(out, {"fewer than two peaks": ~resolved, "no valley between the peaks": flat})
 
 
 def comb(counts: NDArray[np.integer], spacing: float, width: float) -> tuple[float, float, float, float]:

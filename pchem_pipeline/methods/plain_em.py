@@ -42,11 +42,11 @@ class PlainEm(Method):
         start = closed_form_start(sample)
         parameters, steps = run_em(sample, start, False, settings)
         reasons = {
-            "no starting point": int(np.count_nonzero(~np.isfinite(start[:, 1]))),
-            "EM left the allowed range": int(np.count_nonzero(steps < 0)),
-            "stopped at the largest number of steps": int(np.count_nonzero(steps == settings.em_iterations)),
+            "no starting point": ~np.isfinite(start[:, 1]),
+            "EM left the allowed range": steps < 0,
+            "stopped at the largest number of steps": steps == settings.em_iterations,
         }
-        return Estimates(parameters, {words: n for words, n in reasons.items() if n})
+        return Estimates.where(parameters, reasons)
 
 
 def closed_form_start(sample: Sample) -> FloatArray:

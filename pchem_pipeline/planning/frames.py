@@ -8,13 +8,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
 from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.targets import TARGET_NAMES, Target
-
-_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
 @functools.lru_cache(maxsize=8192)
@@ -87,12 +86,8 @@ def best_exposure(targets: Sequence[Target], point: Point, low: float, high: flo
     best = int(np.argmin(values))
     if not np.isfinite(values[best]):
         return float("nan"), float("inf")
-    left, right = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
-    for _ in range(18):
-        a, b = right - _GOLDEN * (right - left), left + _GOLDEN * (right - left)
-        left, right = (left, b) if needed(a) <= needed(b) else (a, right)
-    ends = [grid[best], 0.5 * (left + right)]
-    found = min(ends, key=needed)
+    ends = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
+    found = min(grid[best], minimize_scalar(needed, bounds=ends, method="bounded").x, key=needed)
     return float(np.exp(found)), needed(found)
 
 

@@ -170,7 +170,7 @@ class _Design:
         """Standard deviation of each number, DN."""
         n_parts, ny, nx = self.modes.parts.shape
         variances = np.repeat(self.modes.variances, (1, ny, nx), axis=1).ravel()
-        return np.sqrt(np.concatenate([variances, np.repeat(self.modes.waves[:, 2], 2)]))
+        return np.asarray(np.sqrt(np.concatenate([variances, np.repeat(self.modes.waves[:, 2], 2)])))
 
     def unpacked(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the offsets of rows, with that of their frame, and of columns, and c and s of waves, DN."""
