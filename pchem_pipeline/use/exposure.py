@@ -15,9 +15,6 @@ from pchem_pipeline.use import exposure_numba
 from pchem_pipeline.use.calibration import Calibration
 
 _LEAST_PRIOR = 1e-6  # e-; an exposure of 0 forbids all electrons
-_NOT_HOT = 0.99  # quantile of the exposures above which they do not count
-#: Exposures that stand for their law, and the part of the Poisson variance below which one does.
-_PRIORS, _NEAR = 5, 0.05
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,7 @@ class ExposurePool:
         known = np.isfinite(signal) & np.isfinite(noise)
         if not known.any():
             return cls(_LEAST_PRIOR, 0.0, 0.0, n_frames)
-        some = np.minimum(signal[known], np.quantile(signal[known], _NOT_HOT))
+        some = np.minimum(signal[known], np.quantile(signal[known], 0.99))
         mean, within = max(float(some.mean()), _LEAST_PRIOR), float(noise[known].mean())
         return cls(mean, max(float(some.var()) - (mean + within) / n_frames, 0.0), within, n_frames)
 
@@ -87,10 +84,10 @@ class ExposurePool:
         own = others / (others + self.mean + noise)
         mean = np.maximum(self.mean + own * (signal - self.mean), _LEAST_PRIOR)[..., None]
         left = self.variance * (self.mean + self.noise) / (others + self.mean + self.noise)
-        if left < _NEAR * self.mean:
+        if left < 0.05 * self.mean:  # small beside the variance of the electron number
             return mean
         scale = ((1.0 - own) * self.variance)[..., None] / mean
-        found = gammaincinv(mean / scale, (np.arange(_PRIORS) + 0.5) / _PRIORS) * scale
+        found = gammaincinv(mean / scale, np.arange(0.1, 1.0, 0.2)) * scale
         return np.asarray(np.maximum(found, _LEAST_PRIOR))
 
 

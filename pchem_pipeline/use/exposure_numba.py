@@ -23,7 +23,7 @@ _LEAST_MASS = 1e-300
 _LEAST_WEIGHT = 1e-6  # of a rival: less moves no standard error
 _MOST_STEPS = 200
 _PRECISION = 1e-9
-_DEPTH, _NODES, _FARTHEST = 12.0, 64, 1e4  # nats down to which a likelihood is summed, places, e-
+_DEPTH = 12.0  # nats down to which a likelihood is summed
 _OUTSIDE = 0.05  # part of a standard error by which a parameter is moved to find its slope
 
 
@@ -133,11 +133,11 @@ def _at_border(
         sums: room, shape (3, codes).
     """
     reach = _DEPTH / total  # it falls by one a sample and electron at most
-    while reach < _FARTHEST and height - _evaluate(reach, cells, levels, counts, sums)[0] < _DEPTH:
+    while reach < 1e4 and height - _evaluate(reach, cells, levels, counts, sums)[0] < _DEPTH:
         reach *= 2.0
-    mass = square = 0.0
-    for i in range(_NODES):
-        exposure = reach * (i + 0.5) / _NODES
+    mass, square, nodes = 0.0, 0.0, 64
+    for i in range(nodes):
+        exposure = reach * (i + 0.5) / nodes
         weight = math.exp(min(_evaluate(exposure, cells, levels, counts, sums)[0] - height, 0.0))
         mass += weight
         square += weight * exposure * exposure

@@ -27,7 +27,6 @@ COORDINATES = ("quanta_exposure", "log_gain", "bias_e", "log_read_noise_dn")
 _NODES_PER_SIGMA = 3.0  # halving the step changes no digit that matters; see the tests
 _REACH = 10.0  # read noises beyond which nothing is left
 _COARSE = 1.5  # DN: cells and density differ by exp(-2 pi^2 sigma^2)
-_OFFSETS = 8  # places of the bias between two DN: pixels have any
 _LEAST_EXPOSURE = 1e-12  # below it a sample holds no electrons
 
 
@@ -101,7 +100,7 @@ def _of_cells(
     analog = np.sqrt(max(square - QUANTISATION_VARIANCE, 1e-6 * square))
     codes = np.arange(np.floor(k[0] / gain - _REACH * analog) - 1, k[-1] / gain + _REACH * analog + 2)
     found = []
-    for offset in np.arange(_OFFSETS) / _OFFSETS:
+    for offset in np.arange(8) / 8:
         edges = (codes[:, None] + np.array([0.5, -0.5])[:, None, None] - offset - k / gain) / analog
         share = ndtr(edges[0]) - ndtr(edges[1])
         normal = np.exp(-0.5 * edges**2) / np.sqrt(2.0 * np.pi)

@@ -15,7 +15,6 @@ from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.ordered import Ordered
 
 GOOD, CAUTION, NO_VALUE = 0, 1, 2
-_MOST_OFF = 24  # electrons
 
 
 @dataclass(frozen=True)
@@ -115,9 +114,9 @@ def electrons_off(quanta_exposure: FloatArray, likelihood_gap: FloatArray, n_fra
     with np.errstate(divide="ignore", invalid="ignore"):
         square = np.minimum(2.0 * quanta_exposure**2 / n_frames, 0.5 / likelihood_gap)
     found = np.nan_to_num(square)
-    some = (found > 0) & (found < _MOST_OFF**2 / 32)  # above it the sum is the variance
+    m = np.arange(-24, 25)
+    some = (found > 0) & (found < 18)  # above it the sum is the variance
     half, gap = found[some, None], likelihood_gap[some, None]
-    m = np.arange(-_MOST_OFF, _MOST_OFF + 1)
     weight = np.exp(np.minimum(m * (0.5 - half * gap) / half - 0.5 * m**2 / half, 0.0))
     found[some] = (weight * m**2).sum(axis=1) / weight.sum(axis=1)
     return np.asarray(found)

@@ -184,7 +184,6 @@ def _pair_numbers(pair: Pair) -> dict[str, Any]:
     }
 
 
-_MOST_PLACES = 8  # pixels; all are in history.csv
 _GRADES = ("good fit", "use with caution", "no value")
 _STATES = {
     "identical": "identical to the bit",
@@ -231,8 +230,8 @@ def _hot_words(row: HistoryRow) -> str:
     parts = [f"{row.hot_pixels:,}"]
     for word, places in (("new", row.hot_new), ("gone", row.hot_gone)):
         if places:
-            shown = ", ".join(f"({y}, {x})" for y, x in places[:_MOST_PLACES])
-            more = " …" if len(places) > _MOST_PLACES else ""
+            shown = ", ".join(f"({y}, {x})" for y, x in places[:8])
+            more = " …" if len(places) > 8 else ""  # all are in history.csv
             parts.append(f"{len(places):,} {word}: {shown}{more}")
     return "; ".join(parts)
 
