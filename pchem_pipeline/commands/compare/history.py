@@ -143,7 +143,8 @@ def _number(label: str) -> float:
 def _hot(store: RunStore, sigmas: float) -> NDArray[np.bool_]:
     """Tell which pixels are hot, as the report of the run does."""
     flagged = (store.read("fit/fit_status") & int(flags_of("quanta_exposure"))) != 0
-    return hot_pixels(store.read("maps/quanta_exposure"), flagged, sigmas)
+    exposure, stderr = (store.read(f"maps/quanta_exposure{end}") for end in ("", "_stderr"))
+    return hot_pixels(exposure, stderr, flagged, sigmas)
 
 
 def _places(where: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:

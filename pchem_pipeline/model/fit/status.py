@@ -30,6 +30,7 @@ class FitStatus(IntFlag):
     COARSE_STEPS = 1024
     WEAKLY_IDENTIFIED = 2048
     GAIN_AMBIGUOUS = 4096
+    BIAS_UNSURE = 8192
 
 
 #: Bits for which the parameters of the pixel are NaN.
@@ -46,7 +47,7 @@ AMBIGUOUS = FitStatus.BIAS_AMBIGUOUS | FitStatus.GAIN_AMBIGUOUS
 
 #: Bits of pixels of which the data leave a quantity open by whole electrons, or altogether, whatever its
 #: standard error says.
-FLAGGED = AMBIGUOUS | FitStatus.NOT_INFORMATIVE | FitStatus.WEAKLY_IDENTIFIED
+FLAGGED = AMBIGUOUS | FitStatus.BIAS_UNSURE | FitStatus.NOT_INFORMATIVE | FitStatus.WEAKLY_IDENTIFIED
 
 #: What a bias that is an electron off concerns; the distance of the peaks and their width stay.
 COUNTS_ELECTRONS = ("quanta_exposure", "bias", "spurious_charge", *CHARGE_RATES)
@@ -60,7 +61,8 @@ def flags_of(name: str) -> FitStatus:
     Args:
         name: of the map, without ``_stderr``.
     """
-    return FLAGGED if name in COUNTS_ELECTRONS else FLAGGED & ~FitStatus.BIAS_AMBIGUOUS
+    of_bias = FitStatus.BIAS_AMBIGUOUS | FitStatus.BIAS_UNSURE
+    return FLAGGED if name in COUNTS_ELECTRONS else FLAGGED & ~of_bias
 
 
 def with_rivals_named(
@@ -68,10 +70,7 @@ def with_rivals_named(
 ) -> NDArray[np.int64]:
     """Return status words that say of ambiguous pixels whether their rival differs in bias, gain or both.
 
-    Where bias frames hold the bias, the rival differs in gain alone. Of one sample the rival has one electron
-    more or less, so that mean and variance ask for a gain changed by ``1 / (2 H)``; the peaks hold the gain
-    with ``4 pi^2 H exp(-4 pi^2 s_e^2)`` times their information. What is left of the change is below 3 %
-    where the peaks are resolved: such a rival has the same gain.
+    Where bias frames hold the bias, the rival differs in gain alone. Of one sample see :func:`moves_gain`.
 
     Args:
         words: of the fit, shape (n,).
@@ -82,11 +81,25 @@ def with_rivals_named(
     ambiguous = (words & FitStatus.BIAS_AMBIGUOUS) != 0
     if dark:
         return np.where(ambiguous, words ^ AMBIGUOUS, words)
-    square, h = 4.0 * np.pi**2, exposure.mean(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        change = 0.5 / h / (1.0 + square * h * np.exp(-square * noise**2))
-    of_gain = ambiguous & (exposure.shape[1] == 1) & (change > _LARGEST_GAIN_CHANGE)
+    of_gain = ambiguous & (exposure.shape[1] == 1) & moves_gain(exposure[:, 0], noise)
     return np.where(of_gain, words | FitStatus.GAIN_AMBIGUOUS, words)
+
+
+def moves_gain(exposure: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell where a bias that is an electron off has a gain of its own, too, off by more than 3 %.
+
+    With one electron more or less, mean and variance of the sample ask for a gain changed by ``1 / (2 H)``;
+    the peaks hold the gain with ``4 pi^2 H exp(-4 pi^2 s_e^2)`` times that information. Little is left of the
+    change where they are resolved.
+
+    Args:
+        exposure: H, e-.
+        noise: read noise s_e, e-, same shape.
+    """
+    square = 4.0 * np.pi**2
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        change = 0.5 / exposure / (1.0 + square * exposure * np.exp(-square * noise**2))
+    return np.asarray(change > _LARGEST_GAIN_CHANGE)
 
 
 #: A sentence for every bit.
@@ -103,6 +116,7 @@ MEANINGS: dict[FitStatus, str] = {
     FitStatus.OUTSIDE_WINDOW: "frames outside the histogram window were left out",
     FitStatus.POOR_FIT: "poor goodness of fit: the model does not describe the pixel",
     FitStatus.COARSE_STEPS: "DN too coarse (sigma < 0.6 DN or g > 0.4 e-/DN): rounding biases the estimates",
+    FitStatus.BIAS_UNSURE: "bias clear by chance only: an electron off is as likely in pixels like this one",
     FitStatus.WEAKLY_IDENTIFIED: "too few frames at this sensor's read noise: the bias is clear by chance "
     "only, or the standard errors are rough",
 }

@@ -122,18 +122,23 @@ def electrons_off(quanta_exposure: FloatArray, likelihood_gap: FloatArray, n_fra
     return np.asarray(found)
 
 
-def hot_pixels(quanta_exposure: FloatArray, flagged: NDArray[np.bool_], sigmas: float) -> NDArray[np.bool_]:
+def hot_pixels(
+    quanta_exposure: FloatArray, stderr: FloatArray, flagged: NDArray[np.bool_], sigmas: float
+) -> NDArray[np.bool_]:
     """Tell which pixels are hot: H above the median by more than so many ``1.4826 MAD`` of unflagged pixels.
 
-    A flagged pixel may be hot, whatever electrons it is open by.
+    And by more than so many of its own standard errors: a flagged pixel may be hot, but not by the electrons
+    that it is open by.
 
     Args:
         quanta_exposure: H, e-; NaN where there is no value.
+        stderr: of the map of H, e-, same shape.
         flagged: pixels that do not count for median and MAD, same shape.
         sigmas: ``maps.outlier_sigmas``.
     """
     counted = Ordered.of(quanta_exposure, flagged)
-    return np.asarray(quanta_exposure > counted.median + sigmas * counted.robust_sd)
+    spread = np.fmax(counted.robust_sd, stderr)
+    return np.asarray(quanta_exposure > counted.median + sigmas * spread)
 
 
 def quality_map(fit_status: NDArray[np.integer[Any]], conversion_gain: FloatArray) -> NDArray[np.uint8]:

@@ -70,10 +70,11 @@ def _hot(data: ReportData) -> _Found:
     """Return the share of hot pixels; a flagged one is hot, too, whatever electrons it is open by."""
     if data.few_channels or not data.has_values("quanta_exposure"):
         return None
-    values = data.maps["quanta_exposure"]
-    if data.flagged_in("quanta_exposure")[np.isfinite(values)].all():
+    values, flagged = data.maps["quanta_exposure"], data.flagged_in("quanta_exposure")
+    if flagged[np.isfinite(values)].all():
         return None
-    hot = hot_pixels(values, data.flagged_in("quanta_exposure"), data.outlier_sigmas)
+    stderr = data.maps.get("quanta_exposure_stderr", np.zeros(data.shape))
+    hot = hot_pixels(values, stderr, flagged, data.outlier_sigmas)
     return float(hot.sum() / np.isfinite(values).sum()), f"hot {data.noun}s"
 
 

@@ -110,7 +110,7 @@ def test_flags_name_what_they_concern() -> None:
     for name in ("quanta_exposure", "bias", "dark_current"):
         assert flags_of(name) == FLAGGED
     for name in ("conversion_gain", "read_noise_dn", "read_noise_e", "analog_read_noise_e"):
-        assert flags_of(name) == FLAGGED & ~FitStatus.BIAS_AMBIGUOUS
+        assert flags_of(name) == FLAGGED & ~(FitStatus.BIAS_AMBIGUOUS | FitStatus.BIAS_UNSURE)
     assert [int(FitStatus.BIAS_AMBIGUOUS), int(FitStatus.WEAKLY_IDENTIFIED)] == [32, 2048]  # in old files
 
 
