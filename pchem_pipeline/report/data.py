@@ -312,6 +312,10 @@ class ReportData:
         """Tell whether a map exists and at least one pixel has a value in it."""
         return name in self.maps and self.summary(name, with_flagged=True).n_valid > 0
 
+    def has_median(self, name: str) -> bool:
+        """Tell whether a map exists whose median is not of a selection: most pixels are known in it."""
+        return self.has_values(name) and self.flagged_share(name) <= 0.5
+
     def ordered(self, name: str) -> Ordered:
         """Return the values of a map in their order; the last one is kept, which many ask for in turn."""
         if name not in self._ordered:

@@ -91,9 +91,8 @@ def emva_rows(
     kept = (status & int(FAILED | FLAGGED)) == 0
     maps, errors = _Kept(stored, kept), _Kept(stored, kept, "_stderr")
     gain, exposure = maps["conversion_gain"], stored["quanta_exposure"]
-    stderr = stored["quanta_exposure_stderr"]
-    hot = float(hot_pixels(exposure, stderr, ~kept, outlier_sigmas).sum())
-    hot /= max(np.count_nonzero(np.isfinite(exposure)), 1)
+    is_hot = hot_pixels(exposure, stored["quanta_exposure_stderr"], ~kept, outlier_sigmas)
+    hot = int(is_hot.sum()) / max(int(np.isfinite(exposure).sum()), 1)
     rows = [
         EmvaRow(
             "overall system gain", "K", *_mean(1.0 / gain), "DN/e-", "mean over the pixels of 1/g",

@@ -103,7 +103,7 @@ def key_numbers(data: ReportData, *, with_flagged: bool = False) -> list[KeyNumb
     found = []
     which = f" of unflagged {data.noun}s" if data.often_flagged and not with_flagged else ""
     for name in _KEY_MAPS:
-        if not data.has_values(name) or (not with_flagged and data.flagged_share(name) > 0.5):
+        if not (data.has_values(name) if with_flagged else data.has_median(name)):
             continue
         _, words, unit = symbol(name)
         summary = data.summary(name, with_flagged=with_flagged)
@@ -155,11 +155,11 @@ def _medians(data: ReportData) -> str:
         )
     parts = []
     for name in ("read_noise_e", "conversion_gain", *CHARGE_RATES):
-        if data.has_values(name):
+        if data.has_median(name):
             summary = data.summary(name)
             unit = symbol(name)[2]
             parts.append(f"{symbol(name)[1]} {measured(summary.median, summary.median_stderr, unit)}")
-    left_out = f" ({count(flagged, 'flagged one')} left out)" if flagged else ""
+    left_out = f" ({count(flagged, 'flagged one')} left out where a flag concerns it)" if flagged else ""
     return f"Medians over the {data.noun}s{left_out}: {', '.join(parts)}."
 
 
