@@ -15,7 +15,13 @@ from pchem_pipeline.base.variables import INTERVALS, PARAMETERS, interval_names
 from pchem_pipeline.model.checks.multiple_testing import false_discovery, poorest
 from pchem_pipeline.model.errors.fisher import covariance_from
 from pchem_pipeline.model.fit.status import FAILED, flags_of
-from pchem_pipeline.model.maps.maps import derived_maps, electrons_off, quality_map, status_counts, summarise
+from pchem_pipeline.model.maps.maps import (
+    derived_maps,
+    electron_shifts,
+    quality_map,
+    status_counts,
+    summarise,
+)
 from pchem_pipeline.model.maps.sample_maps import line_map_names, line_maps
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.samples import exposure_axis
@@ -66,7 +72,8 @@ def maps_tile(
     maps: dict[str, NDArray[Any]] = dict(parameters)
     stderr = np.stack([fit[f"{name}_stderr"] for name in PARAMETERS], axis=-1)
     if n_frames is not None:
-        off = np.sqrt(electrons_off(fit["quanta_exposure"], fit["likelihood_gap"], n_frames))
+        m, p = electron_shifts(fit["quanta_exposure"].ravel(), fit["likelihood_gap"].ravel(), n_frames)
+        off = np.sqrt(p @ m**2).reshape(fit["bias"].shape)
         stderr[..., 0] = np.hypot(stderr[..., 0], off)
         stderr[..., 2] = np.hypot(stderr[..., 2], off / fit["conversion_gain"])
     maps |= {f"{name}_stderr": stderr[..., i] for i, name in enumerate(PARAMETERS)}

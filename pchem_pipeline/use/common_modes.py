@@ -168,7 +168,7 @@ class _Design:
     @cached_property
     def _scales(self) -> FloatArray:
         """Standard deviation of each number, DN."""
-        n_parts, ny, nx = self.modes.parts.shape
+        _, ny, nx = self.modes.parts.shape
         variances = np.repeat(self.modes.variances, (1, ny, nx), axis=1).ravel()
         return np.asarray(np.sqrt(np.concatenate([variances, np.repeat(self.modes.waves[:, 2], 2)])))
 

@@ -99,27 +99,34 @@ def _root(variance: FloatArray) -> FloatArray:
         return np.sqrt(np.where(variance >= 0, variance, np.nan))
 
 
-def electrons_off(quanta_exposure: FloatArray, likelihood_gap: FloatArray, n_frames: int) -> FloatArray:
-    """Return the mean square of the electrons by which an estimate of H, and of the bias, is off, e-^2.
+def electron_shifts(
+    quanta_exposure: FloatArray, likelihood_gap: FloatArray, n_frames: int
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return numbers of electrons m, and how probable it is that H, and the bias, is off by as many.
 
     The peaks say nothing of which of them is that of no electron; the width of the law of the electron number
     does, to a standard error of ``s = H sqrt(2 / N)``. The likelihood of being m electrons off is
-    ``exp(-(m - d)^2 / (2 s^2))``, and ``(1 - 2 d) / (2 s^2)`` is the likelihood gap, whence d.
+    ``exp(-(m - d)^2 / (2 s^2))``, and ``(1 - 2 d) / (2 s^2)`` is the likelihood gap, whence d. The gap does
+    not say to which side: m may have either sign.
 
     Args:
-        quanta_exposure: H of one sample, e-, any shape.
-        likelihood_gap: nats, same shape.
+        quanta_exposure: H of one sample, e-, shape (n,).
+        likelihood_gap: nats, shape (n,).
         n_frames: N.
+
+    Returns:
+        m, shape (k,), and probabilities, shape (n, k); m = 0 for certain where a pixel has no value.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         square = np.minimum(2.0 * quanta_exposure**2 / n_frames, 0.5 / likelihood_gap)
-    found = np.nan_to_num(square)
-    m = np.arange(-24, 25)
-    some = (found > 0) & (found < 18)  # above it the sum is the variance
-    half, gap = found[some, None], likelihood_gap[some, None]
-    weight = np.exp(np.minimum(m * (0.5 - half * gap) / half - 0.5 * m**2 / half, 0.0))
-    found[some] = (weight * m**2).sum(axis=1) / weight.sum(axis=1)
-    return np.asarray(found)
+    known = square > 0
+    reach = 2 + int(min(6.0 * np.sqrt(square[known].max(initial=0.0)), 300.0))
+    m = np.arange(-reach, reach + 1)
+    probability = np.tile((m == 0).astype(np.float64), (square.size, 1))
+    half, gap = square[known, None], likelihood_gap[known, None]
+    weight = np.exp(np.minimum(m * (0.5 / half - gap) - 0.5 * m**2 / half, 0.0))
+    probability[known] = weight / weight.sum(axis=1, keepdims=True)
+    return m, probability
 
 
 def hot_pixels(

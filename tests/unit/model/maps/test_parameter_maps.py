@@ -16,7 +16,7 @@ from pchem_pipeline.model.maps.maps import (
     NO_VALUE,
     derived_maps,
     display_edges,
-    electrons_off,
+    electron_shifts,
     hot_pixels,
     quality_map,
     status_counts,
@@ -100,10 +100,17 @@ def test_the_error_of_h_holds_the_chance_of_being_electrons_off(
 
 
 def test_no_chance_of_being_off_where_the_gap_is_large() -> None:
-    off = electrons_off(np.array([2.0, 2.0, np.nan, 0.0]), np.array([40.0, 3.0, np.nan, 1.0]), 1000)
-    assert off[0] < 1e-15
-    assert off[1] == pytest.approx(np.exp(-3) / (1 + np.exp(-3)), rel=0.01)  # of one rival
-    assert off[2:].tolist() == [0.0, 0.0]
+    exposure, gap = np.array([2.0, 2.0, np.nan, 0.0, 8.0]), np.array([40.0, 3.0, np.nan, 1.0, 2.0])
+    m, probability = electron_shifts(exposure, gap, 1000)
+    np.testing.assert_allclose(probability.sum(axis=1), 1.0)
+    right = probability[:, m == 0].ravel()
+    assert 1.0 - right[0] < 1e-15
+    assert right[1] == pytest.approx(1 / (1 + np.exp(-3)), rel=0.01)  # of one rival
+    assert right[2:4].tolist() == [1.0, 1.0]
+    # a gap of 2 nats: the rival on one side, and on the other one at 1 / s^2 - 2 = 5.8 nats
+    others = probability[4] / right[4]
+    assert others[m == 1] == pytest.approx(np.exp(-2.0))
+    assert others[m == -1] == pytest.approx(np.exp(2.0 - 1000 / 128))
 
 
 def test_hot_pixels_are_far_above_the_unflagged_ones() -> None:
