@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _DEFAULT_GAIN = 0.09  # e-/DN, of the cameras that this package was made for
 _ROUNDS = 4
 _LARGEST_STEP = 3.0  # wrong maxima make errors that more frames end at once
+_ERRORS = ("wanted", "rmse", "rmse_stderr", "robust_sd")
 _FIGURES = (".svg", ".png", ".pdf")
 
 
@@ -253,11 +254,8 @@ def _verification_json(result: Verification) -> dict[str, Any]:
         "flagged": result.n_flagged,
         "checks": [
             {
+                **{name: _finite(getattr(check, name)) for name in _ERRORS},
                 "target": str(check.target),
-                "wanted": check.wanted,
-                "rmse": _finite(check.rmse),
-                "rmse_stderr": _finite(check.rmse_stderr),
-                "robust_sd": _finite(check.robust_sd),
                 "reached": bool(check.reached),
             }
             for check in result.checks

@@ -115,17 +115,9 @@ class Offsets:
 
     def of_samples(self, modes: CommonModes, rows: slice = slice(None)) -> NDArray[np.float32]:
         """Return the offset of each sample of some rows, DN, shape (frame, y, x)."""
-        parts = modes.parts[:, rows]
-        out = np.zeros((len(self.rows), *parts.shape[1:]), np.float32)
-        for part, mask in enumerate(parts):
-            out += mask * (self.rows[:, part, rows, None] + self.columns[:, part, None, :]).astype(np.float32)
-        down, along = modes.turns(modes.parts.shape[1:])
-        for wave, part in enumerate(modes.waves[:, 3].astype(int)):
-            pattern = parts[part] * down[wave, rows, None] * along[wave]
-            own = self.waves[:, wave, :, None, None].astype(np.float32)
-            out += own[:, 0] * pattern.real.astype(np.float32)
-            out += own[:, 1] * pattern.imag.astype(np.float32)
-        return out
+        design, n = _Design.of(modes), len(self.rows)
+        frames = [design.offsets(self.rows[t], self.columns[t], self.waves[t], rows) for t in range(n)]
+        return np.array(frames, np.float32).reshape(n, *modes.parts[0, rows].shape)
 
 
 def scene_of(mean: FloatArray, calibration: Calibration) -> FloatArray:
@@ -179,14 +171,20 @@ class _Design:
         lines = values[:n].reshape(n_parts, -1)
         return lines[:, :1] + lines[:, 1 : 1 + ny], lines[:, 1 + ny :], values[n:].reshape(-1, 2)
 
-    def offsets(self, z: FloatArray) -> FloatArray:
-        """Return the offset of each sample, DN, shape (y, x)."""
-        rows, columns, waves = self.unpacked(z)
-        found = np.zeros(self.modes.parts.shape[1:])
-        for mask, row, column in zip(self.modes.parts, rows, columns, strict=True):
-            found += mask * (row[:, None] + column)
+    def offsets(
+        self,
+        rows: NDArray[np.floating[Any]],
+        columns: NDArray[np.floating[Any]],
+        waves: NDArray[np.floating[Any]],
+        some: slice = slice(None),
+    ) -> FloatArray:
+        """Return the offset of each sample of some rows of a frame, DN, shape (y, x)."""
+        parts = self.modes.parts[:, some]
+        found = np.zeros(parts.shape[1:])
+        for mask, row, column in zip(parts, rows, columns, strict=True):
+            found += mask * (row[some, None] + column)
         for part, (c, s), down, along in zip(self.parts_of_waves, waves, self.down, self.along, strict=True):
-            found += self.modes.parts[part] * (down @ np.array([[c, s], [s, -c]]) @ along.T)
+            found += parts[part] * (down[some] @ np.array([[c, s], [s, -c]]) @ along.T)
         return found
 
     def sums(self, values: FloatArray) -> FloatArray:
@@ -207,7 +205,7 @@ class _Design:
 
         size = near.size
         curvature = LinearOperator(
-            (size, size), lambda z: z + self.sums(form[1] * self.offsets(z)), dtype=float
+            (size, size), lambda z: z + self.sums(form[1] * self.offsets(*self.unpacked(z))), dtype=float
         )
         return np.asarray(cg(curvature, self.sums(form[0]), x0=near, rtol=_PRECISION)[0])
 
@@ -255,7 +253,7 @@ def estimate_offsets(
         form = np.stack([weight * np.nan_to_num(frame - calibration.bias - known * step), weight])
         z = design.top(form, np.zeros_like(design.sums(weight)))
         for _ in range(_ROUNDS - 1):
-            from_electrons(frame, pixels, design.offsets(z), form)
+            from_electrons(frame, pixels, design.offsets(*design.unpacked(z)), form)
             z = design.top(form, z)
         found.append((*design.unpacked(z), design.left(form[1])))
     return Offsets(*(np.stack(each) for each in zip(*found, strict=True)))

@@ -189,35 +189,34 @@ def history_csv(rows: Sequence[HistoryRow]) -> str:
     """Return the history as CSV: a line of headings, and a line for each run."""
     maps = list(dict.fromkeys(name for row in rows for name in row.run.summary))
     moved = list(dict.fromkeys(name for row in rows for name in row.moved))
-    flags = list(rows[0].flags)
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(
-        [
-            "label",
-            "date",
-            "temperature",
-            "run",
-            "frames",
-            "pixels_good",
-            "pixels_caution",
-            "pixels_no_value",
-            "hot_pixels",
-            "hot_new",
-            "hot_gone",
-        ]
-        + [f"{name}_{part}" for name in maps for part in ("median", "median_stderr", "scatter")]
-        + [f"{name}_moved" for name in moved]
-        + ["moved_pixels", "compared_pixels", "effects", *(f"flag_{name}" for name in flags)]
-    )
-    for row in rows:
-        of_maps = [row.run.summary.get(name, (float("nan"),) * 3) for name in maps]
-        writer.writerow(
-            [row.label, row.date, "" if row.temperature is None else f"{row.temperature:.6g}"]
-            + [row.run.name, row.run.n_frames or "", *row.run.pixels, row.hot_pixels]
-            + [" ".join(f"{y}/{x}" for y, x in places) for places in (row.hot_new, row.hot_gone)]
-            + ["" if value != value else f"{value:.9g}" for each in of_maps for value in each]
-            + [row.moved.get(name, "") for name in moved]
-            + [row.any_moved, row.compared, " ".join(row.effects), *(row.flags[name] for name in flags)]
-        )
+    lines = [_csv_line(row, maps, moved) for row in rows]
+    writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
     return text.getvalue()
+
+
+def _csv_line(row: HistoryRow, maps: Sequence[str], moved: Sequence[str]) -> dict[str, object]:
+    found: dict[str, object] = {
+        "label": row.label,
+        "date": row.date,
+        "temperature": "" if row.temperature is None else f"{row.temperature:.6g}",
+        "run": row.run.name,
+        "frames": row.run.n_frames or "",
+    }
+    found |= dict(zip(("pixels_good", "pixels_caution", "pixels_no_value"), row.run.pixels, strict=True))
+    found["hot_pixels"] = row.hot_pixels
+    for name, places in (("hot_new", row.hot_new), ("hot_gone", row.hot_gone)):
+        found[name] = " ".join(f"{y}/{x}" for y, x in places)
+    for name in maps:
+        values = row.run.summary.get(name, (float("nan"),) * 3)
+        for part, value in zip(("median", "median_stderr", "scatter"), values, strict=True):
+            found[f"{name}_{part}"] = "" if value != value else f"{value:.9g}"
+    found |= {f"{name}_moved": row.moved.get(name, "") for name in moved}
+    found |= {
+        "moved_pixels": row.any_moved,
+        "compared_pixels": row.compared,
+        "effects": " ".join(row.effects),
+    }
+    return found | {f"flag_{name}": n for name, n in row.flags.items()}
