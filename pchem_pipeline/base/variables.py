@@ -206,7 +206,7 @@ def _applied() -> list[Variable]:
     parts: list[tuple[str, tuple[str, ...], str, str, str]] = [
         ("sums", ("segment", "sum", *_MAP), "float64", "1", "sums over a segment of the frames"),
         ("range", ("end", *_MAP), "int64", "1", "smallest and largest code"),
-        ("prior", _MAP, "float64", "e-", "exposure that the electron numbers are expected to have"),
+        ("prior", _MAP, "float64", "e-", "exposure by the mean of these frames, of which the prior is made"),
         ("covariance", (*_MAP, "row", "column"), "float64", "1", "of (g, mu, sigma), by their likelihood"),
         (
             "rivals",

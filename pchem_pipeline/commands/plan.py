@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _DEFAULT_GAIN = 0.09  # e-/DN, of the cameras that this package was made for
 _ROUNDS = 4
 _LARGEST_STEP = 3.0  # wrong maxima make errors that more frames end at once
+_ERRORS = ("wanted", "rmse", "rmse_stderr", "robust_sd")
 _FIGURES = (".svg", ".png", ".pdf")
 
 
@@ -172,7 +173,8 @@ def _plan_lines(plan: Plan, request: PlanRequest, exposure_given: bool) -> list[
             lines.append(f"  {name:<20}{size:>10.3g} {unit}")
     if exposure_given and np.isfinite(plan.best_exposure):
         limit = " (the largest allowed)" if plan.best_exposure > 0.99 * request.max_exposure else ""
-        lines += ["", f"best exposure: {plan.best_exposure:.3g} e-{limit}, {plan.best_frames:,.0f} frames"]
+        best = f"best exposure: {plan.best_exposure:.3g} e-{limit}, {plan.best_frames:,.0f} frames"
+        lines += ["", f"{best}, with no pixel flagged"]
     return lines
 
 
@@ -189,7 +191,6 @@ def _plan_json(plan: Plan) -> dict[str, Any]:
                 "frames_bound": need.bound,
                 "frames_certain": need.certain,
                 "frames_seen": need.seen,
-                "rounding_shift": need.shift,
             }
             for need in plan.needs
         ],
@@ -238,7 +239,7 @@ def _check_line(result: Verification) -> str:
             f"{check.target.name} {scale * check.rmse:.3g} +- {scale * check.rmse_stderr:.1g} {unit}, "
             f"{'reached' if check.reached else 'not reached'}"
         )
-    caution = f", {result.n_ambiguous} ambiguous in the bias" if result.n_ambiguous else ""
+    caution = f", {result.n_flagged} flagged in what was asked for" if result.n_flagged else ""
     return (
         f"simulated, {result.n_frames:,} frames, {result.n_pixels:,} pixels fitted "
         f"({result.n_failed} without a value{caution}): rms error of {'; '.join(parts)}"
@@ -250,14 +251,11 @@ def _verification_json(result: Verification) -> dict[str, Any]:
         "frames": result.n_frames,
         "pixels": result.n_pixels,
         "failed": result.n_failed,
-        "ambiguous": result.n_ambiguous,
+        "flagged": result.n_flagged,
         "checks": [
             {
+                **{name: _finite(getattr(check, name)) for name in _ERRORS},
                 "target": str(check.target),
-                "wanted": check.wanted,
-                "rmse": _finite(check.rmse),
-                "rmse_stderr": _finite(check.rmse_stderr),
-                "robust_sd": _finite(check.robust_sd),
                 "reached": bool(check.reached),
             }
             for check in result.checks

@@ -109,9 +109,15 @@ class FrameSequence(FrameReader):
             self.check_bits(reader, part)
 
     @property
+    def whole_shape(self) -> tuple[int, int]:
+        """Rows and columns of the files, whatever the region of interest."""
+        _, rows, columns = self._readers[0].shape
+        return rows, columns
+
+    @property
     def whole_frames(self) -> bool:
         """All rows and columns of the files are wanted."""
-        return (self._y0, self._x0, *self.shape[1:]) == (0, 0, *self._readers[0].shape[1:])
+        return (self._y0, self._x0, *self.shape[1:]) == (0, 0, *self.whole_shape)
 
     def pieces(self, t0: int, t1: int) -> Iterator[tuple[FrameReader, int, int, int]]:
         """Yield for each file of frames t0..t1: reader, first frame and end in it, frames before it."""

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.methods.moments import SampleMoments, sample_moments
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS
+from pchem_pipeline.model.law.pcd import log_pcd
 
 FloatArray = NDArray[np.float64]
 Needs = Literal["one sample", "a dark and a bright sample", "a series of samples"]
@@ -35,6 +37,25 @@ class Sample:
     def moments(self) -> SampleMoments:
         """Return the unbiased moments of every pixel."""
         return sample_moments(self.counts, self.origin)
+
+    def likeliest(self, candidates: FloatArray) -> FloatArray:
+        """Return for every pixel the candidate of largest likelihood, NaN where there is none.
+
+        Args:
+            candidates: (H, g, mu, sigma), shape (n, m, 4); NaN for those that do not count.
+
+        Returns:
+            Shape (n, 4).
+        """
+        pixel, bins = np.nonzero(self.counts)
+        x, weights = self.origin[pixel] + bins, self.counts[pixel, bins]
+        heights = np.full(candidates.shape[:2], -np.inf)
+        for place, parameters in enumerate(np.moveaxis(candidates, 1, 0)):
+            values = weights * log_pcd(x, *parameters[pixel].T)
+            heights[:, place] = np.bincount(pixel, values, minlength=self.origin.size)
+        heights[~np.isfinite(heights)] = -np.inf
+        best = candidates[np.arange(self.origin.size), heights.argmax(axis=1)]
+        return np.where(np.isfinite(heights.max(axis=1))[:, None], best, np.nan)
 
 
 @dataclass(frozen=True)
@@ -88,6 +109,18 @@ class Estimates:
 
     parameters: FloatArray
     reasons: Mapping[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def where(cls, parameters: FloatArray, reasons: Mapping[str, NDArray[np.bool_]]) -> Estimates:
+        """Return estimates with the number of pixels for which each reason holds."""
+        counted = {words: int(np.count_nonzero(pixels)) for words, pixels in reasons.items()}
+        return cls(parameters, {words: n for words, n in counted.items() if n})
+
+    @classmethod
+    def of_fit(cls, parameters: FloatArray, words: NDArray[np.uint16]) -> Estimates:
+        """Return the estimates of this package's fit, with the reasons of its status words."""
+        failed = words & int(FAILED)
+        return cls.where(parameters, {MEANINGS[bit]: (failed & int(bit)) != 0 for bit in FAILED})
 
 
 def no_estimates(n_pixels: int) -> FloatArray:

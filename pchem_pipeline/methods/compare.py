@@ -222,23 +222,21 @@ def pixel_bounds(samples: Sequence[Sample], reference: FloatArray) -> FloatArray
             exposures.append(np.where(np.abs(exposure) < 5 * scatter, 0.0, exposure))
         frames.append(moments.n_frames)
     noise = reference[:, 1] * reference[:, 3]
-    rows = [
-        _bound(tuple(map(float, h)), float(s), tuple(map(float, n)))
-        for h, s, n in zip(np.stack(exposures, 1), noise, np.stack(frames, 1), strict=True)
-    ]
+    pixels = zip(np.stack(exposures, 1), noise, reference[:, 1], np.stack(frames, 1), strict=True)
+    rows = [_bound(tuple(map(float, h)), float(s), float(g), tuple(map(float, n))) for h, s, g, n in pixels]
     return np.array(rows).reshape(-1, 4)
 
 
 @functools.lru_cache(maxsize=1 << 16)
-def _bound(exposures: tuple[float, ...], noise: float, frames: tuple[float, ...]) -> FloatArray:
+def _bound(exposures: tuple[float, ...], noise: float, gain: float, frames: tuple[float, ...]) -> FloatArray:
     """Return the bound of (H of the first sample, g, mu, s_e), relative, the bias in e-."""
     if not (
         np.isfinite([*exposures, noise]).all() and exposures[0] > 0 and noise > 0 and min(exposures) >= 0
     ):
         return np.full(4, np.nan)
-    first = expected_information(exposures[0], noise) * frames[0]
+    first = expected_information(exposures[0], noise, gain) * frames[0]
     for exposure, n in zip(exposures[1:], frames[1:], strict=True):
-        first[1:, 1:] += shared_information(exposure, noise) * n
+        first[1:, 1:] += shared_information(exposure, noise, gain) * n
     covariance = inverse_information(first)
     both = covariance[1, 1] + 2 * covariance[1, 3] + covariance[3, 3]
     relative = covariance[0, 0] / exposures[0] ** 2

@@ -43,10 +43,8 @@ class Cumulants(Method):
             variance = moments.variance - exposure / gain**2
             out[:, 0], out[:, 1], out[:, 2] = exposure, gain, moments.mean - exposure / gain
             out[:, 3] = np.sqrt(np.where(variance > 0, variance, np.nan))
-        lost = int(np.count_nonzero(~answered))
-        negative = int(np.count_nonzero(answered & ~(variance > 0)))
         reasons = {
-            "third or fourth cumulant not positive": lost,
-            "no variance left for the read noise": negative,
+            "third or fourth cumulant not positive": ~answered,
+            "no variance left for the read noise": answered & ~(variance > 0),
         }
-        return Estimates(out, {words: n for words, n in reasons.items() if n})
+        return Estimates.where(out, reasons)

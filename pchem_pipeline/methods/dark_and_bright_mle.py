@@ -6,16 +6,12 @@ import numpy as np
 
 from pchem_pipeline.methods.base import (
     Estimates,
-    FloatArray,
     Method,
     PixelSamples,
-    Sample,
     Settings,
-    no_estimates,
     register_method,
 )
-from pchem_pipeline.methods.plain_em import first_start, run_em
-from pchem_pipeline.model.law.pcd import log_pcd
+from pchem_pipeline.methods.plain_em import closed_form_start, run_em
 
 
 @register_method
@@ -42,30 +38,15 @@ class DarkAndBrightMle(Method):
         dark, sample = pixels.samples[order[0]].moments(), pixels.samples[order[-1]]
         bright = sample.moments()
         noise = np.sqrt(np.maximum(dark.variance, 1e-6))
-        best, best_score = no_estimates(pixels.n_pixels), np.full(pixels.n_pixels, -np.inf)
         with np.errstate(divide="ignore", invalid="ignore"):
             transfer = (bright.mean - dark.mean) / (bright.variance - dark.variance)
-        for gain in (transfer, first_start(sample)[:, 1]):
+        ends = []
+        for gain in (transfer, closed_form_start(sample)[:, 1]):
             start = np.stack([gain * (bright.mean - dark.mean), gain, dark.mean, noise], axis=1)
             start[~((start[:, 0] > 0) & (gain > 0))] = np.nan
-            found, _ = run_em(sample, start, True, settings)
-            score = log_likelihoods(sample, found)
-            better = score > best_score
-            best[better], best_score[better] = found[better], score[better]
+            ends.append(run_em(sample, start, True, settings)[0])
+        best = sample.likeliest(np.stack(ends, axis=1))
         with np.errstate(invalid="ignore"):
             best[:, 0] = best[:, 1] * (pixels.samples[0].moments().mean - best[:, 2])
-        bad = int(np.count_nonzero(~np.isfinite(best[:, 1])))
-        return Estimates(best, {"no electrons seen above the dark sample": bad} if bad else {})
-
-
-def log_likelihoods(sample: Sample, parameters: FloatArray) -> FloatArray:
-    """Return the log-likelihood of every pixel, nats, shape (n,); minus infinity without parameters.
-
-    Args:
-        sample: histograms.
-        parameters: (H, g, mu, sigma), shape (n, 4).
-    """
-    pixel, bins = np.nonzero(sample.counts)
-    values = log_pcd(sample.origin[pixel] + bins, *parameters[pixel].T)
-    total = np.bincount(pixel, sample.counts[pixel, bins] * values, minlength=sample.origin.size)
-    return np.where(np.isfinite(total), total, -np.inf)
+        bad = ~np.isfinite(best[:, 1])
+        return Estimates.where(best, {"no electrons seen above the dark sample": bad})

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings, register_method
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 
 
 @register_method
@@ -27,9 +24,4 @@ class PchEm(Method):
         """Return the fit of the first sample."""
         sample = pixels.samples[0]
         result = fit_histograms(sample.counts, sample.origin)
-        parameters = result.columns
-        failed = result.fit_status[(result.fit_status & int(FAILED)) != 0]
-        reasons = {
-            text: int(np.count_nonzero(failed & int(bit))) for bit, text in MEANINGS.items() if bit & FAILED
-        }
-        return Estimates(parameters, {text: n for text, n in reasons.items() if n})
+        return Estimates.of_fit(result.columns, result.fit_status)

@@ -6,7 +6,6 @@ import numpy as np
 
 from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings, register_method
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 
 
 @register_method
@@ -35,8 +34,4 @@ class JointPchEm(Method):
         )
         exposure = result.quanta_exposure[:, 0]
         parameters = np.stack([exposure, result.conversion_gain, result.bias, result.read_noise_dn], axis=1)
-        failed = result.fit_status[(result.fit_status & int(FAILED)) != 0]
-        reasons = {
-            text: int(np.count_nonzero(failed & int(bit))) for bit, text in MEANINGS.items() if bit & FAILED
-        }
-        return Estimates(parameters, {text: n for text, n in reasons.items() if n})
+        return Estimates.of_fit(parameters, result.fit_status)

@@ -42,10 +42,7 @@ class TwoSamplePhotonTransfer(Method):
         out[good, 0] = out[good, 1] * (first.mean - dark.mean)[good]
         out[good, 2] = dark.mean[good]
         out[good, 3] = np.sqrt(dark.variance[good])
-        bad = int(np.count_nonzero(~good))
-        return Estimates(
-            out, {"bright sample not above the dark one in mean and variance": bad} if bad else {}
-        )
+        return Estimates.where(out, {"bright sample not above the dark one in mean and variance": ~good})
 
 
 def gain_variance(

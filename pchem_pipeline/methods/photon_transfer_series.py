@@ -57,7 +57,7 @@ class PhotonTransferSeries(Method):
             "variance does not rise with the mean": ~rising,
             "the line gives no read noise": rising & ~positive,
         }
-        return Estimates(out, {words: int(mask.sum()) for words, mask in bad.items() if mask.any()})
+        return Estimates.where(out, bad)
 
 
 def _line(x: FloatArray, y: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -39,24 +39,19 @@ class PlainEm(Method):
     def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
         """Return where EM stops, in the first sample."""
         sample = pixels.samples[0]
-        start = first_start(sample)
+        start = closed_form_start(sample)
         parameters, steps = run_em(sample, start, False, settings)
         reasons = {
-            "no starting point": int(np.count_nonzero(~np.isfinite(start[:, 1]))),
-            "EM left the allowed range": int(np.count_nonzero(steps < 0)),
-            "stopped at the largest number of steps": int(np.count_nonzero(steps == settings.em_iterations)),
+            "no starting point": ~np.isfinite(start[:, 1]),
+            "EM left the allowed range": steps < 0,
+            "stopped at the largest number of steps": steps == settings.em_iterations,
         }
-        return Estimates(parameters, {words: n for words, n in reasons.items() if n})
+        return Estimates.where(parameters, reasons)
 
 
-def first_start(sample: Sample) -> FloatArray:
-    """Return the first closed-form starting point of each pixel, (H, g, mu, sigma), shape (n, 4), or NaN."""
-    candidates = starting_points(sample.counts, sample.origin)
-    finite: NDArray[np.bool_] = np.asarray(np.isfinite(candidates).all(axis=2))
-    chosen = np.argmax(finite, axis=1)
-    found: FloatArray = candidates[np.arange(chosen.size), chosen]
-    found[~finite.any(axis=1)] = np.nan
-    return found
+def closed_form_start(sample: Sample) -> FloatArray:
+    """Return the likeliest closed-form start of each pixel, (H, g, mu, sigma), shape (n, 4), or NaN."""
+    return sample.likeliest(starting_points(sample.counts, sample.origin))
 
 
 def run_em(

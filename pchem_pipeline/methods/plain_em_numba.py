@@ -22,29 +22,19 @@ def mean_electrons(x: float, theta: NDArray[np.float64]) -> tuple[float, float]:
     fall = np.exp(-step * along)
     residual = x - bias - first * step
     total, one, two = 1.0, float(first), float(first) * first
-    # the ratio of neighbouring terms falls by the same factor at every electron
-    term, ratio, k = 1.0, np.exp((residual - 0.5 * step) * along), first
-    while True:
-        k += 1
-        grow = ratio * exposure / k
-        term *= grow
-        ratio *= fall
-        total += term
-        one += term * k
-        two += term * k * k
-        if grow < 1.0 and term < _SMALL * total:
-            break
-    term, ratio, k = 1.0, np.exp(-(residual + 0.5 * step) * along), first
-    while k > 0:
-        grow = ratio * k / exposure
-        term *= grow
-        ratio *= fall
-        k -= 1
-        total += term
-        one += term * k
-        two += term * k * k
-        if grow < 1.0 and term < _SMALL * total:
-            break
+    for side in (1, -1):
+        # the ratio of neighbouring terms falls by the same factor at every electron
+        term, ratio, k = 1.0, np.exp((side * residual - 0.5 * step) * along), first
+        while side > 0 or k > 0:
+            grow = ratio * (exposure / (k + 1) if side > 0 else k / exposure)
+            k += side
+            term *= grow
+            ratio *= fall
+            total += term
+            one += term * k
+            two += term * k * k
+            if grow < 1.0 and term < _SMALL * total:
+                break
     return one / total, two / total
 
 

@@ -66,32 +66,14 @@ def study_point(point: StudyPoint, settings: Settings) -> dict[str, Any]:
         names = [n for n, m in methods().items() if m.needs == needs and not m.sensor_wide]
         rng = np.random.default_rng([point.seed, number, round(1e6 * point.read_noise_e)])
         frames = max(point.n_frames // len(exposures), 4)
+        bias = 100.0 + rng.random(point.n_pixels)  # pixels differ in where a DN begins
+        noise = max(point.read_noise_e, point.conversion_gain * np.sqrt(QUANTISATION_VARIANCE))
         drawn = [
-            draw_histograms(
-                rng,
-                np.full(point.n_pixels, share * point.quanta_exposure),
-                point.conversion_gain,
-                # pixels differ in where a DN begins
-                100.0 + rng.random(point.n_pixels),
-                max(point.read_noise_e, point.conversion_gain * np.sqrt(QUANTISATION_VARIANCE)),
-                frames,
-            )
-            for share in exposures[:1]
-        ]
-        truth = drawn[0].truth
-        drawn += [
-            draw_histograms(
-                rng,
-                share * point.quanta_exposure,
-                truth[:, 1],
-                truth[:, 2],
-                truth[:, 1] * truth[:, 3],
-                frames,
-            )
-            for share in exposures[1:]
+            draw_histograms(rng, share * point.quanta_exposure, point.conversion_gain, bias, noise, frames)
+            for share in exposures
         ]
         pixels = PixelSamples(tuple(Sample(one.counts, one.origin) for one in drawn))
-        results += compare(pixels, truth, settings, only=names)
+        results += compare(pixels, drawn[0].truth, settings, only=names)
     order = list(methods())
     results.sort(key=lambda result: order.index(result.name))
     return {
@@ -104,8 +86,9 @@ def study_point(point: StudyPoint, settings: Settings) -> dict[str, Any]:
 def _gain_bounds(point: StudyPoint) -> dict[str, float | None]:
     """Return the smallest relative errors of g: one sample, dark and bright, and photon transfer's own."""
     exposure, noise, n = point.quanta_exposure, point.read_noise_e, float(point.n_frames)
-    one = inverse_information(expected_information(exposure, noise) * n)[1, 1]
-    two = shared_information(exposure, noise) + shared_information(0.0, noise)
+    gain = point.conversion_gain
+    one = inverse_information(expected_information(exposure, noise, gain) * n)[1, 1]
+    two = shared_information(exposure, noise, gain) + shared_information(0.0, noise, gain)
     both = inverse_information(two * (n / 2))[0, 0]
     transfer = gain_variance(exposure, 0.0, noise, n / 2, n / 2)
     found = {"one sample": one, "a dark and a bright sample": both, "photon_transfer": transfer}

@@ -8,38 +8,37 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
 from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.targets import TARGET_NAMES, Target
 
-_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
-
 
 @functools.lru_cache(maxsize=8192)
-def _bound(exposure: float, noise: float) -> FloatArray:
-    """Return the smallest covariance from one frame; do not change it."""
-    return inverse_information(expected_information(exposure, noise))
+def _bound(point: Point) -> FloatArray:
+    """Return the smallest covariance from one frame, rounding included; do not change it."""
+    return inverse_information(
+        expected_information(point.quanta_exposure, point.read_noise_e, point.conversion_gain)
+    )
 
 
-def frames_needed(target: Target, point: Point, shift: float = 0.0) -> float:
+def frames_needed(target: Target, point: Point) -> float:
     """Return the number of frames with which one sample reaches a target, by the Cramer-Rao bound.
 
     Args:
         target: what is wanted.
         point: the pixel.
-        shift: systematic error of the parameter, in the unit of ``target.wanted``, which frames do not lower.
 
     Returns:
         Frames, whole; infinite where no number of them reaches it.
     """
     gradient = target.gradient(point)
-    variance = float(gradient @ _bound(point.quanta_exposure, point.read_noise_e) @ gradient)
-    room = target.wanted(point) ** 2 - shift**2
-    if not np.isfinite(variance) or room <= 0:
+    variance = float(gradient @ _bound(point) @ gradient)
+    if not np.isfinite(variance):
         return float("inf")
-    return float(np.ceil(max(variance / room, 1.0)))
+    return float(np.ceil(max(variance / target.wanted(point) ** 2, 1.0)))
 
 
 def precision(point: Point, n_frames: float) -> dict[str, float]:
@@ -52,7 +51,7 @@ def precision(point: Point, n_frames: float) -> dict[str, float]:
     Returns:
         By parameter of :data:`~pchem_pipeline.planning.targets.TARGET_NAMES`; NaN where frames do not tell.
     """
-    covariance = _bound(point.quanta_exposure, point.read_noise_e) / n_frames
+    covariance = _bound(point) / n_frames
     found = {}
     for name, units in TARGET_NAMES.items():
         gradient = Target(name, 1.0, units[0]).gradient(point)
@@ -87,12 +86,8 @@ def best_exposure(targets: Sequence[Target], point: Point, low: float, high: flo
     best = int(np.argmin(values))
     if not np.isfinite(values[best]):
         return float("nan"), float("inf")
-    left, right = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
-    for _ in range(18):
-        a, b = right - _GOLDEN * (right - left), left + _GOLDEN * (right - left)
-        left, right = (left, b) if needed(a) <= needed(b) else (a, right)
-    ends = [grid[best], 0.5 * (left + right)]
-    found = min(ends, key=needed)
+    ends = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
+    found = min(grid[best], minimize_scalar(needed, bounds=ends, method="bounded").x, key=needed)
     return float(np.exp(found)), needed(found)
 
 

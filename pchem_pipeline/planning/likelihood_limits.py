@@ -1,8 +1,7 @@
-"""What the Cramer-Rao bound does not see: electron numbers off by one, and the error of rounding.
+"""What the Cramer-Rao bound does not see: electron numbers off by one, and quite other gains.
 
 Both are distances between laws, found by maximising an expected log-likelihood: how near the fit of
-infinitely many frames comes with every electron number one too large or too small, and where it ends when the
-data are rounded and the model is not.
+infinitely many frames comes with every electron number one too large or too small, or with another gain.
 """
 
 from __future__ import annotations
@@ -14,11 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
-from pchem_pipeline.planning.point import FloatArray, Point
+from pchem_pipeline.model.law.pcd import log_pcd
+from pchem_pipeline.planning.point import FloatArray
 
-_COARSE = 0.9  # DN: rounding errors fall as exp(-2 pi^2 sigma^2), to 1e-7 here
 _OFFSETS = (1.0, 0.75, 0.5, 1.25)  # e- off at the brightest sample; the rival lies near 1
 _GAIN_CHANGES = (0.1, 0.2)  # of ln g
 _LEAST_EXPOSURE = 0.02
@@ -196,39 +193,3 @@ def _descend(cost: Callable[[FloatArray], float], start: FloatArray) -> tuple[Fl
     """Return the minimum next to a start, and its height."""
     result = minimize(cost, start, method="BFGS", options={"gtol": 1e-6, "maxiter": 100})
     return np.asarray(result.x, np.float64), float(result.fun)
-
-
-def rounding_shift(point: Point) -> FloatArray:
-    """Return the error of the fit from infinitely many rounded frames, root mean square over the place of mu.
-
-    The fit treats rounding as noise of 1/12 DN^2 (Hendrickson et al. 2023, eq. X_density), which holds as
-    long as sigma is not small against a DN.
-
-    Returns:
-        Of (H, ln g, g mu, ln sigma), shape (4,); zeros where sigma is above 0.9 DN.
-    """
-    sigma = point.read_noise_dn
-    if sigma >= _COARSE:
-        return np.zeros(4)
-    exposure, gain = point.quanta_exposure, point.conversion_gain
-    analog = gain * np.sqrt(max(sigma**2 - QUANTISATION_VARIANCE, 0.0))
-    last = (exposure + 12 * np.sqrt(exposure) + 12) / gain + 12 * sigma
-    x = np.arange(np.floor(-12 * sigma) - 1, last + 2)
-    shifts = [_shift(x, point, analog, offset) for offset in (0.0, 0.25, 0.5, 0.75)]
-    return np.asarray(np.sqrt(np.mean(np.square(shifts), axis=0)))
-
-
-def _shift(x: FloatArray, point: Point, analog: float, offset: float) -> FloatArray:
-    """Return the error of the fit with the bias at one place between two DN."""
-    exposure, gain = point.quanta_exposure, point.conversion_gain
-    mass = pcd_mass(x, exposure, gain, offset, analog)
-    used = mass > 1e-14 * mass.max()
-    places, weights = x[used], mass[used] / mass[used].sum()
-    origin = np.array([np.log(exposure), np.log(gain), offset, np.log(point.read_noise_dn)])
-
-    def cost(step: FloatArray) -> float:
-        h, g, mu, s = origin + step
-        return -float(weights @ log_pcd(places, np.exp(h), np.exp(g), mu, np.exp(s)))
-
-    step, _ = _descend(cost, np.zeros(4))
-    return np.array([exposure * np.expm1(step[0]), step[1], step[2] * gain, step[3]])

@@ -8,15 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.base.variables import CHARGE_RATES
+from pchem_pipeline.model.fit.status import COUNTS_ELECTRONS
 from pchem_pipeline.planning.frames import best_exposure, exposure_grid, frames_needed, precision
-from pchem_pipeline.planning.likelihood_limits import ambiguity, gain_rival, rounding_shift
-from pchem_pipeline.planning.point import FloatArray, Point
+from pchem_pipeline.planning.likelihood_limits import ambiguity, gain_rival
+from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.split import Split, best_samples, best_split, split_frames
 from pchem_pipeline.planning.targets import Target
 
-#: Parameters that are an electron off where the electron numbers are.
-_COUNTED = ("quanta_exposure", *CHARGE_RATES, "bias")
 #: Without so much knowledge of the gain, the bound says nothing about real fits.
 _SEEN = Target("conversion_gain", 25.0, "%")
 _TRIED = 10  # exposures
@@ -31,17 +29,16 @@ class Need:
     Attributes:
         target: what is wanted.
         bound: frames by the Cramer-Rao bound.
-        certain: frames until electron numbers are not off by one; 0 where that does not matter.
+        certain: frames until electron numbers are not off by one; 0 where that does not matter: at a given
+            exposure for a gain or a read noise.
         seen: frames until the gain is known to a quarter, below which one Gaussian fits as well, and until no
             other gain is as likely by chance.
-        shift: systematic error by rounding; relative, of the bias in e-.
     """
 
     target: Target
     bound: float
     certain: float
     seen: float
-    shift: float
 
     @property
     def frames(self) -> float:
@@ -119,21 +116,20 @@ def plan_one_sample(
         if not np.isfinite(best):
             raise ConfigError(_hopeless(aims[0], point, "at any exposure", ""))
         point = replace(point, quanta_exposure=best)
-    shifts = rounding_shift(point)
-    needs = tuple(_need(target, point, shifts) for target in targets)
+    needs = tuple(_need(target, point, sure=not exposure_given) for target in targets)
     for need in needs:
         _refuse(need, point, max_frames, best, best_frames)
     frames = float(budget) if budget is not None else max(need.frames for need in needs)
     return Plan(point, needs, frames, precision(point, frames), best, best_frames)
 
 
-def _need(target: Target, point: Point, shifts: FloatArray) -> Need:
-    shift = abs(float(target.gradient(point) @ shifts))
+def _need(target: Target, point: Point, *, sure: bool) -> Need:
+    """Return what a target asks for; ``sure``: no flag is to be left, of whatever quantity."""
     certain = 0.0
-    if target.name in _COUNTED:
+    if sure or target.name in COUNTS_ELECTRONS:
         certain = ambiguity([point.quanta_exposure], [1.0], point.read_noise_e).frames()
     seen = max(frames_needed(_SEEN, point), _gain_certain([point.quanta_exposure], [1.0], [target], point))
-    return Need(target, frames_needed(target, point, shift), certain, seen, shift)
+    return Need(target, frames_needed(target, point), certain, seen)
 
 
 def _gain_certain(
@@ -152,15 +148,6 @@ def _refuse(need: Need, point: Point, max_frames: float, best: float, best_frame
         ConfigError: it is.
     """
     target = need.target
-    wanted = target.wanted(point)
-    if need.shift >= wanted:
-        unit = "e-" if target.name == "bias" else "%"
-        size = need.shift if target.name == "bias" else 100 * need.shift
-        raise ConfigError(
-            f"{target}: no number of frames reaches it: rounding to whole DN alone shifts it by "
-            f"{size:.2g} {unit} at {point.conversion_gain:g} e-/DN; "
-            "use a camera setting with fewer electrons per DN"
-        )
     if need.frames > max_frames:
         cure = ""
         if best_frames <= max_frames and best_frames < 0.5 * need.frames:
@@ -187,14 +174,13 @@ def _hopeless(target: Target, point: Point, where: str, more: str) -> str:
 
 
 def _best(targets: Sequence[Target], point: Point, max_exposure: float) -> tuple[float, float]:
-    """Return the best exposure and its frames: those of the bound, and until gain and counts are certain.
+    """Return the best exposure and its frames: those of the bound, and until nothing is flagged.
 
     Where the bound's best will not do, the others are tried in the order of their bounds, as long as these
     promise anything.
     """
     low = min(0.02, 0.1 * max_exposure)
     aims = (*targets, _SEEN)
-    counted = any(target.name in _COUNTED for target in targets)
     first, fewest = best_exposure(aims, point, low, max_exposure)
     if not np.isfinite(first):
         return first, fewest
@@ -208,7 +194,7 @@ def _best(targets: Sequence[Target], point: Point, max_exposure: float) -> tuple
             break
         h = there.quanta_exposure
         certain = _gain_certain([h], [1.0], targets, there)
-        if counted and certain < frames:
+        if certain < frames:
             certain = max(certain, ambiguity([h], [1.0], point.read_noise_e).frames())
         if max(bound, certain) < frames:
             best, frames = h, max(bound, certain)

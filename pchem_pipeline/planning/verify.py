@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.fit.status import FAILED, flags_of
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.targets import Target
@@ -47,52 +48,20 @@ class Verification:
         n_frames: frames of each pixel.
         n_pixels: simulated pixels.
         n_failed: of them without a value.
-        n_ambiguous: of them flagged as ambiguous in the bias.
+        n_flagged: of them flagged in what was wanted.
         checks: one a target.
     """
 
     n_frames: int
     n_pixels: int
     n_failed: int
-    n_ambiguous: int
+    n_flagged: int
     checks: tuple[Check, ...]
 
 
 def verify(targets: Sequence[Target], point: Point, n_frames: int, n_pixels: int, seed: int) -> Verification:
-    """Simulate pixels that differ in where their bias lies between two DN, and fit them.
-
-    Args:
-        targets: what was wanted.
-        point: the pixel.
-        n_frames: frames of each pixel.
-        n_pixels: pixels to simulate.
-        seed: of the random numbers.
-    """
-    rng = np.random.default_rng(seed)
-    bias = 100.0 + rng.random(n_pixels)
-    drawn = draw_histograms(
-        rng, point.quanta_exposure, point.conversion_gain, bias, point.read_noise_e, n_frames
-    )
-    fit = fit_histograms(drawn.counts, drawn.origin)
-    found = fit.columns
-    return _outcome(targets, point, _errors(found, drawn.truth), fit.fit_status, n_frames)
-
-
-def _outcome(
-    targets: Sequence[Target],
-    point: Point,
-    errors: FloatArray,
-    words: NDArray[np.uint16],
-    n_frames: int,
-) -> Verification:
-    """Return what the errors of the fitted pixels say about the targets."""
-    return Verification(
-        n_frames,
-        words.size,
-        int(np.count_nonzero(words & int(FAILED))),
-        int(np.count_nonzero(words & int(FitStatus.BIAS_AMBIGUOUS))),
-        tuple(_check(target, point, errors) for target in targets),
-    )
+    """Simulate pixels under one exposure, that of the point, and fit them; see :func:`verify_samples`."""
+    return verify_samples(targets, point, [point.quanta_exposure], [n_frames], n_pixels, seed)
 
 
 def _check(target: Target, point: Point, errors: FloatArray) -> Check:
@@ -117,11 +86,11 @@ def verify_samples(
     n_pixels: int,
     seed: int,
 ) -> Verification:
-    """Simulate pixels under several exposures, and fit all samples jointly.
+    """Simulate pixels that differ in where their bias lies between two DN, and fit all samples jointly.
 
     Args:
-        targets: what was wanted, of what the samples share.
-        point: read noise and gain of the pixel.
+        targets: what was wanted.
+        point: the pixel; of several exposures its own does not matter.
         exposures: H of the samples, e-; 0 for bias frames.
         frames: of each sample, above 0.
         n_pixels: pixels to simulate.
@@ -140,12 +109,15 @@ def verify_samples(
     found = np.stack(
         [fit.quanta_exposure[:, brightest], fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1
     )
-    errors = _errors(found, drawn[brightest].truth)
-    return _outcome(targets, point, errors, fit.fit_status, sum(frames))
-
-
-def _errors(found: FloatArray, truth: FloatArray) -> FloatArray:
-    """Return the errors of (H, g, mu, sigma): relative, of mu in e-."""
-    errors = found / truth - 1
+    truth = drawn[brightest].truth
+    errors = found / truth - 1  # relative; of mu in e-
     errors[:, 2] = (found[:, 2] - truth[:, 2]) * truth[:, 1]
-    return errors
+    bits = functools.reduce(operator.or_, (int(flags_of(target.name)) for target in targets))
+    words = fit.fit_status
+    return Verification(
+        sum(frames),
+        n_pixels,
+        int(np.count_nonzero(words & int(FAILED))),
+        int(np.count_nonzero(words & bits)),
+        tuple(_check(target, point, errors) for target in targets),
+    )

@@ -135,7 +135,8 @@ class HistoryRow:
         place: number that the label begins with, days of the date, or the temperature; NaN where there is
             none.
         run: what its maps say.
-        hot_pixels: pixels far above the others in dark current, or in exposure.
+        hot_pixels: pixels far above the others in exposure, as in the report of the run.
+        hot_new, hot_gone: pixels (y, x) that are hot here and not in the first run, and the reverse.
         flags: number of pixels that bear each word of ``fit_status``.
         effects: tags of its model.
         moved: map to number of pixels that moved since the first run; empty for that one itself.
@@ -149,6 +150,8 @@ class HistoryRow:
     place: float
     run: RunFacts
     hot_pixels: int = 0
+    hot_new: Sequence[tuple[int, int]] = ()
+    hot_gone: Sequence[tuple[int, int]] = ()
     flags: Mapping[str, int] = field(default_factory=dict)
     effects: tuple[str, ...] = ()
     moved: Mapping[str, int] = field(default_factory=dict)

@@ -19,7 +19,7 @@ from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
-from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus
+from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus, flags_of
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.model.maps.ordered import Ordered, median_of
 from pchem_pipeline.report.settings import Criteria
@@ -256,27 +256,33 @@ class ReportData:
     @cached_property
     def flagged(self) -> NDArray[np.bool_]:
         """Pixels with a value that the data leave open by whole electrons, or altogether; shape ``shape``."""
+        return self._with_bits(self.flagged_mask)
+
+    def flagged_in(self, name: str) -> NDArray[np.bool_]:
+        """Tell which pixels the data leave open in one map: a gain is known where the bias is not."""
+        return self._with_bits(self.flagged_mask & int(flags_of(name)))
+
+    def _with_bits(self, bits: int) -> NDArray[np.bool_]:
         status = self.fit.get("fit_status")
         if status is None:
             return np.zeros(self.shape, dtype=bool)
-        return np.asarray((status & self.failed_mask == 0) & (status & self.flagged_mask != 0))
+        return np.asarray((status & self.failed_mask == 0) & (status & bits != 0))
 
     @cached_property
     def any_flagged(self) -> bool:
         """Whether a pixel is flagged."""
         return bool(self.flagged.any())
 
-    @cached_property
-    def flagged_share(self) -> float:
-        """Share of flagged pixels among those with a value."""
+    def flagged_share(self, name: str = "quanta_exposure") -> float:
+        """Return the share of flagged pixels among those with a value, in one map; by default all flags."""
         status = self.fit.get("fit_status")
         valued = 0 if status is None else int(np.count_nonzero(status & self.failed_mask == 0))
-        return int(np.count_nonzero(self.flagged)) / max(valued, 1)
+        return int(np.count_nonzero(self.flagged_in(name))) / max(valued, 1)
 
     @property
     def mostly_flagged(self) -> bool:
-        """Tell whether most pixels with a value are flagged: medians of the rest describe no sensor."""
-        return self.flagged_share > 0.5
+        """Tell whether the gain of most pixels is open: medians of the rest describe no sensor."""
+        return self.flagged_share("conversion_gain") > 0.5
 
     @property
     def mostly_coarse(self) -> bool:
@@ -293,7 +299,7 @@ class ReportData:
     def often_flagged(self) -> bool:
         """Tell whether more pixels are flagged than the criteria allow: the others are a selection."""
         limit = self.criteria.flagged_pixels
-        return self.flagged_share > (0.1 if limit is None else limit)
+        return self.flagged_share() > (0.1 if limit is None else limit)
 
     @property
     def code_step(self) -> int:
@@ -305,6 +311,10 @@ class ReportData:
     def has_values(self, name: str) -> bool:
         """Tell whether a map exists and at least one pixel has a value in it."""
         return name in self.maps and self.summary(name, with_flagged=True).n_valid > 0
+
+    def has_median(self, name: str) -> bool:
+        """Tell whether a map exists whose median is not of a selection: most pixels are known in it."""
+        return self.has_values(name) and self.flagged_share(name) <= 0.5
 
     def ordered(self, name: str) -> Ordered:
         """Return the values of a map in their order; the last one is kept, which many ask for in turn."""
@@ -323,7 +333,7 @@ class ReportData:
         if (name, with_flagged) not in self._summaries:
             self._summaries[name, True] = self._summaries[name, False] = self._summarised(self.ordered(name))
             if self.any_flagged:
-                known = Ordered.of(self.maps[name], self.flagged)
+                known = Ordered.of(self.maps[name], self.flagged_in(name))
                 self._summaries[name, False] = self._summarised(known)
         return self._summaries[name, with_flagged]
 
@@ -343,6 +353,6 @@ class ReportData:
             return None
         key = name, with_flagged or not self.any_flagged
         if key not in self._errors:
-            median = median_of(errors, None if key[1] else self.flagged)
+            median = median_of(errors, None if key[1] else self.flagged_in(name))
             self._errors[key] = None if np.isnan(median) else median
         return self._errors[key]

@@ -49,6 +49,7 @@ class SensorInfo:
         samples: the exposures, where there are several.
         camera: its name, serial number, temperature and date, as far as the files say.
         shown: place of the one whose histograms, H and ensemble are shown.
+        whole: rows and columns of the frames in the files, whatever the region of interest; None: not known.
     """
 
     kind: Literal["frames", "histograms", "samples"]
@@ -64,6 +65,7 @@ class SensorInfo:
     samples: tuple[Sample, ...] = ()
     shown: int = 0
     camera: CameraFacts = field(default_factory=CameraFacts)
+    whole: tuple[int, int] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -87,4 +89,6 @@ class SensorInfo:
             raise StoreError(f"{store.path} has no input yet; run: pchem ingest {quoted(store.path)}")
         samples = tuple(Sample(**each) for each in content.get("samples", ()))
         camera = CameraFacts(**content.get("camera", {}))
-        return cls(**{**content, "names": tuple(content["names"]), "samples": samples, "camera": camera})
+        whole = content.get("whole")
+        given = {"names": tuple(content["names"]), "samples": samples, "camera": camera}
+        return cls(**{**content, **given, "whole": None if whole is None else tuple(whole)})

@@ -112,6 +112,7 @@ def sensor_of(reader: FrameSequence, context: StageContext, identity: dict[str, 
         mode=context.config.input.mode,
         identity=identity,
         camera=reader.camera,
+        whole=reader.whole_shape,
     )
 
 

@@ -14,8 +14,14 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.variables import INTERVALS, PARAMETERS, interval_names
 from pchem_pipeline.model.checks.multiple_testing import false_discovery, poorest
 from pchem_pipeline.model.errors.fisher import covariance_from
-from pchem_pipeline.model.fit.status import FAILED, FLAGGED
-from pchem_pipeline.model.maps.maps import derived_maps, quality_map, status_counts, summarise
+from pchem_pipeline.model.fit.status import FAILED, flags_of
+from pchem_pipeline.model.maps.maps import (
+    derived_maps,
+    electron_shifts,
+    quality_map,
+    status_counts,
+    summarise,
+)
 from pchem_pipeline.model.maps.sample_maps import line_map_names, line_maps
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.samples import exposure_axis
@@ -45,7 +51,10 @@ def _tell_time(context: StageContext) -> None:
 
 
 def maps_tile(
-    fit: Mapping[str, NDArray[Any]], integration_time: float | None, rate: str = "charge_rate"
+    fit: Mapping[str, NDArray[Any]],
+    integration_time: float | None,
+    rate: str = "charge_rate",
+    n_frames: int | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Return all maps of a tile.
 
@@ -53,14 +62,21 @@ def maps_tile(
         fit: the arrays of the group ``fit`` of the tile, by name.
         integration_time: s, or None.
         rate: name of H over the integration time.
+        n_frames: of the one sample, whose errors of H and mu hold the chance of being electrons off; None:
+            of several samples, which settle the bias.
 
     Returns:
         The arrays of the group ``maps`` of the tile, by name.
     """
     parameters = {name: fit[name] for name in PARAMETERS}
     maps: dict[str, NDArray[Any]] = dict(parameters)
-    maps |= {f"{name}_stderr": fit[f"{name}_stderr"] for name in PARAMETERS}
     stderr = np.stack([fit[f"{name}_stderr"] for name in PARAMETERS], axis=-1)
+    if n_frames is not None:
+        m, p = electron_shifts(fit["quanta_exposure"].ravel(), fit["likelihood_gap"].ravel(), n_frames)
+        off = np.sqrt(p @ m**2).reshape(fit["bias"].shape)
+        stderr[..., 0] = np.hypot(stderr[..., 0], off)
+        stderr[..., 2] = np.hypot(stderr[..., 2], off / fit["conversion_gain"])
+    maps |= {f"{name}_stderr": stderr[..., i] for i, name in enumerate(PARAMETERS)}
     maps |= derived_maps(parameters, covariance_from(stderr, fit["correlation"]), integration_time, rate)
     for name in (path for each in INTERVALS for path in interval_names(each)):
         if name in fit:
@@ -91,7 +107,12 @@ def run(context: StageContext) -> None:
     elif not context.sensor.samples:
         _tell_time(context)
     task = functools.partial(
-        _do_tile, store=context.store.path, integration_time=time, rate=context.charge_rate, line=line
+        _do_tile,
+        store=context.store.path,
+        integration_time=time,
+        rate=context.charge_rate,
+        line=line,
+        n_frames=None if context.sensor.samples else context.sensor.n_frames,
     )
     context.run_units(context.tiles(), task, needs="fit", unit_bytes=context.tile_pixels * _PIXEL_BYTES)
     _summarise(context, names)
@@ -122,14 +143,20 @@ def _create_residuals(context: StageContext, n_samples: int) -> None:
 
 
 def _do_tile(
-    tile: Tile, *, store: Path, integration_time: float | None, rate: str, line: _Line | None = None
+    tile: Tile,
+    *,
+    store: Path,
+    integration_time: float | None,
+    rate: str,
+    line: _Line | None = None,
+    n_frames: int | None = None,
 ) -> dict[str, Any]:
     opened = open_store(store)
-    needed = [*PARAMETERS, *(f"{name}_stderr" for name in PARAMETERS), "fit_status"]
+    needed = [*PARAMETERS, *(f"{name}_stderr" for name in PARAMETERS), "fit_status", "likelihood_gap"]
     needed += [path for name in INTERVALS for path in interval_names(name) if opened.has(f"fit/{path}")]
     fit = {name: opened.read(f"fit/{name}", tile.region) for name in needed}
     fit["correlation"] = opened.read("fit/correlation", (*tile.region, slice(None)))
-    for name, values in maps_tile(fit, integration_time, rate).items():
+    for name, values in maps_tile(fit, integration_time, rate, n_frames).items():
         opened.write(f"maps/{name}", tile.region, values)
     if line is not None:
         _write_line(opened, tile, line)
@@ -155,13 +182,12 @@ def _summarise(context: StageContext, names: list[str]) -> None:
     """Keep the summaries of the maps in the attributes of their group."""
     settings = context.config.maps
     status = context.store.read("fit/fit_status")
-    flagged = (status & int(FLAGGED)) != 0
     found: dict[str, Any] = {}
     for name in names:
         values = context.store.read(f"maps/{name}")
         summary = summarise(
             values,
-            left_out=flagged,
+            left_out=(status & int(flags_of(name))) != 0,
             percentiles=settings.percentiles,
             outlier_sigmas=settings.outlier_sigmas,
         )

@@ -89,7 +89,7 @@ _ALL = (
     ),
     Stage(
         "fit",
-        version=6,
+        version=7,
         upstream=("histogram",),
         settings=("fit", "run.tile"),
         reads=("histogram/counts", "histogram/origin", "histogram/under", "histogram/over"),
@@ -102,7 +102,7 @@ _ALL = (
     ),
     Stage(
         "maps",
-        version=4,
+        version=5,
         upstream=("fit",),
         settings=("maps", "run.tile"),
         reads=("fit", "samples"),

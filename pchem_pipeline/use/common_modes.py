@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 _AXES = ("frame", "row", "column")
 _LEAST_SCENE = 0.02  # e-
+_ROUNDS, _PRECISION = 5, 1e-6  # expansions in the offsets; relative, of their solution
 
 
 @dataclass(frozen=True)
@@ -113,17 +115,9 @@ class Offsets:
 
     def of_samples(self, modes: CommonModes, rows: slice = slice(None)) -> NDArray[np.float32]:
         """Return the offset of each sample of some rows, DN, shape (frame, y, x)."""
-        parts = modes.parts[:, rows]
-        out = np.zeros((len(self.rows), *parts.shape[1:]), np.float32)
-        for part, mask in enumerate(parts):
-            out += mask * (self.rows[:, part, rows, None] + self.columns[:, part, None, :]).astype(np.float32)
-        down, along = modes.turns(modes.parts.shape[1:])
-        for wave, part in enumerate(modes.waves[:, 3].astype(int)):
-            pattern = parts[part] * down[wave, rows, None] * along[wave]
-            own = self.waves[:, wave, :, None, None].astype(np.float32)
-            out += own[:, 0] * pattern.real.astype(np.float32)
-            out += own[:, 1] * pattern.imag.astype(np.float32)
-        return out
+        design, n = _Design.of(modes), len(self.rows)
+        frames = [design.offsets(self.rows[t], self.columns[t], self.waves[t], rows) for t in range(n)]
+        return np.array(frames, np.float32).reshape(n, *modes.parts[0, rows].shape)
 
 
 def scene_of(mean: FloatArray, calibration: Calibration) -> FloatArray:
@@ -135,6 +129,98 @@ def scene_of(mean: FloatArray, calibration: Calibration) -> FloatArray:
     """
     signal = (mean - calibration.bias) * calibration.conversion_gain
     return np.where(calibration.usable, np.maximum(signal, _LEAST_SCENE), np.nan)
+
+
+@dataclass(frozen=True)
+class _Design:
+    """Offsets of samples as a linear function of standard normal numbers, z.
+
+    Of each part there is one of the frame, one of each row, one of each column; of each wave two.
+
+    Attributes:
+        modes: which offsets there are.
+        down: cosine and sine of each wave down the rows, shape (wave, y, 2).
+        along: along the columns, shape (wave, x, 2).
+    """
+
+    modes: CommonModes
+    down: FloatArray
+    along: FloatArray
+
+    @classmethod
+    def of(cls, modes: CommonModes) -> _Design:
+        turns = modes.turns(modes.parts.shape[1:])
+        return cls(modes, *(np.stack([turn.real, turn.imag], axis=2) for turn in turns))
+
+    @property
+    def parts_of_waves(self) -> NDArray[np.int64]:
+        """Number of the part of each wave."""
+        return self.modes.waves[:, 3].astype(np.int64)
+
+    @cached_property
+    def _scales(self) -> FloatArray:
+        """Standard deviation of each number, DN."""
+        _, ny, nx = self.modes.parts.shape
+        variances = np.repeat(self.modes.variances, (1, ny, nx), axis=1).ravel()
+        return np.asarray(np.sqrt(np.concatenate([variances, np.repeat(self.modes.waves[:, 2], 2)])))
+
+    def unpacked(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the offsets of rows, with that of their frame, and of columns, and c and s of waves, DN."""
+        n_parts, ny, nx = self.modes.parts.shape
+        values, n = self._scales * z, n_parts * (1 + ny + nx)
+        lines = values[:n].reshape(n_parts, -1)
+        return lines[:, :1] + lines[:, 1 : 1 + ny], lines[:, 1 + ny :], values[n:].reshape(-1, 2)
+
+    def offsets(
+        self,
+        rows: NDArray[np.floating[Any]],
+        columns: NDArray[np.floating[Any]],
+        waves: NDArray[np.floating[Any]],
+        some: slice = slice(None),
+    ) -> FloatArray:
+        """Return the offset of each sample of some rows of a frame, DN, shape (y, x)."""
+        parts = self.modes.parts[:, some]
+        found = np.zeros(parts.shape[1:])
+        for mask, row, column in zip(parts, rows, columns, strict=True):
+            found += mask * (row[some, None] + column)
+        for part, (c, s), down, along in zip(self.parts_of_waves, waves, self.down, self.along, strict=True):
+            found += parts[part] * (down[some] @ np.array([[c, s], [s, -c]]) @ along.T)
+        return found
+
+    def sums(self, values: FloatArray) -> FloatArray:
+        """Return the transpose of :meth:`offsets`, of values (y, x)."""
+        parts = []
+        for mask in self.modes.parts:
+            some = mask * values
+            rows = some.sum(axis=1)
+            parts += [rows.sum(keepdims=True), rows, some.sum(axis=0)]
+        for part, down, along in zip(self.parts_of_waves, self.down, self.along, strict=True):
+            (cc, cs), (sc, ss) = down.T @ (self.modes.parts[part] * values) @ along
+            parts.append(np.array([cc - ss, sc + cs]))
+        return np.asarray(np.concatenate([np.zeros(0), *parts]) * self._scales)
+
+    def top(self, form: FloatArray, near: FloatArray) -> FloatArray:
+        """Return z of largest ``sum(form[0] o - form[1] o^2 / 2) - z^2 / 2``, by conjugate gradients."""
+        from scipy.sparse.linalg import LinearOperator, cg
+
+        size = near.size
+        curvature = LinearOperator(
+            (size, size), lambda z: z + self.sums(form[1] * self.offsets(*self.unpacked(z))), dtype=float
+        )
+        return np.asarray(cg(curvature, self.sums(form[0]), x0=near, rtol=_PRECISION)[0])
+
+    def left(self, weight: FloatArray) -> FloatArray:
+        """Return the variance of a sample's offset that stays unknown, DN^2, shape (part,)."""
+        parts, waves = self.modes.parts, self.parts_of_waves
+        known = np.einsum("pyx,yx->p", parts, weight)
+        lines = [np.ones(len(parts)), *(parts.any(axis=axis).sum(axis=1) for axis in (2, 1))]
+        with np.errstate(divide="ignore"):
+            each = 1.0 / (
+                known[:, None] / np.maximum(np.stack(lines, axis=1), 1) + 1.0 / self.modes.variances
+            )
+            # each coefficient is known by half of the samples' information, and cos^2 + sin^2 = 1
+            of_waves = 1.0 / (0.5 * known[waves] + 1.0 / self.modes.waves[:, 2])
+        return np.asarray(each.sum(axis=1) + np.bincount(waves, of_waves, len(parts)))
 
 
 def estimate_offsets(
@@ -154,25 +240,20 @@ def estimate_offsets(
         calibration: of the pixels, under a law without these offsets.
         modes: which offsets there are.
     """
-    from pchem_pipeline.use import common_modes_numba  # loads compiled loops
+    from pchem_pipeline.use.common_modes_numba import Pixels, from_electrons  # loads compiled loops
 
-    n, ny, nx = frames.shape
-    m = len(modes.parts)
-    out = common_modes_numba.Offsets(
-        np.empty((n, m, ny)), np.empty((n, m, nx)), np.empty((n, len(modes.waves), 2)), np.empty((n, m))
-    )
-    down, along = (np.stack([each.real, each.imag], axis=1) for each in modes.turns((ny, nx)))
-    waves = common_modes_numba.Waves(
-        down, along, modes.waves[:, 2].copy(), modes.waves[:, 3].astype(np.int64)
-    )
-    sigma = np.sqrt(calibration.noise_variance_dn2)
-    known = np.where(np.isfinite(sigma), scene, np.nan)
-    common_modes_numba.find_offsets(
-        frames,
-        common_modes_numba.Pixels(
-            np.ascontiguousarray(known), calibration.conversion_gain, calibration.bias, sigma
-        ),
-        common_modes_numba.Modes(modes.parts, modes.variances, waves),
-        out,
-    )
-    return Offsets(*out)
+    design, sigma = _Design.of(modes), np.sqrt(calibration.noise_variance_dn2)
+    known = np.ascontiguousarray(np.where(np.isfinite(sigma), scene, np.nan))
+    step = 1.0 / calibration.conversion_gain
+    pixels = Pixels(known, calibration.conversion_gain, calibration.bias, sigma)
+    found = []
+    for frame in frames:
+        # means tell offsets beyond half an electron apart, electron numbers the rest
+        weight = np.nan_to_num(1.0 / (known * step**2 + sigma**2))
+        form = np.stack([weight * np.nan_to_num(frame - calibration.bias - known * step), weight])
+        z = design.top(form, np.zeros_like(design.sums(weight)))
+        for _ in range(_ROUNDS - 1):
+            from_electrons(frame, pixels, design.offsets(*design.unpacked(z)), form)
+            z = design.top(form, z)
+        found.append((*design.unpacked(z), design.left(form[1])))
+    return Offsets(*(np.stack(each) for each in zip(*found, strict=True)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,27 +23,8 @@ _LEAST_MASS = 1e-300
 _LEAST_WEIGHT = 1e-6  # of a rival: less moves no standard error
 _MOST_STEPS = 200
 _PRECISION = 1e-9
+_DEPTH = 12.0  # nats down to which a likelihood is summed
 _OUTSIDE = 0.05  # part of a standard error by which a parameter is moved to find its slope
-
-
-class _Samples(NamedTuple):
-    """The samples of a pixel, with room to evaluate them.
-
-    Attributes:
-        codes: at which they are.
-        pixel: its law.
-        weight: of its free satellites.
-        theta: room for its parameters.
-        counts: samples at each code.
-        sums: room, shape (3, codes).
-    """
-
-    codes: Codes
-    pixel: Pixel
-    weight: float
-    theta: FloatArray
-    counts: FloatArray
-    sums: FloatArray
 
 
 @kernel
@@ -116,15 +97,41 @@ def _climb(start: float, cells: Cells, levels: Levels, counts: FloatArray, sums:
 
 
 @kernel
-def _score_at(exposure: float, parameters: FloatArray, samples: _Samples) -> float:
-    """Return the slope of the log-likelihood in H under other parameters."""
-    codes, pixel, weight, theta, counts, sums = samples
+def _at_border(
+    height: float, total: float, cells: Cells, levels: Levels, counts: FloatArray, sums: FloatArray
+) -> float:
+    """Return one over the mean square of H over its likelihood, of which the maximum is at 0.
+
+    The curvature there says nothing: the likelihood falls as an exponential does, or as half a normal law.
+
+    Args:
+        height: log-likelihood at 0.
+        total: number of samples.
+        cells: of the pixel.
+        levels: of the pixel.
+        counts: samples at each code.
+        sums: room, shape (3, codes).
+    """
+    reach = _DEPTH / total  # it falls by one a sample and electron at most
+    while reach < 1e4 and height - _evaluate(reach, cells, levels, counts, sums)[0] < _DEPTH:
+        reach *= 2.0
+    mass, square, nodes = 0.0, 0.0, 64
+    for i in range(nodes):
+        exposure = reach * (i + 0.5) / nodes
+        weight = math.exp(min(_evaluate(exposure, cells, levels, counts, sums)[0] - height, 0.0))
+        mass += weight
+        square += weight * exposure * exposure
+    return mass / square
+
+
+@kernel
+def _levels_of(
+    parameters: FloatArray, pixel: Pixel, weight: float, codes: Codes, theta: FloatArray
+) -> tuple[Cells, Levels]:
+    """Return cells and levels of a pixel under other parameters, the weight of its satellites held."""
     known_theta(parameters, pixel.centre, weight, theta)
     cells = cells_of(pixel, np.int64(0))
-    levels = list_levels(theta, cells, codes)
-    _, score, _ = _evaluate(exposure, cells, levels, counts, sums)
-    slope: float = score / exposure
-    return slope
+    return cells, list_levels(theta, cells, codes)
 
 
 @kernel
@@ -156,7 +163,7 @@ def estimate_exposures(
     n_codes = counts.shape[1]
     room, scratch = pixel_scratch(n_codes + 2, law)
     theta, sums, weights = scratch.small[OWN], np.empty((3, n_codes)), np.empty(n_codes)
-    moved = np.empty(4)
+    moved, slopes = np.empty(4), np.empty(3)
     for index in range(counts.shape[0]):
         low, high, total, moment = n_codes, 0, 0.0, 0.0
         for i in range(n_codes):
@@ -179,56 +186,34 @@ def estimate_exposures(
         start = (codes.first + moment / total / parts - theta[2]) / theta[1]
         exposure = _climb(start, cells, levels, seen, sums)
         near = max(exposure, _LEAST_EXPOSURE)
-        _, score, information = _evaluate(near, cells, levels, seen, sums)
+        height, score, information = _evaluate(near, cells, levels, seen, sums)
         curvature = (information + score) / (near * near)
+        if exposure == 0.0:
+            curvature = _at_border(height, total, cells, levels, seen, sums)
         out[index, 0] = exposure
         if not curvature > 0.0:
             continue
         out[index, 1] = 1.0 / math.sqrt(curvature)
-        samples = _Samples(codes, pixel, satellites[index, 1], theta, seen, sums)
-        slope = near, score / near, curvature
-        out[index, 2] = _from_calibration(slope, parameters[index], covariance[index], samples, moved)
+        weight = satellites[index, 1]
+        # errors of g, mu and sigma, by the implicit function theorem
+        for j in range(3):
+            step = _OUTSIDE * math.sqrt(covariance[index, j, j])
+            slopes[j] = 0.0 * step  # NaN where the error is not known
+            if step > 0.0:
+                moved[:] = parameters[index]
+                moved[1 + j] += step
+                cells, levels = _levels_of(moved, pixel, weight, codes, theta)
+                _, ahead, _ = _evaluate(near, cells, levels, seen, sums)
+                slopes[j] = (ahead - score) / (near * step * curvature)
+        variance = 0.0
+        for i in range(3):
+            for j in range(3):
+                variance += slopes[i] * covariance[index, i, j] * slopes[j]
+        variance = variance if math.isnan(variance) else max(variance, 0.0)
         for rival in rivals[index]:
             if rival[0] > _LEAST_WEIGHT:
                 moved[1:] = rival[1:]
-                known_theta(moved, pixel.centre, satellites[index, 1], theta)
-                cells = cells_of(pixel, np.int64(0))
-                there = _climb(near, cells, list_levels(theta, cells, codes), seen, sums)
-                out[index, 2] = math.sqrt(out[index, 2] ** 2 + rival[0] * (there - exposure) ** 2)
-
-
-@kernel
-def _from_calibration(
-    slope: tuple[float, float, float],
-    parameters: FloatArray,
-    covariance: FloatArray,
-    samples: _Samples,
-    moved: FloatArray,
-) -> float:
-    """Return the standard error of H from those of g, mu and sigma, by the implicit function theorem.
-
-    Args:
-        slope: H, and slope and curvature of the log-likelihood there.
-        parameters: (H, g, mu, sigma).
-        covariance: of (g, mu, sigma), shape (3, 3).
-        samples: of the pixel.
-        moved: working memory, shape (4,).
-    """
-    exposure, score, curvature = slope
-    slopes = np.zeros(3)
-    for j in range(3):
-        step = _OUTSIDE * math.sqrt(covariance[j, j])
-        if not step > 0.0:
-            if step == 0.0:
-                continue
-            return math.nan
-        for i in range(4):
-            moved[i] = parameters[i]
-        moved[1 + j] += step
-        ahead = _score_at(exposure, moved, samples)
-        slopes[j] = (ahead - score) / (step * curvature)
-    variance = 0.0
-    for i in range(3):
-        for j in range(3):
-            variance += slopes[i] * covariance[i, j] * slopes[j]
-    return math.sqrt(max(variance, 0.0))
+                cells, levels = _levels_of(moved, pixel, weight, codes, theta)
+                there = _climb(near, cells, levels, seen, sums)
+                variance += rival[0] * (there - exposure) ** 2
+        out[index, 2] = math.sqrt(variance)

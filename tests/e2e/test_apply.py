@@ -310,6 +310,33 @@ def test_errors_where_peaks_overlap_hold_what_the_likelihood_leaves_open(tmp_pat
     assert abs(wrong / (1 - found.number_probability.values.mean()) - 1) < 0.1
 
 
+def test_one_frame_is_as_often_right_as_it_says_though_a_bias_may_be_an_electron_off(
+    tmp_path, monkeypatch, capsys
+):
+    """At 8 e- and 1,000 frames a tenth of the biases are; and no frame is its own prior."""
+    monkeypatch.chdir(tmp_path)
+    lab = Lab(tmp_path, {}, capsys)
+    rng = np.random.default_rng(63)
+    camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.15, 0.18))
+    tifffile.imwrite(tmp_path / "bright.tif", camera.frames(rng, 8.0, 1000)[1])
+    electrons, frames = camera.frames(rng, 1.0, 1)
+    tifffile.imwrite(tmp_path / "one.tif", frames)
+    lab.ok("run", "bright.tif", "--store", "run.zarr", "--bit-depth", "14", "--until", "maps", "--quiet")
+    lab.ok("apply", "run.zarr", "one.tif", "--output", "out.zarr", "--what", "exposure,numbers")
+    found = opened(tmp_path / "out.zarr").load()
+    stated = found.number_probability.values.mean()
+    right = (found.electron_number.values == electrons).mean()
+    assert abs(right - stated) < 4 * np.sqrt(0.1 * 0.9 / N)
+    assert stated < 0.93
+    assert float(found.exposure_stderr.max()) < 4.0
+    run = RunStore.open(tmp_path / "run.zarr")
+    pulls = (run.read("maps/quanta_exposure") - 8.0) / run.read("maps/quanta_exposure_stderr")
+    assert 0.7 < np.sqrt(np.mean(pulls**2)) < 1.2
+    summary = run.attributes("maps")["summary"]
+    assert summary["conversion_gain"]["n_left_out"] == 0
+    assert summary["quanta_exposure"]["n_left_out"] > 0.8 * N
+
+
 ROW_NOISE = 2.5  # DN: 0.24 e-, as much as the read noise
 
 

@@ -11,12 +11,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.report_material import report_data
 
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
 from pchem_pipeline.commands.compare.compare import compare_runs, comparison_of
 from pchem_pipeline.commands.compare.history import HistorySettings, history_csv
 from pchem_pipeline.frames.camera import CameraFacts
+from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.figures.history import history_figures
+from pchem_pipeline.report.pages.criteria import criteria
+from pchem_pipeline.report.style.wording import percent
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.store.run_store import RunStore
@@ -160,6 +164,14 @@ def test_the_history_of_a_camera(shell, copies, finished):
     for y, x in good:
         bias[y, x] += 12 * error[y, x]
     third.write("maps/bias", whole(third, "maps/bias"), bias)
+    exposure = third.read("maps/quanta_exposure")
+    places = [tuple(place) for place in good[:3].tolist()]
+    words = third.read("fit/fit_status")
+    for place in places:  # a flagged pixel is hot, too
+        exposure[place] = 60.0
+    words[places[0]] |= int(FitStatus.BIAS_AMBIGUOUS)
+    third.write("maps/quanta_exposure", whole(third, "maps/quanta_exposure"), exposure)
+    third.write("fit/fit_status", whole(third, "fit/fit_status"), words)
     labels = ["-20 C", "-10 C", "0 C"]
     with pytest.raises(ChangedError):
         compare_runs(
@@ -185,6 +197,15 @@ def test_the_history_of_a_camera(shell, copies, finished):
     assert float(rows[2]["conversion_gain_median"]) == pytest.approx(summary["median"])
     assert rows[0]["date"][:2] == "20"
     assert "flag_poor_fit" in rows[0]
+    assert rows[0]["hot_new"] == rows[0]["hot_gone"] == ""
+    assert set(rows[2]["hot_new"].split()) >= {f"{y}/{x}" for y, x in places}
+    known = exposure[np.isfinite(exposure)]
+    data = report_data(exposure.shape)
+    data = replace(
+        data, maps={**data.maps, "quanta_exposure": exposure}, fit={**data.fit, "fit_status": words}
+    )
+    share = next(each for each in criteria(data) if each.setting == "hot_pixels").found  # of the report
+    assert share == percent(int(rows[2]["hot_pixels"]), known.size)
     page = (shell.folder / "history" / "compare.html").read_text(encoding="utf-8")
     assert "The camera over time" in page
     assert "-20 C" in page

@@ -49,6 +49,7 @@ from pchem_pipeline.store.remote_path import local_path, place_of
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
 from pchem_pipeline.use.common_modes import CommonModes, scene_of
+from pchem_pipeline.use.electrons import read_stderr
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
@@ -56,7 +57,7 @@ if TYPE_CHECKING:
 
 #: Name of the work in the records of the output.
 STAGE = "apply"
-_VERSION = 2
+_VERSION = 3
 _PRODUCT = "calibrated frames"
 _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
 _SEGMENT_SAMPLES = 1 << 27
@@ -171,8 +172,8 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         wanted.kinds,
         wanted.prior,
         prior_map,
-        top,
-        modes,
+        top=top,
+        modes=modes,
         depth=_chunks(frames.shape)[0],
         expected=numbers and overlap > 0,
     )
@@ -322,9 +323,8 @@ def _create_counted(context: StageContext, job: Job) -> None:
     _, ny, nx = job.source.shape
     rows = _chunks(job.source.shape)[1]
     context.create("applied_parts/range", (2, ny, nx), chunks=(2, rows, nx))
-    names = [f"applied/{name}" for name in _EXPOSURE]
-    names = names if "exposure" in job.kinds else ["applied_parts/prior"]
-    for name in names if job.estimates else ():
+    names = [f"applied/{name}" for name in _EXPOSURE] if "exposure" in job.kinds else []
+    for name in [*names, *(["applied_parts/prior"] if job.learns_prior else [])]:
         context.create(name, (ny, nx), chunks=(rows, nx))
 
 
@@ -450,6 +450,11 @@ def _counted(context: StageContext, job: Job, made: _Made) -> Job:
     )
     if context.failed or "numbers" not in job.kinds:
         return job
+    if job.learns_prior:
+        from pchem_pipeline.use.exposure import ExposurePool  # loads compiled loops
+
+        noise = read_stderr(made.calibration) ** 2
+        job = replace(job, pool=ExposurePool.of(context.store.read("applied_parts/prior"), noise, n))
     top = context.store.read("applied_parts/range", (slice(1, 2), slice(None), slice(None)))[0]
     known = made.calibration.usable
     dn = top[known] / job.parts - job.lift

@@ -10,7 +10,9 @@ import numpy as np
 
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.model.fit.status import moves_gain
 from pchem_pipeline.model.law.parameters import FloatArray
+from pchem_pipeline.model.maps.maps import electron_shifts
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.fit.fitted_model import fitted_law, fitted_satellites
 from pchem_pipeline.use.calibration import Calibration, covariance_of
@@ -110,7 +112,11 @@ def write_moments(
     settings: FitSettings,
     adc_limits: tuple[int, int] | None,
 ) -> None:
-    """Write the errors of g, mu and sigma of some rows, of doubtful pixels by their likelihood."""
+    """Write the errors of g, mu and sigma of some rows, of doubtful pixels by their likelihood.
+
+    Where peaks are apart its maxima are narrow, an electron from each other, and of one gain and read noise:
+    what is probable is how many electrons the bias is off. Elsewhere the likelihood is walked.
+    """
     from pchem_pipeline.model.fit.api import likelihood_moments  # the fit is much to load
 
     region = (rows, slice(None))
@@ -121,6 +127,14 @@ def write_moments(
     chosen = np.flatnonzero(doubtful_pixels(run, calibration, region))
     covariance = calibration.covariance.reshape(-1, 3, 3).copy()
     rivals = np.zeros((len(maps), 2, 4))
+    apart = chosen[~moves_gain(maps[chosen, 0], maps[chosen, 1] * maps[chosen, 3])]
+    m, share = electron_shifts(maps[apart, 0], maps[apart, 4], SensorInfo.read(run).n_frames)
+    off = 1.0 - share[:, m == 0]
+    shift = np.sqrt(share @ m[:, None] ** 2 / np.maximum(off, 1e-300)) / maps[apart, 1:2]
+    rivals[apart, :, 0] = 0.5 * off
+    rivals[apart, :, 1:] = maps[apart, None, 1:4]
+    rivals[apart, :, 2] += shift * np.array([-1.0, 1.0])
+    chosen = np.setdiff1d(chosen, apart)
     for start in range(0, chosen.size, _BATCH):
         some = chosen[start : start + _BATCH]
         found = likelihood_moments(

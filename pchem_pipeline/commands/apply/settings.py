@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.use.common_modes import CommonModes
+
+if TYPE_CHECKING:
+    from pchem_pipeline.use.exposure import ExposurePool  # loads compiled loops
 
 #: What can be asked for.
 KINDS = ("electrons", "numbers", "exposure")
@@ -89,6 +92,7 @@ class Job:
         kinds: what is wanted.
         prior: as in `ApplySettings`; a file stands as its map in ``prior_map``.
         prior_map: exposure of each pixel (y, x), e-.
+        pool: what the exposures of these frames have in common, where they are the prior.
         top: largest code of the ADC, DN; None: not known.
         modes: offsets that are taken from the frames; none: the frames as they come.
         scene: exposure to expect while the offsets are found (y, x), e-.
@@ -109,6 +113,7 @@ class Job:
     kinds: tuple[str, ...]
     prior: str = "frames"
     prior_map: Any = None
+    pool: ExposurePool | None = None
     top: int | None = None
     modes: CommonModes = field(default_factory=CommonModes)
     scene: Any = None
@@ -133,9 +138,14 @@ class Job:
         return "numbers" in self.kinds or "exposure" in self.kinds
 
     @property
+    def learns_prior(self) -> bool:
+        """Whether the prior of the electron numbers is of these frames."""
+        return "numbers" in self.kinds and self.prior == "frames"
+
+    @property
     def estimates(self) -> bool:
         """Whether the exposure of these frames is needed."""
-        return "exposure" in self.kinds or ("numbers" in self.kinds and self.prior == "frames")
+        return "exposure" in self.kinds or self.learns_prior
 
     @property
     def converts(self) -> bool:

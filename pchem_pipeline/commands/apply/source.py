@@ -51,8 +51,8 @@ def open_like_run(
     )
     if dataset is not None:
         settings = settings.model_copy(update={"dataset": dataset})
-    if settings.roi is not None and _shape(settings) == sensor.shape:
-        settings = settings.model_copy(update={"roi": None})  # the camera read that region alone
+    if settings.roi is not None:
+        settings = _with_region(settings, list(settings.roi), sensor, target.store.name)
     frames = open_frames(settings, Path.cwd(), check_duplicates=False, least=1)
     name = frames.paths[0]
     if frames.shape[1:] != sensor.shape:
@@ -81,12 +81,23 @@ def _settings(target: Target) -> InputSettings:
     return target.config.input
 
 
-def _shape(settings: InputSettings) -> tuple[int, int] | None:
-    """Return the shape of whole frames."""
-    whole = open_frames(
-        settings.model_copy(update={"roi": None}), Path.cwd(), check_duplicates=False, least=1
-    )
-    return whole.shape[1], whole.shape[2]
+def _with_region(settings: InputSettings, region: list[int], sensor: SensorInfo, run: str) -> InputSettings:
+    """Return the settings that take the run's region of whole frames, or all of frames of that region alone.
+
+    Raises:
+        InputError: the frames are of another size than both.
+    """
+    whole = settings.model_copy(update={"roi": None})
+    with open_frames(whole, Path.cwd(), check_duplicates=False, least=1) as frames:
+        shape, name = frames.whole_shape, frames.paths[0]
+    if shape == sensor.shape:
+        return whole
+    if sensor.whole is not None and shape != sensor.whole:
+        raise InputError(
+            f"{name}: frames of {_by(shape)} pixels, the run {run} has the region {region} of frames of "
+            f"{_by(sensor.whole)}; give frames of the same sensor, or of that region alone"
+        )
+    return settings
 
 
 def _by(shape: tuple[int, ...]) -> str:

@@ -19,7 +19,7 @@ from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration
 from pchem_pipeline.use.common_modes import Offsets, estimate_offsets
-from pchem_pipeline.use.electrons import add_up, electrons, whole_parts, with_its_errors
+from pchem_pipeline.use.electrons import add_up, electrons, read_stderr, whole_parts, with_its_errors
 
 if TYPE_CHECKING:
     from pchem_pipeline.model.electrons.electrons import NumberTables
@@ -113,14 +113,14 @@ def count_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
 def _write_exposure(
     output: RunStore, found: RowHistograms, calibration: Calibration, job: Job, rows: slice
 ) -> None:
-    """Write the exposure of some rows and its errors."""
-    from pchem_pipeline.use.exposure import estimate_exposure
+    """Write the exposure of some rows and its errors, and what the prior of their numbers is made of."""
+    from pchem_pipeline.use.exposure import estimate_exposure, mean_signal
 
     origin = found.origin.astype(np.int64) - job.lift * job.parts
-    if "exposure" not in job.kinds:  # a prior needs no errors from the calibration
-        calibration = replace(calibration, covariance=np.zeros_like(calibration.covariance))
-        maps = estimate_exposure(found.counts, origin, calibration, job.parts)
-        output.write("applied_parts/prior", (rows, _WHOLE), maps.exposure)
+    if job.learns_prior:
+        signal = mean_signal(found.counts, origin, calibration, job.parts)
+        output.write("applied_parts/prior", (rows, _WHOLE), signal)
+    if "exposure" not in job.kinds:
         return
     maps = estimate_exposure(found.counts, origin, calibration, job.parts)
     values = {
@@ -166,15 +166,20 @@ def _tables(output: RunStore, job: Job, calibration: Calibration, rows: slice) -
     from pchem_pipeline.model.electrons.electrons import number_tables
 
     ends = output.read("applied_parts/range", (_WHOLE, rows, _WHOLE)) - job.lift * job.parts
-    prior = None
+    prior, signal = None, calibration.quanta_exposure
     if job.prior_map is not None:
-        prior = job.prior_map[rows]
-    elif job.prior == "frames":
-        place = "applied/exposure" if "exposure" in job.kinds else "applied_parts/prior"
-        prior = output.read(place, (rows, _WHOLE))
+        prior = signal = job.prior_map[rows]
+    elif job.pool is not None:
+        priors = job.pool.priors(
+            output.read("applied_parts/prior", (rows, _WHOLE)), read_stderr(calibration) ** 2
+        )
+        prior, signal = priors[..., 0], priors.mean(axis=-1)
+        above = np.nan_to_num(priors - priors[..., :1]).reshape(signal.size, -1)
+        law = calibration.law.with_added_exposure(above, np.full(above.shape, 1.0 / above.shape[1]))
+        calibration = replace(calibration, law=law)
     elif job.prior == "run":
-        prior = calibration.quanta_exposure
-    known = with_its_errors(calibration, calibration.quanta_exposure if prior is None else prior).known
+        prior = signal
+    known = with_its_errors(calibration, signal).known
     found = number_tables(
         ends[0], ends[1], prior, known, dtype=job.number_type, parts=job.parts, detailed=True
     )

@@ -120,7 +120,8 @@ def comparison_of(
         _pair((runs[0], targets[0], stores[0]), (run, target, store), tolerance, reporter)
         for run, target, store in zip(runs[1:], targets[1:], stores[1:], strict=True)
     ]
-    rows = history_rows(runs, stores, pairs, history)
+    sigmas = [target.config.maps.outlier_sigmas for target in targets]
+    rows = history_rows(runs, stores, pairs, history, sigmas)
     return Comparison(runs, pairs, tolerance, rows, history.axis, history.rate)
 
 

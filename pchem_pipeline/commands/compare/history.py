@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -18,8 +18,8 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.checks.multiple_testing import false_discovery
 from pchem_pipeline.model.checks.run_differences import MapDifference
-from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.model.maps.maps import GOOD
+from pchem_pipeline.model.fit.status import FitStatus, flags_of
+from pchem_pipeline.model.maps.maps import GOOD, hot_pixels
 from pchem_pipeline.report.comparison import Against, HistoryRow, Pair, RunFacts
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.sensor import SensorInfo
@@ -29,7 +29,6 @@ from pchem_pipeline.store.run_store import RunStore
 #: Name of the file.
 HISTORY_CSV = "history.csv"
 
-_HOT = ("charge_rate", "dark_current", "quanta_exposure")  # the first that a run has
 _NUMBER = re.compile(r"\s*([+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)")
 
 
@@ -59,6 +58,7 @@ def history_rows(
     stores: Sequence[RunStore],
     pairs: Sequence[Pair],
     wanted: HistorySettings,
+    outlier_sigmas: Sequence[float],
 ) -> list[HistoryRow]:
     """Return a row for each run, in the order given.
 
@@ -67,6 +67,7 @@ def history_rows(
         stores: of them.
         pairs: the first with each of the others.
         wanted: labels, what they are drawn against, and the false-discovery rate.
+        outlier_sigmas: of each run, beyond which a pixel is hot.
 
     Raises:
         ConfigError: there are labels, but not one for each run; or the frames of a run state no
@@ -88,11 +89,13 @@ def history_rows(
             f"--against temperature: the frames of {', '.join(silent)} state none; give --label with the "
             "temperatures"
         )
+    hot = [_hot(store, sigmas) for store, sigmas in zip(stores, outlier_sigmas, strict=True)]
     rows = []
     for i, (run, store) in enumerate(zip(runs, stores, strict=True)):
         moved, any_moved, compared = _moved(pairs[i - 1], stores[0], store, rate) if i else ({}, 0, 0)
         date, temperature = _date(store, cameras[i]), cameras[i].temperature
         warmth = "" if temperature is None else f"{temperature:.4g} °C"
+        same_pixels = hot[i].shape == hot[0].shape
         label = labels[i] if labels else warmth if against == "temperature" else date
         rows.append(
             HistoryRow(
@@ -101,7 +104,9 @@ def history_rows(
                 temperature,
                 {"date": _days(date), "temperature": _number(warmth), "label": _number(label)}[against],
                 run,
-                _hot(store),
+                int(hot[i].sum()),
+                _places(hot[i] & ~hot[0]) if same_pixels else (),
+                _places(hot[0] & ~hot[i]) if same_pixels else (),
                 _flags(store),
                 _effects(store),
                 moved,
@@ -135,10 +140,15 @@ def _number(label: str) -> float:
     return float(match[1]) if match else float("nan")
 
 
-def _hot(store: RunStore) -> int:
-    """Return the number of pixels far above the others."""
-    summary: Mapping[str, Any] = store.attributes("maps").get("summary", {})
-    return next((int(summary[name]["n_high"]) for name in _HOT if name in summary), 0)
+def _hot(store: RunStore, sigmas: float) -> NDArray[np.bool_]:
+    """Tell which pixels are hot, as the report of the run does."""
+    flagged = (store.read("fit/fit_status") & int(flags_of("quanta_exposure"))) != 0
+    exposure, stderr = (store.read(f"maps/quanta_exposure{end}") for end in ("", "_stderr"))
+    return hot_pixels(exposure, stderr, flagged, sigmas)
+
+
+def _places(where: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
+    return tuple((int(y), int(x)) for y, x in np.argwhere(where))
 
 
 def _flags(store: RunStore) -> dict[str, int]:
@@ -179,32 +189,34 @@ def history_csv(rows: Sequence[HistoryRow]) -> str:
     """Return the history as CSV: a line of headings, and a line for each run."""
     maps = list(dict.fromkeys(name for row in rows for name in row.run.summary))
     moved = list(dict.fromkeys(name for row in rows for name in row.moved))
-    flags = list(rows[0].flags)
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(
-        [
-            "label",
-            "date",
-            "temperature",
-            "run",
-            "frames",
-            "pixels_good",
-            "pixels_caution",
-            "pixels_no_value",
-            "hot_pixels",
-        ]
-        + [f"{name}_{part}" for name in maps for part in ("median", "median_stderr", "scatter")]
-        + [f"{name}_moved" for name in moved]
-        + ["moved_pixels", "compared_pixels", "effects", *(f"flag_{name}" for name in flags)]
-    )
-    for row in rows:
-        of_maps = [row.run.summary.get(name, (float("nan"),) * 3) for name in maps]
-        writer.writerow(
-            [row.label, row.date, "" if row.temperature is None else f"{row.temperature:.6g}"]
-            + [row.run.name, row.run.n_frames or "", *row.run.pixels, row.hot_pixels]
-            + ["" if value != value else f"{value:.9g}" for each in of_maps for value in each]
-            + [row.moved.get(name, "") for name in moved]
-            + [row.any_moved, row.compared, " ".join(row.effects), *(row.flags[name] for name in flags)]
-        )
+    lines = [_csv_line(row, maps, moved) for row in rows]
+    writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
     return text.getvalue()
+
+
+def _csv_line(row: HistoryRow, maps: Sequence[str], moved: Sequence[str]) -> dict[str, object]:
+    found: dict[str, object] = {
+        "label": row.label,
+        "date": row.date,
+        "temperature": "" if row.temperature is None else f"{row.temperature:.6g}",
+        "run": row.run.name,
+        "frames": row.run.n_frames or "",
+    }
+    found |= dict(zip(("pixels_good", "pixels_caution", "pixels_no_value"), row.run.pixels, strict=True))
+    found["hot_pixels"] = row.hot_pixels
+    for name, places in (("hot_new", row.hot_new), ("hot_gone", row.hot_gone)):
+        found[name] = " ".join(f"{y}/{x}" for y, x in places)
+    for name in maps:
+        values = row.run.summary.get(name, (float("nan"),) * 3)
+        for part, value in zip(("median", "median_stderr", "scatter"), values, strict=True):
+            found[f"{name}_{part}"] = "" if value != value else f"{value:.9g}"
+    found |= {f"{name}_moved": row.moved.get(name, "") for name in moved}
+    found |= {
+        "moved_pixels": row.any_moved,
+        "compared_pixels": row.compared,
+        "effects": " ".join(row.effects),
+    }
+    return found | {f"flag_{name}": n for name, n in row.flags.items()}

@@ -120,13 +120,19 @@ class NoisePool:
         return cls(noise, _Prior.of(*some.looseness()), _slope(some.of(near), noise.centre))
 
     def weak(self, pixels: Judged, settings: FitSettings) -> NDArray[np.bool_]:
-        """Tell which pixels are weakly identified, shape (n,); False for those without a value.
+        """Tell which pixels are weakly identified for either of the :meth:`reasons`, shape (n,)."""
+        return np.logical_or(*self.reasons(pixels, settings))
+
+    def reasons(self, pixels: Judged, settings: FitSettings) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Tell which pixels have rough errors or too much noise, and which too small a gap, shape (n,) each.
+
+        False for those without a value.
 
         Args:
             pixels: to be judged.
             settings: their ``gap_threshold`` and ``read_noise_limit`` are the limits.
         """
-        weak = np.zeros(pixels.noise.size, np.bool_)
+        weak, ambiguous = np.zeros((2, pixels.noise.size), np.bool_)
         known = pixels.known
         some = pixels.of(known)
         noise = self.noise.shrunk(some.noise, some.stderr)
@@ -134,9 +140,9 @@ class NoisePool:
         looseness, error = some.looseness()
         loose = self.looseness.shrunk(looseness, error) > np.log(LOOSEST)
         loose |= looseness > np.log(_LOOSEST_ALONE)
-        ambiguous = log_gap < np.log(max(settings.gap_threshold, 1e-12))
-        weak[known] = loose | ambiguous | (noise > settings.read_noise_limit)
-        return weak
+        ambiguous[known] = log_gap < np.log(max(settings.gap_threshold, 1e-12))
+        weak[known] = loose | (noise > settings.read_noise_limit)
+        return weak, ambiguous
 
 
 def _slope(pixels: Judged, centre: float) -> float:

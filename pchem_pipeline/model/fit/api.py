@@ -19,7 +19,7 @@ from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, ins
 from pchem_pipeline.model.fit.guard import fit_guarded
 from pchem_pipeline.model.fit.result import FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.fit.status import FAILED, FitStatus, with_rivals_named
 from pchem_pipeline.model.fit.tile_numba import Answers, Histograms, Starts
 from pchem_pipeline.model.law.inputs import kernel_counts, pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood
@@ -514,6 +514,8 @@ class _Batch:
             status[loose] |= FitStatus.NOT_INFORMATIVE
         if self.adc_limits is not None:
             status[self._reaches_adc(some)] |= FitStatus.ADC_LIMIT
+        noise = parameters[:, n] * parameters[:, n + 2]
+        status = with_rivals_named(status, parameters[:, :n], noise, dark=bool(np.any(self.given.dark)))
         failed = (status & int(FAILED)) != 0
         parameters[failed] = np.nan
         covariance[failed] = np.nan

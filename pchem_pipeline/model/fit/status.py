@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from enum import IntFlag
 
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.variables import CHARGE_RATES
+
 
 class FitStatus(IntFlag):
     """Bits of ``fit/fit_status``; 0 means a good fit.
@@ -24,6 +29,8 @@ class FitStatus(IntFlag):
     POOR_FIT = 512
     COARSE_STEPS = 1024
     WEAKLY_IDENTIFIED = 2048
+    GAIN_AMBIGUOUS = 4096
+    BIAS_UNSURE = 8192
 
 
 #: Bits for which the parameters of the pixel are NaN.
@@ -35,9 +42,65 @@ FAILED = (
     | FitStatus.EXPOSURE_AT_BOUND
 )
 
-#: Bits of pixels whose value the data leave open by whole electrons, or altogether, whatever its standard
-#: error says. Medians and tables over the sensor are of the other pixels.
-FLAGGED = FitStatus.BIAS_AMBIGUOUS | FitStatus.NOT_INFORMATIVE | FitStatus.WEAKLY_IDENTIFIED
+#: Bits of pixels with a rival maximum that is nearly as likely.
+AMBIGUOUS = FitStatus.BIAS_AMBIGUOUS | FitStatus.GAIN_AMBIGUOUS
+
+#: Bits of pixels of which the data leave a quantity open by whole electrons, or altogether, whatever its
+#: standard error says.
+FLAGGED = AMBIGUOUS | FitStatus.BIAS_UNSURE | FitStatus.NOT_INFORMATIVE | FitStatus.WEAKLY_IDENTIFIED
+
+#: What a bias that is an electron off concerns; the distance of the peaks and their width stay.
+COUNTS_ELECTRONS = ("quanta_exposure", "bias", "spurious_charge", *CHARGE_RATES)
+
+_LARGEST_GAIN_CHANGE = 0.03  # relative; a rival that differs by less has the same gain
+
+
+def flags_of(name: str) -> FitStatus:
+    """Return the bits of pixels that medians and tables of a quantity leave out.
+
+    Args:
+        name: of the map, without ``_stderr``.
+    """
+    of_bias = FitStatus.BIAS_AMBIGUOUS | FitStatus.BIAS_UNSURE
+    return FLAGGED if name in COUNTS_ELECTRONS else FLAGGED & ~of_bias
+
+
+def with_rivals_named(
+    words: NDArray[np.int64], exposure: NDArray[np.float64], noise: NDArray[np.float64], *, dark: bool
+) -> NDArray[np.int64]:
+    """Return status words that say of ambiguous pixels whether their rival differs in bias, gain or both.
+
+    Where bias frames hold the bias, the rival differs in gain alone. Of one sample see :func:`moves_gain`.
+
+    Args:
+        words: of the fit, shape (n,).
+        exposure: H of each sample, e-, shape (n, J).
+        noise: read noise s_e, e-, shape (n,).
+        dark: whether bias frames are among the samples.
+    """
+    ambiguous = (words & FitStatus.BIAS_AMBIGUOUS) != 0
+    if dark:
+        return np.where(ambiguous, words ^ AMBIGUOUS, words)
+    of_gain = ambiguous & (exposure.shape[1] == 1) & moves_gain(exposure[:, 0], noise)
+    return np.where(of_gain, words | FitStatus.GAIN_AMBIGUOUS, words)
+
+
+def moves_gain(exposure: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell where a bias that is an electron off has a gain of its own, too, off by more than 3 %.
+
+    With one electron more or less, mean and variance of the sample ask for a gain changed by ``1 / (2 H)``;
+    the peaks hold the gain with ``4 pi^2 H exp(-4 pi^2 s_e^2)`` times that information. Little is left of the
+    change where they are resolved.
+
+    Args:
+        exposure: H, e-.
+        noise: read noise s_e, e-, same shape.
+    """
+    square = 4.0 * np.pi**2
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        change = 0.5 / exposure / (1.0 + square * exposure * np.exp(-square * noise**2))
+    return np.asarray(change > _LARGEST_GAIN_CHANGE)
+
 
 #: A sentence for every bit.
 MEANINGS: dict[FitStatus, str] = {
@@ -47,11 +110,13 @@ MEANINGS: dict[FitStatus, str] = {
     FitStatus.GAIN_NOT_IDENTIFIED: "one Gaussian fits as well: the conversion gain is not identified",
     FitStatus.EXPOSURE_AT_BOUND: "quanta exposure at its lower bound: no electrons seen",
     FitStatus.BIAS_AMBIGUOUS: "bias ambiguous by one electron or more",
+    FitStatus.GAIN_AMBIGUOUS: "gain ambiguous: another gain is nearly as likely",
     FitStatus.NOT_INFORMATIVE: "read noise too high for one sample; take several exposures",
     FitStatus.ADC_LIMIT: "values at the limits of the ADC",
     FitStatus.OUTSIDE_WINDOW: "frames outside the histogram window were left out",
     FitStatus.POOR_FIT: "poor goodness of fit: the model does not describe the pixel",
     FitStatus.COARSE_STEPS: "DN too coarse (sigma < 0.6 DN or g > 0.4 e-/DN): rounding biases the estimates",
+    FitStatus.BIAS_UNSURE: "bias clear by chance only: an electron off is as likely in pixels like this one",
     FitStatus.WEAKLY_IDENTIFIED: "too few frames at this sensor's read noise: the bias is clear by chance "
     "only, or the standard errors are rough",
 }

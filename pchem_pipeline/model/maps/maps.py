@@ -99,6 +99,55 @@ def _root(variance: FloatArray) -> FloatArray:
         return np.sqrt(np.where(variance >= 0, variance, np.nan))
 
 
+def electron_shifts(
+    quanta_exposure: FloatArray, likelihood_gap: FloatArray, n_frames: int
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return numbers of electrons m, and how probable it is that H, and the bias, is off by as many.
+
+    The peaks say nothing of which of them is that of no electron; the width of the law of the electron number
+    does, to a standard error of ``s = H sqrt(2 / N)``. The likelihood of being m electrons off is
+    ``exp(-(m - d)^2 / (2 s^2))``, and ``(1 - 2 d) / (2 s^2)`` is the likelihood gap, whence d. The gap does
+    not say to which side: m may have either sign.
+
+    Args:
+        quanta_exposure: H of one sample, e-, shape (n,).
+        likelihood_gap: nats, shape (n,).
+        n_frames: N.
+
+    Returns:
+        m, shape (k,), and probabilities, shape (n, k); m = 0 for certain where a pixel has no value.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        square = np.minimum(2.0 * quanta_exposure**2 / n_frames, 0.5 / likelihood_gap)
+    known = square > 0
+    reach = 2 + int(min(6.0 * np.sqrt(square[known].max(initial=0.0)), 300.0))
+    m = np.arange(-reach, reach + 1)
+    probability = np.tile((m == 0).astype(np.float64), (square.size, 1))
+    half, gap = square[known, None], likelihood_gap[known, None]
+    weight = np.exp(np.minimum(m * (0.5 / half - gap) - 0.5 * m**2 / half, 0.0))
+    probability[known] = weight / weight.sum(axis=1, keepdims=True)
+    return m, probability
+
+
+def hot_pixels(
+    quanta_exposure: FloatArray, stderr: FloatArray, flagged: NDArray[np.bool_], sigmas: float
+) -> NDArray[np.bool_]:
+    """Tell which pixels are hot: H above the median by more than so many ``1.4826 MAD`` of unflagged pixels.
+
+    And by more than so many of its own standard errors: a flagged pixel may be hot, but not by the electrons
+    that it is open by.
+
+    Args:
+        quanta_exposure: H, e-; NaN where there is no value.
+        stderr: of the map of H, e-, same shape.
+        flagged: pixels that do not count for median and MAD, same shape.
+        sigmas: ``maps.outlier_sigmas``.
+    """
+    counted = Ordered.of(quanta_exposure, flagged)
+    spread = np.fmax(counted.robust_sd, stderr)
+    return np.asarray(quanta_exposure > counted.median + sigmas * spread)
+
+
 def quality_map(fit_status: NDArray[np.integer[Any]], conversion_gain: FloatArray) -> NDArray[np.uint8]:
     """Grade the pixels: ``GOOD``, ``CAUTION`` (any word in the status) or ``NO_VALUE`` (parameters are NaN).
 

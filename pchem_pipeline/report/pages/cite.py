@@ -108,7 +108,7 @@ def _result_sentence(data: ReportData) -> str:
         return f"{counts}; no medians can be given."
     parts = []
     for name in ("read_noise_e", "conversion_gain", "charge_rate", "dark_current"):
-        if data.has_values(name):
+        if data.has_median(name):
             summary = data.summary(name)
             _, words, unit = symbol(name)
             value = measured(summary.median, summary.median_stderr, unit)

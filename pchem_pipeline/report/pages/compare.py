@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pchem_pipeline.model.checks.run_differences import FAR
-from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, Setting
+from pchem_pipeline.report.comparison import ArrayRow, Comparison, HistoryRow, Pair, Setting
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.history import history_figures
@@ -207,7 +207,7 @@ def history_table(found: Comparison) -> Table:
                 "" if row.temperature is None else f"{row.temperature:.4g}",
                 row.run.title,
                 f"{row.run.pixels[0]:,}",
-                f"{row.hot_pixels:,}",
+                _hot_words(row),
                 ", ".join(f"{name}: {n:,}" for name, n in flagged.items()) or "none",
                 ", ".join(row.effects) or "none",
                 f"{row.any_moved:,} of {row.compared:,}" if row.compared else "",
@@ -223,6 +223,17 @@ def history_table(found: Comparison) -> Table:
         ("label", "date", "°C", "run", "good pixels", "hot", "flags", "effects", "moved", "in"),
         tuple(rows),
     )
+
+
+def _hot_words(row: HistoryRow) -> str:
+    """Return the number of hot pixels, and where they differ from those of the first run."""
+    parts = [f"{row.hot_pixels:,}"]
+    for word, places in (("new", row.hot_new), ("gone", row.hot_gone)):
+        if places:
+            shown = ", ".join(f"({y}, {x})" for y, x in places[:8])
+            more = " …" if len(places) > 8 else ""  # all are in history.csv
+            parts.append(f"{len(places):,} {word}: {shown}{more}")
+    return "; ".join(parts)
 
 
 def run_table(found: Comparison) -> Table:

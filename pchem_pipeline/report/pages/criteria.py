@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pchem_pipeline.model.maps.maps import hot_pixels
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import percent, short
 
 
@@ -70,12 +70,12 @@ def _hot(data: ReportData) -> _Found:
     """Return the share of hot pixels; a flagged one is hot, too, whatever electrons it is open by."""
     if data.few_channels or not data.has_values("quanta_exposure"):
         return None
-    summary = data.summary("quanta_exposure")
-    if not summary.n_valid:
+    values, flagged = data.maps["quanta_exposure"], data.flagged_in("quanta_exposure")
+    if flagged[np.isfinite(values)].all():
         return None
-    values = finite(data.maps["quanta_exposure"])
-    hot = values > summary.median + data.outlier_sigmas * summary.robust_sd
-    return float(hot.mean()), f"hot {data.noun}s"
+    stderr = data.maps.get("quanta_exposure_stderr", np.zeros(data.shape))
+    hot = hot_pixels(values, stderr, flagged, data.outlier_sigmas)
+    return float(hot.sum() / np.isfinite(values).sum()), f"hot {data.noun}s"
 
 
 def _outlying(data: ReportData) -> _Found:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED
-from pchem_pipeline.model.maps.ordered import Ordered
+from pchem_pipeline.model.maps.maps import hot_pixels
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.style.wording import measured, short, unit_text
@@ -90,7 +90,9 @@ def emva_rows(
     """
     kept = (status & int(FAILED | FLAGGED)) == 0
     maps, errors = _Kept(stored, kept), _Kept(stored, kept, "_stderr")
-    gain = maps["conversion_gain"]
+    gain, exposure = maps["conversion_gain"], stored["quanta_exposure"]
+    is_hot = hot_pixels(exposure, stored["quanta_exposure_stderr"], ~kept, outlier_sigmas)
+    hot = int(is_hot.sum()) / max(int(np.isfinite(exposure).sum()), 1)
     rows = [
         EmvaRow(
             "overall system gain", "K", *_mean(1.0 / gain), "DN/e-", "mean over the pixels of 1/g",
@@ -114,7 +116,7 @@ def emva_rows(
         ),
         _dark_current(stored.get("dark_current"), kept, kind),
         EmvaRow(
-            "hot pixels", "", _hot_share(stored["quanta_exposure"], maps, outlier_sigmas), None, "%",
+            "hot pixels", "", 100.0 * hot if kept.any() else np.nan, None, "%",
             f"pixels whose H is above the median by more than {outlier_sigmas:g} robust standard deviations",
             "EMVA: defect pixels are by a limit that the application sets, on the logarithmic histogram",
         ),
@@ -214,10 +216,3 @@ def _dark_current(found: NDArray[Any] | None, kept: NDArray[np.bool_], kind: str
         "mean over the pixels of H over the integration time (input.kind: dark), or of its slope",
         "EMVA: slope of the mean dark signal over six or more exposure times",
     )  # fmt: skip
-
-
-def _hot_share(exposure: FloatArray, maps: _Kept, outlier_sigmas: float) -> float:
-    kept = Ordered.of(maps["quanta_exposure"])
-    known = exposure[np.isfinite(exposure)]
-    limit = kept.median + outlier_sigmas * kept.robust_sd
-    return float(100.0 * np.mean(known > limit)) if known.size else np.nan

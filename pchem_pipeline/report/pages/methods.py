@@ -14,6 +14,7 @@ _COLUMNS = (
     "g, e-/DN",
     "g bias %",
     "g rmse %",
+    "g spread %",
     "g bound %",
     "rmse/bound",
     "s_e rmse %",
@@ -28,6 +29,7 @@ _HEAD = (
     "median g (e⁻/DN)",
     "bias of g (%)",
     "rms error of g (%)",
+    "robust spread of g (1.4826 MAD, %)",
     "bound (%)",
     "error / bound",
     "rms error of the read noise (%)",
@@ -87,9 +89,9 @@ def method_rows(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
         gain = errors.get("conversion_gain", {})
         ratio = _ratio(gain.get("rmse"), gain.get("bound")) if result["reference"] == "truth" else "-"
         if not errors:
-            cells = ["reference", "", "", "", "", ""]
+            cells = ["reference", *[""] * 6]
         else:
-            cells = [percent_text(gain.get(name)) for name in ("bias", "rmse", "bound")]
+            cells = [percent_text(gain.get(name)) for name in ("bias", "rmse", "robust_sd", "bound")]
             cells += [
                 ratio,
                 *(percent_text(errors[name]["rmse"]) for name in ("read_noise_e", "quanta_exposure")),

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from pchem_pipeline.base.variables import CHARGE_RATES
-from pchem_pipeline.model.fit.status import FLAGGED
+from pchem_pipeline.model.fit.status import FLAGGED, flags_of
 from pchem_pipeline.model.maps.maps import MapSummary
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.maps import status_counts
@@ -103,7 +103,7 @@ def key_numbers(data: ReportData, *, with_flagged: bool = False) -> list[KeyNumb
     found = []
     which = f" of unflagged {data.noun}s" if data.often_flagged and not with_flagged else ""
     for name in _KEY_MAPS:
-        if not data.has_values(name):
+        if not (data.has_values(name) if with_flagged else data.has_median(name)):
             continue
         _, words, unit = symbol(name)
         summary = data.summary(name, with_flagged=with_flagged)
@@ -155,11 +155,11 @@ def _medians(data: ReportData) -> str:
         )
     parts = []
     for name in ("read_noise_e", "conversion_gain", *CHARGE_RATES):
-        if data.has_values(name):
+        if data.has_median(name):
             summary = data.summary(name)
             unit = symbol(name)[2]
             parts.append(f"{symbol(name)[1]} {measured(summary.median, summary.median_stderr, unit)}")
-    left_out = f" ({count(flagged, 'flagged one')} left out)" if flagged else ""
+    left_out = f" ({count(flagged, 'flagged one')} left out where a flag concerns it)" if flagged else ""
     return f"Medians over the {data.noun}s{left_out}: {', '.join(parts)}."
 
 
@@ -229,6 +229,14 @@ def _flagged(data: ReportData) -> list[Flag]:
         return []
     share = percent(int(data.flagged.sum()), pixel_counts(data).fitted)
     cure = "more frames, or more exposures" if data.samples is not None else "several exposures (pchem joint)"
+    if data.flagged_share("conversion_gain") <= 0.5 * data.flagged_share():
+        return [
+            Flag(
+                "caution",
+                f"{share} of the {data.noun}s with a value are flagged: exposure and bias of most are open "
+                f"by whole electrons; gain and read noise are known. What helps: {cure}.",
+            )
+        ]
     if not data.mostly_flagged:
         return [
             Flag(
@@ -247,6 +255,13 @@ def _flagged(data: ReportData) -> list[Flag]:
     ]
 
 
+def _left_out_words(bit: int) -> str:
+    if not bit & int(FLAGGED):
+        return ""
+    which = "" if bit & int(flags_of("conversion_gain")) else " of exposure and bias"
+    return f" (left out of medians and tables{which})"
+
+
 def _cautions(data: ReportData) -> list[Flag]:
     status = data.fit.get("fit_status")
     if status is None:
@@ -256,8 +271,7 @@ def _cautions(data: ReportData) -> list[Flag]:
     return [
         Flag(
             "caution",
-            f"{percent(n, kept.size)} of the {data.noun}s with a value: {text}"
-            f"{' (left out of medians and tables)' if int(bit) & int(FLAGGED) else ''}.",
+            f"{percent(n, kept.size)} of the {data.noun}s with a value: {text}{_left_out_words(bit)}.",
         )
         for bit, text, n in status_counts(kept, data.status_words)
         if n > _CAUTION_SHARE * kept.size

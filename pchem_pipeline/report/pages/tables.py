@@ -136,7 +136,10 @@ def _flagged(data: ReportData) -> Table:
     for name in _ORDER if data.any_flagged else ():
         if not data.has_values(name):
             continue
-        summary = summarise(data.maps[name][data.flagged], percentiles=(5.0, 95.0))
+        flagged = data.flagged_in(name)
+        if not flagged.any():
+            continue
+        summary = summarise(data.maps[name][flagged], percentiles=(5.0, 95.0))
         _, words, unit = symbol(name)
         numbers = (summary.median, *summary.percentiles.values(), summary.minimum, summary.maximum)
         rows.append((f"{words} ({unit})", *(short(number, 4) for number in numbers), f"{summary.n_valid:,}"))
@@ -197,7 +200,7 @@ def _against_truth(data: ReportData) -> Table:
     for name, truth in data.truth.items():
         if name not in data.maps:
             continue
-        estimate = np.where(data.flagged, np.nan, data.maps[name])
+        estimate = np.where(data.flagged_in(name), np.nan, data.maps[name])
         error = estimate - truth
         known = finite(error)
         if known.size == 0:

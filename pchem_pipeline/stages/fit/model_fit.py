@@ -16,11 +16,11 @@ from pchem_pipeline.model.errors.fisher import correlations
 from pchem_pipeline.model.fit.excluding_codes import Interval
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 #: Pixels of which effects are told nothing: no value, or one electron off.
-_UNUSABLE = FAILED | FitStatus.BIAS_AMBIGUOUS
+_UNUSABLE = FAILED | AMBIGUOUS
 
 
 def fit_model(

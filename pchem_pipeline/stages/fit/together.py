@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
 from pchem_pipeline.model.errors.fisher import CORRELATION_PAIRS
-from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.model.fit.status import FitStatus, moves_gain
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.store.run_store import RunStore
 
@@ -21,7 +22,9 @@ _Region = tuple[slice, slice]
 
 
 def judge_sensor(context: StageContext) -> int:
-    """Set ``WEAKLY_IDENTIFIED`` in the status of pixels that are clear by chance only; return their number.
+    """Set ``WEAKLY_IDENTIFIED`` or ``BIAS_UNSURE`` where a pixel is clear by chance; return the number.
+
+    The latter where a bias that is an electron off leaves the gain as it is.
 
     The words depend on the sensor as a whole, not on its tiles, and may be given again and again.
 
@@ -40,15 +43,19 @@ def judge_sensor(context: StageContext) -> int:
         if shape[0] * shape[1] <= _LARGEST_KEPT:
             kept[band[0].start] = pixels
     pool = NoisePool.of(Judged.join(chosen))
-    weakly, found = np.uint16(int(FitStatus.WEAKLY_IDENTIFIED)), 0
+    weakly, unsure = (np.uint16(int(bit)) for bit in (FitStatus.WEAKLY_IDENTIFIED, FitStatus.BIAS_UNSURE))
+    found = 0
     for band in bands:
         words = store.read("fit/fit_status", band)
-        new = words & ~weakly
+        new = words & ~(weakly | unsure)
         if pool is not None:
             pixels = kept[band[0].start] if kept else _judged(store, band)
-            weak = pool.weak(pixels, context.config.fit).reshape(words.shape)
-            new[weak] |= weakly
-            found += int(np.count_nonzero(weak))
+            weak, ambiguous = pool.reasons(pixels, context.config.fit)
+            of_gain = bool(context.sensor.samples) | moves_gain(_exposure(store, band), pixels.noise)
+            weak |= ambiguous & of_gain
+            new[weak.reshape(words.shape)] |= weakly
+            new[(ambiguous & ~of_gain).reshape(words.shape)] |= unsure
+            found += int(np.count_nonzero(weak | ambiguous))
         if not np.array_equal(new, words):
             store.write("fit/fit_status", band, new)
     return found
@@ -58,6 +65,10 @@ def _bands(shape: tuple[int, int], rows: int) -> Iterator[_Region]:
     """Return the rows of the sensor, as high as a tile: whole chunks."""
     for first in range(0, shape[0], rows):
         yield slice(first, min(first + rows, shape[0])), slice(0, shape[1])
+
+
+def _exposure(store: RunStore, band: _Region) -> NDArray[np.float64]:
+    return store.read("fit/quanta_exposure", band).ravel()
 
 
 def _judged(store: RunStore, band: _Region) -> Judged:

@@ -23,7 +23,7 @@ from pchem_pipeline.methods.compare import MethodResult, compare
 from pchem_pipeline.methods.registry import methods
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.methods.study import StudyPoint, study_point
-from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.stages.methods.chosen import methods_settings
 from pchem_pipeline.stages.methods.other_runs import open_other_runs
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
 
 #: Pixels whose fit is no reference: no value, or a bias that may be one electron off.
-_NO_REFERENCE = FAILED | FitStatus.BIAS_AMBIGUOUS
+_NO_REFERENCE = FAILED | AMBIGUOUS
 _BAND_BYTES = 64 << 20
 _DARK_LIMIT = 0.01  # e-: more electrons in the dark sample are remarked
 

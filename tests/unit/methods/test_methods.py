@@ -6,11 +6,11 @@ from helpers import reference_pchem
 from helpers.drawn_pixels import draw, samples
 from scipy.stats import kstat
 
-from pchem_pipeline.methods import base, peak_valley_numba, plain_em_numba
+from pchem_pipeline.methods import base, plain_em_numba
 from pchem_pipeline.methods.base import Method, PixelSamples, Sample, Settings
 from pchem_pipeline.methods.compare import compare, errors_of, pixel_bounds, summarise_errors
 from pchem_pipeline.methods.moments import sample_moments
-from pchem_pipeline.methods.peak_valley import read_noise_of_valley
+from pchem_pipeline.methods.peak_valley import comb, read_noise_of_valley
 from pchem_pipeline.methods.registry import methods
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
@@ -142,14 +142,27 @@ def test_em_with_known_bias_and_noise_is_a_maximum():
     np.testing.assert_allclose(found[:, 3], np.sqrt(moments.variance))
 
 
-def test_peaks_compiled_equal_plain():
-    one = sample(2.0, noise=0.22, n_pixels=2, n_frames=800)
-    spacing, width = np.full(2, 11.0), np.full(2, 1.3)
-    plain, compiled = np.full((2, 5), np.nan), np.full((2, 5), np.nan)
-    peak_valley_numba.peaks_tile.py_func(one.counts, spacing, width, plain)
-    peak_valley_numba.peaks_tile(one.counts, spacing, width, compiled)
-    np.testing.assert_allclose(plain, compiled, rtol=1e-12)
-    assert (plain[:, 0] >= 4).all()
+@pytest.mark.parametrize(
+    ("exposure", "noise", "gain"), [(8.0, 0.15, 0.02), (30.0, 0.15, 0.09), (5.0, 0.2, 0.4)]
+)
+def test_peaks_need_no_luck_with_their_first_distance(exposure, noise, gain):
+    """No pixel takes every second peak, or half a peak: the rms error of g is the spread of all."""
+    one = sample(exposure, noise=noise, n_pixels=150, n_frames=1500, gain=gain)
+    error = methods()["peak_valley"].estimate(PixelSamples((one,)), Settings()).parameters[:, 1] / gain - 1
+    assert np.isfinite(error).all()
+    assert np.abs(error).max() < 0.05
+    assert np.sqrt(np.mean(error**2)) < 2 * 1.4826 * np.median(np.abs(error - np.median(error)))
+
+
+def test_a_comb_is_measured():
+    x = np.arange(120.0)
+    heights = {0: 30.0, 1: 60.0, 2: 45.0, 4: 9.0}  # one peak is missing
+    counts = 1e4 * sum(h * np.exp(-0.5 * ((x - 20.3 - 12.4 * k) / 2.0) ** 2) for k, h in heights.items())
+    step, first, exposure, valley = comb(np.rint(counts).astype(np.uint32), 12.0, 1.5)
+    assert (step, first) == pytest.approx((12.4, 20.3), abs=0.02)
+    assert exposure == pytest.approx(2 * 45 / 60, rel=0.01)
+    tails = (60 + 45) * np.exp(-0.5 * 6.2**2 / (2.0**2 + 1.5**2))
+    assert valley == pytest.approx(tails / 52.5, rel=0.1)
 
 
 def test_valley_and_read_noise_belong_together():

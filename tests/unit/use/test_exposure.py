@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.known_camera import KnownCamera
+from scipy.stats import norm, poisson
 
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -133,3 +134,32 @@ def test_a_bias_that_may_be_an_electron_off_is_in_the_error():
     alone = estimate_exposure(histograms.counts, histograms.origin, calibration)
     np.testing.assert_array_equal(found.exposure, alone.exposure)
     assert (alone.calibration == 0).all()
+
+
+@pytest.mark.parametrize("n_frames", [1, 10, 1000])
+def test_the_error_of_no_exposure_is_that_of_its_likelihood(n_frames):
+    """The mean square of H over its likelihood, by plain sums; the curvature at 0 would say anything."""
+    rng = np.random.default_rng(26)
+    camera = KnownCamera.drawn(rng, (10, 12), read_noise=(0.2, 0.45))
+    _, frames = camera.frames(rng, 0.0, n_frames)
+    histograms = histogram_frames(frames)
+    found = estimate_exposure(
+        histograms.counts, histograms.origin, camera.calibration(rng, (1e-4, 0.1, 0.02))
+    )
+    exact = estimate_exposure(histograms.counts, histograms.origin, camera.calibration())
+    dark = np.argwhere(exact.exposure == 0)
+    assert len(dark) > 30
+    h = np.linspace(0, 40 / np.sqrt(n_frames), 40_001)[1:]
+    k = np.arange(80)[:, None]
+    for y, x in dark[:6]:
+        g, mu, s = (each[y, x] for each in (camera.gain, camera.bias, camera.read_noise_e))
+        log = np.zeros(h.size)
+        levels, number = np.unique(frames[:, y, x], return_counts=True)
+        for dn, count in zip(levels, number, strict=True):
+            edges = (np.array([-0.5, 0.5])[:, None, None] + dn - mu - k / g) / (s / g)
+            share = norm.cdf(edges[1]) - norm.cdf(edges[0])
+            log += count * np.log((poisson.pmf(k, h) * share).sum(axis=0))
+        weight = np.exp(log - log.max())
+        expected = np.sqrt((weight * h**2).sum() / weight.sum())
+        assert exact.counting[y, x] == pytest.approx(expected, rel=0.03)
+    assert np.nanmax(found.stderr) < 4.0 / np.sqrt(n_frames) + 0.2

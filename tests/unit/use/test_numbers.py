@@ -1,11 +1,15 @@
 """Electron numbers under the pixel's own law: wrong as seldom as can be, and the probability is true."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.known_camera import KnownCamera
 
 from pchem_pipeline.model.electrons.electrons import number_tables, number_type
 from pchem_pipeline.model.histogram.count import histogram_frames
+from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.use.exposure import ExposurePool, estimate_exposure, mean_signal
 
 BYTE = np.dtype(np.uint8)
 
@@ -132,3 +136,32 @@ def test_exposure_does_not_depend_on_the_unit_of_codes():
         for h, parts in ((whole, 1), (fine, 4))
     ]
     np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("n_frames", "exposure"), [(1, (1.0, 1.0)), (1, (0.3, 4.0)), (2, (0.0, 0.02)), (4, (0.3, 6.0))]
+)
+def test_a_few_frames_are_no_prior_of_themselves(n_frames, exposure):
+    """The exposure of a pixel from its one sample makes that sample certain; that of all pixels does not."""
+    rng = np.random.default_rng(31)
+    camera = KnownCamera.drawn(rng, (70, 80), read_noise=(0.3, 0.45))
+    electrons, frames = camera.frames(rng, rng.uniform(*exposure, camera.bias.shape), n_frames)
+    histograms = histogram_frames(frames)
+    own = estimate_exposure(histograms.counts, histograms.origin, camera.calibration()).exposure
+    signal = mean_signal(histograms.counts, histograms.origin, camera.calibration())
+    np.testing.assert_allclose(signal, (frames.mean(axis=0) - camera.bias) * camera.gain, atol=1e-9)
+    noise = (camera.sigma * camera.gain) ** 2
+    priors = ExposurePool.of(signal, noise, n_frames).priors(signal, noise)
+    above = (priors - priors[..., :1]).reshape(own.size, -1)
+    law = SampleLaw().with_added_exposure(above, np.full(above.shape, 1 / above.shape[1]))
+    found = converted(frames, priors[..., 0], replace(camera.calibration(), law=law))
+
+    def excess(numbers):
+        """Probability stated less share that is right, in standard errors."""
+        stated, n = numbers.probability.astype(np.float64), electrons.size
+        error = np.sqrt((stated * (1 - stated)).sum()) / n
+        return (stated.mean() - (numbers.number == electrons).mean()) / error
+
+    assert abs(excess(found)) < 4
+    if n_frames == 1:
+        assert excess(converted(frames, own, camera.calibration())) > 5

@@ -14,6 +14,7 @@ from pchem_pipeline.model.errors.expected_information import (
     shared_information,
 )
 from pchem_pipeline.model.errors.fisher import cramer_rao
+from pchem_pipeline.model.law.pcd import pcd_mass
 
 POINTS = [(2.0, 0.2), (0.1, 0.305), (2.0, 0.305), (10.0, 0.45), (2.0, 0.6), (1.0, 1.0)]
 
@@ -104,3 +105,28 @@ def test_impossible_pixels_are_refused(arguments):
 def test_singular_information_has_no_inverse():
     assert np.isnan(inverse_information(np.diag([1.0, 0.0]))).all()
     assert np.isnan(inverse_information(np.ones((2, 2)))).all()
+
+
+@pytest.mark.parametrize(
+    ("exposure", "noise", "gain"), [(2.0, 0.25, 0.5), (0.3, 0.2, 0.15), (6.0, 0.3, 0.21)]
+)
+def test_information_of_cells_is_that_of_their_masses(exposure, noise, gain):
+    """By central differences of the mass of whole DN, for each place of the bias between two."""
+    sigma, h = noise / gain, 1e-5
+    x = np.arange(-12, (exposure + 12 * np.sqrt(exposure) + 14) / gain)
+    covariances = []
+    for offset in np.arange(8) / 8:
+
+        def mass(step, offset=offset):
+            own = sigma * np.exp(step[3])
+            analog = gain * np.exp(step[1]) * np.sqrt(own**2 - 1 / 12)
+            return pcd_mass(x, exposure + step[0], gain * np.exp(step[1]), offset + step[2] / gain, analog)
+
+        slopes = np.array([(mass(h * unit) - mass(-h * unit)) / (2 * h) for unit in np.eye(4)])
+        whole = mass(np.zeros(4))
+        seen = whole > 1e-12
+        covariances.append(np.linalg.inv((slopes[:, seen] / whole[seen]) @ slopes[:, seen].T))
+    found = inverse_information(expected_information(exposure, noise, gain))
+    np.testing.assert_allclose(found, np.mean(covariances, axis=0), rtol=2e-4, atol=1e-6)
+    fine = expected_information(exposure, noise, noise / 1.6)
+    np.testing.assert_allclose(fine, expected_information(exposure, noise))

@@ -11,7 +11,16 @@ from pchem_pipeline.model.fit import search_numba
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus, describe
+from pchem_pipeline.model.fit.status import (
+    FAILED,
+    FLAGGED,
+    MEANINGS,
+    FitStatus,
+    describe,
+    flags_of,
+    with_rivals_named,
+)
+from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 
 
 def fit_one(counts: NDArray[np.generic], origin: int = 100, **options: object) -> FitResult:
@@ -84,6 +93,37 @@ def test_bias_ambiguous() -> None:
     assert np.isfinite(result.bias[0])  # a caution, not a failure
     strict = drawn(40.0, 11.0, 0.35, settings=FitSettings(gap_threshold=0.0))
     assert not word(strict) & FitStatus.BIAS_AMBIGUOUS
+
+
+def test_a_rival_is_of_bias_where_peaks_are_resolved_and_of_gain_where_they_overlap() -> None:
+    words = np.full(4, int(FitStatus.BIAS_AMBIGUOUS))
+    exposure, noise = np.array([[8.0], [8.0], [2.0], [40.0]]), np.array([0.15, 0.4, 0.35, 0.4])
+    both = FitStatus.BIAS_AMBIGUOUS | FitStatus.GAIN_AMBIGUOUS
+    found = with_rivals_named(words, exposure, noise, dark=False)
+    # rivals of an electron more or less, fitted to the law itself: 0.0, 5.4, 26 and 0.3 % of the gain away
+    assert found.tolist() == [FitStatus.BIAS_AMBIGUOUS, both, both, FitStatus.BIAS_AMBIGUOUS]
+    assert (with_rivals_named(words, exposure, noise, dark=True) == int(FitStatus.GAIN_AMBIGUOUS)).all()
+    assert not with_rivals_named(0 * words, exposure, noise, dark=True).any()
+
+
+def test_flags_name_what_they_concern() -> None:
+    for name in ("quanta_exposure", "bias", "dark_current"):
+        assert flags_of(name) == FLAGGED
+    for name in ("conversion_gain", "read_noise_dn", "read_noise_e", "analog_read_noise_e"):
+        assert flags_of(name) == FLAGGED & ~(FitStatus.BIAS_AMBIGUOUS | FitStatus.BIAS_UNSURE)
+    assert [int(FitStatus.BIAS_AMBIGUOUS), int(FitStatus.WEAKLY_IDENTIFIED)] == [32, 2048]  # in old files
+
+
+def test_bias_frames_make_it_the_gain_that_is_ambiguous() -> None:
+    rng = np.random.default_rng(4)
+    shown = draw_histograms(rng, np.full(60, 8.0), 0.09, 100.0 + rng.random(60), 0.7, 400)
+    dark = draw_histograms(rng, 0.0, shown.truth[:, 1], shown.truth[:, 2], 0.7, 400)
+    settings = FitSettings(gap_threshold=50.0)
+    fit = fit_histograms(
+        [shown.counts, dark.counts], [shown.origin, dark.origin], dark=[False, True], settings=settings
+    )
+    assert np.any(fit.fit_status & int(FitStatus.GAIN_AMBIGUOUS))
+    assert not np.any(fit.fit_status & int(FitStatus.BIAS_AMBIGUOUS))
 
 
 def test_not_informative() -> None:

@@ -7,18 +7,23 @@ import pytest
 from scipy.stats import beta
 
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings, MapsSettings
+from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 from pchem_pipeline.model.maps.maps import (
     CAUTION,
     GOOD,
     NO_VALUE,
     derived_maps,
     display_edges,
+    electron_shifts,
+    hot_pixels,
     quality_map,
     status_counts,
     summarise,
 )
 from pchem_pipeline.model.maps.ordered import Ordered
+from pchem_pipeline.stages.maps import maps_tile
 
 PARAMETERS = {
     "quanta_exposure": np.array([[2.0, 1.0]]),
@@ -70,6 +75,52 @@ def test_noise_below_rounding_has_no_analog_part() -> None:
     assert np.isnan(maps["analog_read_noise_e_stderr"]).all()
     assert maps["read_noise_e"][0, 0] == pytest.approx(0.028)
     assert "charge_rate" not in maps
+
+
+@pytest.mark.parametrize(("exposure", "noise", "n_frames"), [(8.0, 0.15, 1000), (80.0, 0.25, 2000)])
+def test_the_error_of_h_holds_the_chance_of_being_electrons_off(
+    exposure: float, noise: float, n_frames: int
+) -> None:
+    rng = np.random.default_rng(3)
+    drawn = draw_histograms(rng, np.full(120, exposure), 0.09, 100 + rng.random(120), noise, n_frames)
+    fit = fit_histograms(drawn.counts, drawn.origin)
+    stored = {name: getattr(fit, name) for name in (*PARAMETERS, "fit_status", "likelihood_gap")}
+    errors = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2))
+    stored |= {f"{name}_stderr": errors[:, i] for i, name in enumerate(PARAMETERS)}
+    stored["correlation"] = np.zeros((120, 6))
+    maps = maps_tile(stored, 2.0, n_frames=n_frames)
+    pull = (fit.quanta_exposure - exposure) / maps["quanta_exposure_stderr"]
+    # of 120 pulls the root mean square is known to 7 %; by the curvature alone it is 4 and 12
+    assert 0.65 < np.sqrt(np.mean(pull**2)) < 1.3
+    assert np.sqrt(np.mean(((fit.quanta_exposure - exposure) / errors[:, 0]) ** 2)) > 3
+    off = (fit.bias - drawn.truth[:, 2]) / maps["bias_stderr"]
+    assert 0.65 < np.sqrt(np.mean(off**2)) < 1.3
+    assert maps["charge_rate_stderr"] == pytest.approx(maps["quanta_exposure_stderr"] / 2, rel=0.05)
+    np.testing.assert_array_equal(maps["conversion_gain_stderr"], errors[:, 1])
+
+
+def test_no_chance_of_being_off_where_the_gap_is_large() -> None:
+    exposure, gap = np.array([2.0, 2.0, np.nan, 0.0, 8.0]), np.array([40.0, 3.0, np.nan, 1.0, 2.0])
+    m, probability = electron_shifts(exposure, gap, 1000)
+    np.testing.assert_allclose(probability.sum(axis=1), 1.0)
+    right = probability[:, m == 0].ravel()
+    assert 1.0 - right[0] < 1e-15
+    assert right[1] == pytest.approx(1 / (1 + np.exp(-3)), rel=0.01)  # of one rival
+    assert right[2:4].tolist() == [1.0, 1.0]
+    # a gap of 2 nats: the rival on one side, and on the other one at 1 / s^2 - 2 = 5.8 nats
+    others = probability[4] / right[4]
+    assert others[m == 1] == pytest.approx(np.exp(-2.0))
+    assert others[m == -1] == pytest.approx(np.exp(2.0 - 1000 / 128))
+
+
+def test_hot_pixels_are_far_above_the_unflagged_ones() -> None:
+    values = np.array([1.0, 1.1, 0.9, 1.0, 1.2, 50.0, 60.0, np.nan])
+    flagged = np.array([0, 0, 0, 0, 0, 0, 1, 0], bool)
+    stderr = np.array([0.1, 0.1, 0.1, 0.1, np.nan, 3.0, 3.0, np.nan])
+    assert np.flatnonzero(hot_pixels(values, stderr, flagged, 6.0)).tolist() == [5, 6]
+    stderr[6] = 10.0  # it may be what the others are
+    assert np.flatnonzero(hot_pixels(values, stderr, flagged, 6.0)).tolist() == [5]
+    assert not hot_pixels(values, stderr, np.ones(8, bool), 6.0).any()
 
 
 def test_quality_follows_the_status() -> None:

@@ -17,7 +17,7 @@ from pchem_pipeline.report.pages.tables import result_tables
 from pchem_pipeline.report.settings import Criteria
 
 
-def flagged(share: float, bit: FitStatus = FitStatus.BIAS_AMBIGUOUS, read_noise: float = 0.9) -> ReportData:
+def flagged(share: float, bit: FitStatus = FitStatus.GAIN_AMBIGUOUS, read_noise: float = 0.9) -> ReportData:
     """A sensor of which the first rows are flagged and read far from their truth."""
     data = report_data((40, 50), failed=0.0)
     mask = np.arange(2000).reshape(40, 50) < round(share * 2000)
@@ -40,6 +40,20 @@ def test_where_most_pixels_are_flagged_the_answer_is_no() -> None:
     assert len(key_numbers(data, with_flagged=True)) == 5
     assert "±" not in sentence(data).split("RMSE")[0]
     assert next_steps(data)[0].of("a.yaml").startswith("pchem joint a.yaml ")
+
+
+def test_a_bias_an_electron_off_leaves_gain_and_read_noise() -> None:
+    data = flagged(0.9, FitStatus.BIAS_AMBIGUOUS)
+    names = [each.name for each in key_numbers(data)]
+    assert "read_noise_e" in names
+    assert "conversion_gain" in names
+    assert not {"quanta_exposure", "charge_rate", "dark_current"} & set(names)
+    assert data.summary("conversion_gain").n_left_out == 0
+    assert data.summary("quanta_exposure").n_left_out == 1800
+    assert any("gain and read noise are known" in flag.text for flag in flags(data))
+    row = next(row for row in table(data, "flagged").rows if row[0].startswith("quanta exposure"))
+    assert row[-1] == "1,800"
+    assert not [row for row in table(data, "flagged").rows if row[0].startswith("read noise")]
 
 
 def test_just_below_half_is_a_caution_and_says_that_the_rest_is_a_selection() -> None:
@@ -79,7 +93,7 @@ def test_frames_without_electrons_are_a_bias_for_others() -> None:
 @pytest.mark.parametrize(
     ("bit", "left_out"),
     [
-        (FitStatus.BIAS_AMBIGUOUS, True),
+        (FitStatus.GAIN_AMBIGUOUS, True),
         (FitStatus.NOT_INFORMATIVE, True),
         (FitStatus.WEAKLY_IDENTIFIED, True),
         (FitStatus.OUTSIDE_WINDOW, False),

@@ -141,7 +141,7 @@ def test_every_figure_of_the_paper_is_there_and_described(
         assert re.search(r"\d", alt), alt
         assert len(alt) > 40
         assert image["width"]
-    median = np.nanmedian(np.where(data.flagged, np.nan, data.maps["read_noise_e"]))
+    median = np.nanmedian(np.where(data.flagged_in("read_noise_e"), np.nan, data.maps["read_noise_e"]))
     assert any(f"read noise: median {median:.4f}" in str(image["alt"]) for image in images)
 
 
@@ -431,7 +431,7 @@ def test_flags_of_the_ensemble(
 def test_how_to_cite_has_the_numbers_and_the_papers(page: Page, data: ReportData) -> None:
     found = citation(data)
     assert found.text in page.text
-    median = np.nanmedian(np.where(data.flagged, np.nan, data.maps["read_noise_e"]))
+    median = np.nanmedian(np.where(data.flagged_in("read_noise_e"), np.nan, data.maps["read_noise_e"]))
     assert f"read noise {median:.4f}" in found.text
     assert (
         f"17,750 frames of {data.shape[0]} × {data.shape[1]} pixels at an integration time of 4.87 s"

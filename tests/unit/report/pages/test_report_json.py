@@ -24,7 +24,7 @@ def numbers(data: ReportData) -> dict[str, object]:
 
 
 def test_the_keys_that_others_read(numbers: dict, data: ReportData) -> None:
-    unflagged = np.where(data.flagged, np.nan, data.maps["read_noise_e"])
+    unflagged = np.where(data.flagged_in("read_noise_e"), np.nan, data.maps["read_noise_e"])
     assert numbers["summary"]["read_noise_e"]["median"] == pytest.approx(np.nanmedian(unflagged))
     assert set(numbers["ensemble"]["rmse"]) >= {
         "epcd_exact",
@@ -54,7 +54,7 @@ def test_every_map_is_summarised_with_its_unit(numbers: dict, data: ReportData) 
     assert noise["percentiles"]["50"] == noise["median"]
     assert noise["n_pixels"] + noise["n_flagged"] + noise["n_without_value"] == data.shape[0] * data.shape[1]
     assert noise["pixel_stderr"] == pytest.approx(
-        np.nanmedian(np.where(data.flagged, np.nan, data.maps["read_noise_e_stderr"]))
+        np.nanmedian(np.where(data.flagged_in("read_noise_e"), np.nan, data.maps["read_noise_e_stderr"]))
     )
 
 

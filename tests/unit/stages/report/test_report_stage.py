@@ -58,6 +58,7 @@ def write_fit(context: StageContext, status_map: np.ndarray, lost: np.ndarray) -
     for name, value in {"chi2": 50.0, "dof": 50.0, "p": 0.5}.items():
         store.write_array(f"fit/goodness_{name}", np.where(lost, np.nan, value))
     store.write_array("fit/outlier_share", np.zeros(lost.shape))
+    store.write_array("fit/likelihood_gap", np.where(lost, np.nan, 100.0))
     store.write_array("fit/fit_status", status_map)
     store.records.write(StageRecord("fit", 1, "truth", {}, keys=len(context.tiles())))
     for tile in context.tiles():
