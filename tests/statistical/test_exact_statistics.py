@@ -43,7 +43,8 @@ def test_codes_at_the_limits_are_censored():
     counts = drawn.counts[:, : last + 1].copy()
     counts[:, last] += drawn.counts[:, last + 1 :].sum(axis=1, dtype=np.uint32)
     assert counts[:, last].mean() / counts.sum(axis=1).mean() > 0.03
-    plain = fit_histograms(counts, drawn.origin, adc_limits=(0, top))
+    density = FitSettings(likelihood="density")
+    plain = fit_histograms(counts, drawn.origin, settings=density, adc_limits=(0, top))
     exact = fit_histograms(
         counts,
         drawn.origin,

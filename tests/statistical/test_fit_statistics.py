@@ -84,7 +84,7 @@ def test_with_few_frames_no_answer_is_less_likely_than_the_truth() -> None:
     at_truth = (pixels.counts * log_pcd(x, *pixels.truth.T[:, :, None])).sum(axis=1)
     gain = result.log_likelihood - at_truth
     unflagged = result.fit_status == 0
-    assert unflagged.mean() > 0.4
+    assert unflagged.mean() > 0.3
     # with the first starting point alone it happens to 8 of these pixels
     assert np.count_nonzero(gain[unflagged] < -1e-9) <= 1
 

@@ -474,11 +474,11 @@ class _Batch:
         return np.asarray(found)
 
     def _aliased(self, plain: FitResult) -> NDArray[np.bool_]:
-        """Tell in which pixels the comb of frequency ``1 - g`` may be the right one, for whole numbers show it at g.
+        """Tell in which pixels the comb of frequency ``1 - g`` may be the right one.
 
-        Between 1.2 and 6 DN per electron there is such a comb. With the same variance V its skewness is at most
-        ``1 / (sqrt(V) (1 - g))``; where that of the fit, ``H / (g^3 V^1.5)``, is higher by five of its standard errors,
-        ``sqrt(6 / N)`` and more of a skewed sample, it is not.
+        Between 1.2 and 6 DN per electron there is such a comb. With the same variance V its skewness is at
+        most ``1 / (sqrt(V) (1 - g))``; where that of the fit, ``H / (g^3 V^1.5)``, is higher by five of its
+        standard errors, ``sqrt(6 / N)`` and more of a skewed sample, it is not.
         """
         if self.n_samples > 1:
             return np.zeros(self.n, np.bool_)
@@ -514,8 +514,7 @@ class _Batch:
             status[loose] |= FitStatus.NOT_INFORMATIVE
         if self.adc_limits is not None:
             status[self._reaches_adc(some)] |= FitStatus.ADC_LIMIT
-        noise = parameters[:, n] * parameters[:, n + 2]
-        status = with_rivals_named(status, parameters[:, :n], noise, dark=bool(np.any(self.given.dark)))
+        status = with_rivals_named(status, dark=bool(np.any(self.given.dark)))
         failed = (status & int(FAILED)) != 0
         parameters[failed] = np.nan
         covariance[failed] = np.nan

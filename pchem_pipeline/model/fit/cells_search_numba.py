@@ -32,6 +32,7 @@ from pchem_pipeline.model.fit.search_numba import (
     loglik_without_gain,
     next_start,
     plus,
+    rival_moves_gain,
     score_of,
     settled,
 )
@@ -160,16 +161,17 @@ def _share_at_limits(pixel: Pixel) -> float:
     for i in range(int(facts[N_BINS])):
         if i <= facts[BOTTOM] or i + 1 >= facts[TOP]:
             found += pixel.bins[0, WEIGHT, i]
-    return found / facts[N_FRAMES]
+    share: float = found / facts[N_FRAMES]
+    return share
 
 
 @kernel(borrows=True)
 def _scan_cut(pixel: Pixel, tools: Tools) -> int:
     """Put the likeliest combs of a cut sample among the starts; return the evaluations.
 
-    Mean and variance of a cut histogram say little, and its characteristic function has a phase of its own; but its
-    median is where it was, as long as less than half is cut. So steps from the range of the sample down, exposures, and
-    biases around the one that has the median right are all tried.
+    Mean and variance of a cut histogram say little, and its characteristic function has a phase of its own;
+    but its median is where it was, as long as less than half is cut. So steps from the range of the sample
+    down, exposures, and biases around the one that has the median right are all tried.
     """
     trial, place, used = tools.scratch.small[HERE], 0, 0
     facts, cumulative = pixel.facts[0], pixel.bins[0, CUMULATIVE]
@@ -207,7 +209,8 @@ def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, found: Found) -> Fo
     else:
         _, used = fill_starts(np.int64(1), pixel, tools.basis, tools.evaluate, scratch)
         used += add_line_starts(pixel, tools.evaluate, np.bool_(True), np.bool_(True), scratch)
-    return _climb_kept(pixel, tools, best, plus(found, used))
+    found = _climb_kept(pixel, tools, best, plus(found, used))
+    return found
 
 
 @kernel(borrows=True)
@@ -237,8 +240,8 @@ def _start_anew(
 ) -> Found:
     """Climb from other starts in pixels that the density may have led astray.
 
-    These are pixels at the limits of the codes, those of few DN per electron, those whose gain is not settled, and
-    those whose climb did not arrive.
+    These are pixels at the limits of the codes, those of few DN per electron, those whose gain is not
+    settled, and those whose climb did not arrive.
     """
     n, limits = pixel.facts.shape[0], tools.limits
     place = n + STEP
@@ -295,7 +298,8 @@ def search_cells(
     """
     n, limits, null = pixel.facts.shape[0], tools.limits, loglik_without_gain(pixel)
     known = task.near[n + STEP] > 0.0
-    gap, score, sure = task.gap if known else math.inf, math.inf, np.bool_(False)
+    gap, score = task.gap if known else math.inf, math.inf
+    sure: bool | np.bool_ = np.bool_(False)
     best[n + STEP] = 0.0
     tools.scratch.flags[FIXED, n + SATELLITE] = True
     out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
@@ -332,4 +336,7 @@ def search_cells(
     out[LOG_LIKELIHOOD], out[GAP] = found.loglik, gap
     # the density has told whether there is a gain: it knows no other law than one Gaussian does
     above_null = math.inf if known else found.loglik - null
-    return judge(pixel, limits, best, above_null, blurred, bias_gap), found.used, int(out[DEGREES])
+    of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.loglik - bias_gap)
+    of_gain = of_gain or (cut and bias_gap < limits.gap)
+    word = judge(pixel, limits, best, above_null, blurred, bias_gap, of_gain)
+    return word, found.used, int(out[DEGREES])

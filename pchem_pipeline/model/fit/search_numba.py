@@ -56,7 +56,7 @@ NO_DATA, TOO_FEW_BINS = int(FitStatus.NO_DATA), int(FitStatus.TOO_FEW_BINS)
 FIT_NOT_CONVERGED, GAIN_NOT_IDENTIFIED = int(FitStatus.NOT_CONVERGED), int(FitStatus.GAIN_NOT_IDENTIFIED)
 EXPOSURE_AT_BOUND, BIAS_AMBIGUOUS = int(FitStatus.EXPOSURE_AT_BOUND), int(FitStatus.BIAS_AMBIGUOUS)
 NOT_INFORMATIVE, COARSE_STEPS = int(FitStatus.NOT_INFORMATIVE), int(FitStatus.COARSE_STEPS)
-WEAKLY_IDENTIFIED = int(FitStatus.WEAKLY_IDENTIFIED)
+GAIN_AMBIGUOUS = int(FitStatus.GAIN_AMBIGUOUS)
 
 # columns of a row of results
 LOG_LIKELIHOOD, GAP, CHI2, DEGREES, OUTLYING, AMPLITUDE, SATELLITE_WEIGHT = range(7)
@@ -72,6 +72,7 @@ _SURE_LOBE = 5.0  # the same where the model does not fit: other starts have onl
 _MOST_MOVES = 40
 _LEAST_BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains apart
 _BLURRED2, _LEAST_SKEWNESS = 0.64, 0.02  # e-^2: read noise without peaks; a skewness of H = 2500 e-
+_SAME_GAIN, _SAME_RIVAL = 0.03, 0.1  # relative; nats
 _SURELY_SEEN = 40.0  # nats: where so much is expected of the peaks alone, they are no chance
 _LOCKED_NOISE = 0.15  # DN: below it each electron number has one code, and many combs have these codes
 _IN_STEP = 0.1  # DN by which the peaks within a standard deviation of H drift against the codes
@@ -245,10 +246,11 @@ def loglik_without_gain(pixel: Pixel) -> float:
 
 @kernel(borrows=True)
 def loglik_without_ripple(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> float:
-    """Return the log-likelihood of a single sample's shape without its peaks: the rival of combs seen by chance.
+    """Return the log-likelihood of a single sample without peaks, the rival of combs seen by chance.
 
-    Mean, variance and skewness are those of the sample, the read noise is 0.8 e-, whose peaks have a contrast of
-    ``2 exp(-2 pi^2 0.8^2) = 7e-6``: ``H / (H + 0.8^2)^(3/2)`` is the skewness, or as near to it as that read noise lets it.
+    Mean, variance and skewness are those of the sample, the read noise is 0.8 e-, whose peaks have a contrast
+    of ``2 exp(-2 pi^2 0.8^2) = 7e-6``: ``H / (H + 0.8^2)^(3/2)`` is the skewness, or as near to it as that
+    read noise lets it.
     """
     facts, weights, trial = pixel.facts[0], pixel.bins[0, WEIGHT], scratch.small[HERE]
     third = 0.0
@@ -291,9 +293,9 @@ def settled(
 ) -> tuple[bool, bool]:
     """Tell whether a maximum fits well, its gain settled, and whether other starts may lead to a higher one.
 
-    They do not where the fit is good and far above one Gaussian, nor where it is poor and the side lobe all the
-    same far out of the noise, which a misfit raises by sqrt(chi2 / freedom): then the model is wrong, and not the
-    start.
+    They do not where the fit is good and far above one Gaussian, nor where it is poor and the side lobe all
+    the same far out of the noise, which a misfit raises by sqrt(chi2 / freedom): then the model is wrong, and
+    not the start.
 
     Args:
         pixel: its samples.
@@ -422,7 +424,13 @@ def score_of(out: FloatArray) -> float:
 
 @kernel(borrows=True)
 def judge(
-    pixel: Pixel, limits: Limits, best: FloatArray, above_null: float, above_blurred: float, gap: float
+    pixel: Pixel,
+    limits: Limits,
+    best: FloatArray,
+    above_null: float,
+    above_blurred: float,
+    gap: float,
+    of_gain: bool,
 ) -> int:
     """Return the status word of a converged pixel.
 
@@ -431,9 +439,10 @@ def judge(
         limits: bounds and limits.
         best: the maximum.
         above_null: nats above the likelihood without a gain.
-        above_blurred: nats above the likelihood without peaks; twice the smallest gap is asked of both, since combs of
-            many steps had the chance to come out higher.
+        above_blurred: nats above the likelihood without peaks. Twice the smallest gap is asked of both: combs
+            of many steps had the chance to come out higher.
         gap: nats above the runner-up, that likelihood aside.
+        of_gain: a runner-up that is near has another gain.
     """
     n, status = pixel.facts.shape[0], 0
     sigma, a = math.exp(0.5 * best[n + LOG_VARIANCE]), best[n + STEP]
@@ -444,8 +453,10 @@ def judge(
         status |= GAIN_NOT_IDENTIFIED
     if gap < limits.gap:
         status |= BIAS_AMBIGUOUS
+    if of_gain:
+        status |= GAIN_AMBIGUOUS
     if n == 1 and min(above_null, above_blurred) < 2.0 * limits.gap:
-        status |= WEAKLY_IDENTIFIED
+        status |= GAIN_AMBIGUOUS
     if at_bound:
         status |= EXPOSURE_AT_BOUND
     if not limits.cells and (sigma < _COARSE_NOISE or a < _COARSE_STEP):
@@ -455,12 +466,35 @@ def judge(
         in_step = abs(a - 2.0) * math.exp(0.5 * best[0]) < _IN_STEP
         locked = sigma < _LOCKED_NOISE or pixel.facts[0, OCCUPIED] < _FEWEST_CODES
         if limits.cells and ((in_step and sigma < _COARSE_NOISE) or locked):
-            status |= WEAKLY_IDENTIFIED
+            status |= GAIN_AMBIGUOUS
         if limits.cells:
             sigma = math.sqrt(sigma * sigma + QUANTISATION_VARIANCE)
         if sigma / a > limits.noise:
             status |= NOT_INFORMATIVE
     return status
+
+
+@kernel(borrows=True)
+def rival_moves_gain(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float, runner_up: float) -> bool:
+    """Tell whether a rival within the smallest gap of a single sample's maximum has another gain.
+
+    An electron more or fewer hardly moves the gain where peaks are resolved, which then bring many nats by
+    themselves. Any other rival has a gain of its own.
+    """
+    least, highest, trial = loglik - tools.limits.gap, -math.inf, tools.scratch.small[OTHER]
+    if pixel.facts.shape[0] > 1 or not runner_up > least:
+        return False
+    blurred = loglik_without_ripple(pixel, tools.evaluate, tools.limits.cells, tools.scratch)
+    if loglik - blurred < CLEAR_GAP:
+        return True
+    for which in range(2):
+        if _neighbour(which, pixel, best, trial):
+            outcome, height, _ = climb_on(pixel, tools, from_start(), best, trial)
+            if outcome == CONVERGED and height > least:
+                highest = max(highest, height)
+                if abs(trial[1 + STEP] - best[1 + STEP]) > _SAME_GAIN * best[1 + STEP]:
+                    return True
+    return bool(runner_up > highest + _SAME_RIVAL)
 
 
 @kernel(inline=True)
@@ -472,7 +506,8 @@ def above_blurred(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -
     facts, noise2 = pixel.facts[0], math.exp(best[1 + LOG_VARIANCE]) / best[1 + STEP] ** 2
     if pixel.facts.shape[0] > 1 or facts[N_FRAMES] * math.exp(-4.0 * math.pi**2 * noise2) > _SURELY_SEEN:
         return math.inf
-    return loglik - loglik_without_ripple(pixel, tools.evaluate, tools.limits.cells, tools.scratch)
+    above: float = loglik - loglik_without_ripple(pixel, tools.evaluate, tools.limits.cells, tools.scratch)
+    return above
 
 
 @kernel(inline=True)
@@ -615,7 +650,7 @@ def search_density(
         if fits:
             copy(trial, best)
             out[LOG_LIKELIHOOD], out[GAP] = loglik, min(task.gap, loglik - null)
-            word = judge(pixel, limits, best, loglik - null, math.inf, math.inf)
+            word = judge(pixel, limits, best, loglik - null, math.inf, math.inf, False)
             return word, used + 1, int(out[DEGREES])
     found = Found(-math.inf, -math.inf, used, np.bool_(False))
     for attempt in range(N_ATTEMPTS):
@@ -638,5 +673,7 @@ def search_density(
     out[LOG_LIKELIHOOD] = found.loglik
     blurred = above_blurred(pixel, tools, best, found.loglik)
     out[GAP] = min(found.loglik - max(found.runner_up, null), blurred)
-    word = judge(pixel, limits, best, found.loglik - null, blurred, found.loglik - found.runner_up)
+    of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.runner_up)
+    gap = found.loglik - found.runner_up
+    word = judge(pixel, limits, best, found.loglik - null, blurred, gap, of_gain)
     return word, found.used, int(out[DEGREES])

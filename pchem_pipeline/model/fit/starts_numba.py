@@ -69,9 +69,9 @@ _HIGHEST_FREQUENCY = 0.5  # cycles/DN: whole numbers cannot tell f from 1 - f
 _TWO_PI = 2.0 * math.pi
 
 N_ATTEMPTS = 2  # the first start, then all steps of the comb; at several samples some starts, then all
-#: Frequencies of the scan over the step of the comb: the first is 1 over the range of the sample, each is larger
-#: than the one before by a share of itself, half the width of a narrow peak, or by a third of the width of a
-#: side lobe, 0.16/sd, if that is less; the last is that of H = 66 e-.
+#: Frequencies of the scan over the step of the comb: the first is 1 over the range of the sample, each is
+#: larger than the one before by a share of itself, half the width of a narrow peak, or by a third of the
+#: width of a side lobe, 0.16/sd, if that is less; the last is that of H = 66 e-.
 _SCAN_SHARE, _SCAN_STEP, _SCAN_END = 0.06, 0.05, 8.2
 _CLEAR = 3.0  # standard errors of the modulus of the ECF, 1 / sqrt(N)
 _UNRESOLVED = 1.1  # ratio of frequencies whose lobes are in the noise
@@ -410,8 +410,8 @@ def _keep_lobe(
 ) -> int:
     """Put the comb of a step among the starts, see `_on_lobe` and `keep_start`; return the evaluations.
 
-    Of few DN per electron, what is left of other frequencies adds to the lobe where H is low; there mean and variance
-    alone give bias and H, for some read noises.
+    Of few DN per electron, what is left of other frequencies adds to the lobe where H is low; there mean and
+    variance alone give bias and H, for some read noises.
     """
     histogram, trial = histogram_of(pixel, np.int64(0)), scratch.small[HERE]
     trial[1 + SATELLITE] = 0.0
@@ -419,7 +419,7 @@ def _keep_lobe(
     if cells:
         analog = max(math.exp(trial[1 + LOG_VARIANCE]) - QUANTISATION_VARIANCE, 1e-6)
         trial[1 + LOG_VARIANCE] = max(math.log(analog), min_log_variance(a, cells))
-    used = keep_start(pixel, evaluate, cells, scratch)
+    used: int = keep_start(pixel, evaluate, cells, scratch)
     if cells and a < FEW_STEP and trial[0] < _DIM:
         for noise in _FEW_NOISES:
             exposure = (histogram.variance - QUANTISATION_VARIANCE) / (a * a) - noise * noise
@@ -435,10 +435,11 @@ def _keep_lobe(
 def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> int:
     """Put the likeliest combs of any step among the starts of a single sample; return the evaluations.
 
-    ``phi(1/a) = exp(-2 pi^2 s^2) exp(2 pi i mu / a)`` for a comb of step a and read noise s (e-), whatever H is: modulus and
-    phase give s and mu, mean and variance H. A step of more than the range of the sample leaves no second peak, one
-    of less than ``sd / 8`` has H > 60 e-; between them the frequencies are closer than the likelihood's maxima. Past the
-    central lobe those that stay in the noise, ``3 / sqrt(N)``, are no comb's and are left out.
+    ``phi(1/a) = exp(-2 pi^2 s^2) exp(2 pi i mu / a)`` for a comb of step a and read noise s (e-), whatever H
+    is: modulus and phase give s and mu, mean and variance H. A step of more than the range of the sample
+    leaves no second peak, one of less than ``sd / 8`` has H > 60 e-; between them the frequencies are closer
+    than the likelihood's maxima. Past the central lobe those that stay in the noise, ``3 / sqrt(N)``, are no
+    comb's and are left out.
     """
     histogram, work, used = histogram_of(pixel, np.int64(0)), scratch.rows, 0
     _no_starts(scratch.small[HEIGHTS])
@@ -477,19 +478,24 @@ def _no_starts(heights: NDArray[np.float64]) -> None:
 
 @kernel(borrows=True)
 def alias_of_step(pixel: Pixel, evaluate: Any, best: NDArray[np.float64], scratch: Scratch) -> int:
-    """Put the comb of frequency ``1 - 1/a`` among the starts, which whole numbers show at 1/a; return the evaluations."""
+    """Put the comb of frequency ``1 - 1/a``, which whole numbers show at 1/a, among the starts.
+
+    Returns:
+        Evaluations.
+    """
     _no_starts(scratch.small[HEIGHTS])
     a = 1.0 / (1.0 - 1.0 / best[1 + STEP])
-    return _keep_lobe(
-        pixel, evaluate, np.bool_(True), a, ecf_at(histogram_of(pixel, np.int64(0)), 1.0 / a), scratch
-    )
+    lobe = ecf_at(histogram_of(pixel, np.int64(0)), 1.0 / a)
+    used: int = _keep_lobe(pixel, evaluate, np.bool_(True), a, lobe, scratch)
+    return used
 
 
 @kernel(inline=True)
 def _holds_one(histogram: Histogram, theta: NDArray[np.float64]) -> bool:
     """Tell whether the peak of one electron is there: a comb of half the step has nothing where this has it.
 
-    Within a fourth of a step of it are more than 0.4 of its ``N H exp(-H)`` samples, the tail of the bias peak taken off.
+    Within a fourth of a step of it are more than 0.4 of its ``N H exp(-H)`` samples, the tail of the bias
+    peak taken off.
     """
     exposure, a, noise = math.exp(theta[0]), theta[1], math.exp(0.5 * theta[3])
     empty = histogram.n * math.exp(-exposure)
@@ -507,8 +513,9 @@ def longer_steps(
 ) -> int:
     """Put combs of longer steps than a maximum's among the starts; return the evaluations.
 
-    Where H and read noise are low, the sample is one peak and some electrons apart, and the comb of half the step fits
-    them with no sample at each second peak; none are needed where the peak of one electron is there. Starts below ``least`` are left out.
+    Where H and read noise are low, the sample is one peak and some electrons apart, and the comb of half the
+    step fits them with no sample at each second peak; none are needed where the peak of one electron is
+    there. Starts below ``least`` are left out.
     """
     histogram, heights, used = histogram_of(pixel, np.int64(0)), scratch.small[HEIGHTS], 0
     _no_starts(heights)

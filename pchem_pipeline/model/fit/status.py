@@ -65,24 +65,17 @@ def flags_of(name: str) -> FitStatus:
     return FLAGGED if name in COUNTS_ELECTRONS else FLAGGED & ~of_bias
 
 
-def with_rivals_named(
-    words: NDArray[np.int64], exposure: NDArray[np.float64], noise: NDArray[np.float64], *, dark: bool
-) -> NDArray[np.int64]:
+def with_rivals_named(words: NDArray[np.int64], *, dark: bool) -> NDArray[np.int64]:
     """Return status words that say of ambiguous pixels whether their rival differs in bias, gain or both.
 
-    Where bias frames hold the bias, the rival differs in gain alone. Of one sample see :func:`moves_gain`.
+    The search says so of one sample. Where bias frames hold the bias, the rival differs in gain alone.
 
     Args:
         words: of the fit, shape (n,).
-        exposure: H of each sample, e-, shape (n, J).
-        noise: read noise s_e, e-, shape (n,).
         dark: whether bias frames are among the samples.
     """
     ambiguous = (words & FitStatus.BIAS_AMBIGUOUS) != 0
-    if dark:
-        return np.where(ambiguous, words ^ AMBIGUOUS, words)
-    of_gain = ambiguous & (exposure.shape[1] == 1) & moves_gain(exposure[:, 0], noise)
-    return np.where(of_gain, words | FitStatus.GAIN_AMBIGUOUS, words)
+    return np.where(ambiguous & dark, words ^ AMBIGUOUS, words)
 
 
 def moves_gain(exposure: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.bool_]:
