@@ -27,8 +27,8 @@ class HistogramSettings(Section):
         ge=32,
         le=65536,
         multiple_of=16,
-        description="largest number of bins of a pixel, DN; fewer where the first frames need fewer. What lies
-        " "outside is counted as under or over",
+        description="largest number of bins of a pixel, DN; fewer where the first frames need fewer. What "
+        "lies outside is counted as under or over",
     )
     summaries: bool = Field(
         default=True,
