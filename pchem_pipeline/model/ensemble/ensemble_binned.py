@@ -10,7 +10,7 @@ pixels in it, which removes the error of first order in the bin width.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -154,8 +154,8 @@ def epcd_independent(pixels: UsablePixels, dn: DnAxis, choice: HistogramChoice) 
         choice: the bins.
 
     Returns:
-        f_E, 1/DN, shape (n_dn,); correct to about 1e-15 absolute, unless it reaches over so many DN that narrow
-        noise is widened.
+        f_E, 1/DN, shape (n_dn,); correct to about 1e-15 absolute unless it is so wide that narrow noise is
+        widened.
     """
     exposures, gains, biases, variances = (
         joint_cells((column,), choice) for column in (*pixels.maps[:3], pixels.read_noise_dn**2)
@@ -212,6 +212,38 @@ def _period(exposures: Cells, gains: Cells, biases: Cells, variances: Cells, dn:
     high = biases.values[0].max() + most / gains.values[0].min() + reach
     first = math.floor(min(max(low, dn.start - _LONGEST), dn.start + dn.size))
     return first, math.ceil(min(max(high, dn.start), dn.start + dn.size + _LONGEST)) - first + 1
+
+
+def within_limits(
+    curve: Callable[[UsablePixels, DnAxis, HistogramChoice], FloatArray],
+    pixels: UsablePixels,
+    dn: DnAxis,
+    choice: HistogramChoice,
+    limits: tuple[int, int] | None,
+) -> FloatArray:
+    """Return a density of the raw ensemble with the mass beyond the limits of the codes at these.
+
+    Args:
+        curve: of an unlimited ADC, :func:`epcd_dependent` or :func:`epcd_independent`.
+        pixels: the pixels.
+        dn: where to evaluate it.
+        choice: the bins.
+        limits: first and last code, DN; those at an end of ``dn`` count. None: no limits.
+
+    Returns:
+        f_E, 1/DN, shape (n_dn,).
+    """
+    low, high = (False, False) if limits is None else (dn.start <= limits[0], dn.start + dn.size > limits[1])
+    below = 0
+    if low:
+        lowest = float(np.min(pixels.bias - (REACH + 1.0) * pixels.read_noise_dn))
+        below = math.ceil(min(max(dn.start - lowest, 0.0), _LONGEST))
+    whole = curve(pixels, DnAxis(dn.start - below, dn.size + below), choice)
+    found = whole[below:].copy()
+    found[0] += whole[:below].sum()
+    if high:  # a density at the integers adds up to 1
+        found[-1] += max(1.0 - float(found.sum()), 0.0)
+    return found
 
 
 def nuced_dependent(pixels: UsablePixels, axis: NucedAxis, choice: HistogramChoice) -> FloatArray:

@@ -30,8 +30,8 @@ Level = Literal["good", "note", "caution", "serious"]
 
 _KEY_MAPS = ("read_noise_e", "conversion_gain", *CHARGE_RATES, "quanta_exposure", "bias")
 
-#: Ratio of an RMSE to that of sampling noise alone up to which the model explains the data, and from which
-#: it clearly does not.
+#: Ratio of an RMSE to that of sampling noise alone up to which a significant difference is small, and from
+#: which it is large.
 _RMSE_GOOD, _RMSE_BAD = 1.3, 3.0
 #: Share of pixels with one reason for caution from which the first screen says so.
 _CAUTION_SHARE = 0.01
@@ -289,15 +289,16 @@ def _goodness(data: ReportData) -> list[Flag]:
 def _agreement(data: ReportData) -> list[Flag]:
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
     found = []
-    for name, floor, words in (
-        ("epcd_exact", "noise_floor", "raw ensemble"),
-        ("nuced_exact", "nuced_noise_floor", "NUCed ensemble"),
-    ):
+    for name, prefix, words in (("epcd_exact", "", "raw"), ("nuced_exact", "nuced_", "NUCed")):
+        floor = f"{prefix}noise_floor"
         if name not in rmse or not rmse.get(floor):
             continue
         ratio = rmse[name] / rmse[floor]
-        text = f"The RMSE of the predicted {words} is {short(ratio, 2)} times that of sampling noise alone"
-        if ratio <= _RMSE_GOOD:
+        p = (data.ensemble_facts.get(f"{prefix}chi_square") or {}).get("p")
+        tested = "" if p is None else f" (chi-square: p {'< 0.001' if p < _POOR_P else f'= {short(p, 2)}'})"
+        text = f"The RMSE of the predicted {words} ensemble is {short(ratio, 2)} times the sampling noise"
+        text += tested
+        if ratio <= _RMSE_GOOD or (p is not None and p >= _POOR_P):
             found.append(Flag("good", f"{text}: the model explains the data."))
         elif ratio <= _RMSE_BAD:
             found.append(Flag("caution", f"{text}: small differences are left."))

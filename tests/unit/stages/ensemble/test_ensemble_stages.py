@@ -94,6 +94,7 @@ def write_fit(context: StageContext, *, tiles: list[str] | None = None, failed: 
     for name, value in {"chi2": 50.0, "dof": 50.0, "p": 0.5}.items():
         store.write_array(f"fit/goodness_{name}", np.where(bad | ~there, np.nan, value))
     store.write_array("fit/outlier_share", np.zeros(shape))
+    store.write_array("fit/likelihood_gap", np.full(shape, 50.0))
     store.write_array("fit/fit_status", status)
     store.records.write(StageRecord("fit", 1, "truth", {}, keys=len(context.tiles())))
     for tile in chosen:
