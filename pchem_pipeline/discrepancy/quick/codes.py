@@ -89,10 +89,12 @@ def code_checks(sample: CodeSample) -> list[Check]:
     Args:
         sample: pixels with a fit that can be relied upon.
     """
-    inside = np.any(sample.counts, axis=1)
-    if not inside.any():
+    # pixels with samples, and of so many electrons that one of them is not too much
+    most = _MOST_WORK // (2 * sample.counts.shape[1])
+    kept = np.any(sample.counts, axis=1) & (sample.parameters[:, 0] < most)
+    if not kept.any():
         return []
-    sample = sample.of(inside)
+    sample = sample.of(kept)
     first = int(sample.origin.min())
     codes = int(sample.origin.max()) + sample.counts.shape[1] - first
     sums = _Residuals(np.zeros(codes), np.zeros(codes), np.zeros(codes), np.zeros(16), np.zeros((16, 16)))
@@ -107,7 +109,7 @@ def _pieces(sample: CodeSample) -> list[NDArray[np.int64]]:
     each = sample.counts.shape[1] * _electrons(exposure)
     n = len(sample.counts)
     chosen = np.unique(np.linspace(0, n - 1, max(min(n, _MOST_WORK // each), 1)).astype(np.int64))
-    return np.array_split(chosen, -(-chosen.size * each // _AT_ONCE))
+    return np.array_split(chosen, min(-(-chosen.size * each // _AT_ONCE), chosen.size))
 
 
 def _trimmed(sample: CodeSample) -> CodeSample:
