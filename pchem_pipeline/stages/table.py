@@ -102,7 +102,7 @@ _ALL = (
     ),
     Stage(
         "maps",
-        version=4,
+        version=5,
         upstream=("fit",),
         settings=("maps", "run.tile"),
         reads=("fit", "samples"),

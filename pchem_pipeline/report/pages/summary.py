@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
 from pchem_pipeline.base.variables import CHARGE_RATES
+from pchem_pipeline.model.checks.map_parts import Parts
 from pchem_pipeline.model.fit.status import FLAGGED
 from pchem_pipeline.model.maps.maps import MapSummary
 from pchem_pipeline.report.data import ReportData
@@ -286,6 +288,28 @@ def _goodness(data: ReportData) -> list[Flag]:
     return [Flag("good", f"{text}.")]
 
 
+def _parts(data: ReportData) -> list[Flag]:
+    """Say where a map has a step or two modes, with the medians of the parts."""
+    return [
+        Flag("note" if name == "bias" else "caution", _parts_sentence(name, parts))
+        for name, found in data.parts.items()
+        for parts in found
+    ]
+
+
+def _parts_sentence(name: str, parts: Parts) -> str:
+    _, words, unit = symbol(name)
+    medians = [f"{short(median, 4)} {unit}" for median in parts.medians]
+    if parts.axis == "modes":
+        return (
+            f"{words.capitalize()} has two modes, {medians[0]} and {medians[1]}: "
+            "its median over the sensor describes neither."
+        )
+    ends = zip(pairwise(parts.edges), medians, strict=True)
+    places = "; ".join(f"{parts.axis} {a:g} to {b - 1:g} {median}" for (a, b), median in ends)
+    return f"{words.capitalize()} has a step, and its median over the sensor describes no part: {places}."
+
+
 def _agreement(data: ReportData) -> list[Flag]:
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
     found = []
@@ -382,7 +406,7 @@ def _model(data: ReportData, article: str = "The") -> str:
 
 #: What looks for remarks; a further check is a further row.
 CHECKS: tuple[Callable[[ReportData], list[Flag]], ...] = (
-    _spaced_codes, _levels, _failed_pixels, _unfitted, _flagged, _cautions, _goodness, _agreement,
+    _spaced_codes, _levels, _failed_pixels, _unfitted, _flagged, _cautions, _parts, _goodness, _agreement,
     _quick_look, _discrepancy, _conditions,
 )  # fmt: skip
 

@@ -185,6 +185,7 @@ _ORDER = (
     "dark_current",
     "charge_per_level",
     "spurious_charge",
+    "dark_signal",
     "conversion_gain",
     "bias",
     "read_noise_dn",
