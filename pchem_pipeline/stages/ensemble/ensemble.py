@@ -547,7 +547,9 @@ def _write_result(
     if frames is None:
         counts = _pixels_of(store, "histogram/counts", tiles)
         per_pixel = counts.sum(axis=1, dtype=np.int64)[fitted.mask]
-    weight = bias_weight(_pixels_of(store, "fit/likelihood_gap", tiles)[fitted.mask])
+    weight = np.ones(len(pixels))
+    if store.has("fit/likelihood_gap"):
+        weight = bias_weight(_pixels_of(store, "fit/likelihood_gap", tiles)[fitted.mask])
     true = _true_pixels(store, asked, tiles, fitted.mask)
     arrays, found = curves(totals, pixels, settings, asked.limits)
     numbers, electron_facts = electron_numbers_of(totals, pixels, settings)
