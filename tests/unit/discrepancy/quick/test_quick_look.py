@@ -394,9 +394,8 @@ def test_the_codes_of_a_joint_fit_are_judged_by_its_parameters() -> None:
     assert widths.p > 1e-3
     rng = np.random.default_rng(4)
     uneven = codes_of(frames - (frames & 1) * (rng.random(frames.shape) < 0.1).astype(frames.dtype), 8.0, 0.7)
-    (wrong,) = (
-        c for c in code_checks(replace(uneven, parameters=given, covariance=error)) if c.name == "codes"
-    )
+    uneven = replace(uneven, parameters=given, covariance=error)
+    (wrong,) = (check for check in code_checks(uneven) if check.name == "codes")
     assert wrong.p < 1e-6
     none = CodeSample(np.zeros_like(codes.counts), codes.origin, given)
     assert code_checks(none) == []
