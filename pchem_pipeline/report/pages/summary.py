@@ -306,8 +306,8 @@ def _parts_sentence(name: str, parts: Parts) -> str:
             "its median over the sensor describes neither."
         )
     ends = zip(pairwise(parts.edges), medians, strict=True)
-    places = "; ".join(f"{parts.axis} {a:g} to {b - 1:g} {median}" for (a, b), median in ends)
-    return f"{words.capitalize()} has a step, and its median over the sensor describes no part: {places}."
+    places = ", ".join(f"{parts.axis} {a:g} to {b - 1:g}: {median}" for (a, b), median in ends)
+    return f"{words.capitalize()} has a step ({places}); its median over the sensor describes no part."
 
 
 def _agreement(data: ReportData) -> list[Flag]:
