@@ -71,7 +71,8 @@ _PARAMETER_WORDS = {
     "analog_read_noise_e": ("e-", "analog read noise, quantisation removed", "sigma_R"),
     "charge_rate": ("e-/px/s", "charge rate: quanta exposure / integration time", "H/t"),
     "dark_current": ("e-/px/s", "dark current: quanta exposure / integration time, in the dark", "i_d"),
-    "spurious_charge": ("e-", "spurious charge: exposure that does not grow with time or light", "H_0"),
+    "spurious_charge": ("e-", "spurious charge: exposure that does not grow with time", "H_0"),
+    "dark_signal": ("e-", "dark signal: quanta exposure at light level 0", "H_0"),
     "charge_per_level": ("e-/level", "slope of the quanta exposure against the light level", ""),
 }
 
@@ -309,7 +310,7 @@ _ALL: list[Variable] = [
     Variable(
         "maps/goodness_q", _MAP, "float64", "1", "false-discovery rate at which the pixel is called misfit"
     ),
-    *_both("maps", ("spurious_charge", "charge_per_level")),  # of several exposures
+    *_both("maps", ("spurious_charge", "charge_per_level", "dark_signal")),  # of several exposures
     *_samples(),
     Variable("maps/quality", _MAP, "uint8", "1", "0 good, 1 use with caution, 2 no value"),
     # raw ensemble (paper, Sec. II-C): axis `dn`

@@ -19,6 +19,7 @@ from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
+from pchem_pipeline.model.checks.map_parts import Parts, map_parts
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus, flags_of
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.model.maps.ordered import Ordered, median_of
@@ -37,7 +38,7 @@ FEW_CHANNELS = 32
 MAP_NAMES = (*CHARGE_RATES, "conversion_gain", "bias", "read_noise_e")
 
 #: Maps of the line through several exposures, beside the charge rate.
-LINE_MAPS = ("charge_per_level", "spurious_charge")
+LINE_MAPS = ("charge_per_level", "spurious_charge", "dark_signal")
 
 #: Order of the axis ``channel`` of the arrays of a verdict.
 CHANNELS = ("charge", "readout")
@@ -315,6 +316,13 @@ class ReportData:
     def has_median(self, name: str) -> bool:
         """Tell whether a map exists whose median is not of a selection: most pixels are known in it."""
         return self.has_values(name) and self.flagged_share(name) <= 0.5
+
+    @cached_property
+    def parts(self) -> dict[str, list[Parts]]:
+        """Parts of the sensor that differ in a map, by its name; flagged pixels are left out."""
+        names = () if self.few_channels else ("conversion_gain", "read_noise_e", "quanta_exposure", "bias")
+        known = (name for name in names if self.has_values(name))
+        return {name: map_parts(np.where(self.flagged_in(name), np.nan, self.maps[name])) for name in known}
 
     def ordered(self, name: str) -> Ordered:
         """Return the values of a map in their order; the last one is kept, which many ask for in turn."""

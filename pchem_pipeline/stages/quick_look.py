@@ -15,6 +15,7 @@ from pchem_pipeline.discrepancy.quick.codes import CodeSample
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.errors.fisher import covariance_from
 
 if TYPE_CHECKING:
     from pchem_pipeline.discrepancy.quick.checks import QuickLook
@@ -51,7 +52,7 @@ def run_quick_look(store: RunStore, run: StoredRun, sums: StackSums | None) -> Q
     elif maps.usable.sum() < _FEWEST:
         missing["codes"] = f"fewer than {_FEWEST} pixels with a fit that can be relied upon"
     else:
-        codes = _codes(store, maps)
+        codes = _codes(store, maps, joint=bool(run.sensor.samples))
     command = f"pchem discrepancy {quoted(Path(run.name))}"
     return quick_look(sums, maps, codes, run.model.effects, missing, command)
 
@@ -149,13 +150,16 @@ def _repeated(store: RunStore, mean: NDArray[np.float64], variance: NDArray[np.f
     return np.array(found, np.int64)
 
 
-def _codes(store: RunStore, maps: PixelMaps) -> CodeSample | None:
-    """Read the histograms of some pixels with a fit, from pieces of whole chunks over the sensor."""
+def _codes(store: RunStore, maps: PixelMaps, *, joint: bool) -> CodeSample | None:
+    """Read the histograms of some pixels with a fit, from pieces of whole chunks over the sensor.
+
+    Of a joint fit of several exposures the errors are read, too: it is not that of the histograms alone.
+    """
     whole = store.file_shape("histogram/counts")
     ny, nx = maps.usable.shape
     tiles = [(y, x) for y in range(0, ny, whole[0]) for x in range(0, nx, whole[1])]
     origin = store.read("histogram/origin")
-    counts, origins, parameters = [], [], []
+    counts, origins, parameters, covariance = [], [], [], []
     pieces = _spread(len(tiles), _PIECES)
     for y, x in (tiles[i] for i in pieces):
         part = (slice(y, y + whole[0]), slice(x, x + whole[1]))
@@ -168,6 +172,12 @@ def _codes(store: RunStore, maps: PixelMaps) -> CodeSample | None:
         origins.append(origin[part].ravel()[inside].astype(np.int64))
         values = maps.maps
         parameters.append(np.stack([each[part].ravel()[inside] for each in values], axis=1))
+        if joint:
+            y_x = y + rows, x + columns
+            errors = [store.read_pixels(f"fit/{name}_stderr", *y_x) for name in PARAMETERS]
+            correlation = store.read_pixels("fit/correlation", *y_x)
+            covariance.append(covariance_from(np.stack(errors, axis=1), correlation))
     if sum(part.size for part in origins) < _FEWEST:
         return None
-    return CodeSample(np.concatenate(counts), np.concatenate(origins), np.concatenate(parameters))
+    of_joint = np.nan_to_num(np.concatenate(covariance)) if joint else None
+    return CodeSample(np.concatenate(counts), np.concatenate(origins), np.concatenate(parameters), of_joint)

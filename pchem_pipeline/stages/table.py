@@ -113,7 +113,7 @@ _ALL = (
     ),
     Stage(
         "ensemble",
-        version=2,
+        version=3,
         upstream=("histogram", "fit"),
         settings=("ensemble", "run.tile"),
         reads=("frames", "histogram", "fit", "truth"),
@@ -125,7 +125,7 @@ _ALL = (
     ),
     Stage(
         "report",
-        version=4,
+        version=5,
         upstream=("histogram", "fit", "maps", "ensemble"),
         settings=("report", "maps", "run.title", "run.allowed_failed_pixels"),
         reads=("histogram", "summary", "fit", "maps", "ensemble", "discrepancy", "samples", "truth"),

@@ -9,7 +9,7 @@ Plain array arithmetic, so that no kernel has to be compiled for it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -57,11 +57,19 @@ class CodeSample:
         counts: samples at each DN, (n, bin).
         origin: DN of bin 0, (n,).
         parameters: H, g, mu, sigma (with quantisation), (n, 4), all finite.
+        covariance: of these, (n, 4, 4), where they come from a joint fit of several exposures, of which the
+            histograms are one: they are taken as they are. None: a fit of these histograms alone.
     """
 
     counts: NDArray[np.unsignedinteger[Any]]
     origin: NDArray[np.integer[Any]]
     parameters: FloatArray
+    covariance: FloatArray | None = None
+
+    def of(self, some: NDArray[Any]) -> CodeSample:
+        """Return some of the pixels."""
+        covariance = None if self.covariance is None else self.covariance[some]
+        return CodeSample(self.counts[some], self.origin[some], self.parameters[some], covariance)
 
 
 @dataclass
@@ -81,13 +89,17 @@ def code_checks(sample: CodeSample) -> list[Check]:
     Args:
         sample: pixels with a fit that can be relied upon.
     """
-    if not len(sample.counts):
+    # pixels with samples, and of so many electrons that one of them is not too much
+    most = _MOST_WORK // (2 * sample.counts.shape[1])
+    kept = np.any(sample.counts, axis=1) & (sample.parameters[:, 0] < most)
+    if not kept.any():
         return []
+    sample = sample.of(kept)
     first = int(sample.origin.min())
     codes = int(sample.origin.max()) + sample.counts.shape[1] - first
     sums = _Residuals(np.zeros(codes), np.zeros(codes), np.zeros(codes), np.zeros(16), np.zeros((16, 16)))
     for some in _pieces(sample):
-        _add(*_trimmed(sample, some), sample.parameters[some], first, sums)
+        _add(_trimmed(sample.of(some)), first, sums)
     return [check for check in (_widths(sums, first), _pile_up(sums, first)) if check is not None]
 
 
@@ -97,15 +109,14 @@ def _pieces(sample: CodeSample) -> list[NDArray[np.int64]]:
     each = sample.counts.shape[1] * _electrons(exposure)
     n = len(sample.counts)
     chosen = np.unique(np.linspace(0, n - 1, max(min(n, _MOST_WORK // each), 1)).astype(np.int64))
-    return np.array_split(chosen, -(-chosen.size * each // _AT_ONCE))
+    return np.array_split(chosen, min(-(-chosen.size * each // _AT_ONCE), chosen.size))
 
 
-def _trimmed(sample: CodeSample, some: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[np.int64]]:
-    """Return histograms and origins of some pixels without the bins that none of them occupies."""
-    counts, origin = sample.counts[some], sample.origin[some].astype(np.int64)
-    filled = np.flatnonzero(counts.any(axis=0))
+def _trimmed(sample: CodeSample) -> CodeSample:
+    """Return pixels without the bins that none of them occupies."""
+    filled = np.flatnonzero(sample.counts.any(axis=0))
     start, stop = max(int(filled[0]) - 2, 0), int(filled[-1]) + 3
-    return counts[:, start:stop], origin + start
+    return replace(sample, counts=sample.counts[:, start:stop], origin=sample.origin.astype(np.int64) + start)
 
 
 def _electrons(exposure: float) -> int:
@@ -151,10 +162,16 @@ class _AtMaximum:
     arrived: NDArray[np.bool_]
 
 
-def _climbed(seen: FloatArray, low: FloatArray, parameters: FloatArray) -> _AtMaximum:
-    """Climb to the maximum of the exact likelihood by Fisher's scoring."""
-    width = np.sqrt(np.maximum(parameters[:, 3] ** 2 - QUANTISATION_VARIANCE, _SMALLEST_WIDTH**2))
-    theta = np.stack([parameters[:, 0], 1.0 / parameters[:, 1], parameters[:, 2], width], axis=1)
+def _climbed(sample: CodeSample) -> _AtMaximum:
+    """Climb to the maximum of the exact likelihood by Fisher's scoring; a joint fit is there already."""
+    seen, low = sample.counts.astype(np.float64), sample.origin.astype(np.float64)
+    exposure, gain, bias, sigma = sample.parameters.T
+    width = np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, _SMALLEST_WIDTH**2))
+    theta = np.stack([exposure, 1.0 / gain, bias, width], axis=1)
+    if sample.covariance is not None:
+        scale = np.stack([np.ones_like(gain), -1.0 / gain**2, np.ones_like(gain), sigma / width], axis=1)
+        joint = scale[:, :, None] * sample.covariance * scale[:, None, :]
+        return _AtMaximum(*_masses(theta, low, seen.shape[1]), joint, np.ones(len(seen), np.bool_))
     total = seen.sum(axis=1)
     for step in range(_STEPS):
         mass, slopes = _masses(theta, low, seen.shape[1])
@@ -180,11 +197,9 @@ def _alike(seen: FloatArray, mass: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(chi2 <= _POOR * np.median(chi2))
 
 
-def _add(
-    counts: NDArray[Any], origin: NDArray[np.int64], parameters: FloatArray, first: int, sums: _Residuals
-) -> None:
+def _add(sample: CodeSample, first: int, sums: _Residuals) -> None:
     """Add pixels: their samples, those expected at the exact estimate, and the variance that is left."""
-    at = _climbed(counts.astype(np.float64), origin.astype(np.float64), parameters)
+    at, counts, origin = _climbed(sample), sample.counts, sample.origin
     kept = at.arrived & _alike(counts.astype(np.float64), at.mass)
     seen, origin, bins = counts[kept].astype(np.float64), origin[kept], counts.shape[1]
     mass, slopes, total = at.mass[kept], at.slopes[kept], seen.sum(axis=1)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from pchem_pipeline.model.law.parameters import FloatArray
 
@@ -19,10 +20,12 @@ class ChiSquare:
     Attributes:
         value: chi-square.
         dof: bins that entered it.
+        p: probability of a larger one if the model holds; NaN without bins.
     """
 
     value: float
     dof: int
+    p: float
 
 
 def central_window(counts: NDArray[np.integer[Any]], coverage: float) -> slice:
@@ -107,7 +110,8 @@ def chi_square(
         least: samples below which a bin is left out.
 
     Returns:
-        Chi-square and the number of bins.
+        Chi-square, the number of bins and the p-value.
     """
     use = (counts >= least) & (variance > 0)
-    return ChiSquare(float(np.sum((data[use] - model[use]) ** 2 / variance[use])), int(use.sum()))
+    value, dof = float(np.sum((data[use] - model[use]) ** 2 / variance[use])), int(use.sum())
+    return ChiSquare(value, dof, float(chdtrc(dof, value)) if dof else math.nan)

@@ -86,7 +86,25 @@ class Components:
     nuced_variance: FloatArray
 
 
-def predicted_moments(pixels: UsablePixels) -> EnsembleMoments:
+def bias_weight(likelihood_gap: FloatArray) -> FloatArray:
+    """Weight of pixels in statements on their bias, which may be an electron off.
+
+    With a rival whose likelihood is lower by the factor ``exp(-gap)``, the posterior of the fit less that of
+    the rival is ``w = tanh(gap / 2)``: 0 where both are as likely, 1 where there is no rival. The rival is
+    right with the probability ``(1 - w) / 2``, and then the bias is off by one electron, 1/g: this adds
+    ``(1 - w^2) / (4 g^2)`` to its variance, which is taken off.
+
+    Args:
+        likelihood_gap: nats to the runner-up, shape (n,); NaN where there is none.
+
+    Returns:
+        Shape (n,), 0..1; 1 throughout where no pixel has a weight.
+    """
+    weight = np.tanh(0.5 * np.nan_to_num(likelihood_gap, nan=np.inf))
+    return np.asarray(weight if weight.any() else np.ones_like(weight))
+
+
+def predicted_moments(pixels: UsablePixels, weight: FloatArray | None = None) -> EnsembleMoments:
     """Mean and variance of the EPCD and the NUCed EPCD from the parameters.
 
     Hendrickson et al. 2023, Appendix A: ``E(E) = E(mu) + E(H/g)`` and ``Var(E) = Var(mu) + Var(H/g) +
@@ -95,6 +113,8 @@ def predicted_moments(pixels: UsablePixels) -> EnsembleMoments:
 
     Args:
         pixels: the pixels.
+        weight: of each in Var(mu), shape (n,), see :func:`bias_weight`; None: all the same. The other moments
+            need none: where the bias is an electron off, H is, too.
 
     Returns:
         The moments and their terms.
@@ -103,12 +123,16 @@ def predicted_moments(pixels: UsablePixels) -> EnsembleMoments:
     signal = exposure / gain
     covariance = float(np.mean((bias - bias.mean()) * (signal - signal.mean())))
     terms = (float(bias.var()), float(signal.var()), float(np.mean(sigma**2)), float(np.mean(signal / gain)))
+    weight = np.ones(len(pixels)) if weight is None else weight
+    mean_bias = np.average(bias, weights=weight)
+    open_square = (bias - mean_bias) ** 2 - 0.25 * (1.0 - weight**2) / gain**2
+    of_bias = max(float(np.average(open_square, weights=weight)), 0.0)
     return EnsembleMoments(
         mean=float(bias.mean() + signal.mean()),
         variance=sum(terms) + 2.0 * covariance,
         nuced_mean=float(exposure.mean()),
         nuced_variance=float(exposure.var() + exposure.mean() + np.mean(pixels.read_noise_e**2)),
-        variance_of_bias=terms[0],
+        variance_of_bias=of_bias,
         variance_of_signal=terms[1],
         mean_read_variance=terms[2],
         mean_shot_variance=terms[3],
@@ -156,7 +180,7 @@ def sample_moments(counts: NDArray[np.integer[Any]], dn: NDArray[np.integer[Any]
     return mean, float(np.dot(counts, (dn - mean) ** 2)) / total
 
 
-def component_widths(pixels: UsablePixels, n_k: int) -> Components:
+def component_widths(pixels: UsablePixels, n_k: int, weight: FloatArray | None = None) -> Components:
     """Mean and variance of the components of the EPCD, in the sixteen cases of Appendix B.
 
     Under the weights ``e^{-H} H^k`` (eq. EPCD_alt_form), ``Var(E|K_e=k) = E(sigma^2) + Var(mu) + 2 k
@@ -167,6 +191,7 @@ def component_widths(pixels: UsablePixels, n_k: int) -> Components:
     Args:
         pixels: the pixels; where all have H = 0 there is no component k > 0, and its moments are NaN.
         n_k: number of components, k = 0 .. n_k - 1.
+        weight: of each pixel, shape (n,), see :func:`bias_weight`; None: all the same.
 
     Returns:
         Means, variances and NUCed variances.
@@ -175,8 +200,11 @@ def component_widths(pixels: UsablePixels, n_k: int) -> Components:
     step = 1.0 / gain
     centres = (float(bias.mean()), float(step.mean()))
     mu, a = bias - centres[0], step - centres[1]
-    table = np.stack([sigma**2, mu, a, mu * mu, mu * a, a * a, pixels.read_noise_e**2], axis=1)
-    constant_h, moments = table.mean(axis=0), _weighted_moments(exposure, table, n_k)
+    weight = np.ones(len(pixels)) if weight is None else weight
+    bias_square = mu * mu - 0.25 * (1.0 - weight**2) * step**2
+    table = np.stack([sigma**2, mu, a, bias_square, mu * a, a * a, pixels.read_noise_e**2], axis=1)
+    constant_h = np.average(table, axis=0, weights=weight)
+    moments = _weighted_moments(exposure, table, weight, n_k)
     mean, nuced, variance = np.empty(n_k), np.empty(n_k), np.empty((len(COMPONENT_CASES), n_k))
     for k, weighted in enumerate(moments):
         mean[k] = centres[0] + weighted[1] + k * (centres[1] + weighted[2])
@@ -187,19 +215,20 @@ def component_widths(pixels: UsablePixels, n_k: int) -> Components:
     return Components(mean, variance, nuced)
 
 
-def _weighted_moments(exposure: FloatArray, table: FloatArray, n_k: int) -> FloatArray:
-    """Return the means of each column of a table of pixels, weighted with P(K = k), shape (n_k, columns)."""
-    sums = np.zeros((n_k, table.shape[1] + 1))
+def _weighted_moments(exposure: FloatArray, table: FloatArray, weight: FloatArray, n_k: int) -> FloatArray:
+    """Return the means of the columns of a table of pixels, weighted with w P(K = k), (n_k, columns)."""
+    columns = np.column_stack([weight, table * weight[:, None]])
+    sums = np.zeros((n_k, columns.shape[1] + 1))
     room = np.zeros(max(n_k, int(ensemble_numba.capacity(exposure))))
-    ensemble_numba.sum_moments(exposure, table, room, sums)
+    ensemble_numba.sum_moments(exposure, columns, room, sums)
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = sums[:, 1:] / sums[:, :1]
+        found = sums[:, 2:] / sums[:, 1:2]
         log_exposure = np.log(exposure)
-    for k in np.flatnonzero(sums[:, 0] < _FEW_ELECTRONS):  # the ratios of the weights are left
+    for k in np.flatnonzero(sums[:, 1] < _FEW_ELECTRONS):  # the ratios of the weights are left
         log_weight = (k * log_exposure if k else 0.0) - exposure
-        largest = log_weight.max()
-        weight = np.exp(log_weight - largest) if np.isfinite(largest) else np.full(exposure.size, np.nan)
-        found[k] = weight @ table / weight.sum()
+        largest = log_weight[weight > 0.0].max()
+        of_k = np.exp(log_weight - largest) if np.isfinite(largest) else np.full(exposure.size, np.nan)
+        found[k] = of_k @ columns[:, 1:] / (of_k @ weight)
     return found
 
 
@@ -208,7 +237,7 @@ def _case_variance(moments: FloatArray, case: tuple[str, ...], k: int, mean_vari
     read, mu, a, mu_mu, mu_a, a_a = (float(value) for value in moments[:6])
     total = mean_variance if "sigma2" in case else read
     if "mu" not in case:
-        total += mu_mu - mu * mu
+        total += max(mu_mu - mu * mu, 0.0)
     if "g" not in case:
         total += k * k * (a_a - a * a)
         if "mu" not in case:

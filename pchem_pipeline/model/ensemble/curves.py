@@ -26,6 +26,7 @@ from pchem_pipeline.model.ensemble.ensemble_binned import (
     epcd_independent,
     nuced_dependent,
     nuced_independent,
+    within_limits,
 )
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.ensemble.totals import EnsembleTotals
@@ -43,7 +44,10 @@ def _choice(settings: EnsembleSettings) -> HistogramChoice:
 
 
 def curves(
-    totals: EnsembleTotals, pixels: UsablePixels, settings: EnsembleSettings
+    totals: EnsembleTotals,
+    pixels: UsablePixels,
+    settings: EnsembleSettings,
+    limits: tuple[int, int] | None = None,
 ) -> tuple[Arrays, dict[str, Any]]:
     """Return the densities, raw and NUCed, and how well they agree with the data.
 
@@ -51,6 +55,7 @@ def curves(
         totals: the sums over all tiles.
         pixels: all pixels with a value.
         settings: the section ``ensemble``.
+        limits: first and last code, DN, that show what is beyond them; None: no samples there.
 
     Returns:
         Arrays of the group ``ensemble``, and numbers for its attributes.
@@ -65,8 +70,8 @@ def curves(
         "density": totals.mean("share"),
         "density_all": totals.mean("share_all"),
         "epcd_exact": totals.mean("pcd"),
-        "epcd_dependent": epcd_dependent(pixels, axes.dn, choice),
-        "epcd_independent": epcd_independent(pixels, axes.dn, choice),
+        "epcd_dependent": within_limits(epcd_dependent, pixels, axes.dn, choice, limits),
+        "epcd_independent": within_limits(epcd_independent, pixels, axes.dn, choice, limits),
         "electrons": axes.nuced.electrons,
         "nuced_counts": totals.counts("nuced_counts"),
         "nuced_density": totals.mean("nuced_share") / width,
@@ -113,13 +118,22 @@ def _agreement(
         for prefix, place in (("epcd", window), ("nuced", nuced_window))
         if f"{prefix}_stderr" in arrays
     }
-    chi = chi_square(arrays["density"], arrays["epcd_exact"], variance, arrays["counts"])
     ends = [window.start, window.stop - 1], [nuced_window.start, nuced_window.stop - 1]
     return {
         "rmse": found,
         "rmse_all_frames": found_all,
         "model_error": model_error,
-        "chi_square": asdict(chi),
+        **{
+            f"{prefix}chi_square": asdict(
+                chi_square(
+                    arrays[f"{prefix}density"],
+                    arrays["nuced_exact" if prefix else "epcd_exact"],
+                    noise,
+                    arrays[f"{prefix}counts"],
+                )
+            )
+            for prefix, noise in (("", variance), ("nuced_", nuced_variance))
+        },
         "rmse_window_dn": [int(arrays["dn"][i]) for i in ends[0]],
         "rmse_window_electrons": [float(arrays["electrons"][i]) for i in ends[1]],
     }
@@ -160,18 +174,19 @@ def electron_numbers(
     }
 
 
-def components(pixels: UsablePixels, mass: FloatArray) -> Arrays:
+def components(pixels: UsablePixels, mass: FloatArray, weight: FloatArray) -> Arrays:
     """Return means and widths of the components that matter (Appendix B).
 
     Args:
         pixels: all pixels with a value.
         mass: mass of each electron number, shape (n_k,).
+        weight: of each pixel, see :func:`bias_weight`.
 
     Returns:
         Arrays of the group ``ensemble``.
     """
     shown = max(2, int(np.flatnonzero(mass >= _SMALLEST_COMPONENT)[-1]) + 1)
-    widths = component_widths(pixels, min(shown, mass.size))
+    widths = component_widths(pixels, min(shown, mass.size), weight)
     return {
         "component_mean": widths.mean,
         "component_variance": widths.variance,

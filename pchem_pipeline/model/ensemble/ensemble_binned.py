@@ -10,7 +10,7 @@ pixels in it, which removes the error of first order in the bin width.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,8 +27,13 @@ from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 _MOST_CELLS = 4
 #: Analog noise (DN) to which narrower cells are widened in the inversion.
 _NARROWEST = 0.05
-#: Longest signal (DN) that the inversion keeps from wrapping round; only a pixel of absurd gain is beyond.
+#: Distance (DN) from the axis within which the inversion keeps signals from wrapping round; only a pixel of
+#: absurd parameters is beyond.
 _LONGEST = 65536.0
+#: Frequencies of an inversion: noise too narrow for them, beside a wide range, is widened.
+_MOST_FREQUENCIES = 1 << 14
+#: Ratio of exposures that are inverted together: a hot pixel has frequencies of its own.
+_ALIKE = 4.0
 
 
 @dataclass(frozen=True)
@@ -149,17 +154,34 @@ def epcd_independent(pixels: UsablePixels, dn: DnAxis, choice: HistogramChoice) 
         choice: the bins.
 
     Returns:
-        f_E, 1/DN, shape (n_dn,); correct to about 1e-15 absolute.
+        f_E, 1/DN, shape (n_dn,); correct to about 1e-15 absolute unless it is so wide that narrow noise is
+        widened.
     """
-    exposure, gain, bias, sigma = pixels.maps
     exposures, gains, biases, variances = (
-        joint_cells((column,), choice) for column in (exposure, gain, bias, sigma**2)
+        joint_cells((column,), choice) for column in (*pixels.maps[:3], pixels.read_noise_dn**2)
     )
-    period, origin = _period(exposures, gains, biases, variances, dn)
-    narrow = variances.values[0] < NARROW**2
-    spread = np.where(
-        narrow, np.maximum(variances.values[0] - QUANTISATION_VARIANCE, _NARROWEST**2), variances.values[0]
-    )
+    density = np.zeros(dn.size)
+    scale = np.floor(np.log(np.maximum(exposures.values[0], 1.0)) / math.log(_ALIKE))
+    for each in np.unique(scale):
+        mine = scale == each
+        alike = Cells(exposures.share[mine], exposures.values[:, mine])
+        origin, values = _inverted(alike, gains, biases, variances, dn)
+        first, end = max(origin, dn.start), min(origin + values.size, dn.start + dn.size)
+        if first < end:
+            density[first - dn.start : end - dn.start] += values[first - origin : end - origin]
+    return np.maximum(density, 0.0)
+
+
+def _inverted(
+    exposures: Cells, gains: Cells, biases: Cells, variances: Cells, dn: DnAxis
+) -> tuple[int, FloatArray]:
+    """Invert the characteristic function of pixels of similar exposures; return first DN and density."""
+    origin, period = _period(exposures, gains, biases, variances, dn)
+    variance = variances.values[0]
+    narrow = variance < NARROW**2
+    # the finest structure that so many frequencies resolve
+    least = max(_NARROWEST, period * REACH / (2 * np.pi * _MOST_FREQUENCIES)) ** 2
+    spread = np.maximum(np.where(narrow, variance - QUANTISATION_VARIANCE, variance), least)
     n_frequencies = math.ceil(period * REACH / (2 * np.pi * math.sqrt(spread.min())))
     folded = np.zeros(period, dtype=np.complex128)
     for start in range(0, n_frequencies + 1, 64):
@@ -171,8 +193,7 @@ def epcd_independent(pixels: UsablePixels, dn: DnAxis, choice: HistogramChoice) 
         product = noise * offset * _electrons_in_dn(t, exposures, gains)
         # frequencies beyond the sampling of the DN grid fold onto it, and those below zero are conjugates
         np.add.at(folded, order % period, np.where(order == 0, 0.5, 1.0) * product)
-    density = 2.0 * np.fft.fft(folded).real / period
-    return np.maximum(density[np.asarray(dn.dn - origin)], 0.0)
+    return origin, 2.0 * np.fft.fft(folded).real / period
 
 
 def _electrons_in_dn(t: FloatArray, exposures: Cells, gains: Cells) -> NDArray[np.complex128]:
@@ -183,12 +204,46 @@ def _electrons_in_dn(t: FloatArray, exposures: Cells, gains: Cells) -> NDArray[n
 
 
 def _period(exposures: Cells, gains: Cells, biases: Cells, variances: Cells, dn: DnAxis) -> tuple[int, int]:
-    """Choose the period (DN) of the inversion, longer than the density, and its first DN."""
+    """Return the first DN of the density and its length, both no further than ``_LONGEST`` from the axis."""
     reach = (REACH + 1.0) * math.sqrt(variances.values[0].max()) + 1.0
-    steps = _enough_k(exposures.values[0]) / gains.values[0].min()
-    low = min(dn.start, math.floor(biases.values[0].min() - reach))
-    high = max(dn.start + dn.size, math.ceil(biases.values[0].max() + min(steps, _LONGEST) + reach))
-    return high - low, low
+    least, most = float(exposures.values[0].min()), _enough_k(exposures.values[0])
+    fewest = max(0.0, least - 12.0 * math.sqrt(least) - 40.0)
+    low = biases.values[0].min() + fewest / gains.values[0].max() - reach
+    high = biases.values[0].max() + most / gains.values[0].min() + reach
+    first = math.floor(min(max(low, dn.start - _LONGEST), dn.start + dn.size))
+    return first, math.ceil(min(max(high, dn.start), dn.start + dn.size + _LONGEST)) - first + 1
+
+
+def within_limits(
+    curve: Callable[[UsablePixels, DnAxis, HistogramChoice], FloatArray],
+    pixels: UsablePixels,
+    dn: DnAxis,
+    choice: HistogramChoice,
+    limits: tuple[int, int] | None,
+) -> FloatArray:
+    """Return a density of the raw ensemble with the mass beyond the limits of the codes at these.
+
+    Args:
+        curve: of an unlimited ADC, :func:`epcd_dependent` or :func:`epcd_independent`.
+        pixels: the pixels.
+        dn: where to evaluate it.
+        choice: the bins.
+        limits: first and last code, DN; those at an end of ``dn`` count. None: no limits.
+
+    Returns:
+        f_E, 1/DN, shape (n_dn,).
+    """
+    low, high = (False, False) if limits is None else (dn.start <= limits[0], dn.start + dn.size > limits[1])
+    below = 0
+    if low:
+        lowest = float(np.min(pixels.bias - (REACH + 1.0) * pixels.read_noise_dn))
+        below = math.ceil(min(max(dn.start - lowest, 0.0), _LONGEST))
+    whole = curve(pixels, DnAxis(dn.start - below, dn.size + below), choice)
+    found = whole[below:].copy()
+    found[0] += whole[:below].sum()
+    if high:  # a density at the integers adds up to 1
+        found[-1] += max(1.0 - float(found.sum()), 0.0)
+    return found
 
 
 def nuced_dependent(pixels: UsablePixels, axis: NucedAxis, choice: HistogramChoice) -> FloatArray:

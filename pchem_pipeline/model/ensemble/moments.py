@@ -9,26 +9,27 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.ensemble.components import EnsembleMoments, moment_errors, predicted_moments
 from pchem_pipeline.model.ensemble.totals import EnsembleTotals
-from pchem_pipeline.model.law.parameters import UsablePixels
+from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
 
 def moment_rows(
-    totals: EnsembleTotals, pixels: UsablePixels, per_pixel: int | NDArray[Any]
+    totals: EnsembleTotals, pixels: UsablePixels, per_pixel: int | NDArray[Any], weight: FloatArray
 ) -> list[dict[str, Any]]:
     """Return the moments of Appendix A, from the maps and from the data.
 
-    Under an extended model mean and variance are those of its masses, and what its effects add to the
-    variance that the parameters explain is a term of its own.
+    Under an extended model, or where samples lie at the limits of the codes, mean and variance are those of
+    its masses, and what effects and limits add to the variance of the parameters is a term of its own.
 
     Args:
         totals: the sums.
         pixels: the pixels.
         per_pixel: samples of each pixel.
+        weight: of each pixel in Var(mu), see :func:`bias_weight`.
 
     Returns:
         Rows ``{name, quantity, unit, predicted, observed, stderr}``; terms have nothing to be observed.
     """
-    plain_ones, errors = predicted_moments(pixels), moment_errors(pixels, per_pixel)
+    plain_ones, errors = predicted_moments(pixels, weight), moment_errors(pixels, per_pixel)
     expected = _extended_moments(totals, plain_ones) if totals.axes.extended else plain_ones
     share, dn = totals.mean("share"), totals.axes.dn.dn
     mean = float(share @ dn / share.sum())
@@ -70,7 +71,7 @@ def moment_rows(
     ]
     if totals.axes.extended:
         added = expected.variance - plain_ones.variance
-        rows.insert(7, ("effects", "of which the effects of the model", "DN2", added, None, None))
+        rows.insert(7, ("effects", "of which effects and limits of the codes", "DN2", added, None, None))
     names = ("name", "quantity", "unit", "predicted", "observed", "stderr")
     return [dict(zip(names, row, strict=True)) for row in rows]
 

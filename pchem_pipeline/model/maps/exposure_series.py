@@ -20,7 +20,7 @@ class ExposureLine:
 
     Attributes:
         slope: e- per unit of x: the charge rate, e-/px/s, where x is the integration time; shape (n,).
-        offset: e-: charge that does not grow with x (spurious charge), shape (n,).
+        offset: e-: charge that does not grow with x (spurious charge; dark signal over light), shape (n,).
         covariance: of slope and offset, shape (n, 2, 2).
         residual: H_j minus the line, e-, shape (n, J).
         residual_stderr: standard error of the residual, e-, shape (n, J); 0 where the line leaves no freedom.

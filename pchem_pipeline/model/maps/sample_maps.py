@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.maps.exposure_series import exposure_line
 
+#: Slope and offset of the exposures over the light level.
+LEVEL_MAPS = ("charge_per_level", "dark_signal")
 FloatArray = NDArray[np.float64]
 
 
@@ -22,7 +24,7 @@ def line_map_names(against: str, rate: str) -> tuple[str, ...]:
     """
     if against == "none":
         return ()
-    return rate if against == "integration_time" else "charge_per_level", "spurious_charge"
+    return (rate, "spurious_charge") if against == "integration_time" else LEVEL_MAPS
 
 
 def own_variance(covariance: FloatArray) -> FloatArray:

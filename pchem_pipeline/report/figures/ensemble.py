@@ -122,7 +122,7 @@ def component_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             "component_widths",
             "components",
             "Width of the components of the ensemble",
-            _COMPONENTS_CAPTION,
+            _COMPONENTS_CAPTION + bias_remark(data),
             "Standard deviation of the ensemble's component k, nothing held constant: "
             f"{short(float(width[0]))} DN at k = 0, "
             f"{short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
@@ -131,6 +131,17 @@ def component_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             PAGE_MM,
         )
     ]
+
+
+def bias_remark(data: ReportData) -> str:
+    """Return how pixels enter whose bias may be an electron off; empty where there are none."""
+    lost = float(data.ensemble_facts.get("pixels_of_open_bias", 0.0))
+    if lost < 0.05:
+        return ""
+    return (
+        " Pixels whose bias may be an electron off count less (weight tanh(d/2), d: log-likelihood over that "
+        f"of the best rival), by {short(lost, 2)} {data.noun}s in all."
+    )
 
 
 def case_name(constant: Sequence[str]) -> str:

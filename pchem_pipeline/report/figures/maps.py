@@ -59,7 +59,8 @@ _CAPTIONS = {
     "conversion_gain": "Conversion gain: electrons per digital number.",
     "bias": "Bias: the digital number at zero electrons.",
     "read_noise_e": "Read noise in electrons, quantisation included.",
-    "spurious_charge": "Spurious charge: quanta exposure that does not grow with time or light.",
+    "spurious_charge": "Spurious charge: quanta exposure that does not grow with time.",
+    "dark_signal": "Dark signal: quanta exposure at light level 0.",
     "charge_per_level": "Charge per light level: quanta exposure gained with each level.",
 }
 _READ_NOISE_CAPTION = (

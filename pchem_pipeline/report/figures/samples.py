@@ -17,10 +17,10 @@ from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import measured, short, symbol
 
-#: Label and unit of what the exposures are drawn against, and the maps that their slope may be.
+#: Label and unit of what the exposures are drawn against, the maps that their slope may be, and the offset.
 AXES = {
-    "integration_time": ("integration time", "s", CHARGE_RATES),
-    "light_level": ("light level", "", ("charge_per_level",)),
+    "integration_time": ("integration time", "s", CHARGE_RATES, "spurious_charge"),
+    "light_level": ("light level", "", ("charge_per_level",), "dark_signal"),
 }
 
 _LINE_CAPTION = (
@@ -43,7 +43,7 @@ def exposure_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
         return []
     words, noun = AXES[samples.against][0], symbol(slope)[1]
     table = exposure_table(samples)
-    line = (_median(data.maps[slope]), *middle(data.maps["spurious_charge"])[:2])
+    line = (_median(data.maps[slope]), *middle(data.maps[AXES[samples.against][3]])[:2])
     centre, error, _low, _high = middle(data.maps[slope])
     return [
         Figure(

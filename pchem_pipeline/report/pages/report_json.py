@@ -94,6 +94,7 @@ def _summary(data: ReportData) -> dict[str, Any]:
             "n_flagged": summary.n_left_out,
             "n_outliers_low": summary.n_low,
             "n_outliers_high": summary.n_high,
+            "parts": [asdict(parts) for parts in data.parts.get(name, ())],
         }
     return found
 

@@ -31,8 +31,8 @@ OPEN: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
     (
         "exposures",
         "Exposures",
-        "Each exposure has its own H; what grows with {against} is the {noun}, and what does not is spurious "
-        "charge (or a bias stack that holds electrons).",
+        "Each exposure has its own H; what grows with {against} is the {noun}, and what does not is the "
+        "{offset} (or a bias stack that holds electrons).",
         ("samples",),
     ),
     (
@@ -212,7 +212,7 @@ def _figures(row: tuple[str, str, str, tuple[str, ...]], folded: bool, material:
         words = AXES.get(data.samples.against)
         slope = slope_of(data)
         noun = symbol(slope)[1] if slope else "charge"
-        intro = intro.format(against=words[0], noun=noun) if words else _NO_LINE
+        intro = intro.format(against=words[0], noun=noun, offset=symbol(words[3])[1]) if words else _NO_LINE
     content = {"intro": intro, "missing": missing, "pictures": shown, "tables": tables}
     return Section(id_, title, "figures", content, folded)
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
 from pchem_pipeline.base.variables import CHARGE_RATES
+from pchem_pipeline.model.checks.map_parts import Parts
 from pchem_pipeline.model.fit.status import FLAGGED, flags_of
 from pchem_pipeline.model.maps.maps import MapSummary
 from pchem_pipeline.report.data import ReportData
@@ -30,8 +32,8 @@ Level = Literal["good", "note", "caution", "serious"]
 
 _KEY_MAPS = ("read_noise_e", "conversion_gain", *CHARGE_RATES, "quanta_exposure", "bias")
 
-#: Ratio of an RMSE to that of sampling noise alone up to which the model explains the data, and from which
-#: it clearly does not.
+#: Ratio of an RMSE to that of sampling noise alone up to which a significant difference is small, and from
+#: which it is large.
 _RMSE_GOOD, _RMSE_BAD = 1.3, 3.0
 #: Share of pixels with one reason for caution from which the first screen says so.
 _CAUTION_SHARE = 0.01
@@ -300,18 +302,41 @@ def _goodness(data: ReportData) -> list[Flag]:
     return [Flag("good", f"{text}.")]
 
 
+def _parts(data: ReportData) -> list[Flag]:
+    """Say where a map has a step or two modes, with the medians of the parts."""
+    return [
+        Flag("note" if name == "bias" else "caution", _parts_sentence(name, parts))
+        for name, found in data.parts.items()
+        for parts in found
+    ]
+
+
+def _parts_sentence(name: str, parts: Parts) -> str:
+    _, words, unit = symbol(name)
+    medians = [f"{short(median, 4)} {unit}" for median in parts.medians]
+    if parts.axis == "modes":
+        return (
+            f"{words.capitalize()} has two modes, {medians[0]} and {medians[1]}: "
+            "its median over the sensor describes neither."
+        )
+    ends = zip(pairwise(parts.edges), medians, strict=True)
+    places = ", ".join(f"{parts.axis} {a:g} to {b - 1:g}: {median}" for (a, b), median in ends)
+    return f"{words.capitalize()} has a step ({places}); its median over the sensor describes no part."
+
+
 def _agreement(data: ReportData) -> list[Flag]:
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
     found = []
-    for name, floor, words in (
-        ("epcd_exact", "noise_floor", "raw ensemble"),
-        ("nuced_exact", "nuced_noise_floor", "NUCed ensemble"),
-    ):
+    for name, prefix, words in (("epcd_exact", "", "raw"), ("nuced_exact", "nuced_", "NUCed")):
+        floor = f"{prefix}noise_floor"
         if name not in rmse or not rmse.get(floor):
             continue
         ratio = rmse[name] / rmse[floor]
-        text = f"The RMSE of the predicted {words} is {short(ratio, 2)} times that of sampling noise alone"
-        if ratio <= _RMSE_GOOD:
+        p = (data.ensemble_facts.get(f"{prefix}chi_square") or {}).get("p")
+        tested = "" if p is None else f" (chi-square: p {'< 0.001' if p < _POOR_P else f'= {short(p, 2)}'})"
+        text = f"The RMSE of the predicted {words} ensemble is {short(ratio, 2)} times the sampling noise"
+        text += tested
+        if ratio <= _RMSE_GOOD or (p is not None and p >= _POOR_P):
             found.append(Flag("good", f"{text}: the model explains the data."))
         elif ratio <= _RMSE_BAD:
             found.append(Flag("caution", f"{text}: small differences are left."))
@@ -395,7 +420,7 @@ def _model(data: ReportData, article: str = "The") -> str:
 
 #: What looks for remarks; a further check is a further row.
 CHECKS: tuple[Callable[[ReportData], list[Flag]], ...] = (
-    _spaced_codes, _levels, _failed_pixels, _unfitted, _flagged, _cautions, _goodness, _agreement,
+    _spaced_codes, _levels, _failed_pixels, _unfitted, _flagged, _cautions, _parts, _goodness, _agreement,
     _quick_look, _discrepancy, _conditions,
 )  # fmt: skip
 

@@ -11,6 +11,7 @@ import numpy as np
 from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
 from pchem_pipeline.model.maps.maps import summarise
 from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.figures.ensemble import bias_remark
 from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.figures.plan import frames_text, target_text
 from pchem_pipeline.report.figures.samples import AXES, middle
@@ -187,6 +188,7 @@ _ORDER = (
     "dark_current",
     "charge_per_level",
     "spurious_charge",
+    "dark_signal",
     "conversion_gain",
     "bias",
     "read_noise_dn",
@@ -302,11 +304,16 @@ def _moments(data: ReportData) -> Table:
         "moments",
         "Moments of the ensemble",
         "From the parameter maps (Hendrickson et al. 2023, Appendix A) and from the data, with "
-        "the standard error of the data.",
+        f"the standard error of the data.{_of_bias(data)}",
         ("moment", "from the maps", "from the data", "difference / standard error"),
         tuple(rows),
         section="ensemble",
     )
+
+
+def _of_bias(data: ReportData) -> str:
+    remark = bias_remark(data)
+    return f" Variance of the bias:{remark}" if remark else ""
 
 
 #: Larger electron numbers are in ``report.json`` only.

@@ -29,6 +29,7 @@ _SYMBOLS = {
     "charge_rate": (r"$H/t$", "charge rate", "e-/px/s"),
     "dark_current": (r"$i_\mathrm{d}$", "dark current", "e-/px/s"),
     "spurious_charge": (r"$H_0$", "spurious charge", "e-"),
+    "dark_signal": (r"$H_0$", "dark signal", "e-"),
     "charge_per_level": (r"$\mathrm{d}H/\mathrm{d}\ell$", "charge per light level", "e-/level"),
 }
 

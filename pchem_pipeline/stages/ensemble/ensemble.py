@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.electrons.electrons import ErrorTally, compare_electron_numbers
 from pchem_pipeline.model.electrons.error_rates import error_rates
-from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
+from pchem_pipeline.model.ensemble.components import COMPONENT_CASES, bias_weight
 from pchem_pipeline.model.ensemble.curves import components, curves
 from pchem_pipeline.model.ensemble.curves import electron_numbers as electron_numbers_of
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, nuced_axis
@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.frames.stream import FrameSource
     from pchem_pipeline.model.ensemble.settings import EnsembleSettings
+    from pchem_pipeline.model.law.sample_law import SampleLaw
     from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.stages.bands import Band
     from pchem_pipeline.store.run_store import RunStore
@@ -80,6 +81,7 @@ class _Job:
         source: where frames come from, if any are read.
         truth: first row, first column and first frame of the input in the true electron numbers, or None.
         effects: with which the maps were fitted.
+        limits: first and last code of the ADC, DN, where samples lie at one of them; else None.
     """
 
     store: Path
@@ -91,6 +93,7 @@ class _Job:
     source: FrameSource | None
     truth: tuple[int, int, int] | None
     effects: tuple[Effect, ...]
+    limits: tuple[int, int] | None
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,12 @@ class _Fitted:
         *maps, origin, low, high = (_pixels_of(store, path, tiles) for path in paths)
         pixels, mask = UsablePixels.from_maps(maps)
         return cls(pixels, mask, origin[mask], low[mask], high[mask], bins)
+
+    def limits(self, known: tuple[int, int] | None) -> tuple[int, int] | None:
+        """Return the known limits of the codes where samples lie at one of them; else None."""
+        if known is None or not np.any((self.low <= known[0]) | (self.high >= known[1])):
+            return None
+        return known
 
     def axes(self, settings: EnsembleSettings, *, extended: bool) -> EnsembleAxes | None:
         """Choose the axes of the ensemble; None where no pixel has a value."""
@@ -176,7 +185,8 @@ def run(context: StageContext) -> None:
     source = open_source(context) if frames is not None and (truth or not everything) else None
     fitted_tiles = [tile for tile in tiles if tile.key in ready]
     fitted = _Fitted.read(store, fitted_tiles)
-    axes = fitted.axes(settings, extended=bool(effects))
+    limits = fitted.limits(context.adc_limits)
+    axes = fitted.axes(settings, extended=bool(effects) or limits is not None)
     if sensor.kind == "histograms":
         context.note(
             "the input is histograms: the ensemble is of all samples, every channel counting the same"
@@ -190,7 +200,7 @@ def run(context: StageContext) -> None:
     numbered = {tile.key: (number, tile) for number, tile in enumerate(tiles)}
     codes = {} if frames is None or everything else _codes(context)
     chosen = None if everything else frames
-    job = _Job(store.path, axes, numbered, chosen, codes, sensor.n_frames, source, truth, effects)
+    job = _Job(store.path, axes, numbered, chosen, codes, sensor.n_frames, source, truth, effects, limits)
     rows = max(1, _BAND_BYTES // (sensor.nx * fitted.bins * 4))
     bands = tiles if source is None else tile_bands(context, "fit", rows, source.rows_per_read)
     task = functools.partial(_do_band, job=job)
@@ -207,7 +217,7 @@ def run(context: StageContext) -> None:
             fitted = _Fitted.read(store, finished)
         made = {"tiles": len(finished), "tiles_missing": context.n_keys - len(finished)}
         totals = _totals(store, axes, [numbered[tile.key][0] for tile in finished], frames, sensor.n_frames)
-        asked = _Asked(context.config, frames, truth, sensor)
+        asked = _Asked(context.config, frames, truth, sensor, limits)
         _write_result(store, totals, finished, fitted, asked, effects, made)
 
 
@@ -220,12 +230,14 @@ class _Asked:
         frames: first and end of the chosen frames, or None where there are none to choose from.
         truth: row, column and frame of the input's origin in the simulation, or None.
         sensor: the input.
+        limits: first and last code of the ADC, DN, where samples lie at one of them; else None.
     """
 
     config: RunConfig
     frames: tuple[int, int] | None
     truth: tuple[int, int, int] | None
     sensor: SensorInfo
+    limits: tuple[int, int] | None
 
 
 def _codes(context: StageContext) -> dict[str, dict[str, Any]]:
@@ -372,7 +384,7 @@ def _sum_tile(
             some,
             everything,
             job.axes,
-            fitted_law(store, of_pixels, place) if job.effects else None,
+            _law(store, of_pixels, place, job),
             fitted_satellites(store, place) if job.effects else None,
             None if errors is None else errors.of(_inside(tile, part)),
         )
@@ -384,6 +396,21 @@ def _sum_tile(
         integers[job.axes.integers["outside_all"]] = outside
         floats[job.axes.floats["share_all"]] = samples / job.n_frames
     return integers, floats
+
+
+def _law(
+    store: RunStore, maps: list[NDArray[np.float64]], place: tuple[slice, slice], job: _Job
+) -> SampleLaw | None:
+    """Return the law of the samples, with effects and limits of the codes; None: the PCD."""
+    if not job.axes.extended:
+        return None
+    law = fitted_law(store, maps, place)
+    low, high = job.limits or (None, None)
+    return replace(
+        law,
+        clip_low=low if law.clip_low is None else law.clip_low,
+        clip_high=high if law.clip_high is None else law.clip_high,
+    )
 
 
 def _read_counted(store: RunStore, tile: Tile, origin: NDArray[np.int64]) -> _Counted:
@@ -520,10 +547,13 @@ def _write_result(
     if frames is None:
         counts = _pixels_of(store, "histogram/counts", tiles)
         per_pixel = counts.sum(axis=1, dtype=np.int64)[fitted.mask]
+    weight = np.ones(len(pixels))
+    if store.has("fit/likelihood_gap"):
+        weight = bias_weight(_pixels_of(store, "fit/likelihood_gap", tiles)[fitted.mask])
     true = _true_pixels(store, asked, tiles, fitted.mask)
-    arrays, found = curves(totals, pixels, settings)
+    arrays, found = curves(totals, pixels, settings, asked.limits)
     numbers, electron_facts = electron_numbers_of(totals, pixels, settings)
-    arrays |= numbers | components(pixels, numbers["electron_pmf"])
+    arrays |= numbers | components(pixels, numbers["electron_pmf"], weight)
     n, n_all = totals.samples
     found |= electron_facts | error_rates(totals, pixels, true)
     found |= {
@@ -532,7 +562,8 @@ def _write_result(
         "first_frame": None if frames is None else frames[0],
         "n_pixels": totals.count("pixels"),
         "n_pixels_without_value": totals.count("excluded"),
-        "moments": moment_rows(totals, pixels, per_pixel),
+        "pixels_of_open_bias": float(np.sum(1.0 - weight)),
+        "moments": moment_rows(totals, pixels, per_pixel, weight),
         "component_cases": COMPONENT_CASES,
         "missing": missing,
     }

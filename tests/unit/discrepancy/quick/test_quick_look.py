@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -13,6 +14,7 @@ from pchem_pipeline import fit_counts
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.quick import places
 from pchem_pipeline.discrepancy.quick.checks import _SIGNS, SIGNIFICANCE, Check, QuickLook
+from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.levels import levels_check
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
 from pchem_pipeline.effects.analog.column_noise import ColumnNoise
@@ -375,3 +377,27 @@ def test_without_summaries_only_codes_are_looked_at() -> None:
     look = quick_look(None, maps_of((8, 8)), codes_of(frames), missing={"rows": "no order in time"})
     assert [check.name for check in look.checks] == ["codes", "top_code"]
     assert look.to_dict()["missing"] == {"rows": "no order in time"}
+
+
+def test_the_codes_of_a_joint_fit_are_judged_by_its_parameters() -> None:
+    """At 8 e- and 0.7 e- one exposure alone does not tell the gain; others did, with errors of their own."""
+    frames = stack(np.random.default_rng(3), (800, 16, 16), exposure=8.0, read_noise=0.7)
+    codes = codes_of(frames, 8.0, 0.7)
+    n, bias = len(codes.counts), frames.mean(axis=0).ravel() - 8.0 / GAIN
+    given = np.stack(
+        [np.full(n, 8.0), np.full(n, GAIN), bias, np.full(n, np.hypot(0.7 / GAIN, 12**-0.5))], axis=1
+    )
+    error = np.zeros((n, 4, 4))
+    error[:, 2, 2] = (8.0 + 0.49) / GAIN**2 / 800  # the mean of the samples places the bias
+    known = CodeSample(codes.counts, codes.origin, given, error)
+    (widths,) = (check for check in code_checks(known) if check.name == "codes")
+    assert widths.p > 1e-3
+    rng = np.random.default_rng(4)
+    uneven = codes_of(frames - (frames & 1) * (rng.random(frames.shape) < 0.1).astype(frames.dtype), 8.0, 0.7)
+    uneven = replace(uneven, parameters=given, covariance=error)
+    (wrong,) = (check for check in code_checks(uneven) if check.name == "codes")
+    assert wrong.p < 1e-6
+    none = CodeSample(np.zeros_like(codes.counts), codes.origin, given)
+    assert code_checks(none) == []
+    bright = CodeSample(codes.counts, codes.origin, given * (1e5, 1.0, 1.0, 1.0))
+    assert code_checks(bright) == []

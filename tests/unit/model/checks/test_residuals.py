@@ -52,3 +52,4 @@ def test_chi_square_leaves_out_bins_with_few_samples() -> None:
     found = chi_square(data, model, variance, np.array([110, 3, 90, 50]))
     assert found.dof == 2
     assert found.value == pytest.approx(0.01 / 0.008 + 0.01 / 0.01)
+    assert found.p == pytest.approx(np.exp(-0.5 * found.value))  # of two degrees of freedom

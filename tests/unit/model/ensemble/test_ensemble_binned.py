@@ -17,6 +17,7 @@ from pchem_pipeline.model.ensemble.ensemble_binned import (
     joint_cells,
     nuced_dependent,
     nuced_independent,
+    within_limits,
 )
 from pchem_pipeline.model.law.parameters import UsablePixels
 
@@ -179,3 +180,36 @@ def test_binned_electron_mass() -> None:
     centres = 0.5 * (edges[1:] + edges[:-1])
     expected = counts / 500 @ poisson.pmf(np.arange(20), centres[:, None])
     np.testing.assert_allclose(electron_pmf_binned(exposure, 20, choice), expected, rtol=1e-10)
+
+
+def test_exposures_far_from_each_other_are_inverted_apart() -> None:
+    """One hot and one very quiet pixel; the product of the four histograms is summed cell by cell."""
+    rng = np.random.default_rng(3)
+    n = 40
+    exposure, gain = rng.uniform(0.5, 2.0, n), rng.uniform(0.19, 0.21, n)
+    exposure[0] = 300.0
+    pixels = UsablePixels(exposure, gain, rng.uniform(99.0, 101.0, n), rng.uniform(1.2, 1.6, n))
+    dn, choice = DnAxis(80, 2000), HistogramChoice(bins=3)
+    h, g, mu, s2 = (joint_cells((each,), choice) for each in (*pixels.maps[:3], pixels.read_noise_dn**2))
+    k, expected = np.arange(500), np.zeros(dn.size)
+    mass = poisson.pmf(k[:, None], h.values[0]) @ h.share
+    for (gain_cell, a), (bias, b), (v, c) in itertools.product(
+        *(zip(x.values[0], x.share, strict=True) for x in (g, mu, s2))
+    ):
+        centre = bias + k / gain_cell
+        bells = np.exp(-0.5 * (dn.dn[:, None] - centre) ** 2 / v) / np.sqrt(2 * np.pi * v)
+        expected += a * b * c * (bells @ mass)
+    np.testing.assert_allclose(epcd_independent(pixels, dn, choice), expected, atol=1e-13)
+
+
+def test_what_is_beyond_the_limits_of_the_codes_is_at_these() -> None:
+    pixels = UsablePixels(*np.outer((1.0, 0.1, 2.0, 3.0), np.ones(30)))
+    choice, dn = HistogramChoice(bins=4), DnAxis(0, 16)
+    wide = epcd_dependent(pixels, DnAxis(-60, 300), choice)
+    for curve in (epcd_dependent, epcd_independent):
+        found = within_limits(curve, pixels, dn, choice, (0, 15))
+        np.testing.assert_allclose(found[1:-1], wide[61:75], atol=1e-12)
+        np.testing.assert_allclose([found[0], found[-1]], [wide[:61].sum(), wide[75:].sum()], atol=1e-6)
+        np.testing.assert_array_equal(
+            within_limits(curve, pixels, dn, choice, None), curve(pixels, dn, choice)
+        )

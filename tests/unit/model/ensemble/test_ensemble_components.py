@@ -8,6 +8,7 @@ from scipy.stats import poisson
 
 from pchem_pipeline.model.ensemble.components import (
     COMPONENT_CASES,
+    bias_weight,
     component_widths,
     moment_errors,
     predicted_moments,
@@ -109,6 +110,30 @@ def test_moments_are_those_of_the_mixture() -> None:
     terms = found.variance_of_bias + found.variance_of_signal + found.mean_read_variance
     terms += found.mean_shot_variance + 2 * found.bias_signal_covariance
     assert found.variance == pytest.approx(terms)
+
+
+def test_pixels_whose_bias_may_be_an_electron_off_do_not_count() -> None:
+    pixels, doubtful = make_pixels(300), np.arange(300) < 60
+    h, g, mu, sigma = pixels.maps
+    wrong = UsablePixels(h + doubtful, g, mu - doubtful / g, sigma)
+    weight = bias_weight(np.where(doubtful, 0.0, np.inf))
+    kept = pixels.of(~doubtful)
+    expected, found = component_widths(kept, 15), component_widths(wrong, 15, weight)
+    for name in ("mean", "variance", "nuced_variance"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-10)
+    right = predicted_moments(kept).variance_of_bias
+    assert predicted_moments(wrong, weight).variance_of_bias == pytest.approx(right)
+    assert predicted_moments(wrong).variance_of_bias > 1.1 * right
+    # of many with a rival at 1 nat as many are wrong as its posterior says: Var(mu) is right on average
+    rng, weight = np.random.default_rng(4), bias_weight(np.full(20_000, 1.0))
+    bias = 100.0 + rng.standard_normal(20_000) + 10.0 * (rng.random(20_000) < 1.0 / (1.0 + np.e))
+    many = UsablePixels(*np.outer((2.0, 0.1), np.ones(20_000)), bias, np.full(20_000, 3.0))
+    found = predicted_moments(many, weight).variance_of_bias
+    # 1 DN^2; a share p of 10 DN scatters by its binomial error
+    assert found == pytest.approx(1.0, abs=4 * 100 * 0.46 * np.sqrt(0.27 * 0.73 / 20_000))
+    assert bias.var() > 15.0
+    np.testing.assert_allclose(bias_weight(np.array([0.0, np.log(3.0), np.nan])), [0.0, 0.5, 1.0])
+    np.testing.assert_array_equal(bias_weight(np.zeros(3)), 1.0)  # nothing else to go by
 
 
 def test_sample_moments_at_a_large_bias() -> None:

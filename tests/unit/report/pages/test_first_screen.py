@@ -153,3 +153,25 @@ def test_next_is_what_the_run_lacks() -> None:
     assert next_steps(replace(data, n_frames=500))[0].command == "pchem view RUN"
     unfinished = replace(data, stages=[{"stage": "fit", "state": "3 of 4 units"}])
     assert [step.command for step in next_steps(unfinished)] == ["pchem run RUN"]
+
+
+def test_two_taps_are_said_with_the_medians_of_both() -> None:
+    data = report_data((40, 64), failed=0.0)
+    noise = np.random.default_rng(6).standard_normal((40, 64))
+    gain = np.where(np.arange(64) < 32, 0.100, 0.115) * (1.0 + 0.01 * noise)
+    data = replace(data, maps={**data.maps, "conversion_gain": gain})
+    (found,) = (flag for flag in flags(data) if flag.text.startswith("Conversion gain has a step"))
+    assert found.level == "caution"
+    assert "columns 0 to 31: 0.1" in found.text
+    assert "columns 32 to 63: 0.115" in found.text
+
+
+@pytest.mark.parametrize(
+    ("ratio", "p", "level"),
+    [(1.5, 0.2, "good"), (1.2, 1e-9, "good"), (1.5, 1e-9, "caution"), (4.0, 1e-9, "serious")],
+)
+def test_a_difference_counts_where_it_is_large_and_no_chance(ratio: float, p: float, level: str) -> None:
+    facts = {"rmse": {"epcd_exact": ratio, "noise_floor": 1.0}, "chi_square": {"p": p}}
+    data = replace(report_data((8, 8), failed=0.0), ensemble_facts=facts)
+    (found,) = (flag for flag in flags(data) if flag.text.startswith("The RMSE of the predicted raw"))
+    assert found.level == level

@@ -40,6 +40,7 @@ NOT_HERE = {
     "map_dark_current",
     "map_charge_per_level",
     "map_spurious_charge",
+    "map_dark_signal",
     "methods_gain_error",
     "frames_needed",
 }

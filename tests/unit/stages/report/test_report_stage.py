@@ -99,7 +99,13 @@ def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
     context = make_context(folder, {"figure_formats": ["svg"]}, title="My <sensor>")
     assert execute("report", context).state == "complete"
     store = folder / "run.zarr"
-    of_others = {"exposures", "photon_transfer", "map_charge_per_level", "map_spurious_charge"}
+    of_others = {
+        "exposures",
+        "photon_transfer",
+        "map_charge_per_level",
+        "map_spurious_charge",
+        "map_dark_signal",
+    }
     of_others |= {"map_dark_current"}
     of_others |= {"methods_gain_error", *(name for _, name in DISCREPANCY_FIGURES)}
     names = {f"{name}.svg" for name in set(FIGURE_NAMES) - of_others}

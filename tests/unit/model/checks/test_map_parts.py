@@ -1,0 +1,57 @@
+"""Steps and modes of maps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.model.checks.map_parts import map_parts
+
+
+def taps(rng: np.random.Generator, shape: tuple[int, int] = (48, 64)) -> np.ndarray:
+    return np.where(np.arange(shape[1]) < 32, 0.100, 0.115) * (1 + 0.02 * rng.standard_normal(shape))
+
+
+def test_two_taps_are_found_along_columns_and_rows() -> None:
+    values = taps(np.random.default_rng(1))
+    values[::7, 3] = np.nan
+    (found,) = map_parts(values)
+    assert (found.axis, found.edges) == ("columns", (0, 32, 64))
+    assert found.medians == pytest.approx((0.100, 0.115), rel=4 * 1.25 * 0.02 / np.sqrt(48 * 32))
+    (turned,) = map_parts(values.T)
+    assert (turned.axis, turned.edges, turned.medians) == ("rows", found.edges, found.medians)
+
+
+def test_three_parts_on_a_slope() -> None:
+    rng, x = np.random.default_rng(2), np.arange(90)
+    level = 100.0 + 0.05 * x + 12.0 * ((x >= 20) & (x < 60))
+    (found,) = map_parts(level + rng.standard_normal((40, 90)))
+    assert found.edges == (0, 20, 60, 90)
+
+
+def test_alternating_columns_are_two_modes() -> None:
+    rng = np.random.default_rng(3)
+    values = np.where(np.arange(64) % 2, 0.115, 0.100) * (1 + 0.02 * rng.standard_normal((48, 64)))
+    (found,) = map_parts(values)
+    assert found.axis == "modes"
+    assert found.medians == pytest.approx((0.100, 0.115), rel=0.005)
+
+
+def test_maps_of_one_part_give_nothing() -> None:
+    """At most 1 in 10,000 may; of 300 none: uniform, shaded, skewed, with columns that differ, with gaps."""
+    rng, (y, x) = np.random.default_rng(4), np.mgrid[-1:1:40j, -1:1:56j]
+    for i in range(60):
+        noise = rng.standard_normal(y.shape)
+        vignetted = 10.0 * np.exp(-((x - 0.2) ** 2) - y**2) + 0.1 * noise
+        gaps = np.where(rng.random(y.shape) < 0.2, np.nan, noise)
+        for values in (
+            noise,
+            vignetted,
+            rng.exponential(size=y.shape),
+            noise + rng.standard_normal(56),
+            gaps,
+        ):
+            assert map_parts(values) == [], i
+    assert map_parts(np.full((8, 8), 2.0)) == []
+    assert map_parts(np.full((8, 8), np.nan)) == []
+    assert map_parts(np.arange(6.0)[None]) == []
