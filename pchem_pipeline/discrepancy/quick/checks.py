@@ -137,6 +137,10 @@ _SIGNS: dict[str, tuple[str, ...]] = {
     "repeated_frames": ("frame.repeated",),
     "codes": ("code.rough", "code.smooth"),
     "top_code": ("code.top",),
+    "bottom_code": ("code.bottom",),
+    "wave": ("space.sample.readout.line", "space.sample.readout.spectrum"),
+    "odd_frames": ("frame.readout.largest", "frame.readout.quadrants"),
+    "empty_frames": (),
 }  # fmt: skip
 
 
@@ -176,6 +180,9 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "wandering_pixels": (0.01, 0.2),
     "codes": (0.1, 0.5),
     "top_code": (1e-4, 1e-2),
+    "bottom_code": (1e-4, 1e-2),
+    "odd_frames": (0.0, 0.05),
+    "empty_frames": (0.01, 0.1),
 }
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.observe.laws import chi_square
+from pchem_pipeline.discrepancy.observe.laws import chi_square, without_skew
 from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLook, graded
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.levels import levels_check
@@ -36,6 +36,7 @@ from pchem_pipeline.discrepancy.quick.places import (
 from pchem_pipeline.discrepancy.quick.series import normal_p, of_many, series_checks
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, frame_words, odd_words
 from pchem_pipeline.model.maps.ordered import median_of
 
 if TYPE_CHECKING:
@@ -81,15 +82,78 @@ def quick_look(
     usable = maps.usable
     gain, noise = (median_of(values, ~usable) for values in (maps.conversion_gain, maps.read_noise_dn))
     if sums is not None and sums.freedom > 0:
-        checks.append(levels_check(sums.frame_mean, sums.frame_variance, gain))
-        checks += _stack_checks(sums, maps)
+        checks.append(levels_check(sums.all_means, sums.all_variances, gain))
+        checks += [*_odd_frames(sums), *_stack_checks(sums, maps), *_wave(sums)]
     if codes is not None:
         checks += code_checks(codes)
     samples = 0 if sums is None else sums.n_frames * int(np.prod(sums.shape))
     found, unseen = graded(checks, gain, noise, model), dict(missing or {})
+    made = {check.name for check in found}
+    unseen |= {} if sums is None else {part: why for name, (part, why) in _NEEDS.items() if name not in made}
     if found and found[0].name == "levels" and found[0].level == "serious":
         found, unseen = found[:1], {**unseen, "all else": "the frames are of several exposures"}
     return QuickLook(found, unseen, samples, command)
+
+
+#: Checks that a stack can be too small for: what they look at, and why it was not.
+_NEEDS = {
+    "wandering_pixels": ("pixels along the run", "frames are fewer than four blocks, of 32 or more each"),
+    "drift": ("the mean of the frames along the run", "frames are fewer than 64"),
+    "wave": ("pickup along the reading order", "rows or columns are fewer than 8"),
+    "frame_noise": ("what all pixels of a frame share", "rows or columns are fewer than 4"),
+}
+
+
+def _odd_frames(sums: StackSums) -> list[Check]:
+    """Return whether frames are empty or far from the others: all other checks are of the rest."""
+    n, odd = sums.all_means.size, sums.odd
+    if not odd:
+        return []
+    nothing = odd["far"][:0]
+    size = odd["far"].size
+    first = size > 0 and int(odd["far"][-1]) == size - 1
+    cure = f"with --frames {size}: (input.frame_range)" if first else "in the files, or by input.frame_range"
+    kinds = (
+        ("odd_frames", "frames stand out", "far", f"the fit has them: leave them out {cure}"),
+        ("empty_frames", "frames are empty", "empty", "they are left out of histograms and sums"),
+    )
+    return [
+        Check(
+            name,
+            title,
+            # the largest that frames so far from the others, or such an empty one, have
+            min(n * FAR_CHANCE, 1.0) if odd[kind].size else 1.0,
+            odd[kind].size / n,
+            "1",
+            limit=1.0 / n,
+            where=odd_words({**dict.fromkeys(odd, nothing), kind: odd[kind]}, sums.all_means),
+            advice=advice,
+        )
+        for name, title, kind, advice in kinds
+    ]
+
+
+def _wave(sums: StackSums) -> list[Check]:
+    """Return whether one wave runs across the samples of the frames as they are read."""
+    line = sums.spectrum
+    if not line:
+        return []
+    frames, cells = line["frames"], line["cells"]
+    cycles = (f"{line[f'cycles_per_{of}']:+.3g} cycles per {of}" for of in ("column", "row"))
+    # of so many means of exponential numbers the largest
+    sure = (math.sqrt(2.0 * math.log(cells)) + 3.0) / math.sqrt(frames)
+    return [
+        Check(
+            "wave",
+            "a wave runs across the samples in the order of reading",
+            of_many(float(special.gammaincc(frames, frames * line["ratio"])), cells),
+            line["size"],
+            "DN",
+            limit=line["unit"] * math.sqrt(sure),
+            where=", ".join(cycles),
+            advice="pickup: it widens the read noise; pchem discrepancy finds its frequency",
+        )
+    ]
 
 
 @dataclass(frozen=True)
@@ -128,10 +192,10 @@ def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
         checks.append(_noise_check("column_noise", "the pixels of a column move together",
                                    columns.less(frame) if math.isfinite(frame.error) else columns,
                                    sums.columns, "column", sums.shape[1]))  # fmt: skip
-    mean, error, skewness = _frame_means(sums, maps)
-    checks += series_checks(mean, error, skewness)
+    third = _third_moment(maps)
+    checks += series_checks(*_frame_means(sums, third), sums.numbers)
     common = _Common(frame, rows, columns, sums)
-    checks += [*_lag_check(sums, common), *_neighbour_checks(sums, common), *_wandering(sums, maps)]
+    checks += [*_lag_check(sums, common), *_neighbour_checks(sums, common), *_wandering(sums, maps, third)]
     return [*_located(checks, sums), *_repeats(sums)]
 
 
@@ -263,7 +327,7 @@ def _frame_covariance(sums: StackSums) -> tuple[_Estimate, _Estimate]:
     neighbours = along * float(np.mean(down[np.isfinite(down)])) if np.isfinite(down).any() else 0.0
     pairs_all = pairs * nx
     in_columns = columns.value if math.isfinite(columns.error) else 0.0
-    others = pairs_all - pairs - along * 0.0
+    others = pairs_all - pairs
     estimate = (value - neighbours - (pairs - along) * in_columns) / others
     error = chance / others
     if math.isfinite(columns.error):
@@ -317,7 +381,16 @@ def _single_lines(lines: Lines, line: str, width: int) -> tuple[float, str]:
     return of_many(float(p.min()), p.size), words
 
 
-def _frame_means(sums: StackSums, maps: PixelMaps) -> tuple[FloatArray, float, float]:
+def _third_moment(maps: PixelMaps) -> FloatArray:
+    """Return the third central moment of each pixel's samples, H / g^3, 0 where it is not known, DN^3."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        third = maps.conversion_gain**3
+        np.divide(maps.quanta_exposure, third, out=third)
+    third[~maps.usable] = 0.0
+    return third
+
+
+def _frame_means(sums: StackSums, third: FloatArray) -> tuple[FloatArray, float, float]:
     """Return the mean of each frame over the quiet rows, its standard deviation and skewness by chance.
 
     Where the sums of some frames are not at hand, over all rows.
@@ -328,10 +401,6 @@ def _frame_means(sums: StackSums, maps: PixelMaps) -> tuple[FloatArray, float, f
     pixels = quiet.sum() * sums.shape[1]
     mean = sums.row_sum[:, quiet].sum(axis=1) / pixels if sums.whole else sums.frame_mean
     scale = float(sums.rows.variance[quiet].sum())
-    with np.errstate(divide="ignore", invalid="ignore"):
-        third = maps.conversion_gain**3
-        np.divide(maps.quanta_exposure, third, out=third)
-    third[~maps.usable] = 0.0
     return mean, math.sqrt(scale) / pixels, float(third[quiet].sum() / scale**1.5)
 
 
@@ -461,8 +530,8 @@ def _neighbour_checks(sums: StackSums, common: _Common) -> list[Check]:
     return found
 
 
-def _wandering(sums: StackSums, maps: PixelMaps) -> list[Check]:
-    """Return whether single pixels change their level along the run, less what all pixels do."""
+def _wandering(sums: StackSums, maps: PixelMaps, third: FloatArray) -> list[Check]:
+    """Return whether pixels change their level along the run, less what all pixels do."""
     lengths = sums.lengths
     if lengths.size < _FEWEST_BLOCKS:
         return []
@@ -476,47 +545,49 @@ def _wandering(sums: StackSums, maps: PixelMaps) -> list[Check]:
     basis = np.stack([np.ones(charge.size), charge])
     inner = (basis * weight) @ basis.T
     shared = np.linalg.lstsq(inner, (basis * weight) @ values.T, rcond=None)[0]
-    chi2 = (lengths[:, None] * (values - shared.T @ basis) ** 2).sum(axis=0) * weight
+    skewness = third[some] * weight**1.5
+    chi2 = np.zeros(charge.size)
+    for n, mean, common in zip(lengths.tolist(), values, shared.T @ basis, strict=True):
+        # block by block: each is as large as a map; the mean of few samples is as skewed as they are
+        chi2 += without_skew((mean - common) * np.sqrt(n * weight), skewness / math.sqrt(n)) ** 2
     p = special.chdtrc(lengths.size - 1.0, chi2)
     out = np.flatnonzero(p < _WANDERS)
-    share = out.size / p.size
     places = np.argwhere(some)[out[np.argsort(-chi2[out])][:3]]
     shown = ", ".join(f"({y}, {x})" for y, x in places)
     return [
         Check(
             "wandering_pixels",
-            "single pixels change their level along the run",
-            1e-12 if out.size else 1.0,
-            share,
+            "pixels change their level along the run",
+            of_many(float(p.min()), p.size) if out.size else 1.0,
+            out.size / p.size,
             "1",
             limit=2.0 / p.size,
             where=f"{out.size:,} pixels, most at (y, x) {shown}" if out.size else "",
-            advice="their exposure is a mean over states",
+            advice="their exposure and read noise are of several levels: a region that was moved, "
+            "a drift, or blinking pixels",
         )
     ]
 
 
 def _repeats(sums: StackSums) -> list[Check]:
-    """Return whether frames repeat the one before: all sums over rows, and of squares, are the same."""
+    """Return whether frames equal an earlier one: all sums over rows, and of squares, are the same."""
     variance = sums.rows.variance
     some = variance > 0
-    # a row repeats its sum by chance with the density of the difference at 0
-    log_chance = float(np.log(np.minimum(1.0, 0.5 / np.sqrt(np.pi * variance[some]))).sum())
-    if not some.any() or log_chance + math.log(sums.n_frames) > math.log(1e-9):
+    # a row repeats its sum by chance with the density of the difference at 0, in any pair of frames
+    log_p = float(np.log(np.minimum(1.0, 0.5 / np.sqrt(np.pi * variance[some]))).sum())
+    log_p += 2.0 * math.log(sums.n_frames)
+    if not some.any() or log_p > math.log(1e-9) or not sums.odd:
         return []
-    same = sums.repeated.tolist()
-    words = ", ".join(str(t) for t in same[:_SHOWN]) + (
-        f" and {len(same) - _SHOWN} more" if len(same) > _SHOWN else ""
-    )
+    same = sums.odd["copied"]
     return [
         Check(
             "repeated_frames",
-            "frames repeat the one before",
-            1e-12 if same else 1.0,
-            len(same) / sums.n_frames,
+            "frames equal an earlier one",
+            math.exp(max(log_p, -700.0)) if same.size else 1.0,
+            same.size / sums.all_means.size,
             "1",
-            limit=1.0 / sums.n_frames,
-            where=f"frame{'s' if len(same) > 1 else ''} {words}" if same else "",
+            limit=1.0 / sums.all_means.size,
+            where=frame_words(same) if same.size else "",
             advice="there are fewer samples than frames, and standard errors are too small",
         )
     ]

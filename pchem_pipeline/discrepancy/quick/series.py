@@ -8,17 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.observe.laws import best, chi_square
+from pchem_pipeline.discrepancy.observe.laws import best, chi_square, without_skew
 from pchem_pipeline.discrepancy.quick.checks import Check
+from pchem_pipeline.model.histogram.odd_frames import frame_words
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 _SLOWEST = (2, 4, 8, 16, 32)
 _FEWEST_FRAMES = 64
 #: Frequencies on either side from which the noise around one is taken.
 _AROUND = 64
 _CLIP = 6.0
-_SHOWN = 6
 
 
 def normal_p(z: float, *, two_sided: bool = False) -> float:
@@ -31,7 +32,7 @@ def of_many(p: float, n: float) -> float:
     return float(-np.expm1(n * np.log1p(-min(max(p, 0.0), 1.0 - 1e-16))))
 
 
-def series_checks(mean: FloatArray, error: float, skewness: float) -> list[Check]:
+def series_checks(mean: FloatArray, error: float, skewness: float, numbers: IntArray) -> list[Check]:
     """Return the checks of the frames' means.
 
     All but that of single frames compare the series with itself in another order, so that noise of frame to
@@ -41,6 +42,7 @@ def series_checks(mean: FloatArray, error: float, skewness: float) -> list[Check
         mean: of each frame, over the same pixels, DN, (n,).
         error: its standard deviation where pixels are independent, DN.
         skewness: likewise.
+        numbers: of the frames, (n,).
     """
     n = mean.size
     if n < _FEWEST_FRAMES:
@@ -55,7 +57,12 @@ def series_checks(mean: FloatArray, error: float, skewness: float) -> list[Check
         return []
     smooth, drift = _drift(series, noise)
     rest = series - smooth
-    return [drift, _period(rest), _memory(rest), _single(mean - smooth, spread, error, skewness)]
+    return [
+        drift,
+        _period(rest),
+        _memory(rest),
+        _single(mean - smooth, max(spread, error), skewness, numbers),
+    ]
 
 
 def _drift(series: FloatArray, noise: float) -> tuple[FloatArray, Check]:
@@ -155,24 +162,19 @@ def _memory(series: FloatArray) -> Check:
     )
 
 
-def _single(series: FloatArray, spread: float, error: float, skewness: float) -> Check:
+def _single(series: FloatArray, spread: float, skewness: float, numbers: IntArray) -> Check:
     """Return whether single frames stand out."""
-    centre = float(np.median(series))
-    z = (series - centre) / max(spread, error)
-    # the law of a sum of counts is a little skewed (Wilson and Hilferty)
-    skew = skewness if abs(skewness) > 1e-6 else 1e-6
-    normal = 6.0 / skew * (np.cbrt(np.maximum(1.0 + 0.5 * skew * z, 0.0)) - 1.0) + skew / 6.0
-    p = 2.0 * special.ndtr(-np.abs(normal))
+    z = (series - float(np.median(series))) / spread
+    # the law of a sum of counts is a little skewed
+    p = 2.0 * special.ndtr(-np.abs(without_skew(z, np.full(z.size, skewness))))
     out = np.flatnonzero(p < 1e-3 / p.size)
-    largest = int(np.argmin(p))
-    shown = out[np.argsort(p[out])][:_SHOWN] if out.size else np.array([largest])
-    more = f" and {out.size - shown.size} more" if out.size > shown.size else ""
+    shown = out if out.size else np.array([int(np.argmin(p))])
     return Check(
         "single_frames",
         "single frames stand out",
-        of_many(float(p[largest]), p.size),
-        max(out.size, 1) / series.size,
+        of_many(float(p.min()), p.size),
+        shown.size / series.size,
         "1",
-        where=f"frame{'s' if shown.size > 1 else ''} {', '.join(str(i) for i in np.sort(shown))}{more}",
+        where=frame_words(numbers[shown], 6),
         advice="leave them out (input.frame_range), or see what happened there",
     )

@@ -27,6 +27,7 @@ from pchem_pipeline.stages.bands import Band, plan_bands
 from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, create_counts, row_frames
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import bytes_per_row
+from pchem_pipeline.stages.histogram.odd_frames import leave_out_odd_frames
 from pchem_pipeline.stages.histogram.shown_sample import copy_shown_sample
 
 if TYPE_CHECKING:
@@ -99,13 +100,12 @@ def run(context: StageContext) -> None:
 
 def _end(context: StageContext, areas: Sequence[Band | Tile]) -> None:
     """Do what needs the whole sensor."""
-    if number := sum(_pixels_outside(context, area) for area in areas):
-        bins = context.store.array("histogram/counts").shape[2]
-        context.note(
-            f"{number} pixels have DN outside of their {bins} bins; they are counted as under or over"
-        )
     if context.config.histogram.summaries:
         _write_frame_statistics(context, (context.sensor.n_frames, *context.sensor.shape))
+    if number := sum(_pixels_outside(context, area) for area in areas):
+        bins = context.store.array("histogram/counts").shape[2]
+        words = "pixels have" if number > 1 else "pixel has"
+        context.note(f"{number} {words} samples outside of the histogram of {bins} bins")
 
 
 def _pixels_outside(context: StageContext, area: Band | Tile) -> int:
@@ -166,6 +166,7 @@ def _write_frame_statistics(context: StageContext, shape: tuple[int, int, int]) 
         mean[part], variance[part] = frame_statistics(sums, squares, nx)
     context.store.write_array("summary/frame_mean", mean)
     context.store.write_array("summary/frame_variance", variance)
+    leave_out_odd_frames(context, mean, variance)
 
 
 # -- ready-made histograms ----------------------------------------------------------------------

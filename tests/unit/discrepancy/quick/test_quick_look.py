@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any, ClassVar, Literal
 
@@ -69,7 +70,7 @@ def clean() -> QuickLook:
 def test_a_clean_stack_passes_all_checks(clean: QuickLook) -> None:
     assert clean.found == ()
     assert {check.level for check in clean.checks} == {"good"}
-    assert len(clean.checks) == 16
+    assert len(clean.checks) == 20
     assert clean.samples == np.prod(SHAPE)
 
 
@@ -314,10 +315,15 @@ def test_repeated_and_single_frames_are_told_by_their_numbers() -> None:
     frames[77] += 3
     found = by_name(looked(frames))
     assert found["repeated_frames"].where == "frame 400"
+    # the error of the mean of a frame is 0.3 DN
+    assert re.fullmatch(r"frame 77 is (2|3|4)(\.\d)? DN above the others", found["odd_frames"].where)
+    assert {check.name for check in found.values() if check.found} == {"repeated_frames", "odd_frames"}
+    assert found["odd_frames"].level == "caution"
+    frames[77] -= 1  # too near to the others to be left out
+    found = by_name(looked(frames))
     assert found["single_frames"].where == "frame 77"
     assert found["single_frames"].found
     assert found["single_frames"].level == "note"
-    assert not found["frame_noise"].found
 
 
 @pytest.mark.parametrize("size", [0.05, 0.15])
@@ -373,5 +379,5 @@ def test_probabilities_count_all_checks(clean: QuickLook) -> None:
 def test_without_summaries_only_codes_are_looked_at() -> None:
     frames = stack(np.random.default_rng(15), (400, 8, 8))
     look = quick_look(None, maps_of((8, 8)), codes_of(frames), missing={"rows": "no order in time"})
-    assert [check.name for check in look.checks] == ["codes", "top_code"]
+    assert [check.name for check in look.checks] == ["codes", "top_code", "bottom_code"]
     assert look.to_dict()["missing"] == {"rows": "no order in time"}

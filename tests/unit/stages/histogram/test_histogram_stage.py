@@ -195,7 +195,7 @@ def test_a_failed_band_leaves_the_others_and_resumes(tmp_path, frames, expected,
     again = make_context(tmp_path, frames)
     assert execute("histogram", again).state == "complete"
     assert_equal(contents(again.store), expected)
-    assert any("2 pixels have DN outside" in note for note in again.notes)
+    assert any("2 pixels have samples outside" in note for note in again.notes)
 
 
 def _single_bands(context: StageContext) -> list[histogram.Band]:
