@@ -70,7 +70,7 @@ def code_checks(sample: CodeSample) -> list[Check]:
     codes = _sums(sample)
     if codes is None:
         return []
-    ends = [_pile_up(codes, -1), _pile_up(codes, 0)]
+    ends = [_pile_up(codes, sample, -1), _pile_up(codes, sample, 0)]
     # cut off, the law of all codes is another one
     widths = None if any(check.p < 1e-6 for check in ends) else _widths(codes)
     return [check for check in (widths, *ends) if check is not None]
@@ -134,11 +134,12 @@ def _widths(codes: CodeSums) -> Check | None:
     )
 
 
-def _pile_up(codes: CodeSums, end: int) -> Check:
+def _pile_up(codes: CodeSums, sample: CodeSample, end: int) -> Check:
     """Return whether so many samples are at the lowest (0) or highest (-1) code that it cuts off."""
     seen, expected = codes.single[:2]
     at = int(np.flatnonzero(seen)[end])
     beyond = expected[at + 1 :] if end else expected[:at]
+    bins = sample.origin[:, None] + np.arange(sample.counts.shape[1])
     on = float(expected[at])
     # a fit that expects too many beyond is poor; what is cut off is on the code
     z = min(extreme(int(seen[at]), on, float(beyond.sum())), poisson(int(seen[at]), on))
@@ -152,7 +153,7 @@ def _pile_up(codes: CodeSums, end: int) -> Check:
         f"{side}_code",
         f"samples pile up at the {level} code",
         normal_p(z),
-        float(seen[at] / seen.sum()),
+        float(sample.counts[bins == codes.first + at].sum() / sample.counts.sum()),
         "1",
         where=f"{codes.first + at} DN",
         advice=cure,

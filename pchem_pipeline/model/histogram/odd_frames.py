@@ -26,17 +26,22 @@ def far_frames(mean: FloatArray, variance: FloatArray, pixels: int) -> IntArray:
         variance: likewise, DN^2; it bounds what independent pixels do to the mean.
         pixels: of a frame.
     """
-    away = levels_apart(mean)
-    if away.size < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS:
+    if mean.size < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS:
         return np.zeros(0, np.int64)
-    noise = max(1.4826 * float(np.median(np.abs(away))), float(np.sqrt(np.median(variance) / pixels)))
-    return _few(np.flatnonzero(np.abs(away) > _FAR * noise), mean.size)
+    away, size = levels_apart(mean), _around(mean)
+    # around a frame the means spread by a drift, too, which the median at an end of the run does not follow
+    low, high = (ndimage.percentile_filter(mean, share, size) for share in (25, 75))
+    floor = max(1.4826 * float(np.median(np.abs(away))), float(np.sqrt(np.median(variance) / pixels)))
+    return _few(np.flatnonzero(np.abs(away) > _FAR * np.maximum((high - low) / 1.349, floor)), mean.size)
 
 
 def levels_apart(mean: FloatArray) -> FloatArray:
     """Return the means of frames less the median of those around them in time, DN."""
-    size = min(_AROUND, max(mean.size // 2, 1))
-    return np.asarray(mean - ndimage.median_filter(mean, size))
+    return np.asarray(mean - ndimage.median_filter(mean, _around(mean)))
+
+
+def _around(mean: FloatArray) -> int:
+    return min(_AROUND, max(mean.size // 2, 1))
 
 
 def copied_frames(

@@ -63,13 +63,15 @@ class FrameSpectrum:
         )
         ratio = power / noise
         y, x = (int(i) for i in np.unravel_index(int(ratio.argmax()), ratio.shape))
-        near = np.s_[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+        # a wave between two frequencies is in those around both
+        near, wide = (power[max(y - r, 0) : y + r + 1, max(x - r, 0) : x + r + 1] for r in (2, 7))
+        excess = float(near.sum()) - near.size * float(np.median(wide))
         unit = self._sd * (2.0 / self._pixels) ** 0.5
         return {
             "ratio": float(ratio[y, x]),
             "cells": float(ratio.size),
             "frames": float(self._n),
-            "size": unit * max(float((power[near] - noise[near]).sum()), 0.0) ** 0.5,
+            "size": unit * max(excess, 0.0) ** 0.5,
             "unit": unit,
             "cycles_per_row": ((y + 1) / rows + 0.5) % 1.0 - 0.5,
             "cycles_per_column": (x + 1) / columns,

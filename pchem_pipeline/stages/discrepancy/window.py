@@ -56,6 +56,7 @@ def choose_window(
     settings: DiscrepancySettings,
     roi: Sequence[int] | None = None,
     places: Mapping[str, SensorPlace] | None = None,
+    left_out: Sequence[int] = (),
 ) -> Window:
     """Return what to look at: everything if small enough, else a window and blocks over the whole run.
 
@@ -67,8 +68,10 @@ def choose_window(
         settings: frames x pixels and pixels to look at, and frames in a block.
         roi: rows and columns that the user asked for: y0, y1, x0, x1.
         places: where the survey found that the sensor stands out.
+        left_out: odd frames, which are not looked at.
     """
-    n_frames, ny, nx = shape
+    kept = np.setdiff1d(np.arange(shape[0], dtype=np.int64), left_out)
+    n_frames, ny, nx = kept.size, *shape[1:]
     y0, y1, x0, x1 = roi or (0, ny, 0, nx)
     within = (y1 - y0) * (x1 - x0)
     frames = min(n_frames, max(_FRAMES_WANTED, settings.max_samples // max(within, 1)))
@@ -78,11 +81,11 @@ def choose_window(
         width = min(x1 - x0, pixels // height)
         y0, x0 = _corner(_worst(places or {}, shape[1:]), (y0, y1, x0, x1), (height, width))
         y1, x1 = y0 + height, x0 + width
-    numbers = np.arange(n_frames, dtype=np.int64)
+    numbers = kept
     if frames < n_frames:
         length = block_length(frames, settings.block_frames)
         starts = np.linspace(0, n_frames - length, frames // length).astype(np.int64)
-        numbers = (starts[:, None] + np.arange(length)).ravel()
+        numbers = kept[(starts[:, None] + np.arange(length)).ravel()]
     return Window(numbers, (y0, y1), (x0, x1))
 
 

@@ -22,6 +22,7 @@ from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.model.histogram.count import histogram_frames
+from pchem_pipeline.model.histogram.settings import HistogramSettings
 
 SHAPE = (800, 32, 32)
 SIGMA = READ_NOISE / GAIN  # DN
@@ -346,6 +347,51 @@ def test_clipping_is_found() -> None:
     rng = np.random.default_rng(12)
     look = looked(stack(rng, SHAPE, lambda dn: np.minimum(dn, 222.0)))
     assert "top_code" in {check.name for check in look.found}
+
+
+def test_samples_cut_off_at_0_are_the_black_level_and_no_widths() -> None:
+    frames = stack(np.random.default_rng(12), SHAPE, lambda dn: dn - dn.mean(axis=(0, 1, 2)) + 11.0)
+    found = by_name(looked(frames))
+    assert found["bottom_code"].found
+    assert found["bottom_code"].size == pytest.approx(np.mean(frames == 0), rel=0.02)
+    assert found["bottom_code"].where == "0 DN"
+    assert "black level is too low" in found["bottom_code"].advice
+    assert "codes" not in found
+    assert not found["top_code"].found
+
+
+@pytest.mark.parametrize("n", [700, 1000, 1500])
+def test_a_region_that_is_moved_in_the_middle_of_the_run_is_found(n: int) -> None:
+    frames = stack(np.random.default_rng(17), (n, 16, 16))
+    frames[n // 2 :] = np.roll(frames[n // 2 :], 1, axis=2)
+    block = HistogramSettings().block_length(n)
+    look = quick_look(sums_of(frames, block), maps_of((16, 16)))
+    assert "wandering_pixels" in {check.name for check in look.found}
+    assert "pixels along the run" not in look.missing
+    short = quick_look(sums_of(frames[:90], HistogramSettings().block_length(90)), maps_of((16, 16)))
+    assert "pixels along the run" in short.missing
+
+
+@pytest.mark.parametrize("exposure", [0.01, 0.05, 0.3, 30.0])
+def test_pixels_with_few_electrons_in_a_block_do_not_wander(exposure: float) -> None:
+    """The means of blocks are as skewed as Poisson counts of a few; 20,000 pixels, a look at each."""
+    for seed in range(4):
+        frames = stack(np.random.default_rng(seed), (600, 70, 71), exposure=exposure)
+        look = quick_look(sums_of(frames, 37), maps_of((70, 71), exposure))
+        assert not by_name(look)["wandering_pixels"].found
+
+
+def test_a_pickup_along_the_reading_order_is_found_with_its_size() -> None:
+    """A wave of 19 % of the read noise, whose phase runs on from row to row and is new in every frame."""
+    rng = np.random.default_rng(18)
+    n, ny, nx = 1500, 24, 24
+    t = np.arange(ny)[:, None] * (nx + 5) + np.arange(nx)
+    phase = rng.uniform(0.0, 2.0 * np.pi, (n, 1, 1))
+    size = 0.19 * SIGMA
+    look = looked(stack(rng, (n, ny, nx), lambda dn: dn + size * 2.0**0.5 * np.sin(0.613 * t + phase)))
+    assert look.found[0].name == "wave"
+    # a frequency between those of the spectrum is spread over more than are summed
+    assert 0.7 * size < look.found[0].size < 1.2 * size
 
 
 def test_what_the_model_has_is_a_remark() -> None:
