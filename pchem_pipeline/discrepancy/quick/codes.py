@@ -82,13 +82,13 @@ def _sums(sample: CodeSample) -> CodeSums | None:
     settings = FitSettings(likelihood="exact")
     fit = fit_histograms(sample.counts, origin, settings=settings, start=sample.parameters)
     found = np.stack([fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
-    usable = np.isfinite(found).all(axis=1)
+    usable: NDArray[np.bool_] = np.asarray(np.isfinite(found).all(axis=1))
     for _ in range(2):  # of all pixels, then without those that may be at a wrong maximum
         laws = pixel_laws(sample.counts, origin, np.zeros((n, 2)), found, usable)
         if not laws.good.any():
             return None
         ratio = laws.moments[:, CHI2] / np.maximum(laws.moments[:, CHI2 + 1], 1.0)
-        usable = laws.good & (ratio <= _POOR * np.median(ratio[laws.good]))
+        usable = np.asarray(laws.good) & (ratio <= _POOR * np.median(ratio[laws.good]))
     return laws.codes
 
 

@@ -8,7 +8,7 @@ from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
 from pchem_pipeline.report.style.wording import percent, short
 
 #: What was looked at, in the order of a reader's questions.
-_SUBJECTS = "frames, rows, columns, neighbours, successive samples and codes"
+_SUBJECTS = "frames, rows, columns, neighbours, successive samples, pickup and codes"
 
 
 #: What a check of resemblance finds where the correlation is negative.
