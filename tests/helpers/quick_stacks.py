@@ -11,7 +11,7 @@ from pchem_pipeline.discrepancy.quick.codes import CodeSample
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.histogram.count import histogram_frames
-from pchem_pipeline.model.histogram.odd_frames import copied_frames, far_frames, left_out
+from pchem_pipeline.model.histogram.odd_frames import left_out, odd_frames
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,
@@ -45,11 +45,9 @@ def sums_of(frames: Array, block: int = 256) -> StackSums:
     """The summaries as the stage ``histogram`` makes them; odd frames are in none of the sums."""
     lines = line_sums(frames)
     mean, variance = frame_statistics(lines.row_sum, lines.row_sum_square, frames.shape[2])
-    odd = {
-        "empty": np.zeros(0, np.int64),
-        "copied": copied_frames(mean, variance, lambda at: [frames[t].tobytes() for t in at]),
-        "far": far_frames(mean, variance, frames[0].size),
-    }
+    _, digest = np.unique(frames.reshape(len(frames), -1), axis=0, return_inverse=True)
+    level = np.median(lines.row_sum - np.median(lines.row_sum, axis=0), axis=1) / frames.shape[2]
+    odd = odd_frames(level, variance, digest.ravel(), frames[0].size)
     numbers = np.setdiff1d(np.arange(len(frames)), left_out(odd, len(frames)))
     frames = frames[numbers]
     n, ny, nx = frames.shape

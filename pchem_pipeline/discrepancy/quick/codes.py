@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.observe.laws import chi_square, extreme, largest_normal, poisson
+from pchem_pipeline.discrepancy.observe.laws import extreme, poisson
 from pchem_pipeline.discrepancy.observe.tables import pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import CHI2, CodeSums
-from pchem_pipeline.discrepancy.observe.vector import period_statistics
+from pchem_pipeline.discrepancy.observe.vector import width_statistics
 from pchem_pipeline.discrepancy.quick.checks import Check
 from pchem_pipeline.discrepancy.quick.series import normal_p, of_many
 from pchem_pipeline.model.fit.api import fit_histograms
@@ -31,8 +31,8 @@ _WORDS = {
     "code.period4": "with a period of 4 DN",
     "code.period8": "with a period of 8 DN",
     "code.period16": "with a period of 16 DN",
-    "rough": "from code to code",
-    "largest": "most at {code} DN",
+    "code.rough": "from code to code",
+    "code.largest": "most at {code} DN",
 }
 #: Samples expected at a code that is judged by itself.
 _ENOUGH = 100.0
@@ -102,21 +102,14 @@ def _widths(codes: CodeSums) -> Check | None:
     some = judged[:-2] & judged[1:-1] & judged[2:]
     if some.sum() < _FEWEST_CODES:
         return None
-    variance = np.maximum(variance, 0.05 * expected)
-    z = np.where(judged, residual / np.sqrt(np.where(judged, variance, 1.0)), 0.0)
-    second = (z[1:-1] - 0.5 * (z[:-2] + z[2:]))[some]
-    m = second.size
-    found = period_statistics(codes.fold, codes.fold_covariance) if codes.fold_covariance.trace() > 0 else {}
-    # white noise under the weights (-1/2, 1, -1/2), whose autocorrelation is (1, -2/3, 1/6)
-    found["rough"] = float(chi_square(np.sum(second**2) / 1.5, m, 2.0 * m * (1.0 + 8.0 / 9.0 + 1.0 / 18.0)))
-    found["largest"] = largest_normal(z[judged])
+    found, z = width_statistics(codes)
     p = {
         name: normal_p(found[name], two_sided=name == "code.alternating") for name in _WORDS if name in found
     }
     worst = min(p, key=lambda name: p[name])
     code = codes.first + int(np.argmax(np.abs(z)))
     safe = np.where(judged, expected, 1.0)
-    deviation, noise = residual / safe, variance / safe**2
+    deviation, noise = residual / safe, np.maximum(variance, 0.05 * expected) / safe**2
     rough = (deviation[1:-1] - 0.5 * (deviation[:-2] + deviation[2:]))[some]
     chance = (noise[1:-1] + 0.25 * (noise[:-2] + noise[2:]))[some]
     weight = chance**-2 / np.sum(chance**-2)

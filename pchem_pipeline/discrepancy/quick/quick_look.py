@@ -105,31 +105,42 @@ _NEEDS = {
 
 
 def _odd_frames(sums: StackSums) -> list[Check]:
-    """Return whether frames are empty or far from the others: all other checks are of the rest."""
-    n, odd = sums.all_means.size, sums.odd
+    """Return whether frames are far from the others, empty or copies: all other checks are of the rest."""
+    n, odd, variance = sums.all_means.size, sums.odd, sums.rows.variance
     if not odd:
         return []
-    nothing = odd["far"][:0]
-    size = odd["far"].size
-    first = size > 0 and int(odd["far"][-1]) == size - 1
-    cure = f"with --frames {size}: (input.frame_range)" if first else "in the files, or by input.frame_range"
+    # rows have the same sum by chance with the density of the difference at 0, in any pair of frames
+    alike = float(np.log(np.minimum(1.0, 0.5 / np.sqrt(np.pi * np.maximum(variance, 0.1)))).sum())
+    far = odd["far"]
+    first = far.size > 0 and int(far[-1]) == far.size - 1
+    cure = (
+        f"with --frames {far.size}: (input.frame_range)" if first else "in the files, or by input.frame_range"
+    )
     kinds = (
-        ("odd_frames", "frames stand out", "far", f"the fit has them: leave them out {cure}"),
-        ("empty_frames", "frames are empty", "empty", "they are left out of histograms and sums"),
+        ("odd_frames", "far", "frames stand out", n * FAR_CHANCE, f"the fit has them: leave them out {cure}"),
+        ("empty_frames", "empty", "frames are empty", n * FAR_CHANCE, "they are not counted"),
+        (
+            "repeated_frames",
+            "copied",
+            "frames equal an earlier one",
+            math.exp(max(alike + 2.0 * math.log(n), -700.0)),
+            "there are fewer samples than frames, and standard errors are too small",
+        ),
     )
     return [
         Check(
             name,
             title,
-            # the largest that frames so far from the others, or such an empty one, have
-            min(n * FAR_CHANCE, 1.0) if odd[kind].size else 1.0,
+            min(p, 1.0) if odd[kind].size else 1.0,
             odd[kind].size / n,
             "1",
             limit=1.0 / n,
-            where=odd_words({**dict.fromkeys(odd, nothing), kind: odd[kind]}, sums.all_means),
+            where=(odd_words({kind: far}, sums.all_means) if kind == "far" else frame_words(odd[kind]))
+            if odd[kind].size
+            else "",
             advice=advice,
         )
-        for name, title, kind, advice in kinds
+        for name, kind, title, p, advice in kinds
     ]
 
 
@@ -196,7 +207,7 @@ def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
     checks += series_checks(*_frame_means(sums, third), sums.numbers)
     common = _Common(frame, rows, columns, sums)
     checks += [*_lag_check(sums, common), *_neighbour_checks(sums, common), *_wandering(sums, maps, third)]
-    return [*_located(checks, sums), *_repeats(sums)]
+    return _located(checks, sums)
 
 
 #: The map that shows where each check fails.
@@ -565,29 +576,5 @@ def _wandering(sums: StackSums, maps: PixelMaps, third: FloatArray) -> list[Chec
             where=f"{out.size:,} pixels, most at (y, x) {shown}" if out.size else "",
             advice="their exposure and read noise are of several levels: a region that was moved, "
             "a drift, or blinking pixels",
-        )
-    ]
-
-
-def _repeats(sums: StackSums) -> list[Check]:
-    """Return whether frames equal an earlier one: all sums over rows, and of squares, are the same."""
-    variance = sums.rows.variance
-    some = variance > 0
-    # a row repeats its sum by chance with the density of the difference at 0, in any pair of frames
-    log_p = float(np.log(np.minimum(1.0, 0.5 / np.sqrt(np.pi * variance[some]))).sum())
-    log_p += 2.0 * math.log(sums.n_frames)
-    if not some.any() or log_p > math.log(1e-9) or not sums.odd:
-        return []
-    same = sums.odd["copied"]
-    return [
-        Check(
-            "repeated_frames",
-            "frames equal an earlier one",
-            math.exp(max(log_p, -700.0)) if same.size else 1.0,
-            same.size / sums.all_means.size,
-            "1",
-            limit=1.0 / sums.all_means.size,
-            where=frame_words(same) if same.size else "",
-            advice="there are fewer samples than frames, and standard errors are too small",
         )
     ]

@@ -94,42 +94,24 @@ def _drift(series: FloatArray, noise: float) -> tuple[FloatArray, Check]:
 
 
 def _period(series: FloatArray) -> Check:
-    """Return whether one frequency stands out of those around it."""
+    """Return whether one frequency stands out of those around it; the last is that of even and odd frames."""
     n = series.size
     power = np.abs(np.fft.rfft(series)[1:]) ** 2
-    frequency = np.arange(1, power.size + 1) / n
-    alternating = n % 2 == 0
-    last = math.nan
-    if alternating:
-        last, power, frequency = float(power[-1]), power[:-1], frequency[:-1]
+    freedom = np.full(power.size, 2.0)
+    freedom[n // 2 - 1 :] = 1.0 if n % 2 == 0 else 2.0
     around, width = _around(power)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(around > 0, power / around, 0.0)
-    # a power over the mean of w others: F(2, 2 w)
-    log_tail = -width * np.log1p(ratio / width)
-    at = int(np.argmin(log_tail))
-    p = of_many(math.exp(max(float(log_tail[at]), -700.0)), power.size)
+    p = special.fdtrc(freedom, 2.0 * width, power / np.maximum(around, 1e-300))
+    at = int(np.argmin(p))
     # a line between two frequencies spreads over those around it
     near = power[max(at - 2, 0) : at + 3]
     height = max(float(near.sum()) - near.size * float(around[at]), 0.0)
-    words, amplitude = f"period {1.0 / frequency[at]:.4g} frames", 2.0 * math.sqrt(height) / n
-    if alternating and around.size:
-        # the last frequency has one degree of freedom
-        ends = 2.0 * normal_p(math.sqrt(last / max(float(around[-1]), 1e-300)))
-        w = float(width[-1])
-        ends = max(
-            ends, float(2.0 * special.stdtr(2.0 * w, -math.sqrt(last / max(float(around[-1]), 1e-300))))
-        )
-        if ends < p:
-            p, words, amplitude = ends, "even and odd frames differ", math.sqrt(last) / n * math.sqrt(2.0)
-        p = of_many(p, 2.0)
     return Check(
         "period",
         "the mean of the frames has a period",
-        p,
-        amplitude / math.sqrt(2.0),
+        of_many(float(p[at]), power.size),
+        math.sqrt(freedom[at] * height) / n,
         "DN",
-        where=words,
+        where=f"period {n / (at + 1):.4g} frames" if freedom[at] == 2.0 else "even and odd frames differ",
         advice="it widens the read noise",
     )
 

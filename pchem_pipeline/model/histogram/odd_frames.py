@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -11,64 +9,54 @@ from scipy import ndimage
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Means of frames farther than this many robust standard deviations from those around them in time are odd,
-#: if they are no more than this share of the run: what more frames do is a property of the sensor.
+KINDS = ("empty", "copied", "far")
+#: Frames whose level is farther than this many robust standard deviations from those around them are odd, if
+#: they are no more than this share of the run: what more frames do is a property of the sensor.
 _FAR, _MOST = 8.0, 0.05
 FAR_CHANCE = 1.3e-15  # of one frame to be as far, by a normal law
 _AROUND, _FEWEST_FRAMES, _FEWEST_PIXELS = 101, 32, 64
 
 
-def far_frames(mean: FloatArray, variance: FloatArray, pixels: int) -> IntArray:
-    """Return the frames whose mean is far from those around them in time, at most 5 % of all.
+def odd_frames(
+    level: FloatArray, variance: FloatArray, digest: NDArray[np.int64], pixels: int
+) -> dict[str, IntArray]:
+    """Return frames that are empty (all pixels at one DN), copies of an earlier one, or far from the others.
 
     Args:
-        mean: of each frame over its pixels, DN, (n,).
-        variance: likewise, DN^2; it bounds what independent pixels do to the mean.
-        pixels: of a frame.
+        level: of each frame over its pixels, DN, (n,).
+        variance: likewise, DN^2; it bounds what independent pixels do to the level.
+        digest: of the content of each frame, (n,).
+        pixels: of a frame; of few pixels chance makes all of these.
     """
-    if mean.size < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS:
-        return np.zeros(0, np.int64)
-    away, size = levels_apart(mean), _around(mean)
-    # around a frame the means spread by a drift, too, which the median at an end of the run does not follow
-    low, high = (ndimage.percentile_filter(mean, share, size) for share in (25, 75))
+    if level.size < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS:
+        return {kind: np.zeros(0, np.int64) for kind in KINDS}
+    away, size = levels_apart(level), _around(level)
+    # around a frame the levels spread by a drift, too, which the median at an end of the run does not follow
+    low, high = (ndimage.percentile_filter(level, share, size) for share in (25, 75))
     floor = max(1.4826 * float(np.median(np.abs(away))), float(np.sqrt(np.median(variance) / pixels)))
-    return _few(np.flatnonzero(np.abs(away) > _FAR * np.maximum((high - low) / 1.349, floor)), mean.size)
+    empty = (variance == 0.0) & (np.abs(level - np.median(level)) > _FAR * floor)
+    far = (np.abs(away) > _FAR * np.maximum((high - low) / 1.349, floor)) & ~empty
+    _, first, kind = np.unique(digest, return_index=True, return_inverse=True)
+    copied = (first[kind] != np.arange(level.size)) & ~empty
+    far &= ~copied
+    if far.sum() > _MOST * level.size:
+        far[:] = False
+    return {"empty": np.flatnonzero(empty), "copied": np.flatnonzero(copied), "far": np.flatnonzero(far)}
 
 
-def levels_apart(mean: FloatArray) -> FloatArray:
-    """Return the means of frames less the median of those around them in time, DN."""
-    return np.asarray(mean - ndimage.median_filter(mean, _around(mean)))
+def levels_apart(level: FloatArray) -> FloatArray:
+    """Return the levels of frames less the median of those around them in time, DN."""
+    return np.asarray(level - ndimage.median_filter(level, _around(level)))
 
 
-def _around(mean: FloatArray) -> int:
-    return min(_AROUND, max(mean.size // 2, 1))
-
-
-def copied_frames(
-    mean: FloatArray, variance: FloatArray, digests: Callable[[IntArray], list[bytes]]
-) -> IntArray:
-    """Return the frames that equal an earlier one.
-
-    Args:
-        mean: of each frame over its pixels, DN, (n,).
-        variance: likewise, DN^2.
-        digests: of the sums along the rows of some frames.
-    """
-    _, kind, number = np.unique(mean + 1j * variance, return_inverse=True, return_counts=True)
-    alike = np.flatnonzero(number[kind] > 1)
-    seen: set[bytes] = set()
-    copies = []
-    for t, digest in zip(alike.tolist(), digests(alike), strict=True):
-        if digest in seen:
-            copies.append(t)
-        seen.add(digest)
-    return np.array(copies, np.int64)
+def _around(level: FloatArray) -> int:
+    return min(_AROUND, max(level.size // 2, 1))
 
 
 def left_out(odd: dict[str, IntArray], n_frames: int) -> IntArray:
-    """Return the frames that are left out of sums, increasing: all empty ones, and of others a few."""
-    some = [odd["empty"], _few(odd["copied"], n_frames), odd["far"]]
-    return np.unique(np.concatenate(some)).astype(np.int64)
+    """Return the frames that are left out of sums, increasing: of copies only a few."""
+    few = odd["copied"].size <= _MOST * n_frames
+    return np.unique(np.concatenate([frames for kind, frames in odd.items() if kind != "copied" or few]))
 
 
 def frame_words(frames: IntArray, most: int = 4) -> str:
@@ -82,18 +70,17 @@ def frame_words(frames: IntArray, most: int = 4) -> str:
 
 def odd_words(odd: dict[str, IntArray], mean: FloatArray) -> str:
     """Return which frames are odd and why; ``mean`` of all frames, DN."""
-    away = levels_apart(mean)
-    words = []
-    for kind, says in (("empty", "empty"), ("copied", "equal to an earlier one")):
-        if odd[kind].size:
-            words.append(f"{frame_words(odd[kind])} {'is' if odd[kind].size == 1 else 'are'} {says}")
-    for sign, side in ((1.0, "above"), (-1.0, "below")):
-        far = odd["far"][sign * away[odd["far"]] > 0]
-        if far.size:
-            dn = f"{float(np.median(np.abs(away[far]))):.2g} DN {side} the others"
-            words.append(f"{frame_words(far)} {'is' if far.size == 1 else 'are'} {dn}")
+    away, words = levels_apart(mean), []
+    nothing = np.zeros(0, np.int64)
+    far = odd.get("far", nothing)
+    above = away[far] > 0
+    for frames, says in (
+        (odd.get("empty", nothing), "empty"),
+        (odd.get("copied", nothing), "equal to an earlier one"),
+        (far[above], "DN above the others"),
+        (far[~above], "DN below the others"),
+    ):
+        if frames.size:
+            size = f"{float(np.median(np.abs(away[frames]))):.2g} " if says.startswith("DN") else ""
+            words.append(f"{frame_words(frames)} {'is' if frames.size == 1 else 'are'} {size}{says}")
     return "; ".join(words)
-
-
-def _few(frames: IntArray, n_frames: int) -> IntArray:
-    return frames if frames.size <= _MOST * n_frames else frames[:0]

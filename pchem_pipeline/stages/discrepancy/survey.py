@@ -30,9 +30,9 @@ from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
 from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
 from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
 from pchem_pipeline.effects.framework.region import Region
-from pchem_pipeline.frames.stream import FrameSource, FrameStream
+from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.run.model_versions import model_of
-from pchem_pipeline.stages.discrepancy.window import Window, choose_window
+from pchem_pipeline.stages.discrepancy.window import Window, choose_window, frame_blocks
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
 from pchem_pipeline.stages.quick_look import read_sums
 
@@ -326,9 +326,5 @@ class _Band:
 
     def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
         """Yield at most so many successive frames at a time, (frame, y, x), DN."""
-        breaks = np.flatnonzero(np.diff(self.numbers) != 1) + 1
-        for part in np.split(self.numbers, breaks):
-            frames = int(part[0]), int(part[-1]) + 1
-            with FrameStream(self.source, [self.rows], size, frames=frames) as stream:
-                for _, (block,) in stream:
-                    yield block
+        for _, block in frame_blocks(self.source, self.numbers, self.rows, size):
+            yield block

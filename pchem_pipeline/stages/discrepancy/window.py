@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -205,11 +205,24 @@ def read_window(source: FrameSource, window: Window) -> NDArray[np.unsignedinteg
     stack = np.empty((window.numbers.size, y1 - y0, x1 - x0), source.dtype)
     # not more at once than a few dozen megabytes, whatever the width of the sensor
     step = max(1, (1 << 23) // ((y1 - y0) * source.shape[2]))
-    breaks = np.flatnonzero(np.diff(window.numbers) != 1) + 1
-    for part in np.split(np.arange(window.numbers.size), breaks):
-        frames = int(window.numbers[part[0]]), int(window.numbers[part[-1]]) + 1
-        with FrameStream(source, [window.rows], step, frames=frames) as stream:
-            for first, (block,) in stream:
-                at = int(part[0]) + first - frames[0]
-                stack[at : at + block.shape[0]] = block[:, :, x0:x1]
+    for at, block in frame_blocks(source, window.numbers, window.rows, step):
+        stack[at : at + block.shape[0]] = block[:, :, x0:x1]
     return stack
+
+
+def frame_blocks(
+    source: FrameSource, numbers: NDArray[np.int64], rows: tuple[int, int], size: int
+) -> Iterator[tuple[int, NDArray[np.unsignedinteger]]]:
+    """Yield at most so many successive frames of some rows at a time, (frame, y, x), DN, with their place.
+
+    Args:
+        source: the frames.
+        numbers: of those that are wanted, increasing.
+        rows: first, and end.
+        size: frames at a time.
+    """
+    for part in np.split(np.arange(numbers.size), np.flatnonzero(np.diff(numbers) != 1) + 1):
+        frames = int(numbers[part[0]]), int(numbers[part[-1]]) + 1
+        with FrameStream(source, [rows], size, frames=frames) as stream:
+            for first, (block,) in stream:
+                yield int(part[0]) + first - frames[0], block

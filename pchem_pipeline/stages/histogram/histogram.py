@@ -20,6 +20,7 @@ from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.count import RowHistograms, choose_bins, most_bins, pixels_by_range
+from pchem_pipeline.model.histogram.odd_frames import odd_frames
 from pchem_pipeline.model.histogram.summaries import frame_statistics
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
@@ -153,9 +154,11 @@ def _do_band(band: Band, *, job: CountJob, source: FrameSource, threads: int) ->
 
 
 def _write_frame_statistics(context: StageContext, shape: tuple[int, int, int]) -> None:
-    """Derive the statistics of whole frames from the row sums, when all bands are there."""
+    """Derive the statistics of whole frames from the row sums of all bands; leave out odd frames."""
     n_frames, ny, nx = shape
-    mean, variance = np.empty(n_frames), np.empty(n_frames)
+    mean, variance, level = np.empty((3, n_frames))
+    weights = np.random.default_rng(1).integers(1 << 62, size=(2, ny))
+    digest, usual = np.empty(n_frames, np.int64), None
     step = row_frames(ny)
     for t in range(0, n_frames, step):
         part = slice(t, min(t + step, n_frames))
@@ -164,9 +167,13 @@ def _write_frame_statistics(context: StageContext, shape: tuple[int, int, int]) 
             for name in ("row_sum", "row_sum_square")
         )
         mean[part], variance[part] = frame_statistics(sums, squares, nx)
+        usual = np.median(sums, axis=0) if usual is None else usual
+        # of most rows: the track of a particle moves the mean, too
+        level[part] = np.median(sums - usual, axis=1) / nx
+        digest[part] = sums @ weights[0] + squares @ weights[1]
     context.store.write_array("summary/frame_mean", mean)
     context.store.write_array("summary/frame_variance", variance)
-    leave_out_odd_frames(context, mean, variance)
+    leave_out_odd_frames(context, odd_frames(level, variance, digest, ny * nx), mean)
 
 
 # -- ready-made histograms ----------------------------------------------------------------------

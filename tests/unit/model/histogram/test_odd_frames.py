@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.model.histogram.odd_frames import copied_frames, far_frames, left_out, odd_words
+from pchem_pipeline.model.histogram.odd_frames import left_out, odd_frames, odd_words
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 
 N, PIXELS, SD = 900, 576, 10.0
@@ -14,35 +14,38 @@ def means(seed=1):
     return 100.0 + SD / PIXELS**0.5 * np.random.default_rng(seed).standard_normal(N)
 
 
-def test_far_frames_are_found_and_chance_makes_none():
+def odd(level, variance=VARIANCE, digest=None, pixels=PIXELS):
+    return odd_frames(level, variance, np.arange(len(level)) if digest is None else digest, pixels)
+
+
+def test_odd_frames_are_found_and_chance_makes_none():
     for seed in range(50):
-        assert far_frames(means(seed), VARIANCE, PIXELS).size == 0
-    odd = means()
-    odd[:5] += 30.0
-    odd[600] -= 60.0
-    far = far_frames(odd, VARIANCE, PIXELS)
-    assert far.tolist() == [0, 1, 2, 3, 4, 600]
-    nothing = np.zeros(0, np.int64)
-    words = odd_words({"empty": nothing, "copied": nothing, "far": far}, odd)
-    assert words == "frames 0 to 4 are 30 DN above the others; frame 600 is 60 DN below the others"
+        assert not any(frames.size for frames in odd(means(seed)).values())
+    level, variance, digest = means(), VARIANCE.copy(), np.arange(N)
+    level[:5] += 30.0
+    level[600] -= 60.0
+    level[700:850], variance[700:850], digest[700:850] = 0.0, 0.0, -1
+    digest[300] = 17
+    found = odd(level, variance, digest)
+    assert {kind: frames.tolist() for kind, frames in found.items()} == {
+        "empty": list(range(700, 850)),
+        "copied": [300],
+        "far": [0, 1, 2, 3, 4, 600],
+    }
+    assert odd_words(found, level) == (
+        "frames 700 to 849 are empty; frame 300 is equal to an earlier one; "
+        "frames 0 to 4 are 30 DN above the others; frame 600 is 60 DN below the others"
+    )
+    assert left_out(found, N).size == 157
+    assert left_out({**found, "copied": np.arange(100, 200)}, N).size == 156  # a property of the camera
 
 
-def test_what_many_frames_do_or_a_drift_is_not_odd():
+def test_what_many_frames_do_or_a_drift_or_few_pixels_is_not_odd():
     t = np.arange(N)
     for moved in (20.0 * (t >= 300), 0.2 * t, 20.0 * (t % 10 == 0), 5.0 * np.sin(t / 3.0)):
-        assert far_frames(means() + moved, VARIANCE, PIXELS).size == 0
-
-
-def test_copies_of_any_earlier_frame_are_found():
-    frames = np.random.default_rng(2).integers(0, 9, (60, 8, 8))
-    frames[50], frames[31] = frames[7], frames[30]
-    frames[40] = frames[12].T  # the same mean and variance, and another frame
-    mean, variance = frames.mean(axis=(1, 2)), frames.var(axis=(1, 2))
-    copied = copied_frames(mean, variance, lambda at: [frames[t].tobytes() for t in at])
-    assert copied.tolist() == [31, 50]
-    odd = {"empty": np.array([1]), "copied": copied, "far": np.array([4])}
-    assert left_out(odd, 60).tolist() == [1, 4, 31, 50]
-    assert left_out(odd, 30).tolist() == [1, 4]  # so many copies are a property of the camera
+        assert odd(means() + moved)["far"].size == 0
+    quiet = np.where(t % 3 == 0, 101.0, 100.0)
+    assert not any(frames.size for frames in odd(quiet, np.zeros(N), quiet.astype(int), pixels=4).values())
 
 
 @pytest.mark.parametrize("size", [0.0, 0.15])
