@@ -18,7 +18,7 @@ from pchem_pipeline.discrepancy.observe.laws import extreme, poisson
 from pchem_pipeline.discrepancy.observe.tables import pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import CHI2, CodeSums
 from pchem_pipeline.discrepancy.observe.vector import width_statistics
-from pchem_pipeline.discrepancy.quick.checks import Check
+from pchem_pipeline.discrepancy.quick.checks import Check, check_of
 from pchem_pipeline.discrepancy.quick.series import normal_p, of_many
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
@@ -115,16 +115,9 @@ def _widths(codes: CodeSums) -> Check | None:
     weight = chance**-2 / np.sum(chance**-2)
     excess = float(weight @ (rough**2 - chance)) / 1.5
     error = math.sqrt(float(weight**2 @ (4.0 * chance**2))) / 1.5
-    return Check(
-        "codes",
-        "codes have different widths",
-        min(_CAUTION * of_many(p[worst], len(p)), 1.0),
-        math.sqrt(max(excess, 0.0)),
-        "LSB",
-        limit=math.sqrt(5.4 * error),
-        where=_WORDS[worst].format(code=code),
-        advice="the histograms of all pixels deviate from the model at the same DN",
-    )
+    p_any = min(_CAUTION * of_many(p[worst], len(p)), 1.0)
+    size, limit = math.sqrt(max(excess, 0.0)), math.sqrt(5.4 * error)
+    return check_of("codes", p_any, size, limit=limit, where=_WORDS[worst].format(code=code))
 
 
 def _pile_up(codes: CodeSums, sample: CodeSample, end: int) -> Check:
@@ -136,18 +129,6 @@ def _pile_up(codes: CodeSums, sample: CodeSample, end: int) -> Check:
     on = float(expected[at])
     # a fit that expects too many beyond is poor; what is cut off is on the code
     z = min(extreme(int(seen[at]), on, float(beyond.sum())), poisson(int(seen[at]), on))
-    side, level = ("top", "highest") if end else ("bottom", "lowest")
-    cure = (
-        "larger signals are cut off there: exposures of bright pixels come out too low"
-        if end
-        else "the black level is too low: raise it, or set input.bit_depth"
-    )
-    return Check(
-        f"{side}_code",
-        f"samples pile up at the {level} code",
-        normal_p(z),
-        float(sample.counts[bins == codes.first + at].sum() / sample.counts.sum()),
-        "1",
-        where=f"{codes.first + at} DN",
-        advice=cure,
-    )
+    share = float(sample.counts[bins == codes.first + at].sum() / sample.counts.sum())
+    name = "top_code" if end else "bottom_code"
+    return check_of(name, normal_p(z), share, where=f"{codes.first + at} DN")

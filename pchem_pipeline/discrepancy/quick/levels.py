@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.quick.checks import Check
+from pchem_pipeline.discrepancy.quick.checks import Check, check_of
 from pchem_pipeline.model.histogram.odd_frames import frame_words
 
 FloatArray = NDArray[np.float64]
@@ -42,18 +42,8 @@ def levels_check(mean: FloatArray, variance: FloatArray, gain: float) -> Check:
     centres = [float(mean[frames].mean()) for frames in levels]
     more = f" and {len(levels) - _SHOWN} levels more" if len(levels) > _SHOWN else ""
     shown = zip(levels[:_SHOWN], centres, strict=False)
-    return Check(
-        "levels",
-        "the frames are of several exposures",
-        p,
-        centres[-1] - centres[0],
-        "DN",
-        where="; ".join(f"{frame_words(frames, 1)} at {centre:.4g} DN" for frames, centre in shown) + more
-        if several
-        else "",
-        advice="make a run of each, from its own files or by input.frame_range, and fit them together with "
-        "pchem joint",
-    )
+    where = "; ".join(f"{frame_words(frames, 1)} at {centre:.4g} DN" for frames, centre in shown) + more
+    return check_of("levels", p, centres[-1] - centres[0], where=where if several else "")
 
 
 def _parted(mean: FloatArray, variance: FloatArray, gain: float) -> tuple[list[NDArray[np.int64]], float]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import best, chi_square, without_skew
-from pchem_pipeline.discrepancy.quick.checks import Check
+from pchem_pipeline.discrepancy.quick.checks import Check, check_of
 from pchem_pipeline.model.histogram.odd_frames import frame_words
 
 FloatArray = NDArray[np.float64]
@@ -80,16 +80,8 @@ def _drift(series: FloatArray, noise: float) -> tuple[FloatArray, Check]:
     p = normal_p(best(*z, independent=0.5 * (1 + len(z))))
     excess = max(float(energy[chosen - 1]) - chosen, 0.0) * noise / n
     peak = float(np.ptp(smooth))
-    check = Check(
-        "drift",
-        "the mean of the frames drifts",
-        p,
-        math.sqrt(excess),
-        "DN",
-        limit=math.sqrt(16.0 * noise / n),
-        where=f"{peak:.2g} DN from its lowest to its highest",
-        advice="it widens the read noise, and what is taken for one exposure changes along the run",
-    )
+    where = f"{peak:.2g} DN from its lowest to its highest"
+    check = check_of("drift", p, math.sqrt(excess), limit=math.sqrt(16.0 * noise / n), where=where)
     return (smooth if p < 1e-3 else np.zeros(n)), check
 
 
@@ -105,15 +97,9 @@ def _period(series: FloatArray) -> Check:
     # a line between two frequencies spreads over those around it
     near = power[max(at - 2, 0) : at + 3]
     height = max(float(near.sum()) - near.size * float(around[at]), 0.0)
-    return Check(
-        "period",
-        "the mean of the frames has a period",
-        of_many(float(p[at]), power.size),
-        math.sqrt(freedom[at] * height) / n,
-        "DN",
-        where=f"period {n / (at + 1):.4g} frames" if freedom[at] == 2.0 else "even and odd frames differ",
-        advice="it widens the read noise",
-    )
+    words = f"period {n / (at + 1):.4g} frames" if freedom[at] == 2.0 else "even and odd frames differ"
+    size = math.sqrt(freedom[at] * height) / n
+    return check_of("period", of_many(float(p[at]), power.size), size, where=words)
 
 
 def _around(power: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -133,15 +119,8 @@ def _memory(series: FloatArray) -> Check:
     n = series.size
     total = float(series @ series)
     correlation = float(series[1:] @ series[:-1]) / max(total, 1e-300) + 1.0 / n
-    return Check(
-        "frame_lag",
-        "the mean of a frame resembles that of the frame before",
-        normal_p(correlation * math.sqrt(n), two_sided=True),
-        correlation,
-        "1",
-        limit=5.7 / math.sqrt(n),
-        advice="noise that the frames share has a memory",
-    )
+    p = normal_p(correlation * math.sqrt(n), two_sided=True)
+    return check_of("frame_lag", p, correlation, limit=5.7 / math.sqrt(n))
 
 
 def _single(series: FloatArray, spread: float, skewness: float, numbers: IntArray) -> Check:
@@ -151,12 +130,5 @@ def _single(series: FloatArray, spread: float, skewness: float, numbers: IntArra
     p = 2.0 * special.ndtr(-np.abs(without_skew(z, np.full(z.size, skewness))))
     out = np.flatnonzero(p < 1e-3 / p.size)
     shown = out if out.size else np.array([int(np.argmin(p))])
-    return Check(
-        "single_frames",
-        "single frames stand out",
-        of_many(float(p.min()), p.size),
-        shown.size / series.size,
-        "1",
-        where=frame_words(numbers[shown], 6),
-        advice="leave them out (input.frame_range), or see what happened there",
-    )
+    where = frame_words(numbers[shown], 6)
+    return check_of("single_frames", of_many(float(p.min()), p.size), shown.size / series.size, where=where)

@@ -61,6 +61,8 @@ def left_out(odd: dict[str, IntArray], n_frames: int) -> IntArray:
 
 def frame_words(frames: IntArray, most: int = 4) -> str:
     """Return the numbers of frames in words, those that follow each other as a range: frames 0 to 4, 17."""
+    if not frames.size:
+        return ""
     runs = np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1)
     if len(runs) > most:
         return f"{frames.size:,} frames from {frames[0]} to {frames[-1]}"
