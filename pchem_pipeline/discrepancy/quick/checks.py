@@ -85,8 +85,6 @@ _WORDS: dict[str, tuple[str, str, str]] = {
     "period": ("DN", "the mean of the frames has a period", "it widens the read noise"),
     "frame_lag": ("1", "the mean of a frame resembles that of the frame before",
                   "noise that the frames share has a memory"),
-    "single_frames": ("1", "single frames stand out",
-                      "leave them out (input.frame_range), or see what happened there"),
     "lag": ("1", "samples resemble those of the frame before",
             f"charge or signal is carried over: {_GAIN} as much"),
     "neighbours_x": ("1", "neighbours in a row resemble each other", _COUPLE),
@@ -170,7 +168,6 @@ _SIGNS: dict[str, tuple[str, ...]] = {
     "frame_lag": (
         "frame.readout.lag1", "frame.charge.lag1", "time.lag1.readout.mean", "time.cross.readout_charge",
     ),
-    "single_frames": ("frame.readout.largest", "frame.readout.quadrants", "tail.high.clusters"),
     "lag": (
         "time.lag1.readout.mean", "time.lag1.charge.mean", "time.cross.readout_charge", "frame.repeated",
     ),
@@ -223,7 +220,6 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "neighbours_x": (0.005, 0.05),
     "neighbours_y": (0.005, 0.05),
     "repeated_frames": (1e-3, 0.05),
-    "single_frames": (0.01, 0.1),
     "wandering_pixels": (0.01, 0.2),
     "codes": (0.1, 0.5),
     "top_code": (1e-4, 1e-2),

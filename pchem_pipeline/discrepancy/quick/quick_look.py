@@ -172,7 +172,7 @@ def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
     if math.isfinite(columns.error):
         checks.append(_noise_check("column_noise", columns.less(shared), sums.columns, sums.shape[1]))
     third = _third_moment(maps)
-    checks += series_checks(*_frame_means(sums, third), sums.numbers)
+    checks += series_checks(_frame_means(sums))
     common = _Common(frame, rows, columns, sums)
     checks += [*_lag_check(sums, common), *_neighbour_checks(sums, common), *_wandering(sums, maps, third)]
     return _located(checks, sums)
@@ -344,18 +344,12 @@ def _third_moment(maps: PixelMaps) -> FloatArray:
     return third
 
 
-def _frame_means(sums: StackSums, third: FloatArray) -> tuple[FloatArray, float, float]:
-    """Return the mean of each frame over the quiet rows, its standard deviation and skewness by chance.
-
-    Where the sums of some frames are not at hand, over all rows.
-    """
-    quiet = _quiet(sums) if sums.whole else sums.rows.variance > 0
-    if not quiet.any():
-        return np.zeros(0), math.nan, 0.0
-    pixels = quiet.sum() * sums.shape[1]
-    mean = sums.row_sum[:, quiet].sum(axis=1) / pixels if sums.whole else sums.frame_mean
-    scale = float(sums.rows.variance[quiet].sum())
-    return mean, math.sqrt(scale) / pixels, float(third[quiet].sum() / scale**1.5)
+def _frame_means(sums: StackSums) -> FloatArray:
+    """Return the mean of each frame over the quiet rows; where sums are not at hand, over all rows."""
+    quiet = _quiet(sums)
+    if not sums.whole or not quiet.any():
+        return sums.frame_mean if quiet.any() else np.zeros(0)
+    return np.asarray(sums.row_sum[:, quiet].sum(axis=1) / (quiet.sum() * sums.shape[1]))
 
 
 # -- successive samples and neighbours -----------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Checks of the mean of the frames as a series in time: drift, periods, memory, single frames, repeats."""
+"""Checks of the mean of the frames as a series in time: drift, periods, memory."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.observe.laws import best, chi_square, without_skew
+from pchem_pipeline.discrepancy.observe.laws import best, chi_square
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
-from pchem_pipeline.model.histogram.odd_frames import frame_words
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _SLOWEST = (2, 4, 8, 16, 32)
 _FEWEST_FRAMES = 64
@@ -32,17 +30,10 @@ def of_many(p: float, n: float) -> float:
     return float(-np.expm1(n * np.log1p(-min(max(p, 0.0), 1.0 - 1e-16))))
 
 
-def series_checks(mean: FloatArray, error: float, skewness: float, numbers: IntArray) -> list[Check]:
-    """Return the checks of the frames' means.
+def series_checks(mean: FloatArray) -> list[Check]:
+    """Return the checks of the frames' means over the same pixels, DN, (n,).
 
-    All but that of single frames compare the series with itself in another order, so that noise of frame to
-    frame is none of them.
-
-    Args:
-        mean: of each frame, over the same pixels, DN, (n,).
-        error: its standard deviation where pixels are independent, DN.
-        skewness: likewise.
-        numbers: of the frames, (n,).
+    They compare the series with itself in another order, so that noise of frame to frame is none of them.
     """
     n = mean.size
     if n < _FEWEST_FRAMES:
@@ -57,12 +48,7 @@ def series_checks(mean: FloatArray, error: float, skewness: float, numbers: IntA
         return []
     smooth, drift = _drift(series, noise)
     rest = series - smooth
-    return [
-        drift,
-        _period(rest),
-        _memory(rest),
-        _single(mean - smooth, max(spread, error), skewness, numbers),
-    ]
+    return [drift, _period(rest), _memory(rest)]
 
 
 def _drift(series: FloatArray, noise: float) -> tuple[FloatArray, Check]:
@@ -121,14 +107,3 @@ def _memory(series: FloatArray) -> Check:
     correlation = float(series[1:] @ series[:-1]) / max(total, 1e-300) + 1.0 / n
     p = normal_p(correlation * math.sqrt(n), two_sided=True)
     return check_of("frame_lag", p, correlation, limit=5.7 / math.sqrt(n))
-
-
-def _single(series: FloatArray, spread: float, skewness: float, numbers: IntArray) -> Check:
-    """Return whether single frames stand out."""
-    z = (series - float(np.median(series))) / spread
-    # the law of a sum of counts is a little skewed
-    p = 2.0 * special.ndtr(-np.abs(without_skew(z, np.full(z.size, skewness))))
-    out = np.flatnonzero(p < 1e-3 / p.size)
-    shown = out if out.size else np.array([int(np.argmin(p))])
-    where = frame_words(numbers[shown], 6)
-    return check_of("single_frames", of_many(float(p.min()), p.size), shown.size / series.size, where=where)

@@ -12,9 +12,9 @@ IntArray = NDArray[np.int64]
 KINDS = ("empty", "copied", "far")
 #: Frames whose level is farther than this many robust standard deviations from those around them are odd, if
 #: they are no more than this share of the run: what more frames do is a property of the sensor.
-_FAR, _MOST = 8.0, 0.05
-FAR_CHANCE = 1.3e-15  # of one frame to be as far, by a normal law
-_AROUND, _FEWEST_FRAMES, _FEWEST_PIXELS = 101, 32, 64
+_FAR, _MOST = 6.5, 0.05
+FAR_CHANCE = 8.1e-11  # of one frame to be as far, by a normal law
+_AROUND, _FEWEST_FRAMES, _FEWEST_PIXELS = 101, 32, 100
 
 
 def odd_frames(
