@@ -103,7 +103,7 @@ class Survey:
             name: SensorPlace(**{**place, "region": Region.model_validate(place["region"])})
             for name, place in numbers["places"].items()
         }
-        return cls(places, numbers["shares"], tuple(numbers["left_out"]))
+        return cls(places, numbers["shares"], tuple(numbers.get("left_out", ())))
 
     def told(self, verdict: Verdict, share: float) -> Verdict:
         """Return a verdict that says on what share of the samples it rests, and on what else."""
