@@ -5,18 +5,17 @@ A link that drops frames says nothing of the pixels.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.histogram.odd_frames import KINDS, FloatArray, IntArray, left_out, odd_words
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, SummaryAccumulator
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.stages.histogram.arrays import COVARIANCES, MAPS, with_block_length
 
 if TYPE_CHECKING:
-    from pchem_pipeline.frames.stream import FrameSource
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.store.run_store import RunStore
 
@@ -94,19 +93,11 @@ def _leave_out_of_sums(context: StageContext, changed: IntArray, out: IntArray) 
         sums = SummaryAccumulator.resumed(state, n_frames, length)
         sums.finish()
         for block in np.unique(changed // length).tolist():
-            end = min((block + 1) * length, n_frames)
-            pieces = (
-                _read(source, (first, min(first + _AT_ONCE, end)), rows)
-                for first in range(block * length, end, _AT_ONCE)
-            )
-            for name, values in vars(sums.exchange(pieces, kept[block * length : end])).items():
+            frames = block * length, min((block + 1) * length, n_frames)
+            with FrameStream(source, [rows], _AT_ONCE, frames=frames) as stream:
+                done = sums.exchange((piece for _, (piece,) in stream), kept[slice(*frames)])
+            for name, values in vars(done).items():
                 store.write(f"summary/{name}", (slice(block, block + 1), *band[1:]), values[None])
         _, covariances = sums.finish()
         for name in COVARIANCES:
             store.write(f"summary/{name}", band[1:], getattr(covariances, name))
-
-
-def _read(source: FrameSource, frames: tuple[int, int], rows: tuple[int, int]) -> NDArray[Any]:
-    block = np.empty((frames[1] - frames[0], rows[1] - rows[0], source.shape[2]), source.dtype)
-    source.read_into(block, *frames, *rows)
-    return block
