@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,8 @@ from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, create_c
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import bytes_per_row
 from pchem_pipeline.stages.histogram.odd_frames import leave_out_odd_frames
-from pchem_pipeline.stages.histogram.shown_sample import copy_shown_sample
+from pchem_pipeline.stages.samples import sample_targets
+from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
     from pchem_pipeline.compute.executor import Outcome
@@ -73,7 +74,7 @@ def run(context: StageContext) -> None:
         StoreError: the input is not complete, or the store refuses.
     """
     if context.sensor.samples:
-        copy_shown_sample(context)
+        _copy_shown_sample(context)
         return
     if context.sensor.kind == "histograms":
         _copy_histograms(context)
@@ -184,11 +185,35 @@ def _copy_histograms(context: StageContext) -> None:
     from pchem_pipeline.frames.histogram_files import read_histograms
 
     given = read_histograms(context.config.input, context.base_dir)
-    create_counts(context, given.counts.shape[2], given.counts.dtype)
-    context.create_maps([f"histogram/{name}" for name in MAPS])
-    context.store.set_attributes("summary", {"missing": "the input is histograms, without order in time"})
     task = functools.partial(_copy_tile, store=context.store.path, given=given)
+    _copied(context, given.counts, "the input is histograms, without order in time", task)
+
+
+def _copy_shown_sample(context: StageContext) -> None:
+    """Copy the histograms of the shown sample of several, so that report and ensemble need no run of it.
+
+    The fit reads the histograms of all samples in their own runs.
+
+    Raises:
+        StoreError: the run of the sample is gone, or the store refuses.
+    """
+    place = sample_targets(context.config, context.base_dir)[context.sensor.shown].store
+    task = functools.partial(_copy_sample_tile, store=context.store.path, sample=place)
+    _copied(context, RunStore.open(place).array("histogram/counts"), "the samples keep their own", task)
+
+
+def _copied(context: StageContext, counts: Any, missing: str, task: Callable[[Tile], Any]) -> None:
+    """Make the arrays, as wide as ``counts``, and do all tiles; summaries are ``missing`` for that reason."""
+    create_counts(context, counts.shape[2], counts.dtype)
+    context.create_maps([f"histogram/{name}" for name in MAPS])
+    context.store.set_attributes("summary", {"missing": missing})
     context.run_units(context.tiles(), task)
+
+
+def _copy_sample_tile(tile: Tile, *, store: Path, sample: Path) -> None:
+    source, target = RunStore.open(sample), open_store(store)
+    for name in ("counts", *MAPS):
+        target.write(f"histogram/{name}", tile.region, source.read(f"histogram/{name}", tile.region))
 
 
 def _copy_tile(tile: Tile, *, store: Path, given: HistogramInput) -> None:
