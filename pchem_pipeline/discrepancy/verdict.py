@@ -323,6 +323,7 @@ class Examined(_Part):
         places: where those stand out.
         unfitted: pixels that are not compared, since they have no fit to be relied upon.
         elsewhere: where the model that was found was looked at again; None: nowhere.
+        left_out: frames that are empty or far from the others.
     """
 
     frames: int
@@ -338,6 +339,7 @@ class Examined(_Part):
     places: tuple[Surveyed, ...] = ()
     unfitted: int = 0
     elsewhere: Elsewhere | None = None
+    left_out: tuple[int, ...] = ()
 
     @property
     def origin(self) -> tuple[int, int]:

@@ -15,7 +15,7 @@ from pchem_pipeline.discrepancy.quick.codes import CodeSample
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.model.errors.fisher import covariance_from
+from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
 
 if TYPE_CHECKING:
     from pchem_pipeline.discrepancy.quick.checks import QuickLook
@@ -73,40 +73,52 @@ def read_sums(store: RunStore) -> StackSums | None:
     """Read the summaries of a run: all covariances, and sums of blocks of frames spread over it.
 
     Returns:
-        None where the stage histogram has not made them, or frames are fewer than two in each block.
+        None where the stage histogram has not made them, or frames are fewer than two in each block. Odd
+        frames are in none of the sums.
 
     Raises:
         StoreError: an array is corrupt.
     """
     if not store.has("summary/frame_mean"):
         return None
+    odd, out = odd_frames_of(store)
     mean, variance = store.read("summary/frame_mean"), store.read("summary/frame_variance")
+    numbers = np.setdiff1d(np.arange(mean.size), out)
     starts = store.read("summary/block_start")
     n_blocks, ny, nx = store.array("summary/block_sum").shape
     lengths = np.diff(np.append(starts, mean.size))
-    if mean.size <= n_blocks:
+    known = lengths - np.bincount(np.searchsorted(starts, out, side="right") - 1, minlength=n_blocks)
+    usable = np.flatnonzero(known > 1)
+    if not usable.size:
         return None  # a single frame in each block
     frames = min(_MOST_LINE_SUMS // ny, mean.size)
     most = min(_MOST_BLOCK_SUMS // (ny * nx), frames // int(lengths[0]) if frames < mean.size else n_blocks)
-    chosen = _spread(n_blocks, most)
+    chosen = usable[_spread(usable.size, most)]
     groups = store.array("summary/column_sum").shape[1]
     some = _spread(chosen.size, _MOST_LINE_SUMS // (groups * nx * int(lengths[0])))
     blocks = (np.s_[:], np.s_[:])
+
+    def lines(name: str, of: NDArray[np.int64], rest: slice | tuple[slice, ...]) -> NDArray[np.int64]:
+        first, end = starts[of], (starts + lengths)[of]
+        there = np.concatenate([np.arange(*each) for each in zip(first, end, strict=True)])
+        return _read(store, name, first, end, rest)[~np.isin(there, out)]
+
     return StackSums(
-        mean.size,
-        n_blocks,
-        lengths[chosen],
+        numbers,
+        usable.size,
+        known[chosen],
         _read(store, "block_sum", chosen, chosen + 1, blocks),
         _read(store, "block_sum_square", chosen, chosen + 1, blocks),
-        _read(store, "row_sum", starts[chosen], (starts + lengths)[chosen], np.s_[:]),
+        lines("row_sum", chosen, np.s_[:]),
         some,
-        _read(store, "column_sum", starts[chosen[some]], (starts + lengths)[chosen[some]], blocks),
+        lines("column_sum", chosen[some], blocks),
         mean,
         variance,
-        _repeated(store, mean, variance),
         store.read("summary/lag1_covariance"),
         store.read("summary/neighbour_covariance_x"),
         store.read("summary/neighbour_covariance_y"),
+        odd,
+        store.attributes("summary").get("spectrum", {}),
     )
 
 
@@ -132,34 +144,13 @@ def _read(
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _repeated(store: RunStore, mean: NDArray[np.float64], variance: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the frames with the sums, and sums of squares, of the one before in all rows."""
-    candidates = np.flatnonzero((mean[1:] == mean[:-1]) & (variance[1:] == variance[:-1])) + 1
-    step = store.array("summary/row_sum").chunks[0]
-    found: list[int] = []
-    for start in np.unique(candidates // step) * step:
-        here = candidates[(candidates >= start) & (candidates < start + step)]
-        first = max(int(start) - 1, 0)
-        part = (slice(first, int(here[-1]) + 1), slice(None))
-        sums, squares = (store.read(f"summary/{name}", part) for name in ("row_sum", "row_sum_square"))
-        found += [
-            int(t)
-            for t, i in zip(here, here - first, strict=True)
-            if (sums[i] == sums[i - 1]).all() and (squares[i] == squares[i - 1]).all()
-        ]
-    return np.array(found, np.int64)
-
-
 def _codes(store: RunStore, maps: PixelMaps, *, joint: bool) -> CodeSample | None:
-    """Read the histograms of some pixels with a fit, from pieces of whole chunks over the sensor.
-
-    Of a joint fit of several exposures the errors are read, too: it is not that of the histograms alone.
-    """
+    """Read the histograms of some pixels with a fit, from pieces of whole chunks over the sensor."""
     whole = store.file_shape("histogram/counts")
     ny, nx = maps.usable.shape
     tiles = [(y, x) for y in range(0, ny, whole[0]) for x in range(0, nx, whole[1])]
     origin = store.read("histogram/origin")
-    counts, origins, parameters, covariance = [], [], [], []
+    counts, origins, parameters = [], [], []
     pieces = _spread(len(tiles), _PIECES)
     for y, x in (tiles[i] for i in pieces):
         part = (slice(y, y + whole[0]), slice(x, x + whole[1]))
@@ -172,12 +163,6 @@ def _codes(store: RunStore, maps: PixelMaps, *, joint: bool) -> CodeSample | Non
         origins.append(origin[part].ravel()[inside].astype(np.int64))
         values = maps.maps
         parameters.append(np.stack([each[part].ravel()[inside] for each in values], axis=1))
-        if joint:
-            y_x = y + rows, x + columns
-            errors = [store.read_pixels(f"fit/{name}_stderr", *y_x) for name in PARAMETERS]
-            correlation = store.read_pixels("fit/correlation", *y_x)
-            covariance.append(covariance_from(np.stack(errors, axis=1), correlation))
     if sum(part.size for part in origins) < _FEWEST:
         return None
-    of_joint = np.nan_to_num(np.concatenate(covariance)) if joint else None
-    return CodeSample(np.concatenate(counts), np.concatenate(origins), np.concatenate(parameters), of_joint)
+    return CodeSample(np.concatenate(counts), np.concatenate(origins), np.concatenate(parameters), joint)

@@ -71,7 +71,7 @@ _ALL = (
     ),
     Stage(
         "histogram",
-        version=1,
+        version=2,
         upstream=("ingest",),
         # not band_memory: it changes no result
         settings=(

@@ -11,7 +11,10 @@ from pchem_pipeline.discrepancy.quick.codes import CodeSample
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.histogram.count import histogram_frames
+from pchem_pipeline.model.histogram.odd_frames import left_out, odd_frames
+from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import (
+    ROW_GROUP,
     SummaryAccumulator,
     block_starts,
     frame_statistics,
@@ -39,7 +42,14 @@ def stack(
 
 
 def sums_of(frames: Array, block: int = 256) -> StackSums:
-    """The summaries as the stage ``histogram`` makes them."""
+    """The summaries as the stage ``histogram`` makes them; odd frames are in none of the sums."""
+    lines = line_sums(frames)
+    mean, variance = frame_statistics(lines.row_sum, lines.row_sum_square, frames.shape[2])
+    _, digest = np.unique(frames.reshape(len(frames), -1), axis=0, return_inverse=True)
+    level = np.median(lines.row_sum - np.median(lines.row_sum, axis=0), axis=1) / frames.shape[2]
+    odd = odd_frames(level, variance, digest.ravel(), frames[0].size)
+    numbers = np.setdiff1d(np.arange(len(frames)), left_out(odd, len(frames)))
+    frames = frames[numbers]
     n, ny, nx = frames.shape
     summaries = SummaryAccumulator((ny, nx), block)
     blocks = summaries.add(frames)
@@ -47,9 +57,10 @@ def sums_of(frames: Array, block: int = 256) -> StackSums:
     blocks += rest
     lines = line_sums(frames)
     starts = block_starts(n, block)
-    mean, variance = frame_statistics(lines.row_sum, lines.row_sum_square, nx)
+    spectrum = FrameSpectrum((min(ny, ROW_GROUP), nx))
+    spectrum.add(frames[:, :ROW_GROUP])
     return StackSums(
-        n,
+        numbers,
         starts.size,
         np.diff(np.append(starts, n)),
         np.stack([each.block_sum for each in blocks]),
@@ -59,10 +70,11 @@ def sums_of(frames: Array, block: int = 256) -> StackSums:
         lines.column_sum,
         mean,
         variance,
-        1 + np.flatnonzero((frames[1:] == frames[:-1]).all(axis=(1, 2))),
         covariances.lag1_covariance,
         covariances.neighbour_covariance_x,
         covariances.neighbour_covariance_y,
+        odd,
+        spectrum.line(),
     )
 
 

@@ -108,7 +108,8 @@ def _score_statistics(scores: FloatArray, log_exposure: FloatArray) -> dict[str,
     return found
 
 
-def _code_statistics(codes: CodeSums, residuals: CodeResiduals) -> dict[str, float]:
+def width_statistics(codes: CodeSums) -> tuple[dict[str, float], FloatArray]:
+    """Return the statistics of the widths of codes, and the deviation of each, 0 of rare ones."""
     found = period_statistics(codes.fold, codes.fold_covariance) if codes.fold_covariance.trace() > 0 else {}
     _, expected, residual, variance = codes.single
     variance = np.maximum(variance, 0.05 * expected)
@@ -125,6 +126,11 @@ def _code_statistics(codes: CodeSums, residuals: CodeResiduals) -> dict[str, flo
         )
     if judged.any():
         found["code.largest"] = laws.largest_normal(z[judged])
+    return found, z
+
+
+def _code_statistics(codes: CodeSums, residuals: CodeResiduals) -> dict[str, float]:
+    found, _ = width_statistics(codes)
     smooth = _absorbed_chi_square(
         codes.bins[0], codes.bin_covariance, np.where(codes.bins[2] >= _ENOUGH, codes.bins[1], 0.0)
     )

@@ -66,6 +66,51 @@ class Check:
         return self.p_global < SIGNIFICANCE
 
 
+_IN_NOISE = "it is in the noise of each pixel and does not average out over pixels"
+_GAIN = "the gain, e⁻/DN, reads {} by about"
+_COUPLE = f"if neighbours couple, {_GAIN} twice the correlation"
+#: Of each check the unit of its size, what was looked for, and what it does to the results.
+_WORDS: dict[str, tuple[str, str, str]] = {
+    "levels": ("DN", "the frames are of several exposures", "make a run of each, from its own files or by "
+               "input.frame_range, and fit them together with pchem joint"),
+    "odd_frames": ("1", "frames stand out", "the fit has them: leave them out {}"),
+    "empty_frames": ("1", "frames are empty", "they are not counted"),
+    "repeated_frames": ("1", "frames equal an earlier one",
+                        "there are fewer samples than frames, and standard errors are too small"),
+    "frame_noise": ("DN", "the pixels of a frame move together", _IN_NOISE),
+    "row_noise": ("DN", "the pixels of a row move together", _IN_NOISE),
+    "column_noise": ("DN", "the pixels of a column move together", _IN_NOISE),
+    "drift": ("DN", "the mean of the frames drifts", "it widens the read noise, and what is taken for one "
+              "exposure changes along the run"),
+    "period": ("DN", "the mean of the frames has a period", "it widens the read noise"),
+    "frame_lag": ("1", "the mean of a frame resembles that of the frame before",
+                  "noise that the frames share has a memory"),
+    "lag": ("1", "samples resemble those of the frame before",
+            f"charge or signal is carried over: {_GAIN} as much"),
+    "neighbours_x": ("1", "neighbours in a row resemble each other", _COUPLE),
+    "neighbours_y": ("1", "neighbours in a column resemble each other", _COUPLE),
+    "wandering_pixels": ("1", "pixels change their level along the run",
+                         "their exposure and read noise are of several levels: a region that was moved, "
+                         "a drift, or blinking pixels"),
+    "local_drift": ("DN", "a part of the sensor drifts apart from the rest",
+                    "it widens the read noise there"),
+    "wave": ("DN", "a wave runs across the samples in the order of reading",
+             "pickup: it widens the read noise; pchem discrepancy finds its frequency"),
+    "codes": ("LSB", "codes have different widths",
+              "the histograms of all pixels deviate from the model at the same DN"),
+    "top_code": ("1", "samples pile up at the highest code",
+                 "larger signals are cut off there: exposures of bright pixels come out too low"),
+    "bottom_code": ("1", "samples pile up at the lowest code", "the black level is too low: raise it, or set "
+                    "input.bit_depth"),
+}  # fmt: skip
+
+
+def check_of(name: str, p: float, size: float, *, how: str = "", **rest: Any) -> Check:
+    """Return a check with its words; ``how`` is what its advice leaves open."""
+    unit, title, advice = _WORDS[name]
+    return Check(name, title, p, size, unit, advice=advice.format(how), **rest)
+
+
 @dataclass(frozen=True)
 class QuickLook:
     """All checks of a run.
@@ -123,7 +168,6 @@ _SIGNS: dict[str, tuple[str, ...]] = {
     "frame_lag": (
         "frame.readout.lag1", "frame.charge.lag1", "time.lag1.readout.mean", "time.cross.readout_charge",
     ),
-    "single_frames": ("frame.readout.largest", "frame.readout.quadrants", "tail.high.clusters"),
     "lag": (
         "time.lag1.readout.mean", "time.lag1.charge.mean", "time.cross.readout_charge", "frame.repeated",
     ),
@@ -137,6 +181,10 @@ _SIGNS: dict[str, tuple[str, ...]] = {
     "repeated_frames": ("frame.repeated",),
     "codes": ("code.rough", "code.smooth"),
     "top_code": ("code.top",),
+    "bottom_code": ("code.bottom",),
+    "wave": ("space.sample.readout.line", "space.sample.readout.spectrum"),
+    "odd_frames": ("frame.readout.largest", "frame.readout.quadrants"),
+    "empty_frames": (),
 }  # fmt: skip
 
 
@@ -172,10 +220,12 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "neighbours_x": (0.005, 0.05),
     "neighbours_y": (0.005, 0.05),
     "repeated_frames": (1e-3, 0.05),
-    "single_frames": (0.01, 0.1),
     "wandering_pixels": (0.01, 0.2),
     "codes": (0.1, 0.5),
     "top_code": (1e-4, 1e-2),
+    "bottom_code": (1e-4, 1e-2),
+    "odd_frames": (0.0, 0.05),
+    "empty_frames": (0.01, 0.1),
 }
 
 

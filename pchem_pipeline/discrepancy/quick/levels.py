@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
-from pchem_pipeline.discrepancy.quick.checks import Check
+from pchem_pipeline.discrepancy.quick.checks import Check, check_of
+from pchem_pipeline.model.histogram.odd_frames import frame_words
 
 FloatArray = NDArray[np.float64]
 
@@ -34,42 +36,40 @@ def levels_check(mean: FloatArray, variance: FloatArray, gain: float) -> Check:
         variance: likewise, DN^2.
         gain: of the median pixel, e-/DN.
     """
-    levels = sorted(_parted(mean, variance, gain), key=lambda frames: float(mean[frames].mean()))
+    levels, p = _parted(mean, variance, gain)
+    levels.sort(key=lambda frames: float(mean[frames].mean()))
     several = len(levels) > 1
     centres = [float(mean[frames].mean()) for frames in levels]
-    return Check(
-        "levels",
-        "the frames are of several exposures",
-        1e-12 if several else 1.0,
-        centres[-1] - centres[0] if several else 0.0,
-        "DN",
-        where="; ".join(
-            f"{_frame_words(frames)} at {centre:.4g} DN"
-            for frames, centre in zip(levels[:_SHOWN], centres, strict=False)
-        )
-        + (f" and {len(levels) - _SHOWN} levels more" if len(levels) > _SHOWN else "")
-        if several
-        else "",
-        advice="make a run of each, from its own files or by input.frame_range, and fit them together with "
-        "pchem joint",
-    )
+    more = f" and {len(levels) - _SHOWN} levels more" if len(levels) > _SHOWN else ""
+    shown = zip(levels[:_SHOWN], centres, strict=False)
+    where = "; ".join(f"{frame_words(frames, 1)} at {centre:.4g} DN" for frames, centre in shown) + more
+    return check_of("levels", p, centres[-1] - centres[0], where=where if several else "")
 
 
-def _parted(mean: FloatArray, variance: FloatArray, gain: float) -> list[NDArray[np.int64]]:
-    """Return the frames of each level; all of them where there is one."""
-    levels = [np.arange(mean.size)]
+def _parted(mean: FloatArray, variance: FloatArray, gain: float) -> tuple[list[NDArray[np.int64]], float]:
+    """Return the frames of each level, and how probable the growth of the variance between any two is."""
+    levels, p = [np.arange(mean.size)], 1.0
     if mean.size < _FEWEST_FRAMES:
-        return levels
+        return levels, p
     fewest = max(_FEWEST_OF_LEVEL, int(np.ceil(_LEAST_SHARE * mean.size)))
     while len(levels) < _MOST_LEVELS:
         for number, frames in enumerate(levels):
             halves = _halves(frames, mean, fewest)
             if halves is not None and _shot_noise_grows(halves, mean, variance, gain):
+                p = min(p, _chance(variance[halves[0]], variance[halves[1]]))
                 levels[number : number + 1] = halves
                 break
         else:
             break
-    return levels
+    return levels, p
+
+
+def _chance(low: FloatArray, high: FloatArray) -> float:
+    """Return how probable it is that the mean of ``high`` is so much larger by chance (Student's test)."""
+    n = low.size + high.size
+    within = (low.size * low.var() + high.size * high.var()) / (n - 2.0)
+    error = np.sqrt(max(within, 1e-300) * (1.0 / low.size + 1.0 / high.size))
+    return float(special.stdtr(n - 2.0, -(high.mean() - low.mean()) / error))
 
 
 def _halves(frames: NDArray[np.int64], mean: FloatArray, fewest: int) -> list[NDArray[np.int64]] | None:
@@ -99,10 +99,3 @@ def _shot_noise_grows(
     low, high = halves
     grown = float(np.median(variance[high]) - np.median(variance[low]))
     return grown * gain > _SHOT_SHARE * float(mean[high].mean() - mean[low].mean())
-
-
-def _frame_words(frames: NDArray[np.int64]) -> str:
-    """Return frames as one range, or as their number where others lie between."""
-    first, last = int(frames[0]), int(frames[-1])
-    whole = last - first + 1 == frames.size
-    return f"frames {first} to {last}" if whole else f"{frames.size:,} frames from {first} to {last}"

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.observe.laws import chi_square
-from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLook, graded
+from pchem_pipeline.discrepancy.observe.laws import chi_square, without_skew
+from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLook, check_of, graded
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.levels import levels_check
 from pchem_pipeline.discrepancy.quick.places import (
@@ -36,6 +36,7 @@ from pchem_pipeline.discrepancy.quick.places import (
 from pchem_pipeline.discrepancy.quick.series import normal_p, of_many, series_checks
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, frame_words, odd_words
 from pchem_pipeline.model.maps.ordered import median_of
 
 if TYPE_CHECKING:
@@ -54,8 +55,6 @@ _LARGEST_SQUARE = 25.0
 _SURE = 5.4
 _FEWEST_LINES = 4
 _FEWEST_BLOCKS = 4
-#: Probability below which a pixel wanders, whose means over blocks are not quite normal.
-_WANDERS = 1e-10
 _SHOWN = 6
 
 
@@ -81,15 +80,62 @@ def quick_look(
     usable = maps.usable
     gain, noise = (median_of(values, ~usable) for values in (maps.conversion_gain, maps.read_noise_dn))
     if sums is not None and sums.freedom > 0:
-        checks.append(levels_check(sums.frame_mean, sums.frame_variance, gain))
-        checks += _stack_checks(sums, maps)
+        checks.append(levels_check(sums.all_means, sums.all_variances, gain))
+        checks += [*_odd_frames(sums), *_stack_checks(sums, maps), *_wave(sums)]
     if codes is not None:
         checks += code_checks(codes)
     samples = 0 if sums is None else sums.n_frames * int(np.prod(sums.shape))
     found, unseen = graded(checks, gain, noise, model), dict(missing or {})
+    made = {check.name for check in found}
+    unseen |= {} if sums is None else {part: why for name, (part, why) in _NEEDS.items() if name not in made}
     if found and found[0].name == "levels" and found[0].level == "serious":
         found, unseen = found[:1], {**unseen, "all else": "the frames are of several exposures"}
     return QuickLook(found, unseen, samples, command)
+
+
+#: Checks that a stack can be too small for: what they look at, and why it was not.
+_NEEDS = {
+    "wandering_pixels": ("pixels along the run", "frames are fewer than four blocks, of 32 or more each"),
+    "drift": ("the mean of the frames along the run", "frames are fewer than 64"),
+    "wave": ("pickup along the reading order", "rows or columns are fewer than 8"),
+    "frame_noise": ("what all pixels of a frame share", "rows or columns are fewer than 4"),
+}
+
+
+def _odd_frames(sums: StackSums) -> list[Check]:
+    """Return whether frames are far from the others, empty or copies: all other checks are of the rest."""
+    n, odd, variance = sums.all_means.size, sums.odd, sums.rows.variance
+    if not odd:
+        return []
+    # rows have the same sum by chance with the density of the difference at 0, in any pair of frames
+    alike = float(np.log(np.minimum(1.0, 0.5 / np.sqrt(np.pi * np.maximum(variance, 0.1)))).sum())
+    equal, far = math.exp(max(alike + 2.0 * math.log(n), -700.0)), odd["far"]
+    first = far.size > 0 and int(far[-1]) == far.size - 1
+    how = f"with --frames {far.size}: (input.frame_range)" if first else "by input.frame_range"
+    return [
+        check_of(
+            name, min(p, 1.0) if frames.size else 1.0, frames.size / n, limit=1.0 / n, where=where, how=how
+        )
+        for name, frames, p, where in (
+            ("odd_frames", far, n * FAR_CHANCE, odd_words({"far": far}, sums.all_means)),
+            ("empty_frames", odd["empty"], n * FAR_CHANCE, frame_words(odd["empty"])),
+            ("repeated_frames", odd["copied"], equal, frame_words(odd["copied"])),
+        )
+    ]
+
+
+def _wave(sums: StackSums) -> list[Check]:
+    """Return whether one wave runs across the samples of the frames as they are read."""
+    line = sums.spectrum
+    if not line:
+        return []
+    frames, cells = line["frames"], line["cells"]
+    cycles = (f"{line[f'cycles_per_{of}']:+.3g} cycles per {of}" for of in ("column", "row"))
+    # of so many means of exponential numbers the largest
+    sure = (math.sqrt(2.0 * math.log(cells)) + 3.0) / math.sqrt(frames)
+    p = of_many(float(special.gammaincc(frames, frames * line["ratio"])), cells)
+    limit, where = line["unit"] * math.sqrt(sure), ", ".join(cycles)
+    return [check_of("wave", p, line["size"], limit=limit, where=where)]
 
 
 @dataclass(frozen=True)
@@ -115,24 +161,21 @@ _NOTHING = _Estimate(0.0, math.inf, 1.0)
 
 
 def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
-    frame, of_columns = _frame_covariance(sums)
-    rows, columns = _of_lines(sums.rows), of_columns
-    checks = []
+    frame, columns = _frame_covariance(sums)
+    rows, checks = _of_lines(sums.rows), []
+    shared = _Estimate(0.0, 0.0, 1.0)
     if math.isfinite(frame.error):
-        checks.append(_noise_check("frame_noise", "the pixels of a frame move together", frame))
+        shared = frame
+        checks.append(_noise_check("frame_noise", frame))
     if math.isfinite(rows.error):
-        checks.append(_noise_check("row_noise", "the pixels of a row move together",
-                                   rows.less(frame) if math.isfinite(frame.error) else rows,
-                                   sums.rows, "row"))  # fmt: skip
+        checks.append(_noise_check("row_noise", rows.less(shared), sums.rows))
     if math.isfinite(columns.error):
-        checks.append(_noise_check("column_noise", "the pixels of a column move together",
-                                   columns.less(frame) if math.isfinite(frame.error) else columns,
-                                   sums.columns, "column", sums.shape[1]))  # fmt: skip
-    mean, error, skewness = _frame_means(sums, maps)
-    checks += series_checks(mean, error, skewness)
+        checks.append(_noise_check("column_noise", columns.less(shared), sums.columns, sums.shape[1]))
+    third = _third_moment(maps)
+    checks += series_checks(_frame_means(sums))
     common = _Common(frame, rows, columns, sums)
-    checks += [*_lag_check(sums, common), *_neighbour_checks(sums, common), *_wandering(sums, maps)]
-    return [*_located(checks, sums), *_repeats(sums)]
+    checks += [*_lag_check(sums, common), *_neighbour_checks(sums, common), *_wandering(sums, maps, third)]
+    return _located(checks, sums)
 
 
 #: The map that shows where each check fails.
@@ -194,24 +237,14 @@ def _placed(check: Check, place: SensorPlace, sums: StackSums) -> Check:
 
 def _local_drift(sums: StackSums, place: SensorPlace | None) -> Check:
     """Return whether a part of the sensor moves along the run, and the rest does not."""
-    title = "a part of the sensor drifts apart from the rest"
-    advice = "it widens the read noise there"
     if place is None:
-        return Check("local_drift", title, 1.0, 0.0, "DN", advice=advice)
+        return check_of("local_drift", 1.0, 0.0)
     inside = place.region.mask(sums.shape) & (sums.variance > 0)
     common = block_deviations(sums)[:, inside].mean(axis=1)
     chance = float(sums.variance[inside].mean()) / (float(sums.lengths.mean()) * inside.sum())
     size = math.sqrt(max(float(np.average(common**2, weights=sums.lengths)) - chance, 0.0))
-    return Check(
-        "local_drift",
-        title,
-        place.p,
-        size,
-        "DN",
-        where=place.region.words(),
-        region=place.region.numbers(),
-        advice=advice,
-    )
+    words, numbers = place.region.words(), place.region.numbers()
+    return check_of("local_drift", place.p, size, where=words, region=numbers)
 
 
 # -- what is common to lines and frames ----------------------------------------------------------
@@ -263,7 +296,7 @@ def _frame_covariance(sums: StackSums) -> tuple[_Estimate, _Estimate]:
     neighbours = along * float(np.mean(down[np.isfinite(down)])) if np.isfinite(down).any() else 0.0
     pairs_all = pairs * nx
     in_columns = columns.value if math.isfinite(columns.error) else 0.0
-    others = pairs_all - pairs - along * 0.0
+    others = pairs_all - pairs
     estimate = (value - neighbours - (pairs - along) * in_columns) / others
     error = chance / others
     if math.isfinite(columns.error):
@@ -271,29 +304,14 @@ def _frame_covariance(sums: StackSums) -> tuple[_Estimate, _Estimate]:
     return _Estimate(estimate, error, freedom), columns
 
 
-def _noise_check(
-    name: str,
-    title: str,
-    found: _Estimate,
-    lines: Lines | None = None,
-    line: str = "",
-    width: int = 0,
-) -> Check:
+def _noise_check(name: str, found: _Estimate, lines: Lines | None = None, width: int = 0) -> Check:
     """Return the check of a covariance that pixels share, and of single lines that share more than others."""
     p, where = normal_p(found.z), ""
     if lines is not None:
-        single, where = _single_lines(lines, line, width)
+        single, where = _single_lines(lines, name.removesuffix("_noise"), width)
         p = of_many(min(p, single), 2.0)
-    return Check(
-        name,
-        title,
-        p,
-        math.sqrt(max(found.value, 0.0)),
-        "DN",
-        limit=math.sqrt(_SURE * found.error),
-        where=where,
-        advice="it is in the noise of each pixel and does not average out over pixels",
-    )
+    size, limit = math.sqrt(max(found.value, 0.0)), math.sqrt(_SURE * found.error)
+    return check_of(name, p, size, limit=limit, where=where)
 
 
 def _single_lines(lines: Lines, line: str, width: int) -> tuple[float, str]:
@@ -317,22 +335,21 @@ def _single_lines(lines: Lines, line: str, width: int) -> tuple[float, str]:
     return of_many(float(p.min()), p.size), words
 
 
-def _frame_means(sums: StackSums, maps: PixelMaps) -> tuple[FloatArray, float, float]:
-    """Return the mean of each frame over the quiet rows, its standard deviation and skewness by chance.
-
-    Where the sums of some frames are not at hand, over all rows.
-    """
-    quiet = _quiet(sums) if sums.whole else sums.rows.variance > 0
-    if not quiet.any():
-        return np.zeros(0), math.nan, 0.0
-    pixels = quiet.sum() * sums.shape[1]
-    mean = sums.row_sum[:, quiet].sum(axis=1) / pixels if sums.whole else sums.frame_mean
-    scale = float(sums.rows.variance[quiet].sum())
+def _third_moment(maps: PixelMaps) -> FloatArray:
+    """Return the third central moment of each pixel's samples, H / g^3, 0 where it is not known, DN^3."""
     with np.errstate(divide="ignore", invalid="ignore"):
         third = maps.conversion_gain**3
         np.divide(maps.quanta_exposure, third, out=third)
     third[~maps.usable] = 0.0
-    return mean, math.sqrt(scale) / pixels, float(third[quiet].sum() / scale**1.5)
+    return third
+
+
+def _frame_means(sums: StackSums) -> FloatArray:
+    """Return the mean of each frame over the quiet rows; where sums are not at hand, over all rows."""
+    quiet = _quiet(sums)
+    if not sums.whole or not quiet.any():
+        return sums.frame_mean if quiet.any() else np.zeros(0)
+    return np.asarray(sums.row_sum[:, quiet].sum(axis=1) / (quiet.sum() * sums.shape[1]))
 
 
 # -- successive samples and neighbours -----------------------------------------------------------
@@ -369,100 +386,69 @@ class _Common:
         return 1.0 + (ny * nx * frame**2 + nx * row**2 + ny * column**2) / typical**2
 
 
-def _mean_correlation(z: FloatArray, common: _Common) -> tuple[float, float]:
-    """Return the mean of correlations that are z standard errors each, and its error, both over 1.
+def _resemblance(
+    name: str,
+    covariance: FloatArray,
+    size: FloatArray,
+    common: _Common,
+    shared: tuple[float, float],
+) -> list[Check]:
+    """Return whether pairs of samples resemble each other, beyond what they share with others.
 
-    ``z`` is clipped in place: it is as large as a map.
+    Args:
+        name: of the check.
+        covariance: of each pair, DN^2; NaN where there is none.
+        size: what it would be if both were equal, DN^2.
+        common: what pixels share.
+        shared: the part of the covariance that is not of the pair alone, and its error, DN^2.
     """
-    freedom = common.sums.freedom_of_all
+    some = (size > 0) & np.isfinite(covariance)
+    if not some.any():
+        return []
+    size, freedom = size[some], common.sums.freedom_of_all
+    z = covariance[some]
+    z /= size
+    z *= math.sqrt(freedom)
     np.clip(z, -_CLIP, _CLIP, out=z)
-    return float(z.mean()) / math.sqrt(freedom), math.sqrt(common.inflation / freedom / z.size)
-
-
-def _off(correlation: float) -> str:
-    """Return in which way charge that other samples take, or give, moves the fitted gain, e-/DN."""
-    return "high" if correlation > 0 else "low"
+    ratio = float(np.mean(np.minimum(1.0 / size, 4.0 / median_of(size))))
+    mean = float(z.mean()) / math.sqrt(freedom) - shared[0] * ratio
+    error = math.hypot(math.sqrt(common.inflation / freedom / z.size), shared[1] * ratio)
+    # charge that other samples take, or give, moves the fitted gain
+    how, limit = "high" if mean > 0 else "low", (_SURE + 0.2) * error
+    return [check_of(name, normal_p(mean / error, two_sided=True), mean, limit=limit, how=how)]
 
 
 def _lag_check(sums: StackSums, common: _Common) -> list[Check]:
     """Return whether samples of a pixel resemble those of the frame before, beyond what frames share."""
-    some = (sums.variance > 0) & np.isfinite(sums.lag)
-    if not some.any():
-        return []
-    variance = sums.variance[some]
-    z = sums.lag[some]
-    z /= variance
-    z *= math.sqrt(sums.freedom_of_all)
-    mean, error = _mean_correlation(z, common)
-    del z
-    quiet = _quiet(sums)
-    total = sums.rows.centred()[:, quiet].sum(axis=1)
-    inside = np.ones(total.size, np.bool_)
-    inside[sums.starts] = False
-    at = np.flatnonzero(inside)
-    pixels = float(quiet.sum() * sums.shape[1])
-    # a centred series is anticorrelated with itself
-    shared = (float(total[at] @ total[at - 1]) + float(np.mean(total**2)) * sums.lengths.size) / sums.freedom
-    shared = (shared - float(np.nansum(sums.lag[quiet]))) / pixels**2
+    shared, error = 0.0, 0.0
     if common.frame.z > 3.0:
-        mean -= shared * float(np.mean(1.0 / variance))
-        error = math.hypot(
-            error, math.sqrt(2.0 / sums.freedom) * abs(common.frame.value) / float(variance.mean())
-        )
-    return [
-        Check(
-            "lag",
-            "samples resemble those of the frame before",
-            normal_p(mean / error, two_sided=True),
-            mean,
-            "1",
-            limit=(_SURE + 0.2) * error,
-            advice=f"charge or signal is carried over: the gain, e⁻/DN, reads {_off(mean)} by about as much",
-        )
-    ]
+        quiet = _quiet(sums)
+        total = sums.rows.centred()[:, quiet].sum(axis=1)
+        inside = np.ones(total.size, np.bool_)
+        inside[sums.starts] = False
+        at = np.flatnonzero(inside)
+        # a centred series is anticorrelated with itself
+        shared = float(total[at] @ total[at - 1]) + float(np.mean(total**2)) * sums.lengths.size
+        shared = shared / sums.freedom - float(np.nansum(sums.lag[quiet]))
+        shared /= float(quiet.sum() * sums.shape[1]) ** 2
+        error = math.sqrt(2.0 / sums.freedom) * abs(common.frame.value)
+    return _resemblance("lag", sums.lag, sums.variance, common, (shared, error))
 
 
 def _neighbour_checks(sums: StackSums, common: _Common) -> list[Check]:
     """Return whether neighbours resemble each other, beyond what their line shares."""
-    v = sums.variance
-    found = []
-    for axis, one, other, covariance, shared in (
-        ("x", v[:, :-1], v[:, 1:], sums.next_x[:, :-1], common.of_row()),
-        ("y", v[:-1], v[1:], sums.next_y[:-1], common.of_column()),
+    v, found = sums.variance, []
+    for name, one, other, covariance, shared, line in (
+        ("neighbours_x", v[:, :-1], v[:, 1:], sums.next_x[:, :-1], common.of_row(), common.rows),
+        ("neighbours_y", v[:-1], v[1:], sums.next_y[:-1], common.of_column(), common.columns),
     ):
-        size = one * other
-        some = (size > 0) & np.isfinite(covariance)
-        if not some.any():
-            continue
-        size = size[some]
-        np.sqrt(size, out=size)
-        z = covariance[some]
-        z /= size
-        z *= math.sqrt(sums.freedom_of_all)
-        mean, error = _mean_correlation(z, common)
-        del z
-        which, line = (common.rows, "row") if axis == "x" else (common.columns, "column")
-        ratio = float(np.mean(np.minimum(1.0 / size, 4.0 / median_of(size))))
-        if math.isfinite(which.error):
-            mean -= shared * ratio
-            error = math.hypot(error, which.error * ratio)
-        found.append(
-            Check(
-                f"neighbours_{axis}",
-                f"neighbours in a {line} resemble each other",
-                normal_p(mean / error, two_sided=True),
-                mean,
-                "1",
-                limit=(_SURE + 0.2) * error,
-                advice=f"if neighbours couple, the gain, e⁻/DN, reads {_off(mean)} by about twice the "
-                "correlation",
-            )
-        )
+        known = (shared, line.error) if math.isfinite(line.error) else (0.0, 0.0)
+        found += _resemblance(name, covariance, np.sqrt(one * other), common, known)
     return found
 
 
-def _wandering(sums: StackSums, maps: PixelMaps) -> list[Check]:
-    """Return whether single pixels change their level along the run, less what all pixels do."""
+def _wandering(sums: StackSums, maps: PixelMaps, third: FloatArray) -> list[Check]:
+    """Return whether pixels change their level along the run, less what all pixels do."""
     lengths = sums.lengths
     if lengths.size < _FEWEST_BLOCKS:
         return []
@@ -476,47 +462,15 @@ def _wandering(sums: StackSums, maps: PixelMaps) -> list[Check]:
     basis = np.stack([np.ones(charge.size), charge])
     inner = (basis * weight) @ basis.T
     shared = np.linalg.lstsq(inner, (basis * weight) @ values.T, rcond=None)[0]
-    chi2 = (lengths[:, None] * (values - shared.T @ basis) ** 2).sum(axis=0) * weight
+    skewness = third[some] * weight**1.5
+    chi2 = np.zeros(charge.size)
+    for n, mean, common in zip(lengths.tolist(), values, shared.T @ basis, strict=True):
+        # block by block: each is as large as a map; the mean of few samples is as skewed as they are
+        chi2 += without_skew((mean - common) * np.sqrt(n * weight), skewness / math.sqrt(n)) ** 2
     p = special.chdtrc(lengths.size - 1.0, chi2)
-    out = np.flatnonzero(p < _WANDERS)
-    share = out.size / p.size
+    out = np.flatnonzero(p < SIGNIFICANCE / p.size)
     places = np.argwhere(some)[out[np.argsort(-chi2[out])][:3]]
     shown = ", ".join(f"({y}, {x})" for y, x in places)
-    return [
-        Check(
-            "wandering_pixels",
-            "single pixels change their level along the run",
-            1e-12 if out.size else 1.0,
-            share,
-            "1",
-            limit=2.0 / p.size,
-            where=f"{out.size:,} pixels, most at (y, x) {shown}" if out.size else "",
-            advice="their exposure is a mean over states",
-        )
-    ]
-
-
-def _repeats(sums: StackSums) -> list[Check]:
-    """Return whether frames repeat the one before: all sums over rows, and of squares, are the same."""
-    variance = sums.rows.variance
-    some = variance > 0
-    # a row repeats its sum by chance with the density of the difference at 0
-    log_chance = float(np.log(np.minimum(1.0, 0.5 / np.sqrt(np.pi * variance[some]))).sum())
-    if not some.any() or log_chance + math.log(sums.n_frames) > math.log(1e-9):
-        return []
-    same = sums.repeated.tolist()
-    words = ", ".join(str(t) for t in same[:_SHOWN]) + (
-        f" and {len(same) - _SHOWN} more" if len(same) > _SHOWN else ""
-    )
-    return [
-        Check(
-            "repeated_frames",
-            "frames repeat the one before",
-            1e-12 if same else 1.0,
-            len(same) / sums.n_frames,
-            "1",
-            limit=1.0 / sums.n_frames,
-            where=f"frame{'s' if len(same) > 1 else ''} {words}" if same else "",
-            advice="there are fewer samples than frames, and standard errors are too small",
-        )
-    ]
+    where = f"{out.size:,} pixels, most at (y, x) {shown}" if out.size else ""
+    p_any, share = of_many(float(p.min()), p.size), out.size / p.size
+    return [check_of("wandering_pixels", p_any, share, limit=2.0 / p.size, where=where)]

@@ -1,4 +1,4 @@
-"""Checks of the mean of the frames as a series in time: drift, periods, memory, single frames, repeats."""
+"""Checks of the mean of the frames as a series in time: drift, periods, memory."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import best, chi_square
-from pchem_pipeline.discrepancy.quick.checks import Check
+from pchem_pipeline.discrepancy.quick.checks import Check, check_of
 
 FloatArray = NDArray[np.float64]
 
@@ -18,7 +18,6 @@ _FEWEST_FRAMES = 64
 #: Frequencies on either side from which the noise around one is taken.
 _AROUND = 64
 _CLIP = 6.0
-_SHOWN = 6
 
 
 def normal_p(z: float, *, two_sided: bool = False) -> float:
@@ -31,16 +30,10 @@ def of_many(p: float, n: float) -> float:
     return float(-np.expm1(n * np.log1p(-min(max(p, 0.0), 1.0 - 1e-16))))
 
 
-def series_checks(mean: FloatArray, error: float, skewness: float) -> list[Check]:
-    """Return the checks of the frames' means.
+def series_checks(mean: FloatArray) -> list[Check]:
+    """Return the checks of the frames' means over the same pixels, DN, (n,).
 
-    All but that of single frames compare the series with itself in another order, so that noise of frame to
-    frame is none of them.
-
-    Args:
-        mean: of each frame, over the same pixels, DN, (n,).
-        error: its standard deviation where pixels are independent, DN.
-        skewness: likewise.
+    They compare the series with itself in another order, so that noise of frame to frame is none of them.
     """
     n = mean.size
     if n < _FEWEST_FRAMES:
@@ -55,7 +48,7 @@ def series_checks(mean: FloatArray, error: float, skewness: float) -> list[Check
         return []
     smooth, drift = _drift(series, noise)
     rest = series - smooth
-    return [drift, _period(rest), _memory(rest), _single(mean - smooth, spread, error, skewness)]
+    return [drift, _period(rest), _memory(rest)]
 
 
 def _drift(series: FloatArray, noise: float) -> tuple[FloatArray, Check]:
@@ -73,58 +66,26 @@ def _drift(series: FloatArray, noise: float) -> tuple[FloatArray, Check]:
     p = normal_p(best(*z, independent=0.5 * (1 + len(z))))
     excess = max(float(energy[chosen - 1]) - chosen, 0.0) * noise / n
     peak = float(np.ptp(smooth))
-    check = Check(
-        "drift",
-        "the mean of the frames drifts",
-        p,
-        math.sqrt(excess),
-        "DN",
-        limit=math.sqrt(16.0 * noise / n),
-        where=f"{peak:.2g} DN from its lowest to its highest",
-        advice="it widens the read noise, and what is taken for one exposure changes along the run",
-    )
+    where = f"{peak:.2g} DN from its lowest to its highest"
+    check = check_of("drift", p, math.sqrt(excess), limit=math.sqrt(16.0 * noise / n), where=where)
     return (smooth if p < 1e-3 else np.zeros(n)), check
 
 
 def _period(series: FloatArray) -> Check:
-    """Return whether one frequency stands out of those around it."""
+    """Return whether one frequency stands out of those around it; the last is that of even and odd frames."""
     n = series.size
     power = np.abs(np.fft.rfft(series)[1:]) ** 2
-    frequency = np.arange(1, power.size + 1) / n
-    alternating = n % 2 == 0
-    last = math.nan
-    if alternating:
-        last, power, frequency = float(power[-1]), power[:-1], frequency[:-1]
+    freedom = np.full(power.size, 2.0)
+    freedom[n // 2 - 1 :] = 1.0 if n % 2 == 0 else 2.0
     around, width = _around(power)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(around > 0, power / around, 0.0)
-    # a power over the mean of w others: F(2, 2 w)
-    log_tail = -width * np.log1p(ratio / width)
-    at = int(np.argmin(log_tail))
-    p = of_many(math.exp(max(float(log_tail[at]), -700.0)), power.size)
+    p = special.fdtrc(freedom, 2.0 * width, power / np.maximum(around, 1e-300))
+    at = int(np.argmin(p))
     # a line between two frequencies spreads over those around it
     near = power[max(at - 2, 0) : at + 3]
     height = max(float(near.sum()) - near.size * float(around[at]), 0.0)
-    words, amplitude = f"period {1.0 / frequency[at]:.4g} frames", 2.0 * math.sqrt(height) / n
-    if alternating and around.size:
-        # the last frequency has one degree of freedom
-        ends = 2.0 * normal_p(math.sqrt(last / max(float(around[-1]), 1e-300)))
-        w = float(width[-1])
-        ends = max(
-            ends, float(2.0 * special.stdtr(2.0 * w, -math.sqrt(last / max(float(around[-1]), 1e-300))))
-        )
-        if ends < p:
-            p, words, amplitude = ends, "even and odd frames differ", math.sqrt(last) / n * math.sqrt(2.0)
-        p = of_many(p, 2.0)
-    return Check(
-        "period",
-        "the mean of the frames has a period",
-        p,
-        amplitude / math.sqrt(2.0),
-        "DN",
-        where=words,
-        advice="it widens the read noise",
-    )
+    words = f"period {n / (at + 1):.4g} frames" if freedom[at] == 2.0 else "even and odd frames differ"
+    size = math.sqrt(freedom[at] * height) / n
+    return check_of("period", of_many(float(p[at]), power.size), size, where=words)
 
 
 def _around(power: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -144,35 +105,5 @@ def _memory(series: FloatArray) -> Check:
     n = series.size
     total = float(series @ series)
     correlation = float(series[1:] @ series[:-1]) / max(total, 1e-300) + 1.0 / n
-    return Check(
-        "frame_lag",
-        "the mean of a frame resembles that of the frame before",
-        normal_p(correlation * math.sqrt(n), two_sided=True),
-        correlation,
-        "1",
-        limit=5.7 / math.sqrt(n),
-        advice="noise that the frames share has a memory",
-    )
-
-
-def _single(series: FloatArray, spread: float, error: float, skewness: float) -> Check:
-    """Return whether single frames stand out."""
-    centre = float(np.median(series))
-    z = (series - centre) / max(spread, error)
-    # the law of a sum of counts is a little skewed (Wilson and Hilferty)
-    skew = skewness if abs(skewness) > 1e-6 else 1e-6
-    normal = 6.0 / skew * (np.cbrt(np.maximum(1.0 + 0.5 * skew * z, 0.0)) - 1.0) + skew / 6.0
-    p = 2.0 * special.ndtr(-np.abs(normal))
-    out = np.flatnonzero(p < 1e-3 / p.size)
-    largest = int(np.argmin(p))
-    shown = out[np.argsort(p[out])][:_SHOWN] if out.size else np.array([largest])
-    more = f" and {out.size - shown.size} more" if out.size > shown.size else ""
-    return Check(
-        "single_frames",
-        "single frames stand out",
-        of_many(float(p[largest]), p.size),
-        max(out.size, 1) / series.size,
-        "1",
-        where=f"frame{'s' if shown.size > 1 else ''} {', '.join(str(i) for i in np.sort(shown))}{more}",
-        advice="leave them out (input.frame_range), or see what happened there",
-    )
+    p = normal_p(correlation * math.sqrt(n), two_sided=True)
+    return check_of("frame_lag", p, correlation, limit=5.7 / math.sqrt(n))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -85,20 +86,21 @@ class StackSums:
     """Summaries of a stack, as the stage ``histogram`` makes them; of a long run those of some blocks.
 
     Attributes:
-        n_frames: frames of the stack.
+        numbers: of the frames that the sums are of, odd ones left out, increasing, (n,).
         n_blocks: blocks of the stack.
         lengths: frames of each block whose sums are at hand, (b,).
         block_sum, block_sum_square: of each pixel, (b, y, x), DN, DN^2.
         row_sum: of the frames of these blocks, (frame, y), DN.
         column_blocks: which of these blocks have column sums at hand, increasing.
         column_sum: of the frames of those, sums over groups of rows, (frame, group, x), DN.
-        frame_mean, frame_variance: of all frames of the stack, over all pixels, DN, DN^2.
-        repeated: frames with the sums, and sums of squares, of the one before in every row.
+        all_means, all_variances: of all frames of the stack, over all pixels, DN, DN^2.
         lag: covariance of successive frames within all blocks, (y, x), DN^2.
         next_x, next_y: covariance with the next pixel along x and y, NaN without one.
+        odd: frames by kind: empty, copied, far.
+        spectrum: of the first frames over rows and columns, see `FrameSpectrum.line`.
     """
 
-    n_frames: int
+    numbers: IntArray
     n_blocks: int
     lengths: IntArray
     block_sum: NDArray[np.int64]
@@ -106,12 +108,23 @@ class StackSums:
     row_sum: NDArray[np.int64]
     column_blocks: IntArray
     column_sum: NDArray[np.signedinteger]
-    frame_mean: FloatArray
-    frame_variance: FloatArray
-    repeated: IntArray
+    all_means: FloatArray
+    all_variances: FloatArray
     lag: FloatArray
     next_x: FloatArray
     next_y: FloatArray
+    odd: dict[str, IntArray] = field(default_factory=dict)
+    spectrum: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def n_frames(self) -> int:
+        """Frames that the sums are of."""
+        return self.numbers.size
+
+    @property
+    def frame_mean(self) -> FloatArray:
+        """Mean over all pixels of each of these frames, DN, (n,)."""
+        return self.all_means[self.numbers]
 
     @property
     def shape(self) -> tuple[int, int]:

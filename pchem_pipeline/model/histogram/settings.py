@@ -10,11 +10,12 @@ from pchem_pipeline.base.settings import Section
 class HistogramSettings(Section):
     """How frames are turned into per-pixel histograms and summaries."""
 
-    block_frames: int = Field(
-        default=512,
+    block_frames: int | None = Field(
+        default=None,
         ge=2,
         le=16384,
-        description="frames in a time block of the summaries (block sums, covariances within blocks)",
+        description="frames in a time block of the summaries (block sums, covariances within blocks); "
+        "null: a sixteenth of the run, 32 to 512",
     )
     window_frames: int = Field(
         default=256,
@@ -40,3 +41,7 @@ class HistogramSettings(Section):
         ge=16,
         description="memory of a worker, MiB; decides the rows that it takes at a time, never the result",
     )
+
+    def block_length(self, n_frames: int) -> int:
+        """Return the frames in a time block of a run of ``n_frames``."""
+        return self.block_frames or min(max(n_frames // 16, 32), 512)

@@ -8,6 +8,7 @@ every frame is read once.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -181,6 +182,24 @@ class SummaryAccumulator:
         down[ROW_GROUP - 1 :: ROW_GROUP] = np.nan
         down[-1] = np.nan
         return done, CovarianceMaps(lag, right, down)
+
+    def exchange(self, pieces: Iterable[_Frames], kept: NDArray[np.bool_]) -> BlockSums:
+        """Leave frames of a closed block out of the covariances; return the block's sums without them.
+
+        Args:
+            pieces: all frames of the block, (frame, y, x), one after the other.
+            kept: which of them stay, (frame,).
+        """
+        shape, n = self._reference.shape, int(kept.sum())
+        before, after = SummaryAccumulator(shape, kept.size), SummaryAccumulator(shape, max(n, 1))
+        done, at = [BlockSums(*np.zeros((2, *shape), np.int64))], 0
+        for piece in pieces:
+            before.add(piece)
+            done += after.add(piece[kept[at : at + len(piece)]])
+            at += len(piece)
+        self._covariances += after._covariances - before._covariances
+        self._freedom += after._freedom - before._freedom
+        return done[-1]
 
     def _add_part(self, frames: _Frames) -> None:
         """Add frames that all belong to the open block."""

@@ -106,7 +106,8 @@ def frame_table(sums: StackSums) -> DataTable:
     starts = np.arange(0, sums.n_frames, together)
     lengths = np.diff(np.append(starts, sums.n_frames))
     means = np.add.reduceat(sums.frame_mean, starts) / lengths
-    columns = {"frame": starts, "mean": means, "error of chance": _chance(sums) / np.sqrt(lengths)}
+    error = _chance(sums) / np.sqrt(lengths)
+    columns = {"frame": sums.numbers[starts], "mean": means, "error of chance": error}
     return DataTable(columns, {"mean": "DN", "error of chance": "DN"})
 
 

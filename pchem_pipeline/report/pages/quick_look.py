@@ -8,7 +8,7 @@ from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
 from pchem_pipeline.report.style.wording import percent, short
 
 #: What was looked at, in the order of a reader's questions.
-_SUBJECTS = "frames, rows, columns, neighbours, successive samples and codes"
+_SUBJECTS = "frames, rows, columns, neighbours, successive samples, pickup and codes"
 
 
 #: What a check of resemblance finds where the correlation is negative.
@@ -29,7 +29,9 @@ def check_title(check: Check) -> str:
 def check_sentence(check: Check) -> str:
     """Return what a check found, without the full stop."""
     text = f"{check_title(check)}: {size_text(check)}"
-    if check.where:
+    if check.name.endswith("_code"):
+        text += f" are {check.where}"
+    elif check.where:
         text += f" ({check.where})"
     if check.in_model:
         return f"{text}; the model has an effect like it"

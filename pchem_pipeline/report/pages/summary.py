@@ -519,11 +519,20 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
         return Answer(
             question, "caution", word, f"{checks}; {count(pixels.failed, data.noun)} have none.{looked}"
         )
-    return Answer(question, "good", "Yes", f"{checks}.{looked}")
+    quick = data.discrepancy is None
+    return Answer(question, "good", _QUICK_YES if quick else "Yes", f"{checks}.{looked}")
+
+
+_QUICK_YES = "No problem found by the quick checks"
 
 
 def _not_looked_for(data: ReportData) -> str:
     """Say that nobody looked closely at what the model may be missing."""
     if data.quick_look is None or not data.quick_look.checks:
         return " What the model may be missing was not looked for."
-    return f" That was a quick look; {data.quick_look.command} compares far more with simulations."
+    missing = data.quick_look.missing
+    parts = f" Not looked at: {', '.join(missing)}." if missing else ""
+    return (
+        f"{parts} The quick checks do not see what is alike in all frames and pixels (a nonlinearity, charge "
+        f"that is not Poisson distributed); {data.quick_look.command} compares that, with simulations."
+    )

@@ -86,7 +86,7 @@ def _limit_text(check: Check) -> str:
 
 
 def _chance_text(p: float) -> str:
-    return "< 10⁻¹⁰" if p < 1e-10 else short(p, 2) if p > 1e-3 else scientific(p, 1)
+    return "< 10⁻⁶" if p < 1e-6 else short(p, 2) if p > 1e-3 else scientific(p, 1)
 
 
 def _parameters(data: ReportData) -> Table:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.discrepancy.null import free_of_parameters
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.quick.places import SensorPlace
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.frames.stream import FrameSource
-from pchem_pipeline.stages.discrepancy.window import choose_window, read_window
+from pchem_pipeline.stages.discrepancy.survey import Survey
+from pchem_pipeline.stages.discrepancy.window import read_window
 
 #: Standard deviations of the largest statistic. Some poor sensors have as many without any effect (of 60 of
 #: all kinds none more than 20), as without simulations their statistics are not quite standard normal: of
@@ -31,7 +31,7 @@ def fewer_samples(
     source: FrameSource,
     settings: DiscrepancySettings,
     roi: Sequence[int] | None,
-    places: Mapping[str, SensorPlace],
+    seen: Survey,
 ) -> DiscrepancySettings:
     """Return the settings with as few samples to be compared as show the disagreement beyond any doubt.
 
@@ -41,13 +41,13 @@ def fewer_samples(
         source: the frames.
         settings: as configured, or as the memory allows.
         roi: rows and columns that the user asked for.
-        places: where the survey found that the sensor stands out.
+        seen: what the survey found.
     """
-    most = choose_window(source.shape, settings, roi, places).share(source.shape)
+    most = seen.window(source.shape, settings, roi).share(source.shape)
     samples = settings.clear_samples
     while samples < settings.max_samples:
         few = settings.model_copy(update={"max_samples": samples})
-        window = choose_window(source.shape, few, roi, places)
+        window = seen.window(source.shape, few, roi)
         if window.share(source.shape) >= most:
             break
         length = block_length(window.numbers.size, settings.block_frames)

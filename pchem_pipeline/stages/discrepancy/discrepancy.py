@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from pchem_pipeline.base.errors import PchEmError, StoreError, error_words, quoted
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.by_likelihood.explainer import find_in_histograms
@@ -28,6 +30,7 @@ from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy, Elsewhere
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.frames.stream import FrameSource
+from pchem_pipeline.model.histogram.odd_frames import frame_words
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
@@ -37,7 +40,6 @@ from pchem_pipeline.stages.discrepancy.clear import fewer_samples
 from pchem_pipeline.stages.discrepancy.survey import Survey, mean_codes, survey
 from pchem_pipeline.stages.discrepancy.window import (
     Window,
-    choose_window,
     other_window,
     read_window,
     within_memory,
@@ -140,7 +142,7 @@ class _Search:
 
     def found(self, settings: DiscrepancySettings, prefix: str) -> tuple[Window, Discrepancy]:
         """Search for what the model is missing in the window of the settings; ``prefix`` begins its units."""
-        window = choose_window(self.source.shape, settings, self.roi, self.seen.places)
+        window = self.seen.window(self.source.shape, settings, self.roi)
         found = find_discrepancies(
             read_window(self.source, window),
             window.numbers,
@@ -226,7 +228,9 @@ def _surveyed(
             settings = less
         tell("looking at every pixel and every frame")
         seen = _survey(context, source, settings)
-        most, few = settings, fewer_samples(source, settings, roi, seen.places) if not before else settings
+        if seen.left_out:
+            context.note(f"left out, empty or far from the others: {frame_words(np.array(seen.left_out))}")
+        most, few = settings, fewer_samples(source, settings, roi, seen) if not before else settings
         if few != settings:
             context.note(
                 f"the disagreement is clear in {few.max_samples:,} samples; raise discrepancy.clear_samples "

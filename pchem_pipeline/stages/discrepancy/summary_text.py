@@ -7,7 +7,10 @@ import re
 import textwrap
 from collections.abc import Sequence
 
+import numpy as np
+
 from pchem_pipeline.discrepancy.verdict import Place, Rival, Step, Verdict, micronats
+from pchem_pipeline.model.histogram.odd_frames import frame_words
 from pchem_pipeline.report.style.wording import fitted_or_chosen
 
 _WIDTH = 100
@@ -33,6 +36,9 @@ def verdict_text(found: Verdict) -> str:
     for number, step in enumerate(found.steps, 1):
         lines += _step(step, number if len(found.steps) > 1 else 0, found)
     lines += _gap(found)
+    if found.examined.left_out:
+        words = frame_words(np.array(found.examined.left_out))
+        lines += _wrapped(f"left out, empty or far from the others: {words}")
     if found.examined.elsewhere is not None:
         lines += _wrapped(found.examined.elsewhere.says())
     if found.doubt and found.steps:

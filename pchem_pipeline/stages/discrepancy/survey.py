@@ -10,7 +10,7 @@ pixels and a block of frames take the memory that the run may have, or no more t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -30,12 +30,15 @@ from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
 from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
 from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
 from pchem_pipeline.effects.framework.region import Region
-from pchem_pipeline.frames.stream import FrameSource, FrameStream
+from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.run.model_versions import model_of
+from pchem_pipeline.stages.discrepancy.window import Window, choose_window, frame_blocks
+from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
 from pchem_pipeline.stages.quick_look import read_sums
 
 if TYPE_CHECKING:
     from pchem_pipeline.discrepancy.quick.sums import StackSums
+    from pchem_pipeline.discrepancy.settings import DiscrepancySettings
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.store.run_store import RunStore
 
@@ -73,17 +76,25 @@ class Survey:
     Attributes:
         places: the most significant place of each map (next_x, score.C2, pairs.row.readout) that has one.
         shares: of the run's samples, by what was looked at; what is absent was not.
+        left_out: frames that are empty or far from the others: nothing is said of them.
     """
 
     places: Mapping[str, SensorPlace] = field(default_factory=dict)
     shares: Mapping[str, float] = field(default_factory=dict)
+    left_out: tuple[int, ...] = ()
+
+    def window(
+        self, shape: tuple[int, int, int], settings: DiscrepancySettings, roi: Sequence[int] | None
+    ) -> Window:
+        """Return what to look at closely, see `choose_window`."""
+        return choose_window(shape, settings, roi, self.places, self.left_out)
 
     def numbers(self) -> dict[str, Any]:
         """Return it as JSON data, of which :meth:`of_numbers` makes it again."""
         places = {
             name: {**vars(place), "region": place.region.numbers()} for name, place in self.places.items()
         }
-        return {"places": places, "shares": dict(self.shares)}
+        return {"places": places, "shares": dict(self.shares), "left_out": list(self.left_out)}
 
     @classmethod
     def of_numbers(cls, numbers: Mapping[str, Any]) -> Survey:
@@ -92,7 +103,7 @@ class Survey:
             name: SensorPlace(**{**place, "region": Region.model_validate(place["region"])})
             for name, place in numbers["places"].items()
         }
-        return cls(places, numbers["shares"])
+        return cls(places, numbers["shares"], tuple(numbers.get("left_out", ())))
 
     def told(self, verdict: Verdict, share: float) -> Verdict:
         """Return a verdict that says on what share of the samples it rests, and on what else."""
@@ -107,6 +118,7 @@ class Survey:
                 "surveyed": max(share, least),
                 "surveyed_by": dict(self.shares),
                 "places": (*verdict.examined.places, *spots),
+                "left_out": self.left_out,
             }
         )
         return verdict.model_copy(update={"examined": examined})
@@ -124,18 +136,19 @@ def survey(context: StageContext, source: FrameSource, compared: int) -> Survey:
         StoreError: an array is corrupt.
     """
     store, shape = context.store, source.shape
-    found = Survey()
+    odd, out = odd_frames_of(store)
+    # copies are an effect that can be found
+    left_out = np.setdiff1d(out, odd["copied"])
     places = places_of_sums(read_sums(store), shape[1:])
-    if places is not None:
-        found = Survey(places, {SUMS: 1.0})
+    shares = {} if places is None else {SUMS: 1.0}
     model = model_of(store, "fit")
     done = all(_complete(context, stage) for stage in ("histogram", "fit"))
-    if math.prod(shape) <= compared or not done or model is None:
-        return found
-    limit = context.config.compute.max_memory
-    memory = None if limit is None else (limit << 20) - resident_bytes()
-    here, shares = places_of_bands(store, source, plain=not model.effects, memory=memory)
-    return Survey({**found.places, **here}, {**found.shares, **shares})
+    if math.prod(shape) > compared and done and model is not None:
+        limit = context.config.compute.max_memory
+        memory = None if limit is None else (limit << 20) - resident_bytes()
+        here, more = places_of_bands(store, source, plain=not model.effects, memory=memory, left_out=left_out)
+        places, shares = (places or {}) | here, shares | more
+    return Survey(places or {}, shares, tuple(left_out.tolist()))
 
 
 def _complete(context: StageContext, stage: str) -> bool:
@@ -161,7 +174,12 @@ def _places(maps: Mapping[str, CellMap], significance: float) -> dict[str, Senso
 
 
 def places_of_bands(
-    store: RunStore, source: FrameSource, *, plain: bool = True, memory: int | None = None
+    store: RunStore,
+    source: FrameSource,
+    *,
+    plain: bool = True,
+    memory: int | None = None,
+    left_out: IntArray | tuple[int, ...] = (),
 ) -> tuple[dict[str, SensorPlace], dict[str, float]]:
     """Return where histograms and pairs of pixels stand out, and the share of the samples looked at.
 
@@ -170,6 +188,7 @@ def places_of_bands(
         source: its frames.
         plain: the pixels were fitted without effects, so that their histograms follow the plain law.
         memory: bytes that this may take: lower bands; None: what the highest ones take.
+        left_out: frames that are not looked at.
 
     Raises:
         ConfigError: it is not enough for the lowest ones.
@@ -177,7 +196,7 @@ def places_of_bands(
     n, ny, nx = source.shape
     rows, at_once = _band_size(store, (ny, nx), memory)
     bands = [(first, min(first + rows, ny)) for first in range(0, ny, rows)]
-    numbers = _spread_frames(n, _MOST_SAMPLES // (ny * nx))
+    numbers = np.setdiff1d(_spread_frames(n, _MOST_SAMPLES // (ny * nx)), left_out)
     maps = {name: CellMap.empty((ny, nx)) for name in (*(f"score.{s}" for s in SCORES), "goodness")}
     places: dict[str, SensorPlace] = {}
     for first, last in bands:
@@ -307,9 +326,5 @@ class _Band:
 
     def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
         """Yield at most so many successive frames at a time, (frame, y, x), DN."""
-        breaks = np.flatnonzero(np.diff(self.numbers) != 1) + 1
-        for part in np.split(self.numbers, breaks):
-            frames = int(part[0]), int(part[-1]) + 1
-            with FrameStream(self.source, [self.rows], size, frames=frames) as stream:
-                for _, (block,) in stream:
-                    yield block
+        for _, block in frame_blocks(self.source, self.numbers, self.rows, size):
+            yield block

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +56,7 @@ def choose_window(
     settings: DiscrepancySettings,
     roi: Sequence[int] | None = None,
     places: Mapping[str, SensorPlace] | None = None,
+    left_out: Sequence[int] = (),
 ) -> Window:
     """Return what to look at: everything if small enough, else a window and blocks over the whole run.
 
@@ -67,8 +68,10 @@ def choose_window(
         settings: frames x pixels and pixels to look at, and frames in a block.
         roi: rows and columns that the user asked for: y0, y1, x0, x1.
         places: where the survey found that the sensor stands out.
+        left_out: odd frames, which are not looked at.
     """
-    n_frames, ny, nx = shape
+    kept = np.setdiff1d(np.arange(shape[0], dtype=np.int64), left_out)
+    n_frames, ny, nx = kept.size, *shape[1:]
     y0, y1, x0, x1 = roi or (0, ny, 0, nx)
     within = (y1 - y0) * (x1 - x0)
     frames = min(n_frames, max(_FRAMES_WANTED, settings.max_samples // max(within, 1)))
@@ -78,11 +81,11 @@ def choose_window(
         width = min(x1 - x0, pixels // height)
         y0, x0 = _corner(_worst(places or {}, shape[1:]), (y0, y1, x0, x1), (height, width))
         y1, x1 = y0 + height, x0 + width
-    numbers = np.arange(n_frames, dtype=np.int64)
+    numbers = kept
     if frames < n_frames:
         length = block_length(frames, settings.block_frames)
         starts = np.linspace(0, n_frames - length, frames // length).astype(np.int64)
-        numbers = (starts[:, None] + np.arange(length)).ravel()
+        numbers = kept[(starts[:, None] + np.arange(length)).ravel()]
     return Window(numbers, (y0, y1), (x0, x1))
 
 
@@ -202,11 +205,24 @@ def read_window(source: FrameSource, window: Window) -> NDArray[np.unsignedinteg
     stack = np.empty((window.numbers.size, y1 - y0, x1 - x0), source.dtype)
     # not more at once than a few dozen megabytes, whatever the width of the sensor
     step = max(1, (1 << 23) // ((y1 - y0) * source.shape[2]))
-    breaks = np.flatnonzero(np.diff(window.numbers) != 1) + 1
-    for part in np.split(np.arange(window.numbers.size), breaks):
-        frames = int(window.numbers[part[0]]), int(window.numbers[part[-1]]) + 1
-        with FrameStream(source, [window.rows], step, frames=frames) as stream:
-            for first, (block,) in stream:
-                at = int(part[0]) + first - frames[0]
-                stack[at : at + block.shape[0]] = block[:, :, x0:x1]
+    for at, block in frame_blocks(source, window.numbers, window.rows, step):
+        stack[at : at + block.shape[0]] = block[:, :, x0:x1]
     return stack
+
+
+def frame_blocks(
+    source: FrameSource, numbers: NDArray[np.int64], rows: tuple[int, int], size: int
+) -> Iterator[tuple[int, NDArray[np.unsignedinteger]]]:
+    """Yield at most so many successive frames of some rows at a time, (frame, y, x), DN, with their place.
+
+    Args:
+        source: the frames.
+        numbers: of those that are wanted, increasing.
+        rows: first, and end.
+        size: frames at a time.
+    """
+    for part in np.split(np.arange(numbers.size), np.flatnonzero(np.diff(numbers) != 1) + 1):
+        frames = int(numbers[part[0]]), int(numbers[part[-1]]) + 1
+        with FrameStream(source, [rows], size, frames=frames) as stream:
+            for first, (block,) in stream:
+                yield int(part[0]) + first - frames[0], block

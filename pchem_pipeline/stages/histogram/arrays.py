@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pchem_pipeline.model.histogram.count import counts_dtype
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, block_starts
 from pchem_pipeline.run.stage import StageContext, open_store
+
+if TYPE_CHECKING:
+    from pchem_pipeline.model.histogram.settings import HistogramSettings
+    from pchem_pipeline.store.run_store import RunStore
 
 MAPS = ("origin", "under", "over", "minimum", "maximum")
 COVARIANCES = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")
@@ -61,7 +65,8 @@ def create_arrays(context: StageContext, shape: tuple[int, int, int], bins: int)
     context.create_maps([f"summary/{name}" for name in COVARIANCES])
     for name, length in (("open_sums", 7), ("open_covariances", 3)):
         context.create(f"summary/{name}", (length, ny, nx), chunks=(length, *tile))
-    starts = block_starts(n_frames, settings.block_frames)
+    length = settings.block_length(n_frames)
+    starts = block_starts(n_frames, length)
     rows = max(tile[0], ROW_GROUP)
     for name in ("block_sum", "block_sum_square"):
         context.create(f"summary/{name}", (starts.size, ny, nx), chunks=(CHUNK_BLOCKS, rows, nx))
@@ -74,13 +79,19 @@ def create_arrays(context: StageContext, shape: tuple[int, int, int], bins: int)
         rows=ROW_GROUP,
     )
     if context.fresh:
-        context.store.write_array("summary/block_start", starts, {"frames": n_frames})
+        context.store.write_array("summary/block_start", starts, {"frames": n_frames, "block": length})
+
+
+def with_block_length(settings: HistogramSettings, store: RunStore) -> HistogramSettings:
+    """Return the settings with the length of the time blocks that a run has, frames."""
+    known = store.attributes("summary/block_start").get("block", settings.block_frames)
+    return settings.model_copy(update={"block_frames": known})
 
 
 def extend_arrays(context: StageContext, shape: tuple[int, int, int], bins: int) -> None:
     """Make the arrays along time longer, and the counts wide enough."""
     store, n_frames = context.store, shape[0]
-    length = context.config.histogram.block_frames
+    length = with_block_length(context.config.histogram, store).block_length(n_frames)
     open_store.cache_clear()
     if store.array("histogram/counts").dtype != counts_dtype(n_frames):
         chunks, shards = counts_layout(context, bins)
@@ -95,4 +106,4 @@ def extend_arrays(context: StageContext, shape: tuple[int, int, int], bins: int)
             store.resize(f"summary/{name}", n_frames)
         for name in ("block_sum", "block_sum_square"):
             store.resize(f"summary/{name}", starts.size)
-        store.write_array("summary/block_start", starts, {"frames": n_frames})
+        store.write_array("summary/block_start", starts, {"frames": n_frames, "block": length})

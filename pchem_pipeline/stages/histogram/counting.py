@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms
+from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,
     CovarianceMaps,
@@ -25,6 +26,7 @@ from pchem_pipeline.model.histogram.summaries import (
     line_sums,
 )
 from pchem_pipeline.run.stage import open_store
+from pchem_pipeline.stages.histogram.arrays import with_block_length
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.stream import Block, Rows
@@ -60,7 +62,9 @@ class TileCounter:
         """
         self._emit: Emit = emit or (lambda name, part: None)
         self._histograms = HistogramAccumulator(shape, bins, n_frames)
-        self._summaries = SummaryAccumulator(shape, settings.block_frames) if settings.summaries else None
+        self._summaries = (
+            SummaryAccumulator(shape, settings.block_length(n_frames)) if settings.summaries else None
+        )
 
     def resume(self, histograms: HistogramAccumulator, summaries: SummaryAccumulator | None) -> None:
         """Go on from frames that were counted before."""
@@ -224,13 +228,15 @@ class _BandCounter:
         self._groups = slice(y0 // ROW_GROUP, -(-y1 // ROW_GROUP))
         self._series: dict[str, _AlongTime] = {}
         self._done = dict.fromkeys(_ALONG_TIME, 0)
-        self._settings, self._shape = job.settings, job.shape
+        self._settings, self._shape = with_block_length(job.settings, open_store(job.store)), job.shape
         shape = (y1 - y0, job.shape[2])
-        self._counter = TileCounter(shape, job.bins, job.shape[0], job.settings, self._emit)
+        self._counter = TileCounter(shape, job.bins, job.shape[0], self._settings, self._emit)
+        first = self._settings.summaries and y0 == 0
+        self._spectrum = FrameSpectrum((min(shape[0], ROW_GROUP), shape[1])) if first else None
 
     def resume(self, n_frames: int) -> None:
         """Go on behind the frames that the run has counted, see `StackCounter.resume`."""
-        opened = open_store(self._store)
+        opened, self._spectrum = open_store(self._store), None  # that of the first frames is there
         held = RowHistograms(**{name: self._read(f"histogram/{name}") for name in _HISTOGRAMS})
         histograms = HistogramAccumulator.resumed(held, self._shape[0])
         if not self._settings.summaries:
@@ -238,7 +244,7 @@ class _BandCounter:
             return
         region = (slice(None), self._rows, slice(None))
         state = OpenSums(*(opened.read(f"summary/{name}", region) for name in _OPEN))
-        length = self._settings.block_frames
+        length = self._settings.block_length(n_frames)
         self._counter.resume(histograms, SummaryAccumulator.resumed(state, n_frames, length))
         blocks = n_frames // length
         self._done = {name: blocks if name.startswith("block") else n_frames for name in _ALONG_TIME}
@@ -249,6 +255,8 @@ class _BandCounter:
     def add(self, frames: NDArray[Any]) -> None:
         """Take the next frames, (frame, y, x) of these rows; see `TileCounter.add`."""
         self._counter.add(frames)
+        if self._spectrum is not None:
+            self._spectrum.add(frames[:, :ROW_GROUP])
 
     def finish(self) -> None:
         """Write all that was not written on the way."""
@@ -264,6 +272,8 @@ class _BandCounter:
             step = opened.file_shape(f"histogram/{name}")[1]
             for x in range(0, values.shape[1], step):
                 opened.write(f"histogram/{name}", (self._rows, slice(x, x + step)), values[:, x : x + step])
+        if self._spectrum is not None:
+            opened.set_attributes("summary", {"spectrum": self._spectrum.line()})
         if covariances is not None:
             for name, values in vars(covariances).items():
                 opened.write(f"summary/{name}", (self._rows, slice(None)), values)

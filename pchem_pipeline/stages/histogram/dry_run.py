@@ -150,7 +150,7 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
 def _written(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> int:
     """Return about how many bytes the store takes."""
     n, ny, nx = shape
-    blocks = n / config.histogram.block_frames
+    blocks = n / config.histogram.block_length(n)
     series = 16 * (n * ny + blocks * ny * nx) + 4 * n * math.ceil(ny / ROW_GROUP) * nx
     total = _STORED_PIXEL * ny * nx + (_STORED_SERIES * series if config.histogram.summaries else 0)
     if config.input.mode == "copy":
@@ -180,7 +180,7 @@ def _speeds(config: RunConfig, frames: NDArray[Any], bins: int, n_frames: int) -
 
     shape = (frames.shape[1], frames.shape[2])
     histograms = HistogramAccumulator(shape, bins, n_frames)
-    summaries = SummaryAccumulator(shape, config.histogram.block_frames)
+    summaries = SummaryAccumulator(shape, config.histogram.block_length(n_frames))
     for _ in range(2):  # the first time loads the compiled loops
         start = time.perf_counter()
         histograms.add(frames)

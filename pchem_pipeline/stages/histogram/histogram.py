@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.count import RowHistograms, choose_bins, most_bins, pixels_by_range
+from pchem_pipeline.model.histogram.odd_frames import odd_frames
 from pchem_pipeline.model.histogram.summaries import frame_statistics
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
@@ -27,7 +28,9 @@ from pchem_pipeline.stages.bands import Band, plan_bands
 from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, create_counts, row_frames
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import bytes_per_row
-from pchem_pipeline.stages.histogram.shown_sample import copy_shown_sample
+from pchem_pipeline.stages.histogram.odd_frames import leave_out_odd_frames
+from pchem_pipeline.stages.samples import sample_targets
+from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
     from pchem_pipeline.compute.executor import Outcome
@@ -71,7 +74,7 @@ def run(context: StageContext) -> None:
         StoreError: the input is not complete, or the store refuses.
     """
     if context.sensor.samples:
-        copy_shown_sample(context)
+        _copy_shown_sample(context)
         return
     if context.sensor.kind == "histograms":
         _copy_histograms(context)
@@ -99,13 +102,12 @@ def run(context: StageContext) -> None:
 
 def _end(context: StageContext, areas: Sequence[Band | Tile]) -> None:
     """Do what needs the whole sensor."""
-    if number := sum(_pixels_outside(context, area) for area in areas):
-        bins = context.store.array("histogram/counts").shape[2]
-        context.note(
-            f"{number} pixels have DN outside of their {bins} bins; they are counted as under or over"
-        )
     if context.config.histogram.summaries:
         _write_frame_statistics(context, (context.sensor.n_frames, *context.sensor.shape))
+    if number := sum(_pixels_outside(context, area) for area in areas):
+        bins = context.store.array("histogram/counts").shape[2]
+        words = "pixels have" if number > 1 else "pixel has"
+        context.note(f"{number} {words} samples outside of the histogram of {bins} bins")
 
 
 def _pixels_outside(context: StageContext, area: Band | Tile) -> int:
@@ -153,9 +155,11 @@ def _do_band(band: Band, *, job: CountJob, source: FrameSource, threads: int) ->
 
 
 def _write_frame_statistics(context: StageContext, shape: tuple[int, int, int]) -> None:
-    """Derive the statistics of whole frames from the row sums, when all bands are there."""
+    """Derive the statistics of whole frames from the row sums of all bands; leave out odd frames."""
     n_frames, ny, nx = shape
-    mean, variance = np.empty(n_frames), np.empty(n_frames)
+    mean, variance, level = np.empty((3, n_frames))
+    weights = np.random.default_rng(1).integers(1 << 62, size=(2, ny))
+    digest, usual = np.empty(n_frames, np.int64), None
     step = row_frames(ny)
     for t in range(0, n_frames, step):
         part = slice(t, min(t + step, n_frames))
@@ -164,8 +168,13 @@ def _write_frame_statistics(context: StageContext, shape: tuple[int, int, int]) 
             for name in ("row_sum", "row_sum_square")
         )
         mean[part], variance[part] = frame_statistics(sums, squares, nx)
+        usual = np.median(sums, axis=0) if usual is None else usual
+        # of most rows: the track of a particle moves the mean, too
+        level[part] = np.median(sums - usual, axis=1) / nx
+        digest[part] = sums @ weights[0] + squares @ weights[1]
     context.store.write_array("summary/frame_mean", mean)
     context.store.write_array("summary/frame_variance", variance)
+    leave_out_odd_frames(context, odd_frames(level, variance, digest, ny * nx), mean)
 
 
 # -- ready-made histograms ----------------------------------------------------------------------
@@ -176,11 +185,35 @@ def _copy_histograms(context: StageContext) -> None:
     from pchem_pipeline.frames.histogram_files import read_histograms
 
     given = read_histograms(context.config.input, context.base_dir)
-    create_counts(context, given.counts.shape[2], given.counts.dtype)
-    context.create_maps([f"histogram/{name}" for name in MAPS])
-    context.store.set_attributes("summary", {"missing": "the input is histograms, without order in time"})
     task = functools.partial(_copy_tile, store=context.store.path, given=given)
+    _copied(context, given.counts, "the input is histograms, without order in time", task)
+
+
+def _copy_shown_sample(context: StageContext) -> None:
+    """Copy the histograms of the shown sample of several, so that report and ensemble need no run of it.
+
+    The fit reads the histograms of all samples in their own runs.
+
+    Raises:
+        StoreError: the run of the sample is gone, or the store refuses.
+    """
+    place = sample_targets(context.config, context.base_dir)[context.sensor.shown].store
+    task = functools.partial(_copy_sample_tile, store=context.store.path, sample=place)
+    _copied(context, RunStore.open(place).array("histogram/counts"), "the samples keep their own", task)
+
+
+def _copied(context: StageContext, counts: Any, missing: str, task: Callable[[Tile], Any]) -> None:
+    """Make the arrays, as wide as ``counts``, and do all tiles; summaries are ``missing`` for that reason."""
+    create_counts(context, counts.shape[2], counts.dtype)
+    context.create_maps([f"histogram/{name}" for name in MAPS])
+    context.store.set_attributes("summary", {"missing": missing})
     context.run_units(context.tiles(), task)
+
+
+def _copy_sample_tile(tile: Tile, *, store: Path, sample: Path) -> None:
+    source, target = RunStore.open(sample), open_store(store)
+    for name in ("counts", *MAPS):
+        target.write(f"histogram/{name}", tile.region, source.read(f"histogram/{name}", tile.region))
 
 
 def _copy_tile(tile: Tile, *, store: Path, given: HistogramInput) -> None:

@@ -373,6 +373,12 @@ def test_what_nearly_disagrees_is_said_beside_consistent() -> None:
     assert "more frames would tell" in words[True, False]
     assert "taken together the frames" in words[True, False]
     assert "taken together the frames" not in words[False, True]
+    high[5] = 60.0  # a gap at its floor does not excuse it
+    sure = Findings("frames", Measured(high, high, high), null, null, near, [], False, nothing)
+    assert sure.state == "unexplained"
+    z = Measured(calm, calm, calm)
+    joint = _sentence(Findings("histograms", z, null, null, near, [], False, nothing), {})
+    assert "frames, rows, columns and neighbours were not looked at" in joint
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,29 @@ def test_the_result_is_that_of_all_frames(tmp_path, monkeypatch, frames, cuts, m
         assert one.records.read(stage).fingerprint == other.records.read(stage).fingerprint
 
 
+def test_odd_frames_among_old_and_new_ones_are_in_no_sum(tmp_path, frames):
+    """The window of a pixel may be another one, as the empty frames do not keep it where it was."""
+    odd = frames.copy()
+    odd[[40, 41, 610]] = 0
+    odd[[250, 500]] += 300
+    write(tmp_path, odd, [301])
+    (tmp_path / "f1.npy").rename(tmp_path / "later")
+    extended, whole = target(tmp_path, "extended.zarr"), target(tmp_path, "whole.zarr")
+    run_stages(extended, ["ingest", "histogram"], QUIET)
+    (tmp_path / "later").rename(tmp_path / "f1.npy")
+    append_frames(extended, QUIET)
+    run_stages(whole, ["ingest", "histogram"], QUIET)
+    expected, found = (arrays_of(tmp_path / name, ("summary",)) for name in ("whole.zarr", "extended.zarr"))
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+    for name in ("whole.zarr", "extended.zarr"):
+        store = RunStore.open(tmp_path / name)
+        assert store.attributes("summary")["left_out"] == [40, 41, 250, 500, 610]
+        counts = store.read("histogram/counts").sum(axis=2)
+        counts += store.read("histogram/under") + store.read("histogram/over")
+        assert (counts == 697).all()
+
+
 def test_old_frames_are_not_read(tmp_path, frames, monkeypatch):
     from pchem_pipeline.frames import sequence
 

@@ -90,7 +90,7 @@ def test_hot_pixels_leave_the_pattern_as_it_is() -> None:
 
 def test_long_runs_are_averaged_and_figures_come_with_their_tables(clean: StackSums) -> None:
 
-    long = replace(clean, n_frames=10 * N, frame_mean=np.tile(clean.frame_mean, 10))
+    long = replace(clean, numbers=np.arange(10 * N), all_means=np.tile(clean.all_means, 10))
     assert frame_table(long)["mean"].size == 1000
     assert frame_table(long)["mean"].mean() == pytest.approx(clean.frame_mean.mean())
     figures = stability_figures(clean)

@@ -46,6 +46,16 @@ def test_a_small_stack_is_looked_at_whole():
     assert (window.rows, window.columns) == ((0, 64), (0, 64))
 
 
+def test_odd_frames_are_not_looked_at():
+    seen = Survey(left_out=(0, 700))
+    seen = Survey.of_numbers(json.loads(json.dumps(seen.numbers())))
+    for shape in ((900, 16, 16), (17750, 512, 512)):
+        numbers = seen.window(shape, WHOLE, None).numbers
+        assert not np.isin(numbers, (0, 700)).any()
+        assert np.all(np.diff(numbers) > 0)
+    assert seen.told(verdict_of("named"), 1.0).examined.left_out == (0, 700)
+
+
 @pytest.mark.parametrize("shape", [(17750, 512, 512), (1000, 2048, 2048), (100_000, 8, 8), (7000, 3, 4000)])
 def test_of_a_large_stack_no_more_than_allowed(shape):
     window = choose_window(shape, WHOLE)
@@ -193,14 +203,14 @@ def test_few_samples_are_compared_where_they_disagree_clearly(row_noise, fewest,
     light = 11.0 * (rng.poisson(2.0, (900, 16, 24)) + 0.3 * rng.standard_normal((900, 16, 24)))
     stack = np.rint(100.0 + light + row_noise * rng.standard_normal((900, 16, 1))).astype(np.uint16)
     settings = DiscrepancySettings(clear_samples=fewest)
-    found = fewer_samples(Stack(stack), settings, None, {})
+    found = fewer_samples(Stack(stack), settings, None, Survey())
     assert found.max_samples == compared
     if compared == ALL:
         assert found == settings
     else:
         assert (found.replicates, found.extended_replicates) == (24, 12)
     own = settings.model_copy(update={"replicates": 20})
-    assert fewer_samples(Stack(stack), own, None, {}).replicates == 20
+    assert fewer_samples(Stack(stack), own, None, Survey()).replicates == 20
 
 
 def test_what_is_wrong_with_frames_is_no_clear_disagreement():

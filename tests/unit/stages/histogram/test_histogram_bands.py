@@ -93,6 +93,12 @@ def test_a_band_that_is_done_holds_no_memory(tmp_path, monkeypatch):
         def file_shape(self, name):
             return (64, 16)
 
+        def attributes(self, name):
+            return {}
+
+        def set_attributes(self, name, values):
+            pass
+
         def write(self, name, region, data):
             pass
 

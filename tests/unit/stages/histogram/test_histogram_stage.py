@@ -195,7 +195,7 @@ def test_a_failed_band_leaves_the_others_and_resumes(tmp_path, frames, expected,
     again = make_context(tmp_path, frames)
     assert execute("histogram", again).state == "complete"
     assert_equal(contents(again.store), expected)
-    assert any("2 pixels have DN outside" in note for note in again.notes)
+    assert any("2 pixels have samples outside" in note for note in again.notes)
 
 
 def _single_bands(context: StageContext) -> list[histogram.Band]:
@@ -264,3 +264,45 @@ def test_ready_made_histograms_are_copied(tmp_path):
 def _forget_stores():
     yield
     open_store.cache_clear()
+
+
+def test_odd_frames_are_in_no_sums_and_empty_ones_in_no_histogram(tmp_path, frames):
+    """Sums are those of the rest, whatever was odd; done twice they are the same."""
+    odd = frames.copy()
+    odd[:2] += 400
+    odd[130:133] = 0
+    odd[290, 3, 4:9] = 60_000  # the track of a particle is no odd frame
+    context = make_context(tmp_path / "odd", odd, tile=8)
+    for _ in range(2):
+        assert execute("histogram", context).state == "complete"
+        left_out = [0, 1, 130, 131, 132]
+        assert context.store.attributes("summary")["left_out"] == left_out
+        found = contents(context.store)
+        total = sum(found[f"histogram/{name}"] for name in ("under", "over"))
+        np.testing.assert_array_equal(found["histogram/counts"].sum(axis=2) + total, len(odd) - 3)
+        np.testing.assert_array_equal(
+            found["histogram/minimum"], np.delete(odd, slice(130, 133), 0).min(axis=0)
+        )
+        blocks = [np.delete(odd.astype(np.int64), left_out, 0)[part] for part in np.s_[:126, 126:251, 251:]]
+        sums = np.stack([block.sum(axis=0) for block in blocks])
+        np.testing.assert_array_equal(found["summary/block_sum"], sums)
+        summed = dict.fromkeys(arrays.COVARIANCES, 0.0)
+        for block in blocks:
+            summaries = SummaryAccumulator((NY, NX), len(block))
+            summaries.add(block.astype(np.uint16))
+            for name, values in vars(summaries.finish()[1]).items():
+                summed[name] = summed[name] + values * (len(block) - 1)
+        for name, values in summed.items():
+            right = values / (len(odd) - 5 - 3)
+            np.testing.assert_allclose(found[f"summary/{name}"], right, rtol=1e-6, atol=1e-6)
+        context.store.records.forget("histogram")
+    assert any("frames 130 to 132 are empty" in note for note in context.notes)
+
+
+def test_a_sensor_that_is_often_at_one_level_has_no_empty_frames(tmp_path):
+    """Four quiet pixels: all at 100 DN in a third of the frames, as their histograms say."""
+    frames = 100 + (np.random.default_rng(4).random((400, 2, 2)) < 0.25).astype(np.uint16)
+    context = make_context(tmp_path, frames)
+    assert execute("histogram", context).state == "complete"
+    assert context.store.attributes("summary")["left_out"] == []
+    assert (context.store.read("histogram/counts").sum(axis=2) == 400).all()

@@ -208,7 +208,7 @@ def test_all_right_and_to_be_believed(data: ReportData) -> None:
     assert (sensor.level, sensor.question) == ("good", "Is this sensor all right?")
     assert sensor.text == "All 1,600 pixels have a value; the 6 criteria are met."
     assert [each.found for each in sensor.criteria if each.setting == "read_noise_e"] == ["0.299 e⁻"]
-    assert (belief.level, belief.word) == ("good", "Yes")
+    assert (belief.level, belief.word) == ("good", "No problem found by the quick checks")
     assert belief.text == (
         "2 checks of the model against the data passed. What the model may be missing was not looked for."
     )

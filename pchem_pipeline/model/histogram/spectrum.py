@@ -1,0 +1,78 @@
+"""The spectrum of the samples of a frame over rows and columns: what is picked up while they are read.
+
+Noise that runs on from sample to sample, with as much from row to row, is one wave across the frame, whatever
+the gap between rows. The samples of each pixel are standardised; without such noise the mean power over T
+frames is 1 at every frequency, with a standard deviation of 1/sqrt(T) (Fisher 1929).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+#: Samples that are looked at, of the first frames, and rows and columns that a spectrum needs.
+_MOST_SAMPLES, _FEWEST_LINES = 1 << 22, 8
+#: Frequencies on either side, along rows or columns, whose median is the noise of the one in their middle.
+_AROUND = 3
+
+
+class FrameSpectrum:
+    """The mean power of the frames that come in, of the same rows each."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        """Begin with no frames of some rows and columns."""
+        self._power = np.zeros((max(shape[0] - 1, 0), shape[1] // 2))
+        self._left = _MOST_SAMPLES // max(shape[0] * shape[1], 1) if min(shape) >= _FEWEST_LINES else 0
+        self._n, self._pixels, self._sd = 0, 0, 0.0
+
+    def add(self, frames: NDArray[np.unsignedinteger[Any]]) -> None:
+        """Add frames, (frame, y, x), until enough have come."""
+        frames = frames[: self._left]
+        if len(frames) < 2:
+            return
+        u = frames.astype(np.float32)
+        u -= u.mean(axis=0)
+        u -= u.mean(axis=(1, 2), keepdims=True)
+        sd = np.sqrt(np.mean(u * u, axis=0))
+        u /= np.where(sd > 0, sd, 1.0)
+        for frame in u:
+            wave = fft.rfft2(frame)[1:, 1:]
+            self._power += wave.real**2 + wave.imag**2
+        self._left -= len(frames)
+        self._n += len(frames)
+        self._pixels, self._sd = int(np.count_nonzero(sd)), float(np.median(sd))
+
+    def line(self) -> dict[str, float]:
+        """Return the frequency that stands out most of those around it; empty where nothing was looked at.
+
+        ``ratio`` is its mean power over that of the noise, ``frames`` of how many, the largest of so many
+        ``cells``; ``size`` is the root mean square of its wave, DN, and ``unit`` that of a power of 1.
+        """
+        if not self._n or not self._pixels:
+            return {}
+        power = self._power / (self._n * self._pixels)
+        rows, columns = power.shape[0] + 1, 2 * power.shape[1]
+        if rows % 2 == 0:
+            power[rows // 2 - 1, -1] /= 2.0  # a real wave, of one phase, where the columns are even
+        filters = ((2 * _AROUND + 1, 1), (1, 2 * _AROUND + 1))
+        noise = np.maximum.reduce(
+            [*(ndimage.median_filter(power, size) for size in filters), np.ones_like(power)]
+        )
+        ratio = power / noise
+        y, x = (int(i) for i in np.unravel_index(int(ratio.argmax()), ratio.shape))
+        # a wave between two frequencies is in those around both
+        near, wide = (power[max(y - r, 0) : y + r + 1, max(x - r, 0) : x + r + 1] for r in (2, 7))
+        excess = float(near.sum()) - near.size * float(np.median(wide))
+        unit = self._sd * (2.0 / self._pixels) ** 0.5
+        return {
+            "ratio": float(ratio[y, x]),
+            "cells": float(ratio.size),
+            "frames": float(self._n),
+            "size": unit * max(excess, 0.0) ** 0.5,
+            "unit": unit,
+            "cycles_per_row": ((y + 1) / rows + 0.5) % 1.0 - 0.5,
+            "cycles_per_column": (x + 1) / columns,
+        }

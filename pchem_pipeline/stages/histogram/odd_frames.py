@@ -1,0 +1,103 @@
+"""Odd frames are left out of the sums over frames, and empty ones of the histograms, once all are counted.
+
+A link that drops frames says nothing of the pixels.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pchem_pipeline.frames.stream import FrameStream
+from pchem_pipeline.model.histogram.odd_frames import KINDS, FloatArray, IntArray, left_out, odd_words
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, SummaryAccumulator
+from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.stages.histogram.arrays import COVARIANCES, MAPS, with_block_length
+
+if TYPE_CHECKING:
+    from pchem_pipeline.run.stage import StageContext
+    from pchem_pipeline.store.run_store import RunStore
+
+_AT_ONCE = 32  # frames
+
+
+def odd_frames_of(store: RunStore) -> tuple[dict[str, IntArray], IntArray]:
+    """Return the odd frames of a run by kind, and those that its sums are without."""
+    known = store.attributes("summary")
+    odd = known.get("odd_frames", {})
+    kinds = {kind: np.array(odd.get(kind, []), np.int64) for kind in KINDS}
+    return kinds, np.array(known.get("left_out", []), np.int64)
+
+
+def leave_out_odd_frames(context: StageContext, odd: dict[str, IntArray], mean: FloatArray) -> None:
+    """Leave odd frames out; the result is the same where that was done in part before.
+
+    Args:
+        context: of the stage, whose bands are all done.
+        odd: frames by kind.
+        mean: of each frame over its pixels, DN, (frame,).
+
+    Raises:
+        InputError: frames cannot be read again.
+        StoreError: the store refuses.
+    """
+    out, (_, before) = left_out(odd, mean.size), odd_frames_of(context.store)
+    if odd["empty"].size:
+        _leave_out_of_histograms(context, odd["empty"], mean)
+        context.note(f"{odd_words({'empty': odd['empty']}, mean)}: not counted")
+    changed = np.union1d(out, before)
+    if changed.size:
+        _leave_out_of_sums(context, changed, out)
+    numbers = {kind: frames.tolist() for kind, frames in odd.items()}
+    context.store.set_attributes("summary", {"odd_frames": numbers, "left_out": out.tolist()})
+
+
+def _leave_out_of_histograms(context: StageContext, frames: IntArray, mean: FloatArray) -> None:
+    """Take samples of empty frames out of all histograms, those that are there still: the newest."""
+    store, names = context.store, [f"histogram/{name}" for name in ("counts", *MAPS)]
+    for tile in context.tiles():
+        held = [store.read(name, tile.region) for name in names]
+        counts, origin, under, over, low, high = (values.astype(np.int64) for values in held)
+        last = origin + counts.shape[2] - 1
+        there = counts.sum(axis=2) + under + over - (context.sensor.n_frames - frames.size)
+        for number, dn in enumerate(mean[frames[::-1]].astype(np.int64)):
+            some = there > number
+            inside = some & (dn >= origin) & (dn <= last)
+            counts[inside, dn - origin[inside]] -= 1
+            under -= some & (dn < origin)
+            over -= some & (dn > last)
+        filled = counts > 0
+        low = np.where(under == 0, origin + filled.argmax(axis=2), low)
+        high = np.where(over == 0, last - filled[:, :, ::-1].argmax(axis=2), high)
+        for name, old, new in zip(names, held, (counts, origin, under, over, low, high), strict=True):
+            store.write(name, tile.region, new.astype(old.dtype))
+
+
+def _leave_out_of_sums(context: StageContext, changed: IntArray, out: IntArray) -> None:
+    """Write block sums and covariances without odd frames, from what all gave and the frames of their blocks.
+
+    Args:
+        context: of the stage.
+        changed: frames whose blocks are done again.
+        out: frames that are left out.
+    """
+    store, source = context.store, open_source(context)
+    n_frames, ny, _ = source.shape
+    length = with_block_length(context.config.histogram, store).block_length(n_frames)
+    kept = ~np.isin(np.arange(n_frames), out)
+    step = max(context.tile[0], ROW_GROUP)
+    for rows in ((y0, min(y0 + step, ny)) for y0 in range(0, ny, step)):
+        band = (slice(None), slice(*rows), slice(None))
+        state = OpenSums(*(store.read(f"summary/open_{name}", band) for name in ("sums", "covariances")))
+        sums = SummaryAccumulator.resumed(state, n_frames, length)
+        sums.finish()
+        for block in np.unique(changed // length).tolist():
+            frames = block * length, min((block + 1) * length, n_frames)
+            with FrameStream(source, [rows], _AT_ONCE, frames=frames) as stream:
+                done = sums.exchange((piece for _, (piece,) in stream), kept[slice(*frames)])
+            for name, values in vars(done).items():
+                store.write(f"summary/{name}", (slice(block, block + 1), *band[1:]), values[None])
+        _, covariances = sums.finish()
+        for name in COVARIANCES:
+            store.write(f"summary/{name}", band[1:], getattr(covariances, name))
