@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.gap import Gap
-from pchem_pipeline.discrepancy.null import Measured, NullModel, look_elsewhere
+from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS, VERSION
 from pchem_pipeline.discrepancy.size import size_of
 from pchem_pipeline.discrepancy.verdict import (
@@ -39,6 +39,7 @@ from pchem_pipeline.effects.framework.compose import place_words, title_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 
 FloatArray = NDArray[np.float64]
 

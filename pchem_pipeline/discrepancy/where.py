@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere
+from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.scan import Stretch, Suspect, scan_map, scan_series
 from pchem_pipeline.discrepancy.scan_events import scan_event_map
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.effects.framework.evidence import SCORES, Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import parse_place
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 
 FloatArray = NDArray[np.float64]
 

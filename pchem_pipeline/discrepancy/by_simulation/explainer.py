@@ -171,7 +171,7 @@ class FrameExplainer:
         vectors = work.replicates(model, work.mapped(model).sensor, "r0", settings.replicates)
         own = observed.statistics()
         names = observed.names([*own, *vectors])
-        first = NullModel.from_replicates(names, as_matrix(names, vectors))
+        first = NullModel.from_replicates(names, as_matrix(names, vectors), effects=bool(model))
         effort.begin()
         z, defects = Measured(*as_matrix(names, own)), dict[str, str]()
         return cls(

@@ -23,13 +23,14 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import expected_codes
 from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
-from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, look_elsewhere
+from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival, Size
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_class
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 
 NAMES = tuple(STATISTICS)[:40]
 UNIT = Covariance(np.ones(40), np.zeros((0, 40)))
@@ -279,6 +280,43 @@ def test_a_right_model_is_below_the_floor_in_19_of_20() -> None:
         gap = StatisticsGap(null, 1000).gap(rng.normal(0.3, 1.0, 40), null.mean, null.replicates)
         below.append(gap.at_floor)
     assert abs(np.mean(below) - 0.95) < 5 * np.sqrt(0.95 * 0.05 / 100)
+
+
+@pytest.mark.parametrize("part", [[7], [6, 7]])  # of both parts of a stack, too
+@pytest.mark.parametrize("size", [1.0, 0.01])
+def test_one_pixel_of_one_replicate_decides_nothing(part: list[int], size: float) -> None:
+    rng = np.random.default_rng(26)
+    strays = {"shape.He3C1.chi": 4595.0, "shape.He2C2.chi": 4451.0, "shape.He3.chi": 2715.0}
+    names = tuple(dict.fromkeys((*strays, *list(STATISTICS)[:500])))
+    vectors = rng.normal(0.0, 1.0, (40, len(names)))
+    strayed = vectors.copy()
+    for name, value in strays.items():
+        strayed[part, names.index(name)] = size * value
+    n, space = 1_900_000, names.index("space.x.rr")
+    z = rng.normal(0.0, 1.0, len(names))
+    z[space] += 36.0  # 650 nats of row noise
+    gaps = []
+    for each in (vectors, strayed):
+        null = NullModel.from_replicates(names, each)
+        gaps.append(StatisticsGap(null, n).gap(z, null.mean, null.replicates))
+        assert null.p_values(z)[space] < 1e-15
+    clean, other = gaps
+    assert clean.standing_out == other.standing_out == ("space",)
+    assert other.floor == pytest.approx(clean.floor, rel=0.5)
+    assert other.value == pytest.approx(clean.value, rel=0.1)
+    assert other.interval[0] > 0.5 * other.value
+
+
+def test_a_family_that_shows_an_effect_is_not_hidden_by_the_chance_of_the_others() -> None:
+    rng = np.random.default_rng(27)
+    names = tuple(STATISTICS)
+    null = NullModel.from_replicates(names, rng.normal(0.0, 1.0, (40, len(names))))
+    metric, z = StatisticsGap(null, 1_000_000), null.mean.copy()
+    z[names.index("code.alternating")] += 9.0
+    gap = metric.gap(z, null.mean, null.replicates)
+    assert gap.value < gap.floor
+    assert gap.standing_out == ("code",)
+    assert not gap.at_floor
 
 
 def test_events_that_a_model_predicts_scatter_as_poisson_counts() -> None:

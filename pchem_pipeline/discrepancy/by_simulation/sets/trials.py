@@ -19,7 +19,8 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import FEW_PIXELS, Witness
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.effort import EffortSpentError
-from pchem_pipeline.discrepancy.null import CONVINCING, look_elsewhere
+from pchem_pipeline.discrepancy.null import CONVINCING
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 
 _MOST_DEAR = 4  # sets whose refit takes long
 #: Relative error of a fingerprint before its refit.
