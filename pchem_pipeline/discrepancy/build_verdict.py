@@ -31,6 +31,8 @@ from pchem_pipeline.discrepancy.verdict import (
     State,
     Step,
     Verdict,
+    closed_share,
+    families_words,
     form_of,
     parameters_of,
 )
@@ -237,15 +239,25 @@ class Findings:
         """The named effects, the weightiest first."""
         return tuple(each.effect for each in self.added.additions if each.named)
 
+    @property
+    def described(self) -> tuple[Effect, ...]:
+        """What was measured and is not understood."""
+        return tuple(each.effect for each in self.added.additions if each.described)
+
+    @property
+    def proposed(self) -> tuple[Effect, ...]:
+        """Descriptions that leave something: the pixels fitted with them may be farther off than without."""
+        return () if self.added.after.at_floor else self.described
+
     def model(self, present: Sequence[Effect], extended: Sequence[Effect]) -> tuple[Effect, ...]:
-        """Return the model without the effects that were added but are neither named nor described.
+        """Return the model with those effects that were added and are named, or describe all that is left.
 
         Args:
             present: effects that it had before the search.
             extended: the same, and all that were added.
         """
-        described = [each.effect for each in self.added.additions if each.described]
-        tags = {effect.tag for effect in (*present, *self.named, *described)}
+        kept = self.named if self.proposed else (*self.named, *self.described)
+        tags = {effect.tag for effect in (*present, *kept)}
         return tuple(effect for effect in extended if effect.tag in tags)
 
 
@@ -290,6 +302,7 @@ def build_verdict(
             limit=found.limit,
             effects=tuple(effect.tag for effect in found.named),
             model_effects=tuple(effect.model_dump(mode="json") for effect in model),
+            proposed=tuple(effect.model_dump(mode="json") for effect in found.proposed),
             steps=tuple(each.step(sizes[each.effect.tag]) for each in found.added.additions),
             gap=_gap_change(found.before, found.added),
             where=tuple(found.places),
@@ -340,16 +353,14 @@ def largest_pulls(
 
 def _gap_change(before: Gap, added: Added) -> GapChange:
     after = added.after
-    closed = 0.0
-    if added.additions and before.value > 0.0:
-        closed = 1.0 - max(after.value, 0.0) / before.value
     return GapChange(
         before=before.value,
         after=after.value,
         floor=after.floor,
-        closed_fraction=closed,
+        closed_fraction=closed_share(before.value, after.value) if added.additions else 0.0,
         interval_before=before.interval,
         interval_after=after.interval,
+        standing_out=after.standing_out,
     )
 
 
@@ -439,21 +450,22 @@ def _sized(effect: Effect, sizes: Mapping[str, Size | None]) -> str:
 
 def _described(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size | None]) -> str:
     """Return what is known of a disagreement that was measured and is not understood."""
-    measured = [each.effect for each in found.added.additions if each.described]
-    known = [(effect.words(), sizes.get(effect.tag)) for effect in measured]
+    known = [(effect.words(), sizes.get(effect.tag)) for effect in found.described]
     told = [text if size is None else f"{text}, in all {size.words()}" for text, size in known]
     words, them = "; and ".join(told), "it" if len(told) == 1 else "them"
     besides = f" besides {_and(titles)}" if titles else ""
     none = "No known effect explains" if not found.limit else "No effect that was tried explains"
     return (
-        f"{none} the {found.samples}{besides}, but what they hold is measured: {words}; "
+        f"{none} the {found.samples}{besides}; a description of them, which names no cause: {words}; "
         f"with {them} {_closed(found)}; {_alike(found)}{_broken(found)}."
     )
 
 
 def _alike(found: Findings) -> str:
-    """Return in words whether a measured component is alike in all that it is said of."""
-    if found.still or not found.added.after.at_floor:
+    """Return in words whether a measured component is alike in all that it is said of, and in the model."""
+    if found.proposed:
+        return "the rest is more than chance, so that the description is proposed and not in the model"
+    if found.still:
         return "whether it is like that throughout is not known"
     return "as far as these statistics show, it is like that throughout"
 
@@ -479,8 +491,10 @@ def _title(tag: str) -> str:
 
 def _closed(found: Findings) -> str:
     """Return the share of the gap that is closed, in words."""
-    share = 1.0 - max(found.added.after.value, 0.0) / found.before.value
-    return f"{_share(share)} of the gap on unseen {found.samples} is closed"
+    before, after = found.before, found.added.after
+    if before.at_floor or after.value >= before.value:
+        return f"the gap on unseen {found.samples} is no smaller"
+    return f"{_share(closed_share(before.value, after.value))} of the gap on unseen {found.samples} is closed"
 
 
 def _share(share: float) -> str:
@@ -494,7 +508,10 @@ def _rest(found: Findings) -> str:
     after = found.added.after
     if after.at_floor or found.before.value <= 0.0:
         return ""
-    return f"; {_share(max(after.value, 0.0) / found.before.value)} of the gap is left unexplained"
+    if after.value <= after.floor:
+        return f"; in {families_words(after.standing_out)} more is left than chance makes"
+    left = 1.0 - closed_share(found.before.value, after.value)
+    return f"; {_share(left)} of the gap is left unexplained"
 
 
 def _broken(found: Findings) -> str:

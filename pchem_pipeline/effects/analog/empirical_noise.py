@@ -398,7 +398,7 @@ class EmpiricalNoise(Effect):
         of_all = len(self.modes) == 1 and self.modes[0].changes == "offset" and self.modes[0].burst is None
         parts = "; ".join(mode.words(None if of_all else self.share_of(mode)) for mode in self.modes)
         if all(mode.changes == "offset" for mode in self.modes):
-            return f"noise of {self.noise_dn:.2g} DN{place} that samples share before the converter ({parts})"
+            return f"noise of {self.noise_dn:.2g} DN{place} that samples share ({parts})"
         changed = dict.fromkeys(_CHANGED.get(mode.changes, "offset") for mode in self.modes)
         return f"a change of the {' and the '.join(changed)}{place} that samples share ({parts})"
 

@@ -273,7 +273,7 @@ class EmpiricalResponse(Effect):
             )
         told = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:_FEW]]
         more = f", and {len(followed) - _FEW} more" if len(followed) > _FEW else ""
-        return f"samples{place} that follow the charge of others (by {', '.join(told)}{more})"
+        return f"samples{place} that correlate with the charge of others ({', '.join(told)}{more})"
 
 
 def _few(parts: Sequence[str]) -> str:

@@ -211,14 +211,13 @@ class Empirical(Effect):
             rows, columns = (("even", "odd")[parity] for parity in self.squares)
             return (
                 f"{per_cent(self.share)} of the squares of 2 x 2 pixels{place}, from {rows} rows and "
-                f"{columns} columns on, come as the mean of their samples"
+                f"{columns} columns on, equal the mean of their samples"
             )
         shares = self.shares()
         order = np.argsort(-shares)[:_MOST_TOLD]
         told = [f"{per_cent(shares[i])} {self.moves[i].words()}" for i in order]
         how = f" {self.moves[0].words()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
-        free = "" if any(move.towards for move in self.moves) else ", whatever was read before or beside them"
-        return f"{per_cent(self.share)} of the {what}{place} are moved after the converter{how}{free}"
+        return f"{per_cent(self.share)} of the {what}{place} differ from the model as if they were moved{how}"
 
 
 def _averaged(values: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -33,6 +33,11 @@ def verdict_text(found: Verdict) -> str:
     for number, step in enumerate(found.steps, 1):
         lines += _step(step, number if len(found.steps) > 1 else 0, found)
     lines += _gap(found)
+    if found.proposed:
+        tags = ", ".join(str(effect["tag"]) for effect in found.proposed)
+        lines += _wrapped(
+            f"proposed, not in the model: {tags} (discrepancy.json: proposed); it leaves a part"
+        )
     if found.examined.elsewhere is not None:
         lines += _wrapped(found.examined.elsewhere.says())
     if found.doubt and found.steps:
