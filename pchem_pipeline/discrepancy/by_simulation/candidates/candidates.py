@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError, error_words
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     PRICE_OF_MORE,
     Hypothesis,
@@ -22,6 +20,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     log_density,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Acquisition, Replicate
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import is_told, note_defect
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.compose import along_chain
@@ -34,7 +33,6 @@ Vector = Mapping[str, float]
 #: Runs replicates and returns their statistics in the same order; an exception in place of those that failed.
 Mapper = Callable[[Sequence[Replicate]], "list[Vector | Exception]"]
 
-_log = logging.getLogger(__name__)
 MOST_HYPOTHESES = 6  # of one effect
 _MOST_IN_A_PART = 2
 # times as many hypotheses of all effects in all parts: each is a simulation, and most are in vain
@@ -86,21 +84,30 @@ def candidate_classes(settings: DiscrepancySettings) -> dict[str, type[Effect]]:
     }
 
 
-def placebo_for(guesses: Sequence[Effect], classes: Mapping[str, type[Effect]]) -> list[Effect]:
+def placebo_for(
+    guesses: Sequence[Effect], classes: Mapping[str, type[Effect]], defects: dict[str, str]
+) -> list[Effect]:
     """Return an effect for which nothing speaks and that is no relative of those for which something does.
 
     It is fitted like the others: a gap that it closes as well proves nothing.
+
+    Args:
+        guesses: effects for which something speaks.
+        classes: of the candidates, by tag.
+        defects: candidates that failed, and why; more come to them.
     """
     guessed = {effect.tag: type(effect) for effect in guesses}
     related = {tag for effect in guessed.values() for tag in effect.separate}
     for tag in sorted(classes):
         effect = classes[tag]
-        if tag in guessed or tag in related or guessed.keys() & effect.separate.keys() or not effect.strength:
+        if tag in defects or tag in guessed or tag in related or guessed.keys() & effect.separate.keys():
             continue
         try:
-            typical = effect.typical()
-        except Exception:
-            continue  # it was left out, or will be, where it is asked for its guesses
+            typical = effect.typical() if effect.strength else ()
+        # whatever a stranger's effect raises must not stop the others
+        except Exception as error:
+            note_defect(defects, tag, error)
+            continue
         if typical:
             return [typical[0]]
     return []
@@ -161,6 +168,8 @@ class ReplicateSimulator:
                 guessed = next(filter(None, (list(effect.estimate(e)) for e in (*known, *evidence))), [])
                 if not guessed and known and known[0].strongest(*effect.signature[:2]) > _LEFT:
                     guessed = list(effect.typical())
+                for each in guessed[:1]:
+                    is_told(each)  # it is asked of each later: a defect shows here, where it is noted
                 found += [window.found(each) for each in guessed[:most]]
                 for part, own in parts:
                     clear = own.strongest(*effect.signature[:2])
@@ -169,7 +178,7 @@ class ReplicateSimulator:
                         placed.append((rank, -clear, found[-1]))
             # whatever a stranger's estimator raises must not stop the others
             except Exception as error:
-                self._note_defect(tag, error)
+                note_defect(self.defects, tag, error)
         placed.sort(key=lambda item: item[:2])
         left_out = {id(each) for _, _, each in placed[_MOST_IN_PARTS * most :]}
         return [each for each in found if id(each) not in left_out]
@@ -204,7 +213,7 @@ class ReplicateSimulator:
             elif effect is None:
                 raise result
             else:
-                self._note_defect(effect.tag, result)
+                note_defect(self.defects, effect.tag, result)
 
     def _known(self, effect: Effect | None, repeats: int) -> FloatArray:
         """Return the statistics of the model with an effect, shape (repeat, statistic)."""
@@ -286,10 +295,6 @@ class ReplicateSimulator:
 
     def _row(self, vector: Vector) -> FloatArray:
         return np.array([vector.get(name, 0.0) for name in self.names], np.float64)
-
-    def _note_defect(self, tag: str, error: Any) -> None:
-        self.defects[tag] = error_words(error)
-        _log.warning("a defect in the candidate %s, which is not compared: %s", tag, self.defects[tag])
 
 
 def _without_chance(shifts: FloatArray) -> FloatArray:

@@ -83,12 +83,15 @@ class Screening:
             self.observed.frames.effects(model),
             self.work.effort,
             self.observed.frames.samples_of,
+            simulator.defects,
         )
         guesses = histograms.with_numbers(self._guesses(simulator, model, null, evidence, MOST_HYPOTHESES))
         parts = self.observed.frames.parts
         suggested = self._apart(model, histograms.suggested(self.classes, parts, guesses))
         guesses += suggested
-        hypotheses = simulator.fingerprints([*guesses, *placebo_for(guesses, self.classes)])
+        hypotheses = simulator.fingerprints(
+            [*guesses, *placebo_for(guesses, self.classes, simulator.defects)]
+        )
         shift = self.z.both - null.mean
         noise = noise_of_splits(null, 2, self.model_error)
         hypotheses = simulator.refined(hypotheses, shift, noise, histograms.told)
@@ -110,7 +113,9 @@ class Screening:
         """
         simulator = self._simulator(model, null, number, "/".join([str(number), *(e.tag for e in model)]))
         guesses = self._guesses(simulator, model, null, (), _MOST_BESIDE)
-        hypotheses = simulator.fingerprints([*guesses, *placebo_for(guesses, self.classes)])
+        hypotheses = simulator.fingerprints(
+            [*guesses, *placebo_for(guesses, self.classes, simulator.defects)]
+        )
         self.defects.update(simulator.defects)
         return self._compared(hypotheses, null, _DOUBT * slopes)
 
