@@ -257,8 +257,8 @@ class Findings:
             extended: the same, and all that were added.
         """
         kept = self.named if self.proposed else (*self.named, *self.described)
-        tags = {effect.tag for effect in (*present, *kept)}
-        return tuple(effect for effect in extended if effect.tag in tags)
+        keys = {effect.key for effect in (*present, *kept)}
+        return tuple(effect for effect in extended if effect.key in keys)
 
 
 def build_verdict(
@@ -286,7 +286,7 @@ def build_verdict(
     """
     # e-, and the share of the read noise, of pixels whose gain and read noise are open would be made up
     sizes = {
-        each.effect.tag: None
+        each.effect: None
         if found.doubt
         else size_of(fitted.seen(each.effect), fitted.maps, looked_at[1].frames)
         for each in found.added.additions
@@ -300,10 +300,10 @@ def build_verdict(
             + (f"; {found.limit}." if found.limit else "."),
             doubt=found.doubt,
             limit=found.limit,
-            effects=tuple(effect.tag for effect in found.named),
+            effects=tuple(dict.fromkeys(effect.tag for effect in found.named)),
             model_effects=tuple(effect.model_dump(mode="json") for effect in model),
             proposed=tuple(effect.model_dump(mode="json") for effect in found.proposed),
-            steps=tuple(each.step(sizes[each.effect.tag]) for each in found.added.additions),
+            steps=tuple(each.step(sizes[each.effect]) for each in found.added.additions),
             gap=_gap_change(found.before, found.added),
             where=tuple(found.places),
             unexplained=(*found.added.residuals, *_still(found, pulls[1])),
@@ -388,7 +388,7 @@ def _nearly(found: Findings) -> str:
     return f"; near the limit: {'; '.join(words)}; more frames would tell" if words else ""
 
 
-def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
+def _sentence(found: Findings, sizes: Mapping[Effect, Size | None]) -> str:
     """Return the verdict in one sentence: what, how large, and what it closes beside its rivals."""
     state, data, added = found.state, found.samples, found.added
     titles = [_sized(effect, sizes) for effect in found.named]
@@ -420,7 +420,7 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
     return f"The model was missing {_and(titles)}; {words}."
 
 
-def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size | None]) -> str:
+def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Size | None]) -> str:
     """Return what the model may lack: effects not told apart, and what the final samples do not confirm."""
     data, additions = found.samples, found.added.additions
     unknown = [" or ".join(_title(c.effect) for c in each.candidates) for each in additions if not each.alone]
@@ -439,18 +439,18 @@ def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size 
     return f"The model lacks something that these {data} cannot tell apart: {lacks}."
 
 
-def _sized(effect: Effect, sizes: Mapping[str, Size | None]) -> str:
+def _sized(effect: Effect, sizes: Mapping[Effect, Size | None]) -> str:
     """Return what an effect is called, with its size, and then its place."""
-    size = sizes.get(effect.tag)
+    size = sizes.get(effect)
     if size is None:
         return title_words(effect)
     place = "" if effect.everywhere else f", in {place_words(effect)}"
     return f"{_title(effect.tag)} of {size.words()}{place}"
 
 
-def _described(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size | None]) -> str:
+def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Size | None]) -> str:
     """Return what is known of a disagreement that was measured and is not understood."""
-    known = [(effect.words(), sizes.get(effect.tag)) for effect in found.described]
+    known = [(effect.words(), sizes.get(effect)) for effect in found.described]
     told = [text if size is None else f"{text}, in all {size.words()}" for text, size in known]
     words, them = "; and ".join(told), "it" if len(told) == 1 else "them"
     besides = f" besides {_and(titles)}" if titles else ""

@@ -120,6 +120,11 @@ class Effect(Section):
         return self.region is None and self.when is None
 
     @property
+    def key(self) -> tuple[str, Region | None, When | None]:
+        """What tells it from the other effects of a model: tag, part of the sensor, frames."""
+        return self.tag, self.region, self.when
+
+    @property
     def unlisted(self) -> bool:
         """Whether it is measured, and of a kind that no effect with a name makes."""
         return False

@@ -150,7 +150,8 @@ class ReplicateSimulator:
 
         The first evidence in which a candidate sees anything counts. A guess says only what to look at:
         strengths are fitted on one split and scored on the other, both ways round. The evidence of a part of
-        the sensor or run gives hypotheses that act there only. Beside the effects of the model others stand
+        the sensor or run gives hypotheses that act there only. What the model has at some places is looked
+        for at others. Beside the effects of the model others stand
         out that the frames hide: that evidence comes first, and where an estimator sees nothing although the
         leading statistics of its effect deviate, what is typical is a guess. Of one effect, everywhere, there
         are ``most`` at most. In parts there are six times as many of all effects together: the likeliest of
@@ -162,7 +163,8 @@ class ReplicateSimulator:
         placed: list[tuple[int, float, Effect]] = []
         window = self.acquisition.window or SensorWindow.whole(self.maps.bias.shape)
         for tag, effect in classes.items():
-            if tag in {present.tag for present in self.model} | self.defects.keys():
+            taken = [present for present in self.model if present.tag == tag]
+            if tag in self.defects or any(present.everywhere for present in taken):
                 continue
             try:
                 guessed = next(filter(None, (list(effect.estimate(e)) for e in (*known, *evidence))), [])
@@ -170,18 +172,26 @@ class ReplicateSimulator:
                     guessed = list(effect.typical())
                 for each in guessed[:1]:
                     is_told(each)  # it is asked of each later: a defect shows here, where it is noted
-                found += [window.found(each) for each in guessed[:most]]
+                found += [] if taken else [window.found(each) for each in guessed[:most]]
                 for part, own in parts:
                     clear = own.strongest(*effect.signature[:2])
                     for rank, each in enumerate(list(effect.estimate(own))[:_MOST_IN_A_PART]):
-                        found.append(window.found(each, part))
-                        placed.append((rank, -clear, found[-1]))
+                        there = window.found(each, part)
+                        if not any(self._overlap(there, present, window.shape) for present in taken):
+                            found.append(there)
+                            placed.append((rank, -clear, there))
             # whatever a stranger's estimator raises must not stop the others
             except Exception as error:
                 note_defect(self.defects, tag, error)
         placed.sort(key=lambda item: item[:2])
         left_out = {id(each) for _, _, each in placed[_MOST_IN_PARTS * most :]}
         return [each for each in found if id(each) not in left_out]
+
+    def _overlap(self, one: Effect, other: Effect, shape: tuple[int, int]) -> bool:
+        """Tell whether two effects meet in some pixel in some frame."""
+        pixels = one.region is None or other.region is None or one.region.overlap(other.region, shape) > 0
+        n_run = self.acquisition.n_run
+        return pixels and (one.when is None or other.when is None or one.when.overlap(other.when, n_run) > 0)
 
     def fingerprints(self, effects: Sequence[Effect], repeats: int = 1) -> list[Hypothesis]:
         """Simulate effects on the random numbers of the model without them; failures are defects.
@@ -197,7 +207,11 @@ class ReplicateSimulator:
         self._simulate([None, *(effect for effect, _ in shown)], repeats)
         base = self._known(None, repeats)
         return [
-            Hypothesis(effect, share * _without_chance(self._known(one, repeats) - base))
+            Hypothesis(
+                effect,
+                share * _without_chance(self._known(one, repeats) - base),
+                1 + sum(effect.tag == each.tag for each in self.model),
+            )
             for effect, (one, share) in zip(effects, shown, strict=True)
             if all(self._replicate(one, j).key in self._rows for j in range(repeats))
         ]

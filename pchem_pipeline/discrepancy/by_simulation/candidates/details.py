@@ -169,7 +169,9 @@ def _moved(
         ahead = float(np.clip(so_far + step[at], -_FARTHEST, _FARTHEST)) - so_far
         effect = now.effect.times(detail.name, float(np.exp(ahead)))
         taken[at] = _logarithm(now.effect, effect, detail.name)
-        found[detail.place] = Hypothesis(effect, now.fingerprint + taken[at] * detail.slope)
+        found[detail.place] = replace(
+            now, effect=effect, fingerprint=now.fingerprint + taken[at] * detail.slope
+        )
     return tuple(found), taken
 
 

@@ -46,15 +46,17 @@ class Hypothesis:
     Attributes:
         effect: with guessed or refined parameters.
         fingerprint: shift of the statistics at this strength, shape (m,).
+        number: of effects with its tag, at several places of the model, the first, second and so on.
     """
 
     effect: Effect
     fingerprint: FloatArray
+    number: int = 1
 
     @property
     def tag(self) -> str:
-        """Tag of the effect."""
-        return self.effect.tag
+        """Tag of the effect, with its number if there are others of it beside: what tells it from those."""
+        return self.effect.tag if self.number == 1 else f"{self.effect.tag} {self.number}"
 
     def rescaled(self, factor: float) -> Effect:
         """Return the effect with the strength at which its fingerprint is ``factor`` times as large."""
@@ -64,7 +66,7 @@ class Hypothesis:
 
     def times(self, factor: float) -> Hypothesis:
         """Return the effect so many times as strong, its fingerprint in proportion."""
-        return Hypothesis(self.rescaled(factor), self.fingerprint * factor)
+        return replace(self, effect=self.rescaled(factor), fingerprint=self.fingerprint * factor)
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,7 @@ class Screening:
         suggested = self._apart(model, histograms.suggested(self.classes, parts, guesses))
         guesses += suggested
         hypotheses = simulator.fingerprints(
-            [*guesses, *placebo_for(guesses, self.classes, simulator.defects)]
+            [*guesses, *placebo_for([*guesses, *model], self.classes, simulator.defects)]
         )
         shift = self.z.both - null.mean
         noise = noise_of_splits(null, 2, self.model_error)
@@ -114,7 +114,7 @@ class Screening:
         simulator = self._simulator(model, null, number, "/".join([str(number), *(e.tag for e in model)]))
         guesses = self._guesses(simulator, model, null, (), _MOST_BESIDE)
         hypotheses = simulator.fingerprints(
-            [*guesses, *placebo_for(guesses, self.classes, simulator.defects)]
+            [*guesses, *placebo_for([*guesses, *model], self.classes, simulator.defects)]
         )
         self.defects.update(simulator.defects)
         return self._compared(hypotheses, null, _DOUBT * slopes)

@@ -269,7 +269,8 @@ def _witnessed(
 
 def unrelated(one: Effect, other: Effect) -> bool:
     """Tell whether neither of two effects is known to be confused with the other."""
-    return other.tag not in type(one).separate and one.tag not in type(other).separate
+    known = other.tag in type(one).separate or one.tag in type(other).separate
+    return not known and one.tag != other.tag
 
 
 def _placebo(

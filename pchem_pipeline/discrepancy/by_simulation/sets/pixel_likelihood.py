@@ -252,7 +252,7 @@ def _at(hypothesis: Hypothesis, effect: Effect) -> Hypothesis:
     factor = max(new / old, 0.0) ** effect.power if old else 0.0
     if not 1.0 / _FARTHEST < factor < _FARTHEST:
         return hypothesis
-    return Hypothesis(effect, hypothesis.fingerprint * factor)
+    return replace(hypothesis, effect=effect, fingerprint=hypothesis.fingerprint * factor)
 
 
 def _starts(kind: type[Effect]) -> tuple[Effect, ...]:

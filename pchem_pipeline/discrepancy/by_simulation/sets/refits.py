@@ -315,7 +315,7 @@ class Refitter:
             None if scatter is None else scatter[:, kept],
         )
         change = np.where(scaling, np.log1p(np.maximum(change, -_LARGEST_SHARE)), 0.0)
-        found = tuple(Hypothesis(h.effect, part) for h, part in zip(hypotheses, parts, strict=True))
+        found = tuple(replace(h, fingerprint=part) for h, part in zip(hypotheses, parts, strict=True))
         allowed = noise.of(parts)
         promised = residual - np.expm1(change) @ slopes
         return Refitted(
