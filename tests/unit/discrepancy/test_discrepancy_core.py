@@ -17,7 +17,9 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Noise,
     choose,
     fit_set,
+    meets_itself,
     score_set,
+    seconds,
     tolerance,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import expected_codes
@@ -203,6 +205,27 @@ def test_two_at_once_are_both_named() -> None:
     choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(UNIT, 0.05))
     assert choice is not None
     assert choice.best.tags == {"row_noise", "exposure_drift"}
+
+
+def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_sensor() -> None:
+    rng = np.random.default_rng(28)
+    left, right = rng.normal(size=40), rng.normal(size=40)
+    regions = [Region.model_validate(f"columns={span}") for span in ("0:12", "12:24")]
+    placed = [
+        Hypothesis(_hypothesis("row_noise", each).effect.at_place(region), each)
+        for region, each in zip(regions, (left, right), strict=True)
+    ]
+    hypotheses = [_hypothesis("row_noise", left + right + rng.normal(size=40)), *placed]
+    hypotheses += seconds(hypotheses)
+    assert [h.tag for h in hypotheses] == ["row_noise", "row_noise", "row_noise", "row_noise 2"]
+    shifts = tuple(3.0 * left + 2.0 * right + rng.normal(size=40) for _ in range(2))
+    choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(UNIT, 0.05))
+    assert choice is not None
+    assert [h.effect.region for h in choice.best.hypotheses] == regions
+    assert all(not meets_itself(one.hypotheses) for one in choice.tried)
+    assert all("row_noise" in one.tags for one in choice.tried)  # none is a second one alone
+    keys = {h.effect.key for h in choice.best.hypotheses}
+    assert len(keys) == 2
 
 
 def test_twins_are_ambiguous() -> None:
@@ -507,7 +530,7 @@ def test_the_verdict_says_where_the_fit_itself_breaks_down(left: float) -> None:
 def test_the_place_of_an_effect_stands_behind_its_size() -> None:
     """Not: columns 10 to 13 of 0.96 DN."""
     effect = effect_class("row_noise")(row_noise_dn=0.96).at_place(Region.model_validate("columns=10:14"))
-    words = _sized(effect, {"row_noise": Size(electrons=0.089, dn=0.96, of_read_noise=0.29)})
+    words = _sized(effect, {effect: Size(electrons=0.089, dn=0.96, of_read_noise=0.29)})
     assert words.endswith(" of 0.96 DN rms (0.089 e-, 29 % of the read noise), in columns 10 to 13")
 
 

@@ -19,6 +19,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,
     choose,
+    seconds,
     share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
@@ -97,6 +98,7 @@ class Screening:
         hypotheses = simulator.refined(hypotheses, shift, noise, histograms.told)
         # what they do to pixels that are led astray says little about them: others do not go before them
         hypotheses.sort(key=lambda h: all(h.effect is not each for each in suggested))
+        hypotheses += seconds(hypotheses)
         self.defects.update(simulator.defects)
         return tuple(hypotheses), self._compared(hypotheses, null)
 

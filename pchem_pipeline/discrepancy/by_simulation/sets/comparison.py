@@ -24,7 +24,9 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Contender,
     Hypothesis,
     ScoredSet,
+    firsts,
     fit_set,
+    meets_itself,
     seen_among,
     share_place,
 )
@@ -87,6 +89,8 @@ class Comparison:
                 continue
             [name] = new
             hypothesis = next(h for h in one.hypotheses if h.tag == name)
+            if name != tag and hypothesis.effect.tag == tag.partition(" ")[0]:
+                continue  # the same effect elsewhere
             if one.tags in self.witnessed:
                 behind, error = self.witnessed[one.tags]
                 # neither need be the very law of the samples
@@ -329,8 +333,8 @@ def own_signature(own: FloatArray, others: FloatArray, left: FloatArray, noise: 
 
 def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesis]:
     """Return hypotheses to be refitted alone: those of the best set, and the likeliest of all."""
-    chosen = [*choice.best.hypotheses]
-    for hypothesis in hypotheses:
+    chosen = firsts(choice.best.hypotheses)
+    for hypothesis in firsts(hypotheses):
         same = sum(h.tag == hypothesis.tag for h in chosen)
         most = 1 if type(hypothesis.effect).erratic else _MOST_OF_ONE
         if same < most and len(chosen) < _MOST_SINGLES and all(hypothesis is not h for h in chosen):
@@ -433,11 +437,9 @@ def _sets(choice: Choice, singles: Sequence[Refitted]) -> list[tuple[Hypothesis,
     for one in sorted(alone, key=lambda one: one.promise, reverse=True):
         kinds.setdefault(one.hypotheses[-1].tag, one.hypotheses[-1])
     # of an effect that was refitted alone, the kind that did best; its strength is that of the set
-    return [
-        tuple(_kind(h, kinds[h.tag]) if h.tag in kinds else h for h in scored.at_fit())
-        for scored in choice.tried
-        if len(scored.hypotheses) > 1
-    ]
+    sets = [scored.at_fit() for scored in choice.tried if len(scored.hypotheses) > 1]
+    better = [tuple(_kind(h, kinds[h.tag]) if h.tag in kinds else h for h in members) for members in sets]
+    return [own if meets_itself(new) else new for own, new in zip(sets, better, strict=True)]
 
 
 def _of_different_effects(sets: Sequence[tuple[Hypothesis, ...]]) -> list[tuple[Hypothesis, ...]]:

@@ -12,6 +12,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     PRICE_OF_MORE,
     Hypothesis,
     fit_set,
+    meets_itself,
     share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
@@ -175,7 +176,8 @@ class Trials:
     def _worth_it(self, members: Sequence[Hypothesis]) -> bool:
         """Tell whether a set may come near the best one, and was not refitted before."""
         tags = frozenset(h.tag for h in (*self.held, *members))
-        if share_place(h.effect for h in (*self.held, *members)):
+        every = (*self.held, *members)
+        if share_place(h.effect for h in every) or meets_itself(every):
             return False
         dear = [one for one in self.tried if is_dear(one.effects)]
         if is_dear(h.effect for h in members) and len(dear) >= _MOST_DEAR:
