@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -668,9 +667,10 @@ def parameters_of(effect: Effect, stderr: float) -> dict[str, Measured]:
         effect: with its fitted parameters.
         stderr: of its strength; NaN where there is none.
     """
+    errors = {effect.strength: stderr}
     return {
         name: Measured(
-            value=value, stderr=stderr if name == effect.strength else _NAN, unit=_unit(type(effect), name)
+            value=value, stderr=errors.get(name, _NAN), unit=effect.unit(name).removeprefix("none")
         )
         for name, value in effect.model_dump(exclude={"tag"}).items()
         if isinstance(value, int | float) and not isinstance(value, bool)
@@ -685,16 +685,6 @@ def form_of(effect: Effect) -> dict[str, str]:
         for name, value in effect.model_dump(exclude={"tag"}).items()
         if isinstance(value, str) and value != fields[name].default
     }
-
-
-def _unit(effect: type[Effect], name: str) -> str:
-    """Return the unit that the description of a field has behind its first part, or nothing."""
-    found = _UNIT.search(effect.model_fields[name].description or "")
-    return found[1] if found else ""
-
-
-#: Behind a comma, before a semicolon, a bracket or the end: one word ("no unit" is none).
-_UNIT = re.compile(r", ([^\s,;]+(?: per frame)?)(?=;| \(|$)")
 
 
 @dataclass(frozen=True)

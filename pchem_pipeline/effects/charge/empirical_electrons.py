@@ -18,7 +18,7 @@ from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.estimators.electrons import binomial_upper
 from pchem_pipeline.effects.framework.compose import place_words
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class EmpiricalElectrons(Effect):
     source: ClassVar[str] = "Cox and Isham 1980, Point processes (factorial cumulants)"
     strength: ClassVar[str] = "chance"
     measured_only: ClassVar[bool] = True
-    chance: float = Field(
+    chance: Ratio = Field(
         ge=0, le=0.5, description="largest chance or mean number, that of weight 1, no unit"
     )
     modes: tuple[ElectronMode, ...] = Field(

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.charge_sums import BlockCharge, block_charge
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Electrons, Frames, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -63,8 +63,8 @@ class DarkCurrentRts(Effect):
         "persistence": "a longer run: regions fade once there, single pixels jump up and down here",
         "overdispersed_counts": "slower and longer runs: the blinking becomes correlated in time",
     }
-    fraction: float = Field(ge=0, le=1, description="fraction of the pixels that blink, no unit")
-    step_e: float = Field(
+    fraction: Ratio = Field(ge=0, le=1, description="fraction of the pixels that blink, no unit")
+    step_e: Electrons = Field(
         default=1.0,
         ge=0,
         le=1e6,
@@ -73,8 +73,10 @@ class DarkCurrentRts(Effect):
     steps: Literal["equal", "exponential"] = Field(
         default="equal", description="equal: step_e in each of these pixels; exponential: distributed so"
     )
-    dwell_low_frames: float = Field(default=200.0, ge=0.5, description="mean time in the lower level, frames")
-    dwell_high_frames: float = Field(
+    dwell_low_frames: Frames = Field(
+        default=200.0, ge=0.5, description="mean time in the lower level, frames"
+    )
+    dwell_high_frames: Frames = Field(
         default=200.0, ge=0.5, description="mean time in the upper level, frames"
     )
 

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import place_words
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class Empirical(Effect):
     source: ClassVar[str] = "Laird 1978, Lindsay 1983 (mixing laws); Raftery 1985 (mixture transitions)"
     strength: ClassVar[str] = "share"
     measured_only: ClassVar[bool] = True
-    share: float = Field(ge=0, le=1, description="share of the samples that are moved, no unit")
+    share: Ratio = Field(ge=0, le=1, description="share of the samples that are moved, no unit")
     moves: tuple[Move, ...] = Field(min_length=1, max_length=16, description="how; one of them each")
     together: Together = Field(
         default="sample", description="what is moved alike: each sample by itself, a row, a column or a frame"
