@@ -21,7 +21,7 @@ from scipy import special
 from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.null import NullModel, moments
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
-from pchem_pipeline.model.arithmetic.robust import chi_square_deviate, look_elsewhere, robust_sd
+from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere, robust_sd
 
 FloatArray = NDArray[np.float64]
 
@@ -217,5 +217,5 @@ def _stands_out(distance: float, chance: FloatArray, families: int) -> bool:
     mean, variance = float(chance.mean()), float(chance.var(ddof=1)) * (1.0 + 1.0 / chance.size)
     if not (mean > 0.0 and variance > 0.0):
         return False
-    deviate = float(chi_square_deviate(distance, mean, variance))
+    deviate = float(chi_square(distance, mean, variance))
     return look_elsewhere(float(special.stdtr(chance.size - 1, -deviate)), families) < _BEYOND_CHANCE

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
@@ -105,7 +106,7 @@ def _check(target: Target, point: Point, errors: FloatArray) -> Check:
     square = values**2
     root = float(np.sqrt(square.mean()))
     spread = float(square.std(ddof=1) / np.sqrt(square.size))
-    robust = float(1.4826 * np.median(np.abs(values)))
+    robust = robust_sd(values, 0.0)
     return Check(target, target.wanted(point), root, spread / (2 * root), robust)
 
 

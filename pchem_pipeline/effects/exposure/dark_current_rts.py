@@ -16,6 +16,7 @@ from pydantic import Field
 from pchem_pipeline.effects.estimators.charge_sums import BlockCharge, block_charge
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Frames, Plane, Ratio, register_effect
+from pchem_pipeline.model.arithmetic.robust import chi_square
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -192,9 +193,7 @@ def _outliers(evidence: Evidence, blocks: BlockCharge) -> NDArray[np.bool_]:
     assert evidence.time is not None
     freedom = blocks.length.size - 1
     chi2 = np.sum(blocks.length[:, None] * blocks.deviation**2, axis=0) / blocks.variance
-    # Wilson and Hilferty 1931: the cube root of a chi-square is nearly normal
-    mean = 1.0 - 2.0 / (9.0 * freedom)
-    wander = ((chi2 / freedom) ** (1.0 / 3.0) - mean) / np.sqrt(2.0 / (9.0 * freedom))
+    wander = chi_square(chi2, freedom)
     lags = np.asarray(evidence.time.lag_charge, np.float64)[:, blocks.y, blocks.x]
     alike = lags.sum(axis=0) * np.sqrt(evidence.time.n_pairs / lags.shape[0])
     outliers: NDArray[np.bool_] = np.fmax(wander, alike) > _STANDS_OUT

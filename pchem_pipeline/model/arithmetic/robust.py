@@ -41,7 +41,7 @@ def look_elsewhere(p: float, tests: float) -> float:
     return float(-np.expm1(tests * np.log1p(-min(max(p, 0.0), 1.0 - 1e-16))))
 
 
-def chi_square_deviate(value: ArrayLike, mean: ArrayLike, variance: ArrayLike | None = None) -> FloatArray:
+def chi_square(value: ArrayLike, mean: ArrayLike, variance: ArrayLike | None = None) -> FloatArray:
     """Return the normal deviate of a sum of squares, whose cube root is nearly normal (Wilson-Hilferty 1931).
 
     Args:

@@ -19,6 +19,7 @@ from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.where import PAIRS, pixel_maps
 from pchem_pipeline.effects.framework.evidence import SCORES
+from pchem_pipeline.model.arithmetic.robust import chi_square
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.context import EffectContext
@@ -134,8 +135,7 @@ def _block_spread(evidence: Evidence, time: TimeSeries) -> NDArray[np.float32]:
     ):
         centre = (weight * means).sum(axis=0) / max(float(frames.sum()), 1.0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            chi2 = (weight * (means - centre) ** 2).sum(axis=0) / std**2
-        quantile = (np.cbrt(chi2 / dof) - (1.0 - 2.0 / (9.0 * dof))) / np.sqrt(2.0 / (9.0 * dof))
+            quantile = chi_square((weight * (means - centre) ** 2).sum(axis=0) / std**2, dof)
         found.append(np.where(np.isfinite(quantile), quantile, np.nan))
     return _single(np.stack(found))
 

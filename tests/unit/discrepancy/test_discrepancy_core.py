@@ -32,7 +32,6 @@ from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival, Size
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_class
-from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 
 NAMES = tuple(STATISTICS)[:40]
 UNIT = Covariance(np.ones(40), np.zeros((0, 40)))
@@ -161,10 +160,6 @@ def test_an_effect_that_only_widens_a_statistic_makes_no_false_deviation() -> No
         assert np.median(after.std[8:]) == pytest.approx(1.0, abs=0.1)
     assert low <= stats.binom.ppf(0.999, tests, 0.03)
     assert unaware > 0.3 * tests
-
-
-def test_sidak() -> None:
-    assert look_elsewhere(0.01, 10) == pytest.approx(1 - 0.99**10)
 
 
 # -- fingerprints and naming ------------------------------------------------------------------------

@@ -29,6 +29,7 @@ from pchem_pipeline.discrepancy.scan_pairs import Limits, Shared, scan_pairs
 from pchem_pipeline.discrepancy.where import frame_series, pixel_maps, suspected_regions
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import When
+from pchem_pipeline.model.arithmetic.robust import robust_sd
 
 FloatArray = NDArray[np.float64]
 
@@ -132,8 +133,7 @@ def _frames_of_places(shared: Sequence[Shared], samples: Samples, time: TimeSeri
     for each in shared:
         mask = samples.usable & each.place.region.mask((samples.usable.shape[0], samples.usable.shape[1]))
         energy = samples.energies(each.channel, each.mode, mask)
-        spread = 1.4826 * float(np.median(np.abs(energy - np.median(energy))))
-        values = (energy - np.median(energy)) / max(spread, 1e-300)
+        values = (energy - np.median(energy)) / max(robust_sd(energy), 1e-300)
         for one in scan_series(
             values, time.frames, significance=_SIGNIFICANCE, most=1, shortest=FEWEST_FRAMES
         ):
