@@ -245,6 +245,8 @@ class ReplicateSimulator:
         Those are simulated several times in the end. One that is far behind the best by itself, and beside
         it brings nothing, is left as it is; ``told`` are effects whose numbers are known better.
         """
+        if not hypotheses:
+            return []
         fits = [fit_set([h], shift, noise) for h in hypotheses]
         scores = np.array([fit.log_score(shift, noise) for fit in fits])
         order = np.argsort(-scores, kind="stable")
