@@ -90,9 +90,7 @@ class Screening:
         parts = self.observed.frames.parts
         suggested = self._apart(model, histograms.suggested(self.classes, parts, guesses))
         guesses += suggested
-        hypotheses = simulator.fingerprints(
-            [*guesses, *placebo_for([*guesses, *model], self.classes, simulator.defects)]
-        )
+        hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses, simulator)])
         shift = self.z.both - null.mean
         noise = noise_of_splits(null, 2, self.model_error)
         hypotheses = simulator.refined(hypotheses, shift, noise, histograms.told)
@@ -115,11 +113,17 @@ class Screening:
         """
         simulator = self._simulator(model, null, number, "/".join([str(number), *(e.tag for e in model)]))
         guesses = self._guesses(simulator, model, null, (), _MOST_BESIDE)
-        hypotheses = simulator.fingerprints(
-            [*guesses, *placebo_for([*guesses, *model], self.classes, simulator.defects)]
-        )
+        hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses, simulator)])
         self.defects.update(simulator.defects)
         return self._compared(hypotheses, null, _DOUBT * slopes)
+
+    def _placebo(
+        self, model: tuple[Effect, ...], guesses: Sequence[Effect], simulator: ReplicateSimulator
+    ) -> list[Effect]:
+        """Return an effect that the model does not have and for which nothing speaks."""
+        have = {effect.tag for effect in model}
+        others = {tag: kind for tag, kind in self.classes.items() if tag not in have}
+        return placebo_for(guesses, others, simulator.defects)
 
     def _compared(
         self, hypotheses: Sequence[Hypothesis], null: NullModel, doubt: FloatArray | None = None
