@@ -7,7 +7,6 @@ from dataclasses import replace
 from pchem_pipeline.commands.model import adopt_verdict, yaml_of
 from pchem_pipeline.config.edit import check_writable
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, read_verdict
-from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target
@@ -45,10 +44,9 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
     if command.options.dry_run:
         return ""
     if add:
-        target, version = adopt_verdict(target)
-        if version is not None:
-            words = f"model {version.number} is in force: {model_words(version.effects)}"
-            written = "" if path is None else f", and written in {path}"
+        target, words = adopt_verdict(target)
+        if words:
+            written = "" if path is None else f" (it is in {path} now)"
             Reporter(command.progress, quiet=command.quiet, log=command.log_json).info(words + written)
     if refit:
         done = {s.stage for s in run_status(target) if s.state != "missing"}

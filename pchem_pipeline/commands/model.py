@@ -130,8 +130,18 @@ def use_model(target: Target, number: int) -> str:
         before = _kept(store, target)
         version = version_with(store, number)
         changed = _put_in_force(store, target, version)
-    what = "is in force" if before.number != number else "was in force already"
-    return "\n".join([f"model {number} {what}: {_words(version)}", *_stale_lines(changed)])
+    if before.number == number:
+        words = f"model {number} was in force already: {_words(version)}"
+    else:
+        words = _change_words(changed, before, version)
+    return "\n".join([words, *_stale_lines(changed)])
+
+
+def _change_words(target: Target, before: ModelVersion, version: ModelVersion) -> str:
+    """Say which version is in force now, and how to go back to the one before."""
+    place = quoted(yaml_of(target) or target.store)
+    back = f"to go back: pchem model {place} --use {before.number}"
+    return f"model {version.number} is in force: {_words(version)}; {back}"
 
 
 def _stale_lines(target: Target) -> list[str]:
@@ -176,14 +186,14 @@ def _put_in_force(store: RunStore, target: Target, version: ModelVersion) -> Tar
     return replace(target, config=config)
 
 
-def adopt_verdict(target: Target) -> tuple[Target, ModelVersion | None]:
+def adopt_verdict(target: Target) -> tuple[Target, str]:
     """Make the model of a run's verdict a version, and put it in force, in the store and in the YAML.
 
     Args:
         target: a run whose search is complete.
 
     Returns:
-        The run with that model; the version, None where the verdict leaves the model as it is.
+        The run with that model; what changed and how to go back, empty where the verdict changes nothing.
 
     Raises:
         ConfigError: the YAML cannot be edited.
@@ -195,14 +205,15 @@ def adopt_verdict(target: Target) -> tuple[Target, ModelVersion | None]:
         before = _kept(store, target)
         start, found = model_of(store, _SEARCH), read_verdict(store.path)
         if start is None or found is None:
-            return target, None
+            return target, ""
         aside = found.set_aside or start.model["set_aside_e"]
         settings = ModelSettings.model_validate({"effects": found.model_effects, "set_aside_e": aside})
-        closed = found.gap.closed_fraction if math.isfinite(found.gap.closed_fraction) else None
+        closed = found.closed_in_model if math.isfinite(found.closed_in_model) else None
         version = verdict_version(store, settings, start, group=_SEARCH, closed_fraction=closed)
         if version.digest == before.digest:
-            return target, None
-        return _put_in_force(store, target, version), version
+            return target, ""
+        changed = _put_in_force(store, target, version)
+        return changed, _change_words(changed, before, version)
 
 
 def models_json(models: Sequence[ListedModel]) -> str:

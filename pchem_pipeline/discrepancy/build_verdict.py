@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.gap import Gap
-from pchem_pipeline.discrepancy.null import Measured, NullModel, look_elsewhere
+from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS, VERSION
 from pchem_pipeline.discrepancy.size import size_of
 from pchem_pipeline.discrepancy.verdict import (
@@ -31,6 +31,8 @@ from pchem_pipeline.discrepancy.verdict import (
     State,
     Step,
     Verdict,
+    closed_share,
+    families_words,
     form_of,
     parameters_of,
 )
@@ -39,6 +41,7 @@ from pchem_pipeline.effects.framework.compose import place_words, title_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 
 FloatArray = NDArray[np.float64]
 
@@ -238,16 +241,26 @@ class Findings:
         """The named effects, the weightiest first."""
         return tuple(each.effect for each in self.added.additions if each.named)
 
+    @property
+    def described(self) -> tuple[Effect, ...]:
+        """What was measured and is not understood."""
+        return tuple(each.effect for each in self.added.additions if each.described)
+
+    @property
+    def proposed(self) -> tuple[Effect, ...]:
+        """Descriptions that leave something: the pixels fitted with them may be farther off than without."""
+        return () if self.added.after.at_floor else self.described
+
     def model(self, present: Sequence[Effect], extended: Sequence[Effect]) -> tuple[Effect, ...]:
-        """Return the model without the effects that were added but are neither named nor described.
+        """Return the model with those effects that were added and are named, or describe all that is left.
 
         Args:
             present: effects that it had before the search.
             extended: the same, and all that were added.
         """
-        described = [each.effect for each in self.added.additions if each.described]
-        tags = {effect.tag for effect in (*present, *self.named, *described)}
-        return tuple(effect for effect in extended if effect.tag in tags)
+        kept = self.named if self.proposed else (*self.named, *self.described)
+        keys = {effect.key for effect in (*present, *kept)}
+        return tuple(effect for effect in extended if effect.key in keys)
 
 
 def build_verdict(
@@ -275,7 +288,7 @@ def build_verdict(
     """
     # e-, and the share of the read noise, of pixels whose gain and read noise are open would be made up
     sizes = {
-        each.effect.tag: None
+        each.effect: None
         if found.doubt
         else size_of(fitted.seen(each.effect), fitted.maps, looked_at[1].frames)
         for each in found.added.additions
@@ -289,9 +302,10 @@ def build_verdict(
             + (f"; {found.limit}." if found.limit else "."),
             doubt=found.doubt,
             limit=found.limit,
-            effects=tuple(effect.tag for effect in found.named),
+            effects=tuple(dict.fromkeys(effect.tag for effect in found.named)),
             model_effects=tuple(effect.model_dump(mode="json") for effect in model),
-            steps=tuple(each.step(sizes[each.effect.tag]) for each in found.added.additions),
+            proposed=tuple(effect.model_dump(mode="json") for effect in found.proposed),
+            steps=tuple(each.step(sizes[each.effect]) for each in found.added.additions),
             gap=_gap_change(found.before, found.added),
             where=tuple(found.places),
             unexplained=(*found.added.residuals, *_still(found, pulls[1])),
@@ -341,16 +355,14 @@ def largest_pulls(
 
 def _gap_change(before: Gap, added: Added) -> GapChange:
     after = added.after
-    closed = 0.0
-    if added.additions and before.value > 0.0:
-        closed = 1.0 - max(after.value, 0.0) / before.value
     return GapChange(
         before=before.value,
         after=after.value,
         floor=after.floor,
-        closed_fraction=closed,
+        closed_fraction=closed_share(before.value, after.value) if added.additions else 0.0,
         interval_before=before.interval,
         interval_after=after.interval,
+        standing_out=after.standing_out,
     )
 
 
@@ -382,7 +394,7 @@ def _nearly(found: Findings) -> str:
 _OF_PIXELS = ", of the histograms of single pixels; frames, rows, columns and neighbours were not looked at"
 
 
-def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
+def _sentence(found: Findings, sizes: Mapping[Effect, Size | None]) -> str:
     """Return the verdict in one sentence: what, how large, and what it closes beside its rivals."""
     state, data, added = found.state, found.samples, found.added
     titles = [_sized(effect, sizes) for effect in found.named]
@@ -415,7 +427,7 @@ def _sentence(found: Findings, sizes: Mapping[str, Size | None]) -> str:
     return f"The model was missing {_and(titles)}; {words}."
 
 
-def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size | None]) -> str:
+def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Size | None]) -> str:
     """Return what the model may lack: effects not told apart, and what the final samples do not confirm."""
     data, additions = found.samples, found.added.additions
     unknown = [" or ".join(_title(c.effect) for c in each.candidates) for each in additions if not each.alone]
@@ -434,32 +446,33 @@ def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size 
     return f"The model lacks something that these {data} cannot tell apart: {lacks}."
 
 
-def _sized(effect: Effect, sizes: Mapping[str, Size | None]) -> str:
+def _sized(effect: Effect, sizes: Mapping[Effect, Size | None]) -> str:
     """Return what an effect is called, with its size, and then its place."""
-    size = sizes.get(effect.tag)
+    size = sizes.get(effect)
     if size is None:
         return title_words(effect)
     place = "" if effect.everywhere else f", in {place_words(effect)}"
     return f"{_title(effect.tag)} of {size.words()}{place}"
 
 
-def _described(found: Findings, titles: Sequence[str], sizes: Mapping[str, Size | None]) -> str:
+def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Size | None]) -> str:
     """Return what is known of a disagreement that was measured and is not understood."""
-    measured = [each.effect for each in found.added.additions if each.described]
-    known = [(effect.words(), sizes.get(effect.tag)) for effect in measured]
+    known = [(effect.words(), sizes.get(effect)) for effect in found.described]
     told = [text if size is None else f"{text}, in all {size.words()}" for text, size in known]
     words, them = "; and ".join(told), "it" if len(told) == 1 else "them"
     besides = f" besides {_and(titles)}" if titles else ""
     none = "No known effect explains" if not found.limit else "No effect that was tried explains"
     return (
-        f"{none} the {found.samples}{besides}, but what they hold is measured: {words}; "
+        f"{none} the {found.samples}{besides}; a description of them, which names no cause: {words}; "
         f"with {them} {_closed(found)}; {_alike(found)}{_broken(found)}."
     )
 
 
 def _alike(found: Findings) -> str:
-    """Return in words whether a measured component is alike in all that it is said of."""
-    if found.still or not found.added.after.at_floor:
+    """Return in words whether a measured component is alike in all that it is said of, and in the model."""
+    if found.proposed:
+        return "the rest is more than chance, so that the description is proposed and not in the model"
+    if found.still:
         return "whether it is like that throughout is not known"
     return "as far as these statistics show, it is like that throughout"
 
@@ -485,8 +498,10 @@ def _title(tag: str) -> str:
 
 def _closed(found: Findings) -> str:
     """Return the share of the gap that is closed, in words."""
-    share = 1.0 - max(found.added.after.value, 0.0) / found.before.value
-    return f"{_share(share)} of the gap on unseen {found.samples} is closed"
+    before, after = found.before, found.added.after
+    if before.at_floor or after.value >= before.value:
+        return f"the gap on unseen {found.samples} is no smaller"
+    return f"{_share(closed_share(before.value, after.value))} of the gap on unseen {found.samples} is closed"
 
 
 def _share(share: float) -> str:
@@ -500,7 +515,10 @@ def _rest(found: Findings) -> str:
     after = found.added.after
     if after.at_floor or found.before.value <= 0.0:
         return ""
-    return f"; {_share(max(after.value, 0.0) / found.before.value)} of the gap is left unexplained"
+    if after.value <= after.floor:
+        return f"; in {families_words(after.standing_out)} more is left than chance makes"
+    left = 1.0 - closed_share(found.before.value, after.value)
+    return f"; {_share(left)} of the gap is left unexplained"
 
 
 def _broken(found: Findings) -> str:

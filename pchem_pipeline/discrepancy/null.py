@@ -22,6 +22,7 @@ from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.observe.laws import without_skew
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 
 FloatArray = NDArray[np.float64]
 
@@ -46,7 +47,9 @@ _REPLICATION = 0.02  # in each split by itself, and in the same direction
 #: Nats on held-out frames that an explanation must be worth where no statistic deviates by itself.
 CONVINCING = 6.0
 _SUSPICION = 0.1  # chance of a deviation for which it is worth to ask the candidates
-_STRAY = 30.0  # robust standard deviations beyond which a value of a replicate is a single pixel's
+# robust standard deviations beyond which a value of a replicate is a single pixel's: with effects, that may
+# move a few replicates only, and without
+_STRAY, _STRAY_ALONE = 30.0, 10.0
 _SIGNATURE = 3.0  # standard deviations by which an effect moves the statistics of its signature
 
 
@@ -76,7 +79,12 @@ class NullModel:
 
     @classmethod
     def from_replicates(
-        cls, names: tuple[str, ...], vectors: FloatArray, before: NullModel | None = None
+        cls,
+        names: tuple[str, ...],
+        vectors: FloatArray,
+        before: NullModel | None = None,
+        *,
+        effects: bool = False,
     ) -> NullModel:
         """Estimate from replicates, shape (b, m).
 
@@ -85,7 +93,9 @@ class NullModel:
             vectors: the replicates.
             before: null of the model to which effects were added: statistics that they leave where they were,
                 and do not widen, scatter as they did, which few new replicates need not show again.
+            effects: whether the model has effects, as one with a model before it has.
         """
+        vectors = without_strays(vectors, _STRAY if effects or before is not None else _STRAY_ALONE)
         mean, std, covariance = moments(vectors)
         skewness = _skewness(names, vectors)
         tests = _effective_tests(names, vectors, skewness)
@@ -169,21 +179,17 @@ def two_sided(pulls: FloatArray, freedom: float) -> FloatArray:
     return np.asarray(np.maximum(2.0 * special.stdtr(freedom, -np.abs(pulls)), 1e-300))
 
 
-def look_elsewhere(p: float, tests: float) -> float:
-    """Return the chance that the smallest of ``tests`` independent p-values is ``p`` or less (Sidak)."""
-    return float(-np.expm1(tests * np.log1p(-min(p, 1.0 - 1e-16))))
-
-
-def without_strays(vectors: FloatArray) -> FloatArray:
+def without_strays(vectors: FloatArray, apart: float = _STRAY) -> FloatArray:
     """Return replicates, (b, m), in which no value is farther from the others than any scatter takes it.
 
     A single pixel that no fit holds makes a sum of squares of one replicate thousands of times as large as in
-    all others; its mean and scatter would be those of that pixel.
+    all others; its mean and scatter would be those of that pixel. What is farther than ``apart`` robust
+    standard deviations from the median is taken to be as far.
     """
     middle = np.median(vectors, axis=0)
     # statistics scatter by about 1 without effects
-    scatter = np.maximum(1.4826 * np.median(np.abs(vectors - middle), axis=0), 1.0)
-    return np.asarray(np.clip(vectors, middle - _STRAY * scatter, middle + _STRAY * scatter))
+    reach = apart * np.maximum(robust_sd(vectors, middle, axis=0), 1.0)
+    return np.asarray(np.clip(vectors, middle - reach, middle + reach))
 
 
 def as_matrix(

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -243,8 +242,38 @@ class Families(_Part):
     after: dict[str, Number] = {}
 
 
+#: What the families of statistics are of.
+_FAMILIES = {
+    "shape": "the shape of the histograms",
+    "code": "the codes",
+    "tail": "the tails",
+    "time": "the order in time",
+    "frame": "the frames",
+    "space": "neighbours and lines",
+}
+
+
+def closed_share(before: float, after: float) -> float:
+    """Return the share of a gap that is closed, 0 to 1; 0 where there is none or it grew."""
+    return min(max(1.0 - max(after, 0.0) / before, 0.0), 1.0) if before > 0.0 else 0.0
+
+
+def families_words(families: Sequence[str]) -> str:
+    """Return in words what families of statistics are of."""
+    return " and ".join(_FAMILIES.get(family, family) for family in families)
+
+
 class GapChange(_Part):
-    """The gap of the model on samples that no fit has seen, before and after effects were added."""
+    """The gap of the model on samples that no fit has seen, before and after effects were added.
+
+    Attributes:
+        unit: of all but the share.
+        before, after: without and with the effects.
+        floor: what chance makes at most in 19 of 20 cases.
+        closed_fraction: share that is closed, 0 to 1.
+        interval_before, interval_after: 95 % intervals.
+        standing_out: families of statistics that are beyond chance by themselves with the effects.
+    """
 
     unit: str = "nats/sample"
     before: Number
@@ -253,6 +282,7 @@ class GapChange(_Part):
     closed_fraction: Number
     interval_before: Interval = (_NAN, _NAN)
     interval_after: Interval = (_NAN, _NAN)
+    standing_out: tuple[str, ...] = ()
 
     @property
     def within_chance(self) -> bool:
@@ -393,15 +423,18 @@ class Step(_Part):
         return self.gap_before <= self.gap_floor
 
     @property
+    def closed(self) -> float:
+        """Share of the gap before this step that it closes."""
+        return closed_share(self.gap_before, self.gap_after)
+
+    @property
     def runner_up(self) -> Rival | None:
         """The best of the rivals."""
         return self.rivals[0] if self.rivals else None
 
     def closed_by(self, rival: Rival) -> float:
-        """Return the share of the gap before this step that a rival closes in its place; NaN: no gap."""
-        if not self.gap_before > 0.0:
-            return _NAN
-        return 1.0 - max(rival.gap_after, 0.0) / self.gap_before
+        """Return the share of the gap before this step that a rival closes in its place."""
+        return closed_share(self.gap_before, rival.gap_after)
 
     @property
     def likeliest(self) -> str:
@@ -421,6 +454,7 @@ class Verdict(_Part):
         sentence: the same for people.
         effects: tags of the named effects.
         model_effects: all effects that the model has afterwards, as the YAML holds them.
+        proposed: effects that describe what none explains but leave something; they are not in the model.
         steps: what was added, in order of weight.
         gap: with no new effect, and with all.
         where: the disagreements with the model as it was.
@@ -443,6 +477,7 @@ class Verdict(_Part):
     limit: str = ""
     effects: tuple[str, ...]
     model_effects: tuple[dict[str, Any], ...]
+    proposed: tuple[dict[str, Any], ...] = ()
     steps: tuple[Step, ...]
     gap: GapChange
     where: tuple[Place, ...]
@@ -490,6 +525,18 @@ class Verdict(_Part):
             first = error.errors()[0]
             place = ".".join(str(part) for part in first["loc"])
             raise StoreError(f"{source} is damaged ({place}: {first['msg']}); {cure}") from error
+
+    @property
+    def closed_in_model(self) -> float:
+        """Share of the gap that the effects close which the model has afterwards."""
+        named = [step for step in self.steps if step.verdict != "described"]
+        if not self.proposed:
+            return self.gap.closed_fraction
+        return closed_share(self.gap.before, named[-1].gap_after) if named else 0.0
+
+    def part_of_model(self, step: Step) -> bool:
+        """Tell whether the effect of a step is in the model: named, or a description of all that was left."""
+        return step.effect is not None or (step.verdict == "described" and not self.proposed)
 
     @property
     def word(self) -> str:
@@ -622,9 +669,10 @@ def parameters_of(effect: Effect, stderr: float) -> dict[str, Measured]:
         effect: with its fitted parameters.
         stderr: of its strength; NaN where there is none.
     """
+    errors = {effect.strength: stderr}
     return {
         name: Measured(
-            value=value, stderr=stderr if name == effect.strength else _NAN, unit=_unit(type(effect), name)
+            value=value, stderr=errors.get(name, _NAN), unit=effect.unit(name).removeprefix("none")
         )
         for name, value in effect.model_dump(exclude={"tag"}).items()
         if isinstance(value, int | float) and not isinstance(value, bool)
@@ -639,16 +687,6 @@ def form_of(effect: Effect) -> dict[str, str]:
         for name, value in effect.model_dump(exclude={"tag"}).items()
         if isinstance(value, str) and value != fields[name].default
     }
-
-
-def _unit(effect: type[Effect], name: str) -> str:
-    """Return the unit that the description of a field has behind its first part, or nothing."""
-    found = _UNIT.search(effect.model_fields[name].description or "")
-    return found[1] if found else ""
-
-
-#: Behind a comma, before a semicolon, a bracket or the end: one word ("no unit" is none).
-_UNIT = re.compile(r", ([^\s,;]+(?: per frame)?)(?=;| \(|$)")
 
 
 @dataclass(frozen=True)

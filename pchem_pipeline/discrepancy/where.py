@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.null import NullModel, look_elsewhere
+from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.scan import Stretch, Suspect, scan_map, scan_series
 from pchem_pipeline.discrepancy.scan_events import scan_event_map
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.effects.framework.evidence import SCORES, Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import parse_place
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 
 FloatArray = NDArray[np.float64]
 
@@ -355,7 +356,7 @@ def _frames(name: str, evidence: Evidence) -> tuple[int, ...]:
         return tuple(int(f) for f in np.unique(time.hits[:, 0])[:_MOST_LISTED])
     if name.endswith(".largest"):
         series = _series(name, time)
-        spread = 1.4826 * np.median(np.abs(series - np.median(series)))
+        spread = robust_sd(series)
         order = np.argsort(-np.abs(series - np.median(series)))
         outlying = [i for i in order if abs(series[i] - np.median(series)) > 5.0 * spread]
         return tuple(sorted(int(time.frames[i]) for i in (outlying or order[:1])[:_MOST_LISTED]))

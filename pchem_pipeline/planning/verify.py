@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, flags_of
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
@@ -74,7 +75,7 @@ def _check(target: Target, point: Point, errors: FloatArray) -> Check:
     square = values**2
     root = float(np.sqrt(square.mean()))
     spread = float(square.std(ddof=1) / np.sqrt(square.size))
-    robust = float(1.4826 * np.median(np.abs(values)))
+    robust = robust_sd(values, 0.0)
     return Check(target, target.wanted(point), root, spread / (2 * root), robust)
 
 

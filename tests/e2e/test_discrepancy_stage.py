@@ -178,6 +178,8 @@ def test_effects_beside_one_that_is_no_candidate_are_named_in_part_and_a_killed_
     text = CAMERA.replace(hidden, f"{hidden}, {others}").replace("[16, 16]", "[12, 12]")
     shell = Shell(tmp_path / "whole", {**os.environ, "NUMBA_CACHE_DIR": kernels})
     shell.folder.mkdir()
+    # a third one, that is not there, to be asked for beside the others
+    text = text.replace("[row_noise, frame_noise]", "[row_noise, frame_noise, column_noise]")
     (shell.folder / "run.yaml").write_text(text.replace("1800", "1000"))
     shell.ok("simulate", "run.yaml")
     shell.ok("run", "run.yaml", "--until", "fit")

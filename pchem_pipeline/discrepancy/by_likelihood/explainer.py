@@ -203,7 +203,7 @@ class HistogramExplainer:
             replicates,
             sets,
             both,
-            NullModel.from_replicates(names, as_matrix(names, vectors)),
+            NullModel.from_replicates(names, as_matrix(names, vectors), effects=bool(model)),
             Measured(*(as_matrix(names, [row])[0] for row in own)),
             members,
             model,
@@ -274,7 +274,7 @@ class HistogramExplainer:
     def add(self, explanation: Explanation, null: NullModel) -> NullModel:
         """Put the named effects into the model, and observe histograms drawn from it."""
         vectors = self.replicates.drawn(_with_effects(explanation))
-        return NullModel.from_replicates(null.names, as_matrix(null.names, vectors))
+        return NullModel.from_replicates(null.names, as_matrix(null.names, vectors), effects=True)
 
     def replaced(self, null: NullModel) -> NullModel | None:
         """Leave what was added: nothing is measured of anything else here."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_likelihood.sets import chance_of_cells, saturated
-from pchem_pipeline.discrepancy.gap import Gap
+from pchem_pipeline.discrepancy.gap import Gap, among_themselves
 from pchem_pipeline.model.fit.shared import SharedFit, SharedProblem, Tangent
 
 FloatArray = NDArray[np.float64]
@@ -100,7 +100,10 @@ class LikelihoodGap:
         return float(max(((seen * ratio**2).sum(axis=1) - sums**2 / total[:, 0]).sum(), 0.0))
 
     def by_chance(self, problem: SharedProblem, fit: SharedFit) -> FloatArray:
-        """Return distances that replicates of the fit have from their own refits, nats, (replicates,)."""
+        """Return distances that replicates of the fit have from their own refits, nats, (b,).
+
+        Those whose one step went astray, as the others show, are left out.
+        """
         judged = self._judged(problem)
         tangent = Tangent.at(problem, fit.theta, fit.shared)
         fitted, compared = (
@@ -115,7 +118,8 @@ class LikelihoodGap:
             moved = np.clip(fit.shared + shared, problem.bounds[:, 0], problem.bounds[:, 1])
             log_masses = judged.log_masses(fit.theta + own, moved)
             found.append(self._distance(log_masses, self.rng.multinomial(n_compared, compared)))
-        return np.array(found)
+        distances = np.array(found)
+        return distances[among_themselves(distances)]
 
     def chance(self, problem: SharedProblem, fit: SharedFit) -> float:
         """Return what chance contributes to the distance of a fit, nats."""

@@ -195,7 +195,7 @@ class AddedRounds:
         best = fit_set(this.added.hypotheses, shift, noise).log_score(shift, noise)
         refitted = {*compared.chosen.tags, *found}
         for hypothesis in this.hypotheses:
-            if hypothesis.tag in refitted:
+            if hypothesis.tag in refitted or hypothesis.effect.tag == added.effect.tag:
                 continue
             fit = fit_set([*kept, hypothesis], shift, noise)
             mean = this.null.mean + fit.parts.sum(axis=0)

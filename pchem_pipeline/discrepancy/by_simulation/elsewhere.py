@@ -17,7 +17,6 @@ from pchem_pipeline.discrepancy.null import (
     NullModel,
     as_matrix,
     disagrees,
-    without_strays,
 )
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.effects.framework.effect import Effect
@@ -43,7 +42,7 @@ def deviation(by: Simulations, model: Sequence[Effect]) -> str:
     names = by.observed.names([*own, *vectors])
     if not names:
         return ""
-    null = NullModel.from_replicates(names, without_strays(as_matrix(names, vectors)))
+    null = NullModel.from_replicates(names, as_matrix(names, vectors), effects=bool(model))
     z, tolerance = Measured(*as_matrix(names, own)), _DETAILS * np.abs(null.mean)
     if not disagrees(null, z, _SIGNIFICANCE, tolerance):
         return ""

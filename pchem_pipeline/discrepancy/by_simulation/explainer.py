@@ -171,7 +171,7 @@ class FrameExplainer:
         vectors = work.replicates(model, work.mapped(model).sensor, "r0", settings.replicates)
         own = observed.statistics()
         names = observed.names([*own, *vectors])
-        first = NullModel.from_replicates(names, as_matrix(names, vectors))
+        first = NullModel.from_replicates(names, as_matrix(names, vectors), effects=bool(model))
         effort.begin()
         z, defects = Measured(*as_matrix(names, own)), dict[str, str]()
         return cls(
@@ -267,7 +267,6 @@ class FrameExplainer:
         found = self._compared(explanation, refitter)
         if found is None:
             return None
-        self.defects.update(found.failed)
         # what was chosen is not lost for the little that is left to do: no limit
         refitter = replace(refitter, allow=lambda _: None)
         count, held = self.settings.extended_replicates, {h.tag for h in self.extended.added}
@@ -319,7 +318,7 @@ class FrameExplainer:
             self.work.effort.check(f"{words} was fitted")
 
         events = np.asarray(noise_of_splits(first, 2, self.settings.model_error).events)
-        return Refitter(draw, first, self.z.both, events, present, allow=allow)
+        return Refitter(draw, first, self.z.both, events, present, allow=allow, defects=self.defects)
 
     def _left_by(self, best: Refitted, refitter: Refitter) -> Choice | None:
         """Compare what candidates would do beside a refitted set: what that hid stands out there."""
@@ -341,7 +340,7 @@ class FrameExplainer:
                 del self._likelihoods[next(iter(self._likelihoods))]
             samples = self.work.own_samples((*present, *effects))
             self._likelihoods[key] = PixelLikelihood(
-                samples, self.observed.plain.maps, present, self.work.effort, pixels
+                samples, self.observed.plain.maps, present, self.work.effort, pixels, self.defects
             )
         return self._likelihoods[key]
 

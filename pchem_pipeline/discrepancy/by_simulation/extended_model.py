@@ -50,8 +50,12 @@ class ExtendedModel:
     @property
     def present(self) -> tuple[Effect, ...]:
         """The effects beside which those of the rounds are fitted."""
-        added = {h.tag for h in self.added}
-        return tuple(e for e in self.effects if e.tag not in added)
+        return self._without(self.added)
+
+    def _without(self, gone: tuple[Hypothesis, ...]) -> tuple[Effect, ...]:
+        """Return its effects without some, whatever their strengths are now."""
+        keys = {h.effect.key for h in gone}
+        return tuple(e for e in self.effects if e.key not in keys)
 
     def put(
         self,
@@ -100,7 +104,7 @@ class ExtendedModel:
     def put_measured(self, found: Refitted) -> NullModel:
         """Put what was measured into the model, without effects that are not beside it, and their rounds."""
         gone = {h.tag for h in self.added} - found.tags
-        self.effects = tuple(e for e in self.effects if e.tag not in gone)
+        self.effects = self._without(tuple(h for h in self.added if h.tag in gone))
         changed = [i for i, this in enumerate(self.rounds) if gone & {h.tag for h in this.added.hypotheses}]
         self.rounds = self.rounds[: min(changed, default=len(self.rounds))]
         null = self.rounds[-1].extended if self.rounds else self.first
@@ -113,8 +117,7 @@ class ExtendedModel:
             NotFittedError: no pixels can be fitted with that.
         """
         taken = tuple(h.times(1.0 + float(c)) for h, c in zip(added.hypotheses, change, strict=True))
-        tags = {h.tag for h in taken}
-        effects = along_chain([e for e in self.effects if e.tag not in tags], [h.effect for h in taken])
+        effects = along_chain(self._without(taken), [h.effect for h in taken])
         self.work.mapped(effects)
         self.effects = effects
         return taken

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
+from pchem_pipeline.model.arithmetic.robust import chi_square as chi_square
+
 FloatArray = NDArray[np.float64]
 
 _SMALL = 1e-12
@@ -24,22 +26,6 @@ def counted(count: ArrayLike, expected: ArrayLike) -> FloatArray:
     """Return ``2 sqrt(c + 3/8) - 2 sqrt(e + 3/8)``: variance 1 for a Poisson count (Anscombe 1948)."""
     seen, mean = np.asarray(count, np.float64), np.maximum(np.asarray(expected, np.float64), 0.0)
     return np.asarray(2.0 * (np.sqrt(seen + 0.375) - np.sqrt(mean + 0.375)))
-
-
-def chi_square(value: ArrayLike, mean: ArrayLike, variance: ArrayLike | None = None) -> FloatArray:
-    """Return the normal quantile of a sum of squares (Wilson and Hilferty 1931).
-
-    Args:
-        value: the sum.
-        mean: its expectation (the degrees of freedom where the squares have variance 1).
-        variance: its variance; twice the mean if None.
-    """
-    mu = np.asarray(mean, np.float64)
-    spread = 2.0 * mu if variance is None else np.asarray(variance, np.float64)
-    # a multiple of a chi-square with the same mean and variance has this many degrees of freedom
-    width = spread / (9.0 * mu**2)
-    ratio = np.maximum(np.asarray(value, np.float64), 0.0) / mu
-    return np.asarray((np.cbrt(ratio) - (1.0 - width)) / np.sqrt(width))
 
 
 def without_skew(z: FloatArray, skewness: FloatArray) -> FloatArray:

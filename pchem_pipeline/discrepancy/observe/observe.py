@@ -55,7 +55,8 @@ MINIMUM_BLOCKS = 4
 UNTRUSTWORTHY = FAILED | FitStatus.NOT_INFORMATIVE
 _MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
 _FINEST_STEP = 2.5  # DN per electron, the least that whole DN show
-_STRAY_STEP = 1.0 / 3.0  # of the steps of most pixels
+_FAR_FINER = 2.0 / 3.0  # of the step of most pixels
+_ALIKE, _FEW = 1.25, 0.1  # ratio of like steps, and share of the pixels that makes a gain of their own
 
 
 def observe(
@@ -278,15 +279,23 @@ def _fitted(
 
 
 def _without_steps(gain: FloatArray, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Tell which pixels have no steps of electrons that whole DN could show, where most pixels have, (n,).
+    """Tell which pixels have a comb that whole DN hardly show, where most pixels have a coarser one, (n,).
 
-    In the dark, as in reference columns, a few of many fits find such a comb by chance; replicates of what
-    they found would be of bright pixels.
+    Of noise that hides the electrons, as in the dark, in reference columns or in noisy pixels, a few of many
+    fits make such a comb by chance. Replicates of what they found would be of other pixels; and in samples
+    that it was not fitted to, a comb that is not there is off by hundreds of standard deviations.
+
+    Args:
+        gain: fitted, e-/DN, (n,).
+        usable: pixels whose fit succeeded, (n,).
     """
     if not usable.any():
         return np.zeros_like(usable)
     step = 1.0 / np.where(usable, gain, np.nan)
-    return np.asarray((step < _FINEST_STEP) & (step < _STRAY_STEP * np.nanmedian(step)))
+    known, most = np.sort(step[usable]), float(np.nanmedian(step))
+    first, last = (np.searchsorted(known, step * ratio) for ratio in (1.0 / _ALIKE, _ALIKE))
+    few = last - first - 1 < _FEW * known.size
+    return np.asarray(few & (step < min(_FINEST_STEP, _FAR_FINER * most)) & (most > _FINEST_STEP))
 
 
 def _inside(counts: NDArray[Any], outside: FloatArray) -> NDArray[np.bool_]:

@@ -22,7 +22,7 @@ from pchem_pipeline.effects.estimators.codes import (
     roughness,
     usable_codes,
 )
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Code, Count, Effect, Lsb, Plane, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -70,7 +70,7 @@ class AdcDnl(Effect):
         "clipping": "a shifted bias: unequal widths are at all codes, a limit at the extreme one",
         "adc_inl": "a ramp or a shifted bias over many codes: DNL is new from code to code, INL smooth",
     }
-    dnl_lsb: float = Field(
+    dnl_lsb: Lsb = Field(
         ge=-1,
         le=1,
         description="random: rms deviation of the code widths, LSB; edges: scale of `edges`, LSB; bit: error "
@@ -82,8 +82,8 @@ class AdcDnl(Effect):
     per_column: bool = Field(
         default=False, description="random pattern: an ADC of its own for each column, with its own shifts"
     )
-    bit: int = Field(default=0, ge=0, le=23, description="bit pattern: which bit, 0 the least significant")
-    first_code: int = Field(default=0, ge=0, description="edges pattern: code of the first of `edges`, DN")
+    bit: Count = Field(default=0, ge=0, le=23, description="bit pattern: which bit, 0 the least significant")
+    first_code: Code = Field(default=0, ge=0, description="edges pattern: code of the first of `edges`, DN")
     edges: tuple[float, ...] = Field(
         default=(),
         max_length=1 << 16,

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.bends import Curve, best_bend, best_curve, through_knots
 from pchem_pipeline.effects.estimators.codes import code_range
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Dn, Effect, Lsb, Plane, Radians, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -59,18 +59,18 @@ class AdcInl(Effect):
         "adc_dnl": "a ramp over many codes: INL is smooth along DN, DNL new from code to code",
         "signal_dependent_noise": "a shifted bias: INL moves peaks to and fro in DN, noise only widens them",
     }
-    inl_lsb: float = Field(
+    inl_lsb: Lsb = Field(
         ge=0, le=1e4, description="amplitude of the sine, or scale of `curve` (its largest value is 1), LSB"
     )
     form: Literal["sine", "curve"] = Field(
         default="sine", description="sine: of one period; curve: smooth through the values of `curve`"
     )
-    period_dn: float = Field(
+    period_dn: Dn = Field(
         default=100.0, ge=4, le=1e6, description="sine: period of the deviation, DN; two bends per period"
     )
-    phase: float = Field(default=0.0, ge=-100, le=100, description="sine: phase at 0 DN, rad")
-    first_dn: float = Field(default=0.0, description="curve: where the first value of `curve` lies, DN")
-    spacing_dn: float = Field(
+    phase: Radians = Field(default=0.0, ge=-100, le=100, description="sine: phase at 0 DN, rad")
+    first_dn: Dn = Field(default=0.0, description="curve: where the first value of `curve` lies, DN")
+    spacing_dn: Dn = Field(
         default=10.0, gt=0, le=1e6, description="curve: from one value of `curve` to the next, DN"
     )
     curve: tuple[float, ...] = Field(

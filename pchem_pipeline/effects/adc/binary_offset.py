@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, field_validator
 
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,7 +47,7 @@ class BinaryOffset(Effect):
         "optical_crosstalk": "a bright spot: crosstalk follows the charge beside it, an offset the code",
         "adc_dnl": "a dark neighbour: widths of codes stay, an offset by the code before does not",
     }
-    offset_dn: float = Field(
+    offset_dn: Dn = Field(
         ge=-1e4, le=1e4, description="difference between a bit of 1 and of 0, in units of `bits`, DN"
     )
     bits: tuple[float, ...] = Field(

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from pchem_pipeline.effects.estimators.clamps import best_clamp
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Count, Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.region import Span
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class BlackClamp(Effect):
         "exposure_flicker": "the camera's clamp switched off, or covered pixels: they follow the light",
         "interpixel_capacitance": "pixels far apart: a clamp couples all of the frame alike",
     }
-    follow: float = Field(
+    follow: Ratio = Field(
         ge=0, le=1, description="part of the clamp's deviation that is taken off, no unit; 1: all of it"
     )
     rows: Span | None = Field(
@@ -61,7 +61,7 @@ class BlackClamp(Effect):
     columns: Span | None = Field(
         default=None, description="columns of the clamp: first, and behind the last; null: all"
     )
-    pixels: int | None = Field(
+    pixels: Count | None = Field(
         default=None, ge=1, description="number of these pixels, for the law of a sample; null: left as it is"
     )
 

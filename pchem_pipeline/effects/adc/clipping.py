@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Code, Effect, Plane, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -52,10 +52,10 @@ class Clipping(Effect):
         "adc_dnl": "a shifted bias: a limit stays where it is, and nothing comes from beyond it",
         "adc_inl": "a shifted bias or more light: a limit is one code, a bent curve all of them",
     }
-    low: int | None = Field(
+    low: Code | None = Field(
         default=None, ge=0, description="smallest DN that comes out; null: that of the ADC"
     )
-    high: int | None = Field(
+    high: Code | None = Field(
         default=None, ge=0, description="largest DN that comes out; null: that of the ADC"
     )
 

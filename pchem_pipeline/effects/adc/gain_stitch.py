@@ -16,7 +16,7 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.bends import Stitch, best_stitch
 from pchem_pipeline.effects.estimators.codes import code_range
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -57,11 +57,11 @@ class GainStitch(Effect):
         "branching_counts": "a shifted bias: the surplus of many electrons moves with it",
         "signal_dependent_noise": "a shifted bias: a stitch stays at its DN, noise with the electrons",
     }
-    gain_change: float = Field(
+    gain_change: Ratio = Field(
         ge=-0.5, le=0.5, description="relative change of the DN per electron above the level, no unit"
     )
-    level_dn: float = Field(ge=0, le=1e6, description="level at which the two gains are joined, DN")
-    origin_dn: float | None = Field(
+    level_dn: Dn = Field(ge=0, le=1e6, description="level at which the two gains are joined, DN")
+    origin_dn: Dn | None = Field(
         default=None,
         ge=-_FARTHEST,
         le=_FARTHEST,

@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field
 from scipy import special
 
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -58,20 +58,20 @@ class AnalogMemory(Effect):
         "dark_current_rts": "one bright frame and then dark ones: memory fades within a frame, defects stay",
         "repeated_frames": "frame counters; repeated frames are equal in every sample",
     }
-    memory: float = Field(
+    memory: Ratio = Field(
         ge=-0.5,
         le=0.5,
         description="part of the charge of the frame before that is read again, mean of the pixels, no unit; "
         "negative: overshoot",
     )
-    spread: float = Field(
+    spread: Ratio = Field(
         default=0.0,
         ge=0,
         le=2,
         description="standard deviation of the logarithm of the memory, which differs from pixel to pixel; "
         "0: alike in all",
     )
-    saturation_e: float | None = Field(
+    saturation_e: Electrons | None = Field(
         default=None,
         gt=0,
         le=1e9,

@@ -28,7 +28,7 @@ from pchem_pipeline.effects.estimators.time_profiles import (
     settling,
     settling_time,
 )
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class BiasDrift(Effect):
         "bias_jumps": "means of the quadrants, frame by frame: jumps are sudden and each quadrant's own",
         "flicker_noise": "block means of single pixels: flicker is each pixel's own, a drift common to all",
     }
-    drift_dn: float = Field(
+    drift_dn: Dn = Field(
         ge=-1e6,
         le=1e6,
         description="linear, settling: bias at the end less that at the start, DN; path: its scale, DN; "
@@ -80,7 +80,7 @@ class BiasDrift(Effect):
         description="linear; settling: exponential approach to the end; path: as listed in `path`; walk: "
         "random walk",
     )
-    settling_fraction: float = Field(
+    settling_fraction: Ratio = Field(
         default=0.2, gt=0, le=10, description="settling: time constant in lengths of the run"
     )
     path: tuple[float, ...] = Field(

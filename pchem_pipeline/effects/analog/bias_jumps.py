@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.effects.estimators.common_modes import quantile_means, responsivity, with_offsets
 from pchem_pipeline.effects.estimators.levels.change_points import noise_variance
 from pchem_pipeline.effects.estimators.levels.two_levels import likeliest_parts
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Count, Dn, Effect, PerFrame, Plane, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 
 if TYPE_CHECKING:
@@ -70,11 +70,11 @@ class BiasJumps(Effect):
         "flicker_noise": "means of the quadrants: flicker of single pixels averages out",
         "rts_noise": "histograms of single pixels: RTS shows in few of them, jumps in all of a quadrant",
     }
-    amplitude_dn: float = Field(
+    amplitude_dn: Dn = Field(
         ge=0, le=1e6, description="distance between neighbouring levels, DN; the scale of `path` if given"
     )
-    rate: float = Field(default=1e-3, ge=0, le=0.5, description="jumps per frame of each part")
-    levels: int = Field(default=2, ge=2, le=64, description="number of evenly spaced levels")
+    rate: PerFrame = Field(default=1e-3, ge=0, le=0.5, description="jumps per frame of each part")
+    levels: Count = Field(default=2, ge=2, le=64, description="number of evenly spaced levels")
     parts: Parts = Field(default="quadrants", description="parts of the sensor with an output of their own")
     path: tuple[Path, ...] = Field(
         default=(),

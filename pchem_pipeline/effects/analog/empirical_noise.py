@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import place_words
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.shared_offset import add_offset
 
@@ -295,7 +295,7 @@ class EmpiricalNoise(Effect):
     strength: ClassVar[str] = "noise_dn"
     power: ClassVar[float] = 2.0
     measured_only: ClassVar[bool] = True
-    noise_dn: float = Field(ge=0, le=1e6, description="standard deviation of all of it, DN")
+    noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of all of it, DN")
     modes: tuple[NoiseMode, ...] = Field(
         min_length=1,
         max_length=4,
@@ -398,7 +398,7 @@ class EmpiricalNoise(Effect):
         of_all = len(self.modes) == 1 and self.modes[0].changes == "offset" and self.modes[0].burst is None
         parts = "; ".join(mode.words(None if of_all else self.share_of(mode)) for mode in self.modes)
         if all(mode.changes == "offset" for mode in self.modes):
-            return f"noise of {self.noise_dn:.2g} DN{place} that samples share before the converter ({parts})"
+            return f"noise of {self.noise_dn:.2g} DN{place} that samples share ({parts})"
         changed = dict.fromkeys(_CHANGED.get(mode.changes, "offset") for mode in self.modes)
         return f"a change of the {' and the '.join(changed)}{place} that samples share ({parts})"
 

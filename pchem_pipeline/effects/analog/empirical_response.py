@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.compose import place_words
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 from pchem_pipeline.effects.framework.region import Region
 
@@ -153,7 +153,7 @@ class EmpiricalResponse(Effect):
     strength: ClassVar[str] = "response"
     measured_only: ClassVar[bool] = True
     far_reaching: ClassVar[bool] = True
-    response: float = Field(
+    response: Ratio = Field(
         ge=0,
         le=1,
         description="part of the charge of another sample that a sample gets, for weight 1, no unit",
@@ -273,7 +273,7 @@ class EmpiricalResponse(Effect):
             )
         told = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:_FEW]]
         more = f", and {len(followed) - _FEW} more" if len(followed) > _FEW else ""
-        return f"samples{place} that follow the charge of others (by {', '.join(told)}{more})"
+        return f"samples{place} that correlate with the charge of others ({', '.join(told)}{more})"
 
 
 def _few(parts: Sequence[str]) -> str:

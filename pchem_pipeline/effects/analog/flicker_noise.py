@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.long_memory import between_grid_points, frame_key
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Frames, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -57,8 +57,8 @@ class FlickerNoise(Effect):
         "gain_drift": "dark and bright pixels: a drift of the gain grows with the signal",
         "rts_noise": "longer runs: slow telegraph noise has two levels and stays in the same few pixels",
     }
-    share: float = Field(ge=0, le=1, description="part of the power of the read noise, no unit")
-    correlation_frames: float = Field(
+    share: Ratio = Field(ge=0, le=1, description="part of the power of the read noise, no unit")
+    correlation_frames: Frames = Field(
         default=30.0,
         gt=0,
         le=1e6,

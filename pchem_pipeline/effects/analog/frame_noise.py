@@ -21,7 +21,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
     responsivity,
     successive,
 )
-from pchem_pipeline.effects.framework.effect import register_effect
+from pchem_pipeline.effects.framework.effect import Dn, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedNoise
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class FrameNoise(SharedNoise):
         "periodic_pickup": "a spectrum of frame means of a longer run: pickup is a line, noise is flat",
         "bias_drift": "a longer run: a drift grows with the time between two frames, noise does not",
     }
-    frame_noise_dn: float = Field(ge=0, le=1e6, description="standard deviation of the frames' offsets, DN")
+    frame_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the frames' offsets, DN")
 
     @classmethod
     def typical(cls) -> Sequence[Self]:

@@ -21,7 +21,7 @@ from pchem_pipeline.effects.estimators.time_profiles import (
     settling,
     settling_time,
 )
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -61,7 +61,7 @@ class GainDrift(Effect):
         "signal_dependent_noise": "repeating the run: a drift follows a time profile, noise does not",
         "flicker_noise": "dark and bright pixels: a drift of the gain grows with the signal",
     }
-    drift: float = Field(
+    drift: Ratio = Field(
         ge=-0.5,
         le=0.5,
         description="linear: relative change of the gain (DN/e-) from the first frame to the last, no unit; "
@@ -71,7 +71,7 @@ class GainDrift(Effect):
         default="linear",
         description="linear; settling: exponential approach to the end; path: as listed in `path`",
     )
-    settling_fraction: float = Field(
+    settling_fraction: Ratio = Field(
         default=0.2, gt=0, le=10, description="settling: time constant in lengths of the run"
     )
     path: tuple[float, ...] = Field(

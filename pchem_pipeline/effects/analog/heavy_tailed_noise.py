@@ -17,7 +17,7 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
 from pchem_pipeline.effects.estimators.response import first_order
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 if TYPE_CHECKING:
@@ -58,8 +58,8 @@ class HeavyTailedNoise(Effect):
         "adc_dnl": "a sweep of the bias: wrong codes stay where they are in DN, tails move along",
         "signal_dependent_noise": "frames without any exposure: the tails remain there",
     }
-    share: float = Field(ge=0, le=1, description="probability that a sample is noisy, no unit")
-    factor: float = Field(
+    share: Ratio = Field(ge=0, le=1, description="probability that a sample is noisy, no unit")
+    factor: Ratio = Field(
         default=3.0,
         ge=1,
         le=30,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -50,10 +50,10 @@ class InterpixelCapacitance(Effect):
         "row_noise": "distant pixels of a row: row noise reaches them, capacitance does not",
         "column_noise": "distant pixels of a column: column noise reaches them, capacitance does not",
     }
-    coupling: float = Field(
+    coupling: Ratio = Field(
         ge=0, le=0.2, description="part of a neighbour's charge that a pixel shows (mean of four), no unit"
     )
-    anisotropy: float = Field(
+    anisotropy: Ratio = Field(
         default=0.0,
         ge=-1,
         le=1,

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.response import strength_of
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -54,7 +54,7 @@ class NoiseSkew(Effect):
         "adc_inl": "a sweep of the bias: the skew moves along with the peaks, wrong codes do not",
         "rts_noise": "longer runs: telegraph noise stays in the same few pixels",
     }
-    share: float = Field(
+    share: Ratio = Field(
         ge=-1,
         le=1,
         description="standard deviation of the exponential part relative to that of all read noise, no unit; "

@@ -17,7 +17,7 @@ from pydantic import Field
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.estimators.response import strength_of
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, PerElectron, Plane, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -54,7 +54,7 @@ class Nonlinearity(Effect):
         "noise_skew": "a ladder of exposures: the bend grows with the signal, the skew does not",
         "branching_counts": "a sweep of the bias voltage or exposure: a bent comb stays bent at any exposure",
     }
-    step_change: float = Field(
+    step_change: PerElectron = Field(
         ge=-0.2,
         le=0.2,
         description="relative change of the step per electron (five electrons up, steps differ by five times "

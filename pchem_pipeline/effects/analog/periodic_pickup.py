@@ -21,7 +21,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
     with_offsets,
 )
 from pchem_pipeline.effects.estimators.lines import coherent_line, incoherent_line
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, Radians, Turns, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
 
 if TYPE_CHECKING:
@@ -70,20 +70,20 @@ class PeriodicPickup(Effect):
         "readout_alternation": "another frame rate: pickup moves away from half the frame rate",
         "bias_drift": "a second run: the phase of pickup is another, a warming up repeats itself",
     }
-    amplitude_dn: float = Field(ge=0, le=1e6, description="amplitude of the sine, DN")
-    cycles_per_row: float = Field(
+    amplitude_dn: Dn = Field(ge=0, le=1e6, description="amplitude of the sine, DN")
+    cycles_per_row: Turns = Field(
         default=0.0, ge=-0.5, le=0.5, description="f_y: advance of the phase from row to row, cycles"
     )
-    cycles_per_frame: float = Field(
+    cycles_per_frame: Turns = Field(
         default=0.0, ge=-0.5, le=0.5, description="f_t: advance of the phase from frame to frame, cycles"
     )
-    cycles_per_column: float = Field(
+    cycles_per_column: Turns = Field(
         default=0.0,
         ge=-0.5,
         le=0.5,
         description="f_x: advance of the phase from column to column, cycles; 0 with column-parallel readout",
     )
-    phase: float = Field(default=0.0, ge=-100, le=100, description="phase at row, column and frame 0, rad")
+    phase: Radians = Field(default=0.0, ge=-100, le=100, description="phase at row, column and frame 0, rad")
     random_phase: bool = Field(default=False, description="true: a new random phase in every frame")
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.read_order import RECORD, pink_amplitudes, pink_noise_of
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Count, Dn, Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.shared_offset import add_offset
 
@@ -55,8 +55,8 @@ class ReadOrderNoise(Effect):
         "periodic_pickup": "a spectrum in the order of reading: pickup is a line, 1/f noise falls",
         "bias_jumps": "successive frames: 1/f noise is new in each",
     }
-    noise_dn: float = Field(ge=0, le=1e6, description="standard deviation of this noise, DN")
-    taps: int = Field(
+    noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of this noise, DN")
+    taps: Count = Field(
         default=1, ge=1, le=4096, description="blocks of columns read at the same time, noise of their own"
     )
 

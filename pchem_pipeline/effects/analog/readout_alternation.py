@@ -19,7 +19,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
     responsivity,
     with_offsets,
 )
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class ReadoutAlternation(Effect):
         "periodic_pickup": "another frame rate: pickup moves away from half the frame rate",
         "frame_noise": "a spectrum of frame means: alternation is all at half the frame rate",
     }
-    alternation_dn: float = Field(
+    alternation_dn: Dn = Field(
         ge=-1e6, le=1e6, description="offset of even frames, and minus that of odd ones, DN"
     )
 

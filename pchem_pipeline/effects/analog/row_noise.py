@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, Self
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.common_modes import line_noise
-from pchem_pipeline.effects.framework.effect import register_effect
+from pchem_pipeline.effects.framework.effect import Dn, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedNoise
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class RowNoise(SharedNoise):
         "interpixel_capacitance": "pixels far apart in a row: they are as correlated as neighbours",
         "frame_noise": "means of rows within a frame: frame noise shifts them all alike",
     }
-    row_noise_dn: float = Field(ge=0, le=1e6, description="standard deviation of the rows' offsets, DN")
+    row_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the rows' offsets, DN")
 
     @classmethod
     def typical(cls) -> Sequence[Self]:

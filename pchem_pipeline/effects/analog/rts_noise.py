@@ -19,7 +19,15 @@ from scipy import special
 
 from pchem_pipeline.effects.estimators.long_memory import frame_key, two_states
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import (
+    Count,
+    Effect,
+    Electrons,
+    Frames,
+    Plane,
+    Ratio,
+    register_effect,
+)
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 if TYPE_CHECKING:
@@ -88,8 +96,8 @@ class RtsNoise(Effect):
         "overdispersed_counts": "frames without any exposure: telegraph noise remains there",
         "flicker_noise": "longer runs: slow telegraph noise has two levels and stays in the same few pixels",
     }
-    fraction: float = Field(ge=0, le=1, description="share of the pixels that have a trap, no unit")
-    amplitude_e: float = Field(
+    fraction: Ratio = Field(ge=0, le=1, description="share of the pixels that have a trap, no unit")
+    amplitude_e: Electrons = Field(
         ge=0, le=1e4, description="step of the trap, e-; exponential: its mean over these pixels"
     )
     spread: Literal["equal", "lognormal", "exponential"] = Field(
@@ -97,7 +105,7 @@ class RtsNoise(Effect):
         description="equal: the same step in all these pixels; lognormal: the stated one is the median, with "
         "a standard deviation of 0.4 of the logarithm; exponential: distributed so",
     )
-    probability: float = Field(
+    probability: Ratio = Field(
         default=0.2,
         ge=0,
         le=1,
@@ -107,16 +115,16 @@ class RtsNoise(Effect):
         default="correlated",
         description="correlated: signal less reset, drawn anew in every frame; single: the trap as it is",
     )
-    samples: int = Field(
+    samples: Count = Field(
         default=1,
         ge=1,
         le=64,
         description="correlated: samples averaged before and after (1: double sampling)",
     )
-    correlation_frames: float = Field(
+    correlation_frames: Frames = Field(
         default=30.0, gt=0, le=1e6, description="single: correlation time of the trap's state, frames"
     )
-    times_spread: float = Field(
+    times_spread: Ratio = Field(
         default=0.0,
         ge=0,
         le=3,

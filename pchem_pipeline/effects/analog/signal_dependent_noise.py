@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.response import strength_of
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -50,7 +50,7 @@ class SignalDependentNoise(Effect):
         "overdispersed_counts": "higher exposure: peaks of few electrons that are still narrow exclude this",
         "gain_drift": "repeating the run: a drift follows a time profile, noise does not",
     }
-    noise_e: float = Field(ge=0, description="standard deviation that one electron adds, e-")
+    noise_e: Electrons = Field(ge=0, description="standard deviation that one electron adds, e-")
     growth: Literal["root", "linear"] = Field(
         default="root",
         description="root: each electron adds variance of its own (noise_e k^(1/2)); linear: the electrons "

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.count_scores import count_excess
 from pchem_pipeline.effects.estimators.electrons import regrouped
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -52,7 +52,7 @@ class BranchingCounts(Effect):
         "optical_crosstalk": "correlation of the electron numbers of neighbours: none here",
         "exposure_flicker": "correlation between pixels of one frame: none here",
     }
-    branching: float = Field(
+    branching: Ratio = Field(
         ge=0, le=0.5, description="mean number of further electrons made by each electron (l), no unit"
     )
 

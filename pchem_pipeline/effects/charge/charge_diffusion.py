@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.electrons import sent_to_neighbours
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,7 +42,7 @@ class ChargeDiffusion(Effect):
         "Poisson electrons that each move by chance stay independent Poisson electrons, so only the map of H "
         "changes; an edge, a spot or single X-rays would show it"
     )
-    fraction: float = Field(ge=0, le=0.9, description="probability that an electron moves, no unit")
+    fraction: Ratio = Field(ge=0, le=0.9, description="probability that an electron moves, no unit")
 
     def halo(self) -> int:
         """Return 1 row: the neighbours above and below."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.electrons import binomial_upper
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,7 +39,7 @@ class ChargeLag(Effect):
         "Poisson electrons that are each delayed by chance stay independent Poisson electrons; a bright "
         "frame followed by dark ones would show it"
     )
-    fraction: float = Field(
+    fraction: Ratio = Field(
         ge=0, le=0.9, description="probability that an electron is one frame late, no unit"
     )
 

@@ -18,7 +18,16 @@ from scipy import special
 from scipy.sparse import coo_array, csgraph
 from scipy.spatial import KDTree
 
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import (
+    Effect,
+    Electrons,
+    ElectronsPerUm,
+    Micrometres,
+    PerFrame,
+    Plane,
+    Ratio,
+    register_effect,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -76,24 +85,26 @@ class CosmicRays(Effect):
         "rts_noise": "the same pixels again and again: tracks fall everywhere",
         "branching_counts": "the excess grows with the exposure: tracks do not",
     }
-    tracks_per_frame: float = Field(
+    tracks_per_frame: PerFrame = Field(
         ge=0, le=100, description="mean number of tracks and clouds on the sensor in a frame"
     )
-    length_um: float = Field(
+    length_um: Micrometres = Field(
         default=15.0, gt=0, description="mean length of a track projected on the sensor, um"
     )
-    electrons_per_um: float = Field(
+    electrons_per_um: ElectronsPerUm = Field(
         default=80.0, gt=0, description="electrons freed per length of the projected track, e-/um"
     )
-    pixel_pitch_um: float = Field(default=3.0, gt=0, description="distance between pixels, um")
-    cloud_share: float = Field(
+    pixel_pitch_um: Micrometres = Field(default=3.0, gt=0, description="distance between pixels, um")
+    cloud_share: Ratio = Field(
         default=0.0, ge=0, le=1, description="share of them that are round clouds, as alpha particles leave"
     )
-    cloud_electrons: float = Field(default=2e4, gt=0, description="median of the electrons of a cloud, e-")
-    cloud_range: float = Field(
+    cloud_electrons: Electrons = Field(
+        default=2e4, gt=0, description="median of the electrons of a cloud, e-"
+    )
+    cloud_range: Ratio = Field(
         default=0.0, ge=0, le=3, description="standard deviation of the logarithm of its electrons, no unit"
     )
-    cloud_um: float = Field(
+    cloud_um: Micrometres = Field(
         default=3.0, gt=0, description="standard deviation of such a cloud along an axis, um"
     )
 

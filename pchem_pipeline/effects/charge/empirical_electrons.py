@@ -15,9 +15,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
+from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.estimators.electrons import binomial_upper
 from pchem_pipeline.effects.framework.compose import place_words
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 
 if TYPE_CHECKING:
@@ -60,14 +61,14 @@ class ElectronMode(Section):
         return self
 
     def words(self, chance: float) -> str:
-        """Return in words what happens with a chance (or a mean number)."""
+        """Return in words how the numbers vary together, with a chance (or a mean number)."""
         if self.fate == "emptied":
-            return f"a sample loses all of them with a chance of {chance:.2g}"
-        where = f"to {neighbour_words(self.place)}" if any(self.place) else "to its own sample"
+            return f"{per_cent(chance)} of the samples have none"
+        where = neighbour_words(self.place) if any(self.place) else "the same sample"
         if self.fate == "followed":
-            return f"each brings {chance:.2g} others on average {where}"
-        end = "is lost" if self.fate == "lost" else f"goes {where}"
-        return f"each {end} with a chance of {chance:.2g} for every other one in its sample"
+            return f"for each one {where} has {chance:.2g} more on average"
+        more = f", and {where} as many more" if self.fate == "moved" else ""
+        return f"a sample of k has {chance:.2g} k (k - 1) fewer than independent ones would be{more}"
 
 
 @register_effect
@@ -86,7 +87,7 @@ class EmpiricalElectrons(Effect):
     source: ClassVar[str] = "Cox and Isham 1980, Point processes (factorial cumulants)"
     strength: ClassVar[str] = "chance"
     measured_only: ClassVar[bool] = True
-    chance: float = Field(
+    chance: Ratio = Field(
         ge=0, le=0.5, description="largest chance or mean number, that of weight 1, no unit"
     )
     modes: tuple[ElectronMode, ...] = Field(
@@ -170,7 +171,7 @@ class EmpiricalElectrons(Effect):
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         told = [mode.words(chance) for mode, chance in zip(self.modes, self._chances(), strict=True)]
-        return f"electrons{place} that do not come independently ({'; '.join(told)})"
+        return f"electron numbers{place} that are not independent ({'; '.join(told)})"
 
 
 def _gone(electrons: NDArray[np.int64], u: NDArray[np.float64], chance: float) -> NDArray[np.int64]:

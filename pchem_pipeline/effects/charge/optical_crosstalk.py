@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.electrons import sent_to_neighbours
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -50,7 +50,7 @@ class OpticalCrosstalk(Effect):
         "exposure_flicker": "correlation of distant pixels: none here",
         "cosmic_rays": "longer exposures: tracks are rare and bright, crosstalk is everywhere and single",
     }
-    probability: float = Field(
+    probability: Ratio = Field(
         ge=0, le=0.5, description="probability that an electron makes one more in a neighbour, no unit"
     )
 

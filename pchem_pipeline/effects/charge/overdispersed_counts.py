@@ -17,7 +17,7 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.count_scores import count_excess
 from pchem_pipeline.effects.estimators.electrons import binomial_upper, regrouped
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -53,7 +53,7 @@ class OverdispersedCounts(Effect):
         "exposure_flicker": "correlation between pixels of one frame: none here",
         "dark_current_rts": "slower frames and longer runs: blinking pixels become correlated in time",
     }
-    relative_variance: float = Field(
+    relative_variance: Ratio = Field(
         ge=0, le=1, description="variance of the exposure divided by its squared mean (a), no unit"
     )
     exposures: Literal["gamma", "lognormal"] = Field(

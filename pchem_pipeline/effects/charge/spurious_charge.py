@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,7 +42,7 @@ class SpuriousCharge(Effect):
         "sums of Poisson electrons are Poisson, so it is part of H; a series of integration times would show "
         "it (the part of H that does not grow with time)"
     )
-    mean_e: float = Field(
+    mean_e: Electrons = Field(
         ge=0, le=1e6, description="mean number of spurious electrons per pixel and frame, e-"
     )
 

@@ -27,7 +27,7 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.count_scores import charlier_information
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -84,18 +84,18 @@ class Trapping(Effect):
         "dark_current_rts": "longer runs: the sum over many frames varies as that of Poisson electrons here, "
         "and more there",
     }
-    capture: float = Field(
+    capture: Ratio = Field(
         ge=0,
         le=_LIMITS[1],
         description="chance that an empty trap catches an electron of a sample that has any, no unit",
     )
-    release: float = Field(
+    release: Ratio = Field(
         default=0.3,
         ge=_LIMITS[0],
         le=_LIMITS[1],
         description="chance that a full trap gives its electron to a sample, in each frame, no unit",
     )
-    fraction: float = Field(default=1.0, ge=0, le=1, description="share of the pixels with a trap, no unit")
+    fraction: Ratio = Field(default=1.0, ge=0, le=1, description="share of the pixels with a trap, no unit")
 
     def history(self) -> int:
         """Return how many frames ago a trap was last filled or emptied whatever its state was, at most."""

@@ -17,6 +17,7 @@ import numpy as np
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.arithmetic.robust import chi_square
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 if TYPE_CHECKING:
@@ -132,16 +133,14 @@ class PixelLaw:
     def goodness(self, change: FloatArray, n_frames: int) -> float:
         """Return how the form of the peaks will fit samples whose mass is changed, as a normal quantile.
 
-        By groups of codes as wide as the read noise. The cube root of chi squared is about normal (Wilson and
-        Hilferty 1931).
+        By groups of codes as wide as the read noise.
         """
         first = np.arange(0, self.mass.size, max(round(float(self.maps.read_noise_dn[0])), 1))
         mass, moved = (np.add.reduceat(values, first) for values in (self.mass, change))
         grouped = mass * n_frames >= _FEWEST
         degrees = max(int(grouped.sum()) - len(_PARAMETERS), 1)
         excess = n_frames * float((moved[grouped] ** 2 / mass[grouped]).sum())
-        width = 2.0 / (9.0 * degrees)
-        return float((np.cbrt(1.0 + excess / degrees) - (1.0 - width)) / np.sqrt(width))
+        return float(chi_square(degrees + excess, degrees))
 
     def mass_of(self, law: SampleLaw) -> tuple[FloatArray, FloatArray]:
         """Return codes, DN, somewhat beyond those of the PCD, and their mass under a law."""

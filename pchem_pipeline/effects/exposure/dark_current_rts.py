@@ -15,7 +15,8 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.charge_sums import BlockCharge, block_charge
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Electrons, Frames, Plane, Ratio, register_effect
+from pchem_pipeline.model.arithmetic.robust import chi_square
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -63,8 +64,8 @@ class DarkCurrentRts(Effect):
         "persistence": "a longer run: regions fade once there, single pixels jump up and down here",
         "overdispersed_counts": "slower and longer runs: the blinking becomes correlated in time",
     }
-    fraction: float = Field(ge=0, le=1, description="fraction of the pixels that blink, no unit")
-    step_e: float = Field(
+    fraction: Ratio = Field(ge=0, le=1, description="fraction of the pixels that blink, no unit")
+    step_e: Electrons = Field(
         default=1.0,
         ge=0,
         le=1e6,
@@ -73,8 +74,10 @@ class DarkCurrentRts(Effect):
     steps: Literal["equal", "exponential"] = Field(
         default="equal", description="equal: step_e in each of these pixels; exponential: distributed so"
     )
-    dwell_low_frames: float = Field(default=200.0, ge=0.5, description="mean time in the lower level, frames")
-    dwell_high_frames: float = Field(
+    dwell_low_frames: Frames = Field(
+        default=200.0, ge=0.5, description="mean time in the lower level, frames"
+    )
+    dwell_high_frames: Frames = Field(
         default=200.0, ge=0.5, description="mean time in the upper level, frames"
     )
 
@@ -190,9 +193,7 @@ def _outliers(evidence: Evidence, blocks: BlockCharge) -> NDArray[np.bool_]:
     assert evidence.time is not None
     freedom = blocks.length.size - 1
     chi2 = np.sum(blocks.length[:, None] * blocks.deviation**2, axis=0) / blocks.variance
-    # Wilson and Hilferty 1931: the cube root of a chi-square is nearly normal
-    mean = 1.0 - 2.0 / (9.0 * freedom)
-    wander = ((chi2 / freedom) ** (1.0 / 3.0) - mean) / np.sqrt(2.0 / (9.0 * freedom))
+    wander = chi_square(chi2, freedom)
     lags = np.asarray(evidence.time.lag_charge, np.float64)[:, blocks.y, blocks.x]
     alike = lags.sum(axis=0) * np.sqrt(evidence.time.n_pairs / lags.shape[0])
     outliers: NDArray[np.bool_] = np.fmax(wander, alike) > _STANDS_OUT

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
 from pchem_pipeline.effects.estimators.time_profiles import along_path, settling, settling_time
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -64,10 +64,10 @@ class ExposureDrift(Effect):
         "persistence": "the map of the change: proportional to H here",
         "exposure_flicker": "a reference photodiode or the logged temperature",
     }
-    drift: float = Field(
+    drift: Ratio = Field(
         ge=-2, le=2, description="(H_last - H_first) / H_mean (range of the time profile for a path), no unit"
     )
-    settling_fraction: float | None = Field(
+    settling_fraction: Ratio | None = Field(
         default=None,
         gt=0,
         le=10,

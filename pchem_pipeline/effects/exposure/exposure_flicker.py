@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
 from pchem_pipeline.effects.estimators.common_modes import successive
 from pchem_pipeline.effects.estimators.levels.level_mixtures import Levels, few_levels
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Frames, Plane, Ratio, Turns, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -64,16 +64,16 @@ class ExposureFlicker(Effect):
         "frame_noise": "covered pixels, or frames without exposure: constant here",
         "overdispersed_counts": "correlation between pixels of one frame: all of them here",
     }
-    rms: float = Field(ge=0, le=1, description="standard deviation of the exposure over its mean, no unit")
-    correlation_frames: float = Field(
+    rms: Ratio = Field(ge=0, le=1, description="standard deviation of the exposure over its mean, no unit")
+    correlation_frames: Frames = Field(
         default=0.0,
         ge=0,
         description="time in which the memory of a fluctuation falls to 1/e, frames; 0: every frame anew",
     )
-    period_frames: float | None = Field(
+    period_frames: Frames | None = Field(
         default=None, gt=1, description="period of a sine, frames; null: random fluctuations"
     )
-    phase_cycles: float = Field(
+    phase_cycles: Turns = Field(
         default=0.0,
         ge=0,
         le=1,

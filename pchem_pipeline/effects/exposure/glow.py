@@ -19,7 +19,7 @@ from pchem_pipeline.effects.estimators.common_modes import run_position
 from pchem_pipeline.effects.estimators.fading_images import FadingCells
 from pchem_pipeline.effects.estimators.spots import Spot, best_bursts, best_spot
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.spot import Falloff, spot_found_in, spot_image, spot_seen_in
 
@@ -65,17 +65,19 @@ class Glow(Effect):
         "cosmic_rays": "longer runs: a glow comes at the same place each time",
         "optical_crosstalk": "dark frames without the source of the glow: crosstalk follows each electron",
     }
-    peak_e: float = Field(ge=0, le=1e6, description="largest additional exposure of the brightest pixel, e-")
-    burst_share: float | None = Field(
+    peak_e: Electrons = Field(
+        ge=0, le=1e6, description="largest additional exposure of the brightest pixel, e-"
+    )
+    burst_share: Ratio | None = Field(
         default=None, gt=0, le=1, description="share of the frames with a burst; null: it grows along the run"
     )
-    centre_y: float = Field(
+    centre_y: Ratio = Field(
         default=0.0, ge=0, le=1, description="row of the centre over the number of rows, no unit"
     )
-    centre_x: float = Field(
+    centre_x: Ratio = Field(
         default=0.0, ge=0, le=1, description="column of the centre over the number of columns, no unit"
     )
-    radius: float = Field(
+    radius: Ratio = Field(
         default=0.2, gt=0, description="radius of the spot over the longer side of the sensor, no unit"
     )
     falloff: Falloff = Field(

@@ -18,7 +18,14 @@ from pchem_pipeline.effects.estimators.charge_sums import block_charge, block_si
 from pchem_pipeline.effects.estimators.fading_images import FadingCells, fading_of
 from pchem_pipeline.effects.estimators.spots import best_spot
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import (
+    Effect,
+    ElectronsPerFrame,
+    Frames,
+    Plane,
+    Ratio,
+    register_effect,
+)
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.spot import spot_found_in, spot_image, spot_seen_in
 
@@ -65,23 +72,23 @@ class Persistence(Effect):
         "dark_current_rts": "a longer run: single pixels jump up and down there, regions fade once here",
         "bias_drift": "frames without exposure: the residual stays here",
     }
-    peak_e: float = Field(
+    peak_e: ElectronsPerFrame = Field(
         ge=0, le=_BRIGHTEST, description="largest additional exposure in the first frame, e- per frame"
     )
-    decay_frames: float = Field(gt=0, description="time constant of the fading, frames")
-    slow_decay_frames: float | None = Field(
+    decay_frames: Frames = Field(gt=0, description="time constant of the fading, frames")
+    slow_decay_frames: Frames | None = Field(
         default=None, gt=0, description="time constant of a second, slower part, frames; null: none"
     )
-    slow_share: float = Field(
+    slow_share: Ratio = Field(
         default=0.5, ge=0, le=1, description="share of the slower part in the first frame, no unit"
     )
-    centre_y: float = Field(
+    centre_y: Ratio = Field(
         default=0.5, ge=0, le=1, description="row of the spot's centre over the number of rows, no unit"
     )
-    centre_x: float = Field(
+    centre_x: Ratio = Field(
         default=0.5, ge=0, le=1, description="column of the spot's centre over the number of columns, no unit"
     )
-    radius: float = Field(
+    radius: Ratio = Field(
         default=0.2,
         gt=0,
         description="standard deviation of the Gaussian spot over the longer side of the sensor, no unit",

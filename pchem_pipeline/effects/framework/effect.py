@@ -33,13 +33,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar, get_args
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.settings import Section
-from pchem_pipeline.effects.framework.plane import Plane
+from pchem_pipeline.effects.framework.plane import Plane as Plane
 from pchem_pipeline.effects.framework.region import Region, Span, When
 
 if TYPE_CHECKING:
@@ -53,9 +53,30 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.shared_offset import SharedOffset
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
-__all__ = ["Effect", "Plane", "register_effect", "registered_effects"]
-
 _registered: dict[str, type[Effect]] = {}
+
+
+class Unit(NamedTuple):
+    """Marks the type of a field with its unit."""
+
+    name: str
+
+
+#: Types of numbers with their unit, for the fields of effects.
+Ratio = Annotated[float, Unit("none")]
+Count = Annotated[int, Unit("none")]
+Dn = Annotated[float, Unit("DN")]
+Code = Annotated[int, Unit("DN")]
+Lsb = Annotated[float, Unit("LSB")]
+Electrons = Annotated[float, Unit("e-")]
+ElectronsPerFrame = Annotated[float, Unit("e- per frame")]
+ElectronsPerUm = Annotated[float, Unit("e-/um")]
+PerElectron = Annotated[float, Unit("1/e-")]
+Frames = Annotated[float, Unit("frames")]
+PerFrame = Annotated[float, Unit("1/frame")]
+Turns = Annotated[float, Unit("cycles")]
+Radians = Annotated[float, Unit("rad")]
+Micrometres = Annotated[float, Unit("um")]
 
 
 class Effect(Section):
@@ -118,6 +139,18 @@ class Effect(Section):
     def everywhere(self) -> bool:
         """Whether it acts on all pixels, in all frames."""
         return self.region is None and self.when is None
+
+    @property
+    def key(self) -> tuple[str, Region | None, When | None]:
+        """What tells it from the other effects of a model: tag, part of the sensor, frames."""
+        return self.tag, self.region, self.when
+
+    @classmethod
+    def unit(cls, name: str) -> str:
+        """Return the unit with which a field is declared, "none" of a pure number; empty: without."""
+        field = cls.model_fields[name]
+        marks = [*field.metadata, *(m for part in get_args(field.annotation) for m in get_args(part))]
+        return next((m.name for m in marks if isinstance(m, Unit)), "")
 
     @property
     def unlisted(self) -> bool:

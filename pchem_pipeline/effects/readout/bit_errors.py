@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.moved_codes import moved_shares
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Count, Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -61,8 +61,8 @@ class BitErrors(Effect):
         "rts_noise": "a shifted bias: a bit's errors are in all pixels and follow the codes",
         "clipping": "a shifted bias: a limit is one code, a bit has a period",
     }
-    share: float = Field(ge=0, le=1, description="share of the samples in which the bit is wrong, no unit")
-    bit: int = Field(ge=0, lt=_MOST_BITS, description="which bit, 0 the least significant")
+    share: Ratio = Field(ge=0, le=1, description="share of the samples in which the bit is wrong, no unit")
+    bit: Count = Field(ge=0, lt=_MOST_BITS, description="which bit, 0 the least significant")
     fault: Fault = Field(default="zero", description="what it reads then: zero, one, or flip: its opposite")
 
     def faulty(self, codes: NDArray[Any]) -> NDArray[Any]:

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import place_words
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class Empirical(Effect):
     source: ClassVar[str] = "Laird 1978, Lindsay 1983 (mixing laws); Raftery 1985 (mixture transitions)"
     strength: ClassVar[str] = "share"
     measured_only: ClassVar[bool] = True
-    share: float = Field(ge=0, le=1, description="share of the samples that are moved, no unit")
+    share: Ratio = Field(ge=0, le=1, description="share of the samples that are moved, no unit")
     moves: tuple[Move, ...] = Field(min_length=1, max_length=16, description="how; one of them each")
     together: Together = Field(
         default="sample", description="what is moved alike: each sample by itself, a row, a column or a frame"
@@ -211,14 +211,13 @@ class Empirical(Effect):
             rows, columns = (("even", "odd")[parity] for parity in self.squares)
             return (
                 f"{per_cent(self.share)} of the squares of 2 x 2 pixels{place}, from {rows} rows and "
-                f"{columns} columns on, come as the mean of their samples"
+                f"{columns} columns on, equal the mean of their samples"
             )
         shares = self.shares()
         order = np.argsort(-shares)[:_MOST_TOLD]
         told = [f"{per_cent(shares[i])} {self.moves[i].words()}" for i in order]
         how = f" {self.moves[0].words()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
-        free = "" if any(move.towards for move in self.moves) else ", whatever was read before or beside them"
-        return f"{per_cent(self.share)} of the {what}{place} are moved after the converter{how}{free}"
+        return f"{per_cent(self.share)} of the {what}{place} differ from the model as if they were moved{how}"
 
 
 def _averaged(values: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.int64]:

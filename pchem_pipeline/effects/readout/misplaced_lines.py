@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.evidence import PLACES
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class MisplacedLines(Effect):
         "repeated_lines": "equality of neighbouring lines: lines that change places differ from each other",
         "interpixel_capacitance": "a line's samples taken together: a coupling moves all lines a little",
     }
-    share: float = Field(
+    share: Ratio = Field(
         ge=0,
         le=0.5,
         description="probability that this happens to a line, no unit; of a line lost or delivered twice: "

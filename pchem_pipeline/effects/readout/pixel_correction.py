@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.prediction import PREDICTORS, Predictor, predicted
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Code, Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.replacement import Replacement
 
 if TYPE_CHECKING:
@@ -54,10 +54,10 @@ class PixelCorrection(Effect):
         "optical_crosstalk": "the camera's corrections switched off; crosstalk raises neighbours of any size",
         "clipping": "pixels of different bias: a limit is one code, a correction follows the neighbours",
     }
-    threshold_dn: int = Field(
+    threshold_dn: Code = Field(
         ge=1, le=1 << 20, description="by how much a sample must exceed the prediction, DN"
     )
-    share: float = Field(
+    share: Ratio = Field(
         default=1.0, ge=0, le=1, description="share of those samples that is replaced, no unit"
     )
     predictor: Predictor = Field(

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, field_validator
 
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -59,7 +59,7 @@ class RepeatedFrames(Effect):
         "analog_memory": "equality of successive frames, sample by sample: memory never makes them equal",
         "flicker_noise": "equality of successive frames, sample by sample: correlated noise is never equal",
     }
-    probability: float = Field(
+    probability: Ratio = Field(
         default=0.0, ge=0, le=0.5, description="probability that a frame repeats the one before, no unit"
     )
     frames: tuple[int, ...] = Field(

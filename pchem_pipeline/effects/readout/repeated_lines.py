@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.framework.effect import Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -44,7 +44,7 @@ class RepeatedLines(Effect):
         "repeated_frames": "equality within a frame: there it is the frame before that is repeated",
         "row_noise": "equality of lines, sample by sample: noise never makes them equal",
     }
-    share: float = Field(ge=0, le=0.5, description="probability that a line repeats the one before, no unit")
+    share: Ratio = Field(ge=0, le=0.5, description="probability that a line repeats the one before, no unit")
     lines: Literal["rows", "columns"] = Field(default="rows", description="which lines")
 
     def halo(self) -> int:

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.arithmetic.robust import chi_square
+
 
 def false_discovery(probability: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Return the false-discovery rate at which each of many tests would be called significant.
@@ -49,8 +51,7 @@ def misfit(chi2: NDArray[np.float64], dof: NDArray[np.float64]) -> NDArray[np.fl
         Deviates, same shape; NaN where nothing was tested.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
-        spread = 2.0 / (9.0 * np.where(dof > 0, dof, np.nan))
-        return np.asarray((np.cbrt(chi2 * 4.5 * spread) - (1.0 - spread)) / np.sqrt(spread))
+        return chi_square(chi2, np.where(dof > 0, dof, np.nan))
 
 
 def poorest(chi2: NDArray[np.float64], dof: NDArray[np.float64], n: int) -> list[tuple[int, int]]:

@@ -14,6 +14,7 @@ from pchem_pipeline.discrepancy.verdict import (
     Moved,
     Step,
     Verdict,
+    families_words,
 )
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.report.data import DiscrepancyData
@@ -259,7 +260,7 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
         return [KeyFact("distance of data and model", nats, (unit, chance + closed))]
     more = (f"{nats} {unit}", chance + _interval(gap))
     nearest = " by what is most like it, not named" if found.verdict == "unexplained" else ""
-    return [KeyFact(f"of the gap closed{nearest}", percent(max(gap.closed_fraction, 0.0), 1.0), more)]
+    return [KeyFact(f"of the gap closed{nearest}", percent(gap.closed_fraction, 1.0), more)]
 
 
 def _interval(gap: GapChange) -> str:
@@ -282,7 +283,8 @@ def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
             values += [f"{name} {word}" for name, word in step.form.items()]
             value, more = _size_texts(step, values)
             place = (f"in {step.place}",) if step.place else ()
-            facts.append(KeyFact(data.title(step.likeliest), value, (*more, *place)))
+            only = () if data.found.part_of_model(step) else ("proposed, not in the model",)
+            facts.append(KeyFact(data.title(step.likeliest), value, (*more, *place, *only)))
     return facts[:4]
 
 
@@ -299,7 +301,7 @@ def _size_texts(step: Step, values: Sequence[str]) -> tuple[str, tuple[str, ...]
 
 
 def _moved_fact(found: Verdict) -> list[KeyFact]:
-    moved = _largest_move(found.steps)
+    moved = _largest_move([step for step in found.steps if not found.proposed or step.effect])
     if moved is None or abs(moved[1].in_stderr) < _NOT_MOVED:
         return []
     name, largest = moved
@@ -373,10 +375,13 @@ def _closing(found: Verdict) -> list[Flag]:
                 "The gap is at its floor without the effect, too: single statistics show it, not their sum."
             )
             flags.append(Flag("note", words))
+        elif gap.after <= gap.floor and gap.standing_out:
+            words = f"In {families_words(gap.standing_out)} more of the gap is left than chance alone makes."
+            flags.append(Flag("caution", words))
         elif gap.after <= gap.floor:
             flags.append(Flag("good", "The gap that is left is at its floor: chance alone makes as much."))
         else:
-            left = percent(1.0 - max(gap.closed_fraction, 0.0), 1.0)
+            left = percent(1.0 - gap.closed_fraction, 1.0)
             words = f"{gap_text(gap.after)} against {gap_text(gap.floor)} micronats per sample"
             level = "caution" if found.verdict == "named_in_part" else "note"
             flags.append(Flag(level, f"{left} of the gap is left, more than chance alone makes: {words}."))
@@ -390,7 +395,7 @@ def _short(data: DiscrepancyData, tag: str) -> str:
 
 def _compared(step: Step, data: DiscrepancyData) -> list[Flag]:
     """Say what the runner-up and the placebo of a step close in the place of the named effect."""
-    own, flags = 1.0 - max(step.gap_after, 0.0) / step.gap_before if step.gap_before > 0.0 else math.nan, []
+    own, flags = step.closed, []
     name, runner_up, placebo = _short(data, step.effect or ""), step.runner_up, step.placebo
     if step.within_chance:  # shares of what chance makes tell nothing
         if runner_up is None or not runner_up.why:
@@ -399,15 +404,15 @@ def _compared(step: Step, data: DiscrepancyData) -> list[Flag]:
     if not own > 0.0:
         return []
     if runner_up is not None:
-        share = percent(max(step.closed_by(runner_up), 0.0), 1.0)
+        share = percent(step.closed_by(runner_up), 1.0)
         why = f": {runner_up.why}" if runner_up.why else ""
         rival = f"In the place of {name} the runner-up, {_short(data, runner_up.effect)}"
         flags.append(Flag("note", f"{rival}, would close {share} of the gap{why}."))
     if placebo is None:
         return [*flags, Flag("good", f"No effect unrelated to {name} closes any of the gap in its place.")]
-    of_that = step.closed_by(placebo) / own
+    of_that = min(step.closed_by(placebo) / own, 1.0)
     doubtful = of_that > CONVINCING_PLACEBO
     end = ": take the name with caution" if doubtful else ""
     text = f"A placebo in the place of {name} ({_short(data, placebo.effect)}, unrelated to it) closes"
-    words = f"{text} {percent(max(of_that, 0.0), 1.0)} of what it closes{end}."
+    words = f"{text} {percent(of_that, 1.0)} of what it closes{end}."
     return [*flags, Flag("caution" if doubtful else "good", words)]

@@ -73,7 +73,7 @@ def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
             _separate(found.steps),
         ],
         "shown": [_gaps(found)],
-        "parameters": [_parameters(data), _moved(found.steps)],
+        "parameters": [_parameters(data), _moved(found)],
         "limits": [_untestable(data), _unexplained(found.unexplained), _defects(found), _examined(data)],
     }
     return {part: [table for table in tables if table.rows] for part, tables in parts.items()}
@@ -224,21 +224,23 @@ def _gaps(found: Verdict) -> Table:
     )
 
 
-def _how(step: Step) -> str:
+def _how(step: Step, found: Verdict) -> str:
     """Return in which way an effect is known that was not named: measured, or but the likeliest."""
     if step.effect:
         return ""
-    return " (measured)" if step.verdict == "described" else " (the likeliest)"
+    if step.verdict != "described":
+        return " (the likeliest)"
+    return " (measured)" if found.part_of_model(step) else " (measured, not in the model)"
 
 
-def _beside(step: Step) -> str:
+def _beside(step: Step, found: Verdict) -> str:
     """Return what stands beside the title of an effect: where it acts, and how it is known."""
-    return f"{f', in {step.place}' if step.place else ''}{_how(step)}"
+    return f"{f', in {step.place}' if step.place else ''}{_how(step, found)}"
 
 
 def _parameters(data: DiscrepancyData) -> Table:
     rows = tuple(
-        (f"{tag}: {name}", value, data.title(tag) + _beside(step), data.sources.get(tag, ""))
+        (f"{tag}: {name}", value, data.title(tag) + _beside(step, data.found), data.sources.get(tag, ""))
         for step in data.found.steps
         for tag in [step.likeliest]
         if tag and (step.effect or step.verdict == "described" or data.found.verdict == "ambiguous")
@@ -260,15 +262,15 @@ def _values(step: Step) -> dict[str, str]:
     return numbers | step.form
 
 
-def _moved(steps: Sequence[Step]) -> Table:
+def _moved(found: Verdict) -> Table:
     rows = []
-    for step in steps:
+    for step in found.steps:
         for name, each in step.moved.items():
             unit = unit_text(each.unit)
             rows.append(
                 (
                     f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
-                    f"{step.likeliest}{_how(step)}",
+                    f"{step.likeliest}{_how(step, found)}",
                     short(each.median) if math.isfinite(each.median) else "not known",
                     signed(each.in_stderr),
                 )

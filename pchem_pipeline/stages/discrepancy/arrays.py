@@ -7,6 +7,7 @@ chance.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -14,9 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.where import PAIRS, pixel_maps
 from pchem_pipeline.effects.framework.evidence import SCORES
+from pchem_pipeline.model.arithmetic.robust import chi_square
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.context import EffectContext
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 
 FloatArray = NDArray[np.float64]
+
+_log = logging.getLogger(__name__)
 
 #: Frames in the pictures of the row and column means.
 _SHOWN_FRAMES = 96
@@ -130,8 +135,7 @@ def _block_spread(evidence: Evidence, time: TimeSeries) -> NDArray[np.float32]:
     ):
         centre = (weight * means).sum(axis=0) / max(float(frames.sum()), 1.0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            chi2 = (weight * (means - centre) ** 2).sum(axis=0) / std**2
-        quantile = (np.cbrt(chi2 / dof) - (1.0 - 2.0 / (9.0 * dof))) / np.sqrt(2.0 / (9.0 * dof))
+            quantile = chi_square((weight * (means - centre) ** 2).sum(axis=0) / std**2, dof)
         found.append(np.where(np.isfinite(quantile), quantile, np.nan))
     return _single(np.stack(found))
 
@@ -166,7 +170,9 @@ def path_arrays(
             first, second = (
                 _path(evidence, time, effect, seed, integration_time, bit_depth) for seed in (1, 2)
             )
-        except Exception:  # an effect of others may expect more than a noiseless sensor
+        # an effect of others may expect more than a noiseless sensor
+        except Exception as error:
+            _log.warning("no path is drawn of %s: %s", effect.tag, error_words(error))
             continue
         if np.allclose(first, second, rtol=1e-6, atol=1e-12) and np.isfinite(first).all():
             exposure += first[0] - first[0].mean()

@@ -39,6 +39,11 @@ def verdict_text(found: Verdict) -> str:
     if found.examined.left_out:
         words = frame_words(np.array(found.examined.left_out))
         lines += _wrapped(f"left out, empty or far from the others: {words}")
+    if found.proposed:
+        tags = ", ".join(str(effect["tag"]) for effect in found.proposed)
+        lines += _wrapped(
+            f"proposed, not in the model: {tags} (discrepancy.json: proposed); it leaves a part"
+        )
     if found.examined.elsewhere is not None:
         lines += _wrapped(found.examined.elsewhere.says())
     if found.doubt and found.steps:

@@ -17,13 +17,15 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Noise,
     choose,
     fit_set,
+    meets_itself,
     score_set,
+    seconds,
     tolerance,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import expected_codes
 from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
-from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, look_elsewhere
+from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival, Size
@@ -160,10 +162,6 @@ def test_an_effect_that_only_widens_a_statistic_makes_no_false_deviation() -> No
     assert unaware > 0.3 * tests
 
 
-def test_sidak() -> None:
-    assert look_elsewhere(0.01, 10) == pytest.approx(1 - 0.99**10)
-
-
 # -- fingerprints and naming ------------------------------------------------------------------------
 
 
@@ -202,6 +200,27 @@ def test_two_at_once_are_both_named() -> None:
     choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(UNIT, 0.05))
     assert choice is not None
     assert choice.best.tags == {"row_noise", "exposure_drift"}
+
+
+def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_sensor() -> None:
+    rng = np.random.default_rng(28)
+    left, right = rng.normal(size=40), rng.normal(size=40)
+    regions = [Region.model_validate(f"columns={span}") for span in ("0:12", "12:24")]
+    placed = [
+        Hypothesis(_hypothesis("row_noise", each).effect.at_place(region), each)
+        for region, each in zip(regions, (left, right), strict=True)
+    ]
+    hypotheses = [_hypothesis("row_noise", left + right + rng.normal(size=40)), *placed]
+    hypotheses += seconds(hypotheses)
+    assert [h.tag for h in hypotheses] == ["row_noise", "row_noise", "row_noise", "row_noise 2"]
+    shifts = tuple(3.0 * left + 2.0 * right + rng.normal(size=40) for _ in range(2))
+    choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(UNIT, 0.05))
+    assert choice is not None
+    assert [h.effect.region for h in choice.best.hypotheses] == regions
+    assert all(not meets_itself(one.hypotheses) for one in choice.tried)
+    assert all("row_noise" in one.tags for one in choice.tried)  # none is a second one alone
+    keys = {h.effect.key for h in choice.best.hypotheses}
+    assert len(keys) == 2
 
 
 def test_twins_are_ambiguous() -> None:
@@ -279,6 +298,43 @@ def test_a_right_model_is_below_the_floor_in_19_of_20() -> None:
         gap = StatisticsGap(null, 1000).gap(rng.normal(0.3, 1.0, 40), null.mean, null.replicates)
         below.append(gap.at_floor)
     assert abs(np.mean(below) - 0.95) < 5 * np.sqrt(0.95 * 0.05 / 100)
+
+
+@pytest.mark.parametrize("part", [[7], [6, 7]])  # of both parts of a stack, too
+@pytest.mark.parametrize("size", [1.0, 0.01])
+def test_one_pixel_of_one_replicate_decides_nothing(part: list[int], size: float) -> None:
+    rng = np.random.default_rng(26)
+    strays = {"shape.He3C1.chi": 4595.0, "shape.He2C2.chi": 4451.0, "shape.He3.chi": 2715.0}
+    names = tuple(dict.fromkeys((*strays, *list(STATISTICS)[:500])))
+    vectors = rng.normal(0.0, 1.0, (40, len(names)))
+    strayed = vectors.copy()
+    for name, value in strays.items():
+        strayed[part, names.index(name)] = size * value
+    n, space = 1_900_000, names.index("space.x.rr")
+    z = rng.normal(0.0, 1.0, len(names))
+    z[space] += 36.0  # 650 nats of row noise
+    gaps = []
+    for each in (vectors, strayed):
+        null = NullModel.from_replicates(names, each)
+        gaps.append(StatisticsGap(null, n).gap(z, null.mean, null.replicates))
+        assert null.p_values(z)[space] < 1e-15
+    clean, other = gaps
+    assert clean.standing_out == other.standing_out == ("space",)
+    assert other.floor == pytest.approx(clean.floor, rel=0.5)
+    assert other.value == pytest.approx(clean.value, rel=0.1)
+    assert other.interval[0] > 0.5 * other.value
+
+
+def test_a_family_that_shows_an_effect_is_not_hidden_by_the_chance_of_the_others() -> None:
+    rng = np.random.default_rng(27)
+    names = tuple(STATISTICS)
+    null = NullModel.from_replicates(names, rng.normal(0.0, 1.0, (40, len(names))))
+    metric, z = StatisticsGap(null, 1_000_000), null.mean.copy()
+    z[names.index("code.alternating")] += 9.0
+    gap = metric.gap(z, null.mean, null.replicates)
+    assert gap.value < gap.floor
+    assert gap.standing_out == ("code",)
+    assert not gap.at_floor
 
 
 def test_events_that_a_model_predicts_scatter_as_poisson_counts() -> None:
@@ -475,7 +531,7 @@ def test_the_verdict_says_where_the_fit_itself_breaks_down(left: float) -> None:
 def test_the_place_of_an_effect_stands_behind_its_size() -> None:
     """Not: columns 10 to 13 of 0.96 DN."""
     effect = effect_class("row_noise")(row_noise_dn=0.96).at_place(Region.model_validate("columns=10:14"))
-    words = _sized(effect, {"row_noise": Size(electrons=0.089, dn=0.96, of_read_noise=0.29)})
+    words = _sized(effect, {effect: Size(electrons=0.089, dn=0.96, of_read_noise=0.29)})
     assert words.endswith(" of 0.96 DN rms (0.089 e-, 29 % of the read noise), in columns 10 to 13")
 
 

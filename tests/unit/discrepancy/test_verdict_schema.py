@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import pytest
 from helpers.discrepancy_material import UNTESTABLE, VERDICTS, result, verdict_of
@@ -19,7 +19,7 @@ from pchem_pipeline.discrepancy.verdict import (
     parameters_of,
     read_verdict,
 )
-from pchem_pipeline.effects.framework.registry import effect_class
+from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 
 OPTIONAL = {"schema_version", "set_aside"}
 OPTIONAL_OF_STEP = {
@@ -158,13 +158,30 @@ def test_a_place_takes_its_words_from_the_catalogue() -> None:
         ("rts_noise", "amplitude_e", "e-"),
         ("read_order_noise", "taps", ""),
         ("exposure_flicker", "correlation_frames", "frames"),
+        ("clipping", "low", "DN"),
+        ("cosmic_rays", "tracks_per_frame", "1/frame"),
     ],
 )
-def test_the_unit_of_a_parameter_is_that_of_its_description(tag: str, name: str, unit: str) -> None:
-    """Remarks behind the unit are none of it."""
+def test_the_unit_of_a_parameter_is_that_of_its_type(tag: str, name: str, unit: str) -> None:
     kind = effect_class(tag)
-    effect = kind.model_construct(**{name: 1 if kind.model_fields[name].annotation is int else 1.0})
+    effect = kind.model_construct(**{name: 1})
     assert parameters_of(effect, 0.1)[name].unit == unit
+
+
+@pytest.mark.parametrize("tag", effect_classes())
+def test_every_number_of_an_effect_is_declared_with_its_unit(tag: str) -> None:
+    kind = effect_class(tag)
+    for typical in kind.typical():
+        for name in parameters_of(typical, 0.1):
+            assert kind.unit(name), name
+    # also where it is null by default, and never another unit than the description has
+    for name, field in kind.model_fields.items():
+        kinds = () if get_origin(field.annotation) is tuple else get_args(field.annotation)
+        if {float, int} & {field.annotation, *kinds}:
+            assert kind.unit(name), name
+        unit = kind.unit(name)
+        if unit not in ("", "none") and "," in (field.description or "") and tag != "cosmic_rays":
+            assert unit in field.description or unit == "1/frame", name
 
 
 def test_the_form_of_an_effect_is_told_where_it_is_not_the_usual_one() -> None:

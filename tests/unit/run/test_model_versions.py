@@ -208,9 +208,9 @@ def test_status_tells_the_model_that_each_result_rests_on(run: Path) -> None:
 def test_a_verdict_is_put_in_force_and_taken_back(run: Path) -> None:
     before, text = arrays_of(run.parent / "run.zarr", ("fit", "maps")), run.read_text(encoding="utf-8")
     verdict(run, ROW)
-    target, version = adopt_verdict(find_run(run))
-    assert version is not None
-    assert load_config(run).model == version.settings == target.config.model
+    target, words = adopt_verdict(find_run(run))
+    assert words == f"model 2 is in force: PCD + row_noise 1.2 DN; to go back: pchem model {run} --use 1"
+    assert load_config(run).model == settings(ROW) == target.config.model
     assert states(run)["fit"] == ("stale - model 1 -> 2", 1)
     # what the search found is not what it started from
     assert states(run)["discrepancy"] == ("complete", 1)
@@ -232,7 +232,7 @@ def test_a_verdict_is_put_in_force_and_taken_back(run: Path) -> None:
         np.testing.assert_array_equal(values, before[name], err_msg=name)
     assert "was in force already" in use_model(find_run(run), 1)
     use_model(find_run(run.parent / "run.zarr"), 2)
-    assert load_config(run).model == version.settings
+    assert load_config(run).model == settings(ROW)
     run_stages(find_run(run), DONE, QUIET)
     for name, values in arrays_of(run.parent / "run.zarr", ("fit", "maps")).items():
         np.testing.assert_array_equal(values, after[name], err_msg=name)
@@ -241,15 +241,13 @@ def test_a_verdict_is_put_in_force_and_taken_back(run: Path) -> None:
 
 def test_what_a_new_verdict_withdraws_leaves_the_model(run: Path) -> None:
     verdict(run, ROW)
-    assert adopt_verdict(find_run(run))[1] is not None
-    assert adopt_verdict(find_run(run))[1] is None  # the same once more
+    assert adopt_verdict(find_run(run))[1]
+    assert not adopt_verdict(find_run(run))[1]  # the same once more
     # the search was done again from where it had started, and found nothing
     store = RunStore.open(run.parent / "run.zarr", writable=True)
     nothing = verdict_of("consistent").model_copy(update={"model_effects": ()})
     store.write_file(VERDICT_FILE, nothing.to_json().encode())
-    _, version = adopt_verdict(find_run(run))
-    assert version is not None
-    assert version.number == 1
+    assert adopt_verdict(find_run(run))[1].startswith("model 1 is in force")
     assert load_config(run).model == settings()
 
 
@@ -269,7 +267,7 @@ def test_the_yaml_of_another_run_stays(finished: Path, run: Path) -> None:
     verdict(run, ROW)
     target = find_run(run.parent / "run.zarr")
     assert target.config_path == finished
-    assert adopt_verdict(target)[1] is not None
+    assert adopt_verdict(target)[1]
     assert finished.read_text(encoding="utf-8") == text
     assert find_run(run.parent / "run.zarr").config.model == settings(ROW)
 

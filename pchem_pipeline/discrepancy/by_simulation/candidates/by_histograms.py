@@ -36,6 +36,7 @@ class Histograms:
         present: effects of the model.
         effort: counts the work.
         samples_of: returns the frames, (frame,), and the pixels, (y, x), of a part.
+        defects: effects that failed, and why; more come to them.
         told: effects of which the numbers are those that the histograms tell.
     """
 
@@ -44,6 +45,7 @@ class Histograms:
     present: Sequence[Effect]
     effort: Effort
     samples_of: Callable[[Part], tuple[BoolArray, BoolArray]]
+    defects: dict[str, str] = field(default_factory=dict)
     told: list[Effect] = field(default_factory=list)
     _known: dict[Part, PixelLikelihood | None] = field(default_factory=dict, repr=False)
 
@@ -94,9 +96,8 @@ class Histograms:
             told = enough and all(each.everywhere for each in self.present)
             own = self.frames if some.all() else self.frames[some]
             maps = replace(self.maps, usable=usable)
-            self._known[part] = (
-                PixelLikelihood(own, maps, self.present, self.effort, FEW_PIXELS) if told else None
-            )
+            of = own, maps, self.present, self.effort, FEW_PIXELS
+            self._known[part] = PixelLikelihood(*of, self.defects) if told else None
         return self._known[part]
 
 

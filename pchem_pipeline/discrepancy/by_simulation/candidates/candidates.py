@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError, error_words
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     PRICE_OF_MORE,
     Hypothesis,
@@ -22,6 +20,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     log_density,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Acquisition, Replicate
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import is_told, note_defect
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.compose import along_chain
@@ -34,7 +33,6 @@ Vector = Mapping[str, float]
 #: Runs replicates and returns their statistics in the same order; an exception in place of those that failed.
 Mapper = Callable[[Sequence[Replicate]], "list[Vector | Exception]"]
 
-_log = logging.getLogger(__name__)
 MOST_HYPOTHESES = 6  # of one effect
 _MOST_IN_A_PART = 2
 # times as many hypotheses of all effects in all parts: each is a simulation, and most are in vain
@@ -86,21 +84,30 @@ def candidate_classes(settings: DiscrepancySettings) -> dict[str, type[Effect]]:
     }
 
 
-def placebo_for(guesses: Sequence[Effect], classes: Mapping[str, type[Effect]]) -> list[Effect]:
+def placebo_for(
+    guesses: Sequence[Effect], classes: Mapping[str, type[Effect]], defects: dict[str, str]
+) -> list[Effect]:
     """Return an effect for which nothing speaks and that is no relative of those for which something does.
 
     It is fitted like the others: a gap that it closes as well proves nothing.
+
+    Args:
+        guesses: effects for which something speaks.
+        classes: of the candidates, by tag.
+        defects: candidates that failed, and why; more come to them.
     """
     guessed = {effect.tag: type(effect) for effect in guesses}
     related = {tag for effect in guessed.values() for tag in effect.separate}
     for tag in sorted(classes):
         effect = classes[tag]
-        if tag in guessed or tag in related or guessed.keys() & effect.separate.keys() or not effect.strength:
+        if tag in defects or tag in guessed or tag in related or guessed.keys() & effect.separate.keys():
             continue
         try:
-            typical = effect.typical()
-        except Exception:
-            continue  # it was left out, or will be, where it is asked for its guesses
+            typical = effect.typical() if effect.strength else ()
+        # whatever a stranger's effect raises must not stop the others
+        except Exception as error:
+            note_defect(defects, tag, error)
+            continue
         if typical:
             return [typical[0]]
     return []
@@ -143,7 +150,8 @@ class ReplicateSimulator:
 
         The first evidence in which a candidate sees anything counts. A guess says only what to look at:
         strengths are fitted on one split and scored on the other, both ways round. The evidence of a part of
-        the sensor or run gives hypotheses that act there only. Beside the effects of the model others stand
+        the sensor or run gives hypotheses that act there only. What the model has at some places is looked
+        for at others. Beside the effects of the model others stand
         out that the frames hide: that evidence comes first, and where an estimator sees nothing although the
         leading statistics of its effect deviate, what is typical is a guess. Of one effect, everywhere, there
         are ``most`` at most. In parts there are six times as many of all effects together: the likeliest of
@@ -155,24 +163,35 @@ class ReplicateSimulator:
         placed: list[tuple[int, float, Effect]] = []
         window = self.acquisition.window or SensorWindow.whole(self.maps.bias.shape)
         for tag, effect in classes.items():
-            if tag in {present.tag for present in self.model} | self.defects.keys():
+            taken = [present for present in self.model if present.tag == tag]
+            if tag in self.defects or any(present.everywhere for present in taken):
                 continue
             try:
                 guessed = next(filter(None, (list(effect.estimate(e)) for e in (*known, *evidence))), [])
                 if not guessed and known and known[0].strongest(*effect.signature[:2]) > _LEFT:
                     guessed = list(effect.typical())
-                found += [window.found(each) for each in guessed[:most]]
+                for each in guessed[:1]:
+                    is_told(each)  # it is asked of each later: a defect shows here, where it is noted
+                found += [] if taken else [window.found(each) for each in guessed[:most]]
                 for part, own in parts:
                     clear = own.strongest(*effect.signature[:2])
                     for rank, each in enumerate(list(effect.estimate(own))[:_MOST_IN_A_PART]):
-                        found.append(window.found(each, part))
-                        placed.append((rank, -clear, found[-1]))
+                        there = window.found(each, part)
+                        if not any(self._overlap(there, present, window.shape) for present in taken):
+                            found.append(there)
+                            placed.append((rank, -clear, there))
             # whatever a stranger's estimator raises must not stop the others
             except Exception as error:
-                self._note_defect(tag, error)
+                note_defect(self.defects, tag, error)
         placed.sort(key=lambda item: item[:2])
         left_out = {id(each) for _, _, each in placed[_MOST_IN_PARTS * most :]}
         return [each for each in found if id(each) not in left_out]
+
+    def _overlap(self, one: Effect, other: Effect, shape: tuple[int, int]) -> bool:
+        """Tell whether two effects meet in some pixel in some frame."""
+        pixels = one.region is None or other.region is None or one.region.overlap(other.region, shape) > 0
+        n_run = self.acquisition.n_run
+        return pixels and (one.when is None or other.when is None or one.when.overlap(other.when, n_run) > 0)
 
     def fingerprints(self, effects: Sequence[Effect], repeats: int = 1) -> list[Hypothesis]:
         """Simulate effects on the random numbers of the model without them; failures are defects.
@@ -188,7 +207,11 @@ class ReplicateSimulator:
         self._simulate([None, *(effect for effect, _ in shown)], repeats)
         base = self._known(None, repeats)
         return [
-            Hypothesis(effect, share * _without_chance(self._known(one, repeats) - base))
+            Hypothesis(
+                effect,
+                share * _without_chance(self._known(one, repeats) - base),
+                1 + sum(effect.tag == each.tag for each in self.model),
+            )
             for effect, (one, share) in zip(effects, shown, strict=True)
             if all(self._replicate(one, j).key in self._rows for j in range(repeats))
         ]
@@ -204,7 +227,7 @@ class ReplicateSimulator:
             elif effect is None:
                 raise result
             else:
-                self._note_defect(effect.tag, result)
+                note_defect(self.defects, effect.tag, result)
 
     def _known(self, effect: Effect | None, repeats: int) -> FloatArray:
         """Return the statistics of the model with an effect, shape (repeat, statistic)."""
@@ -222,6 +245,8 @@ class ReplicateSimulator:
         Those are simulated several times in the end. One that is far behind the best by itself, and beside
         it brings nothing, is left as it is; ``told`` are effects whose numbers are known better.
         """
+        if not hypotheses:
+            return []
         fits = [fit_set([h], shift, noise) for h in hypotheses]
         scores = np.array([fit.log_score(shift, noise) for fit in fits])
         order = np.argsort(-scores, kind="stable")
@@ -286,10 +311,6 @@ class ReplicateSimulator:
 
     def _row(self, vector: Vector) -> FloatArray:
         return np.array([vector.get(name, 0.0) for name in self.names], np.float64)
-
-    def _note_defect(self, tag: str, error: Any) -> None:
-        self.defects[tag] = error_words(error)
-        _log.warning("a defect in the candidate %s, which is not compared: %s", tag, self.defects[tag])
 
 
 def _without_chance(shifts: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, log_density
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import is_told
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import is_told, note_defect
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, beyond_chance
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
@@ -52,14 +52,14 @@ class _Detail:
     slope: FloatArray
 
 
-def has_numbers(hypotheses: Sequence[Hypothesis]) -> bool:
+def has_numbers(refitter: Refitter, hypotheses: Sequence[Hypothesis]) -> bool:
     """Tell whether effects have numbers that are tuned by simulation."""
-    return bool(_numbers(hypotheses))
+    return bool(_numbers(refitter, hypotheses))
 
 
 def may_be_tuned(refitter: Refitter, one: Refitted) -> bool:
     """Tell whether what a set leaves lies where effects move it whose numbers are not known."""
-    places = sorted({place for place, _ in _numbers(one.hypotheses)})
+    places = sorted({place for place, _ in _numbers(refitter, one.hypotheses)})
     if not places:
         return False
     scatter = refitter.scatter(one.covariance, len(one.vectors))
@@ -75,7 +75,7 @@ def tuned(refitter: Refitter, one: Refitted) -> Refitted:
         EffortSpentError: the work is at its limit, and nothing was tuned.
     """
     words = " + ".join(h.tag for h in one.hypotheses)
-    measured = [_measured(refitter, one, place, name) for place, name in _numbers(one.hypotheses)]
+    measured = [_measured(refitter, one, place, name) for place, name in _numbers(refitter, one.hypotheses)]
     details = [detail for detail in measured if detail is not None]
     if not details:
         return one
@@ -102,24 +102,22 @@ def tuned(refitter: Refitter, one: Refitted) -> Refitted:
     return best
 
 
-def _numbers(hypotheses: Sequence[Hypothesis]) -> list[tuple[int, str]]:
-    """Return the numbers that may be tuned, by the place of their effect; a law tells those of others."""
-    found = [
-        (place, name)
-        for place, h in enumerate(hypotheses)
-        if h.effect.strength and not is_told(h.effect)
-        for name in _details(h.effect)
-    ]
+def _numbers(refitter: Refitter, hypotheses: Sequence[Hypothesis]) -> list[tuple[int, str]]:
+    """Return the numbers that may be tuned, by the place of their effect; a law tells those of others.
+
+    Those that have a logarithm; none of an effect that fails.
+    """
+    found: list[tuple[int, str]] = []
+    for place, h in enumerate(hypotheses):
+        # whatever a stranger's effect raises must not stop the others
+        try:
+            tuned = h.effect.details() if h.effect.strength and not is_told(h.effect) else ()
+            named = [(name, getattr(h.effect, name)) for name in tuned]
+        except Exception as error:
+            note_defect(refitter.defects, h.tag, error)
+            continue
+        found += [(place, n) for n, value in named if isinstance(value, float) and 0.0 < value < np.inf]
     return found[:_MOST]
-
-
-def _details(effect: Effect) -> list[str]:
-    """Return the numbers that an effect names; of a stranger's only those that have a logarithm."""
-    try:
-        named = [(name, getattr(effect, name)) for name in effect.details()]
-    except Exception:
-        return []  # it is worth no more than one that names none
-    return [name for name, value in named if isinstance(value, float) and 0.0 < value < np.inf]
 
 
 def _measured(refitter: Refitter, one: Refitted, place: int, name: str) -> _Detail | None:
@@ -171,7 +169,9 @@ def _moved(
         ahead = float(np.clip(so_far + step[at], -_FARTHEST, _FARTHEST)) - so_far
         effect = now.effect.times(detail.name, float(np.exp(ahead)))
         taken[at] = _logarithm(now.effect, effect, detail.name)
-        found[detail.place] = Hypothesis(effect, now.fingerprint + taken[at] * detail.slope)
+        found[detail.place] = replace(
+            now, effect=effect, fingerprint=now.fingerprint + taken[at] * detail.slope
+        )
     return tuple(found), taken
 
 

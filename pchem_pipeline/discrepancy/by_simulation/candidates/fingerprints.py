@@ -46,15 +46,17 @@ class Hypothesis:
     Attributes:
         effect: with guessed or refined parameters.
         fingerprint: shift of the statistics at this strength, shape (m,).
+        number: of effects with its tag, at several places of the model, the first, second and so on.
     """
 
     effect: Effect
     fingerprint: FloatArray
+    number: int = 1
 
     @property
     def tag(self) -> str:
-        """Tag of the effect."""
-        return self.effect.tag
+        """Tag of the effect, with its number if there are others of it beside: what tells it from those."""
+        return self.effect.tag if self.number == 1 else f"{self.effect.tag} {self.number}"
 
     def rescaled(self, factor: float) -> Effect:
         """Return the effect with the strength at which its fingerprint is ``factor`` times as large."""
@@ -64,7 +66,7 @@ class Hypothesis:
 
     def times(self, factor: float) -> Hypothesis:
         """Return the effect so many times as strong, its fingerprint in proportion."""
-        return Hypothesis(self.rescaled(factor), self.fingerprint * factor)
+        return replace(self, effect=self.rescaled(factor), fingerprint=self.fingerprint * factor)
 
 
 @dataclass(frozen=True)
@@ -316,6 +318,26 @@ def share_place(effects: Iterable[Effect]) -> bool:
     )
 
 
+def seconds(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return those of an effect in another region than its first one, as second ones beside that."""
+    first: dict[str, Hypothesis] = {}
+    placed = [h for h in hypotheses if h.effect.region is not None]
+    apart = [h for h in placed if first.setdefault(h.tag, h).effect.region != h.effect.region]
+    return [replace(h, number=h.number + 1) for h in apart]
+
+
+def meets_itself(members: Iterable[Hypothesis]) -> bool:
+    """Tell whether an effect is more than once in a set without regions that tell its places apart."""
+    pairs = itertools.combinations([h.effect for h in members], 2)
+    return any(a.tag == b.tag and (None in (a.region, b.region) or a.region == b.region) for a, b in pairs)
+
+
+def firsts(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return hypotheses without those that are second ones of others among them."""
+    tags = {(h.effect.tag, h.number) for h in hypotheses}
+    return [h for h in hypotheses if (h.effect.tag, h.number - 1) not in tags]
+
+
 def choose(
     hypotheses: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise
 ) -> Choice | None:
@@ -326,11 +348,13 @@ def choose(
         shifts: measured statistics minus null mean of the two splits, shape (m,) each.
         noise: covariance of a shift.
     """
-    shortlist = _shortlist(hypotheses, shifts, noise)
+    shortlist, alone = _shortlist(hypotheses, shifts, noise), firsts(hypotheses)
     sets = []
     for size in range(1, _LARGEST_SET + 1):
         for members in itertools.combinations(shortlist, size):
-            if len({h.tag for h in members}) == size and not share_place(h.effect for h in members):
+            once = len({h.tag for h in members}) == size and not meets_itself(members)
+            led = all(any(h is one for one in alone) for h in firsts(members))
+            if once and led and not share_place(h.effect for h in members):
                 scored = score_set(members, shifts, noise)
                 if _all_needed(scored, shifts, noise):
                     sets.append(scored)
@@ -389,10 +413,11 @@ def _shortlist(
 ) -> list[Hypothesis]:
     """Return the hypotheses that do best alone, and those that do best with the best ones."""
     chosen: list[Hypothesis] = []
+    alone = firsts(hypotheses)
 
     def take(count: int, others: Sequence[Hypothesis]) -> None:
         scored = []
-        for hypothesis in hypotheses:
+        for hypothesis in alone:
             if any(hypothesis is h for h in chosen) or hypothesis.tag in {h.tag for h in others}:
                 continue
             scored.append((score_set([*others, hypothesis], shifts, noise).score, hypothesis))
@@ -410,7 +435,9 @@ def _shortlist(
         )
         if second is not None:
             take(_SHORTLIST - len(chosen), (best, second))
-    return chosen
+    # an effect that does well in one region may do so in others at once
+    kept = {h.effect.tag for h in chosen if h.effect.region is not None}
+    return chosen + [h for h in hypotheses if h.effect.tag in kept and not any(h is one for one in alone)]
 
 
 def _all_needed(scored: ScoredSet, shifts: tuple[FloatArray, FloatArray], noise: Noise) -> bool:

@@ -29,6 +29,7 @@ from pchem_pipeline.discrepancy.scan_pairs import Limits, Shared, scan_pairs
 from pchem_pipeline.discrepancy.where import frame_series, pixel_maps, suspected_regions
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import When
+from pchem_pipeline.model.arithmetic.robust import robust_sd
 
 FloatArray = NDArray[np.float64]
 
@@ -41,6 +42,7 @@ _FARTHEST = 6.0  # standard deviations of a pixel's shape
 _SIGNIFICANCE = 1e-3
 _LARGEST = 0.6  # of sensor or run
 _MOST = 2  # regions, and ranges of frames
+_AS_CLEAR = 0.5  # of the standard deviations of the clearest region
 _TREND = 0.7  # of the deviation of a range, what a trend from end to end may explain
 
 
@@ -97,13 +99,18 @@ def with_ends(part: Part, evidence: Evidence) -> Part:
 
 
 def _apart(found: list[_Found], shape: tuple[int, ...]) -> list[Part]:
-    """Return the regions that stand out most and neither overlap nor touch."""
+    """Return the regions that stand out most and do not overlap.
+
+    One that touches another, as a tap does, must be nearly as clear: else it is the edge of that.
+    """
     parts: list[Part] = []
     taken = np.zeros(shape, np.bool_)
-    for each in sorted(found, key=lambda one: -one.z):
+    found = sorted(found, key=lambda one: -one.z)
+    for each in found:
         assert each.part.region is not None
         mask = each.part.region.mask((shape[0], shape[1]))
-        if len(parts) < _MOST and not (mask & binary_dilation(taken)).any():
+        beside = taken if each.z > _AS_CLEAR * found[0].z else binary_dilation(taken)
+        if len(parts) < _MOST and not (mask & beside).any():
             parts.append(each.part)
             taken |= mask
     return parts
@@ -126,8 +133,7 @@ def _frames_of_places(shared: Sequence[Shared], samples: Samples, time: TimeSeri
     for each in shared:
         mask = samples.usable & each.place.region.mask((samples.usable.shape[0], samples.usable.shape[1]))
         energy = samples.energies(each.channel, each.mode, mask)
-        spread = 1.4826 * float(np.median(np.abs(energy - np.median(energy))))
-        values = (energy - np.median(energy)) / max(spread, 1e-300)
+        values = (energy - np.median(energy)) / max(robust_sd(energy), 1e-300)
         for one in scan_series(
             values, time.frames, significance=_SIGNIFICANCE, most=1, shortest=FEWEST_FRAMES
         ):

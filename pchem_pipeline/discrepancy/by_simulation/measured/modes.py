@@ -34,7 +34,6 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 _CHANGED: tuple[Changed, ...] = ("offset", "gain", "light", "noise")
-_OF: tuple[Shared, ...] = ("frame", "row", "column")
 _CLEAR = 15.0  # nats
 _NEARLY = 0.5  # of the nats of the clearest change: another one may be it as well
 # by how much bursts must explain more than a Gaussian, of what there is to win, and nats: scores are skewed

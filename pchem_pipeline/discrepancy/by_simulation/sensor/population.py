@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.by_simulation.sensor.population_numba import solve_parabolas
+from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -46,7 +47,6 @@ _LOWEST_LOG_EXPOSURE, _LOWEST_LOG_VARIANCE = float(np.log(1e-5)), float(np.log(1
 # share of mistaken pixels up to which the fits are nearly the truth, and beyond which they are no start
 _HARDLY_ANY, _MANY = 0.003, 0.3
 _SHIFTS = (0, 1, -1)  # electrons by which a bias may be mistaken
-_MAD = 1.4826
 _ALIKE = np.array([0.3, 0.02, 0.5, 0.15])  # scatter of theta of pixels that are much alike
 _WIDEST_DRAW = 1.5  # of log H and log sigma_R^2 from the maximum
 _RARE = 0.003
@@ -212,7 +212,7 @@ def lost_variance(posterior: Posterior, totals: NDArray[np.integer], law: Sample
 def clipped_mean(values: FloatArray) -> FloatArray:
     """Return means over the pixels, (n, m) -> (m,), pixels far from the others cut to three deviations."""
     middle = np.median(values, axis=0)
-    widest = 3.0 * _MAD * np.median(np.abs(values - middle), axis=0)
+    widest = 3.0 * robust_sd(values, middle, axis=0)
     return np.asarray(np.clip(values, middle - widest, middle + widest).mean(axis=0))
 
 
@@ -529,7 +529,7 @@ def _cumulants(pixels: _Pixels) -> tuple[FloatArray, FloatArray]:
 def _first_guess(theta: FloatArray) -> Population:
     """Return centre and scatter of the fits by robust figures, along the axes."""
     centre = np.median(theta, axis=0)
-    scatter = _MAD * np.median(np.abs(theta - centre), axis=0)
+    scatter = robust_sd(theta, centre, axis=0)
     return Population(centre, np.diag(np.maximum(scatter, 5.0 * _LEAST_SCATTER) ** 2))
 
 

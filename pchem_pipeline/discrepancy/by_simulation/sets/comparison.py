@@ -24,12 +24,14 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Contender,
     Hypothesis,
     ScoredSet,
+    firsts,
     fit_set,
+    meets_itself,
     seen_among,
     share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Witness
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Witness, note_defect
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.by_simulation.sets.trials import (
     FAR,
@@ -69,14 +71,12 @@ class Comparison:
     Attributes:
         chosen: the best.
         tried: all, the best first.
-        failed: effects of which the refit failed, and why.
         witnessed: by their tags, how far other sets are behind the chosen one by another witness than the
             statistics, nats, and the error of that.
     """
 
     chosen: Refitted
     tried: tuple[Refitted, ...]
-    failed: Mapping[str, str] = field(default_factory=dict)
     witnessed: Mapping[frozenset[str], tuple[float, float]] = field(default_factory=dict)
 
     def rivals_of(self, tag: str) -> tuple[Contender, ...]:
@@ -89,6 +89,8 @@ class Comparison:
                 continue
             [name] = new
             hypothesis = next(h for h in one.hypotheses if h.tag == name)
+            if name != tag and hypothesis.effect.tag == tag.partition(" ")[0]:
+                continue  # the same effect elsewhere
             if one.tags in self.witnessed:
                 behind, error = self.witnessed[one.tags]
                 # neither need be the very law of the samples
@@ -211,8 +213,8 @@ def _concluded(
     known = {h.tag for h in trials.held}
     for member in chosen.hypotheses:
         if member.tag not in known:
-            tried += _placebo(trials.refitter, hypotheses, chosen, member, tried)
-    return Comparison(chosen, tuple(tried), trials.failed, witnessed)
+            tried += _placebo(trials, hypotheses, chosen, member)
+    return Comparison(chosen, tuple(tried), witnessed)
 
 
 def _within(asked: Callable[[], Answer]) -> Answer | None:
@@ -271,22 +273,19 @@ def _witnessed(
 
 def unrelated(one: Effect, other: Effect) -> bool:
     """Tell whether neither of two effects is known to be confused with the other."""
-    return other.tag not in type(one).separate and one.tag not in type(other).separate
+    known = other.tag in type(one).separate or one.tag in type(other).separate
+    return not known and one.tag != other.tag
 
 
 def _placebo(
-    refitter: Refitter,
-    hypotheses: Sequence[Hypothesis],
-    chosen: Refitted,
-    member: Hypothesis,
-    tried: Sequence[Refitted],
+    trials: Trials, hypotheses: Sequence[Hypothesis], chosen: Refitted, member: Hypothesis
 ) -> list[Refitted]:
     """Return the refit of the best unrelated effect in the place of a member, unless there is one.
 
     Of all that have nothing to do with it, the one whose fingerprint would explain most: one that cannot
     close anything, whatever its strength, proves nothing about the name.
     """
-    others = [h for h in chosen.hypotheses if h.tag != member.tag]
+    refitter, others = trials.refitter, [h for h in chosen.hypotheses if h.tag != member.tag]
     kept = {h.tag for h in others}
     pool = [
         h
@@ -296,7 +295,7 @@ def _placebo(
         and not is_dear([h.effect])
         and not share_place(other.effect for other in (*others, h))
     ]
-    if any(one.tags == kept | {h.tag} for one in tried for h in pool):
+    if any(one.tags == kept | {h.tag} for one in trials.tried for h in pool):
         return []
     noise = refitter.noise(refitter.null.covariance, refitter.null.n_replicates)
     shift = refitter.target - refitter.null.mean
@@ -309,8 +308,12 @@ def _placebo(
     try:
         # at the strength that its fingerprint asks for: it is not to win
         return [replace(refitter, steps=0).refined((*others, best))]
-    # its defect is told where it is asked for its guesses; at the limit of the work its fingerprint must do
-    except Exception:
+    # at the limit of the work its fingerprint must do
+    except (NotFittedError, EffortSpentError):
+        return []
+    # whatever a stranger's effect raises must not stop the others
+    except Exception as error:
+        note_defect(refitter.defects, best.tag, error)
         return []
 
 
@@ -330,8 +333,8 @@ def own_signature(own: FloatArray, others: FloatArray, left: FloatArray, noise: 
 
 def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesis]:
     """Return hypotheses to be refitted alone: those of the best set, and the likeliest of all."""
-    chosen = [*choice.best.hypotheses]
-    for hypothesis in hypotheses:
+    chosen = firsts(choice.best.hypotheses)
+    for hypothesis in firsts(hypotheses):
         same = sum(h.tag == hypothesis.tag for h in chosen)
         most = 1 if type(hypothesis.effect).erratic else _MOST_OF_ONE
         if same < most and len(chosen) < _MOST_SINGLES and all(hypothesis is not h for h in chosen):
@@ -434,11 +437,9 @@ def _sets(choice: Choice, singles: Sequence[Refitted]) -> list[tuple[Hypothesis,
     for one in sorted(alone, key=lambda one: one.promise, reverse=True):
         kinds.setdefault(one.hypotheses[-1].tag, one.hypotheses[-1])
     # of an effect that was refitted alone, the kind that did best; its strength is that of the set
-    return [
-        tuple(_kind(h, kinds[h.tag]) if h.tag in kinds else h for h in scored.at_fit())
-        for scored in choice.tried
-        if len(scored.hypotheses) > 1
-    ]
+    sets = [scored.at_fit() for scored in choice.tried if len(scored.hypotheses) > 1]
+    better = [tuple(_kind(h, kinds[h.tag]) if h.tag in kinds else h for h in members) for members in sets]
+    return [own if meets_itself(new) else new for own, new in zip(sets, better, strict=True)]
 
 
 def _of_different_effects(sets: Sequence[tuple[Hypothesis, ...]]) -> list[tuple[Hypothesis, ...]]:
@@ -493,7 +494,7 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
     for place, hypothesis in enumerate(one.hypotheses):
         members = [h for h in one.hypotheses if h.tag != hypothesis.tag]
         # at numbers of their own the others may move other statistics
-        fixed = not has_numbers(members) or is_dear(h.effect for h in members)
+        fixed = not has_numbers(refitter, members) or is_dear(h.effect for h in members)
         if fixed and _beyond_others(refitter, one, place):
             continue
         # the same kinds: another kind of one that mimics both is another set

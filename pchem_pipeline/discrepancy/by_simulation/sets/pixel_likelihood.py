@@ -8,22 +8,26 @@ that the histograms say, for a fraction of the cost of one simulation.
 from __future__ import annotations
 
 import copy
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import ConfigError, error_words
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, leads_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, at_other_peaks, off_by
 from pchem_pipeline.discrepancy.effort import Effort
-from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.effect import Effect, tag_of
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.histogram.count import histogram_frames
 
 FloatArray = NDArray[np.float64]
+
+_log = logging.getLogger(__name__)
 
 #: Pixels that tell effects apart.
 MANY_PIXELS = 1024
@@ -51,6 +55,7 @@ class PixelLikelihood:
         present: Sequence[Effect],
         effort: Effort,
         pixels: int = MANY_PIXELS,
+        defects: dict[str, str] | None = None,
     ) -> None:
         """Count the samples.
 
@@ -60,6 +65,7 @@ class PixelLikelihood:
             present: effects of the model, which act everywhere.
             effort: counts the work.
             pixels: about so many are looked at.
+            defects: effects that failed, and why; more come to them.
         """
         y, x = np.nonzero(maps.usable)
         some = slice(None, None, max(1, y.size // pixels))
@@ -77,6 +83,7 @@ class PixelLikelihood:
         self._asked: dict[tuple[frozenset[str], tuple[Effect, ...]], FittedSet | None] = {}
         self._without: dict[tuple[Effect, ...], float] = {}  # log-likelihood, by what is present
         self._fewer: PixelLikelihood | None = None
+        self._defects = {} if defects is None else defects
 
     def fewer(self) -> PixelLikelihood:
         """Return that of a part of these pixels, a first answer for a fraction of the work; itself if few."""
@@ -112,7 +119,13 @@ class PixelLikelihood:
         """
         fits: list[tuple[float, Effect]] = []
         for kind in kinds:
-            rough = self.fewer().fitted(_starts(kind))
+            # whatever a stranger's effect raises must not stop the others
+            try:
+                starts = _starts(kind)
+            except Exception as error:
+                note_defect(self._defects, tag_of(kind), error)
+                continue
+            rough = self.fewer().fitted(starts)
             if rough and rough[0][0] > _SILENT:
                 fits += rough[:1] if self.fewer() is self else self.fitted([rough[0][1]])
         return [effect for rise, effect in sorted(fits, key=lambda fit: -fit[0]) if rise > _SPEAKS]
@@ -160,7 +173,6 @@ class PixelLikelihood:
 
     def _fit(self, effects: Sequence[Effect], besides: Sequence[Effect]) -> FittedSet | None:
         """Fit effects; None where that cannot be done, or led to less than there is without them."""
-        # its numbers may not go together where the fit leads, and a stranger's law may raise anything
         try:
             sets = replace(self._sets, present=(*self._sets.present, *besides))
             fitted = sets.fit([Member.of(effect) for effect in effects])
@@ -174,7 +186,10 @@ class PixelLikelihood:
             if fitted.fit.log_likelihood.sum() - without > _ASTRAY * len(fitted.fit.log_likelihood):
                 for electrons in (-1.0, 1.0):
                     fitted = _electrons_off(sets, fitted, electrons)
-        except Exception:
+        # whatever a stranger's effect raises must not stop the others
+        except Exception as error:
+            if not _refuses(error):
+                note_defect(self._defects, (*besides, *effects)[-1].tag, error)
             return None
         return None if without - float(fitted.fit.log_likelihood.sum()) > _ALIKE else fitted
 
@@ -237,17 +252,13 @@ def _at(hypothesis: Hypothesis, effect: Effect) -> Hypothesis:
     factor = max(new / old, 0.0) ** effect.power if old else 0.0
     if not 1.0 / _FARTHEST < factor < _FARTHEST:
         return hypothesis
-    return Hypothesis(effect, hypothesis.fingerprint * factor)
+    return replace(hypothesis, effect=effect, fingerprint=hypothesis.fingerprint * factor)
 
 
 def _starts(kind: type[Effect]) -> tuple[Effect, ...]:
     """Return what is typical of an effect and the same stronger; nothing where no law tells it."""
-    # what a stranger's effect raises is told where it is asked for its guesses
-    try:
-        typical = next((e for e in kind.typical() if e.strength and is_told(e)), None)
-        return () if typical is None else (typical, typical.scaled(_STRONG))
-    except Exception:
-        return ()
+    typical = next((e for e in kind.typical() if e.strength and is_told(e)), None)
+    return () if typical is None else (typical, typical.scaled(_STRONG))
 
 
 def _electrons_off(sets: SetComparison, fitted: FittedSet, electrons: float) -> FittedSet:
@@ -299,9 +310,21 @@ def is_told(effect: Effect) -> bool:
         return False
     if not kind.signature or not leads_in_histograms(kind):
         return False
-    # whatever a stranger's law raises is told where the effect is simulated
+    member = Member.of(effect)
     try:
-        member = Member.of(effect)
         return not member.free_satellites and not member.tabulated and bool(member.coordinates)
-    except Exception:
+    except ConfigError as error:
+        if not _refuses(error):
+            raise
         return False
+
+
+def _refuses(error: Exception) -> bool:
+    """Tell whether an effect says that its numbers do not go together, or are no law of the pixels."""
+    return isinstance(error.__cause__ or error, ValueError | ConfigError)
+
+
+def note_defect(defects: dict[str, str], tag: str, error: Exception) -> None:
+    """Keep why an effect is not compared, and warn."""
+    defects[tag] = error_words(error)
+    _log.warning("a defect in the candidate %s, which is not compared: %s", tag, defects[tag])

@@ -10,7 +10,7 @@ by secants): an effect is judged by what is left after its best fit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,6 +131,7 @@ class Refitter:
         splits: number of parts.
         steps: corrections of the strengths, at most.
         allow: hears which effects are simulated next, and raises an error where the work is at its limit.
+        defects: effects that failed, and why; more come to them.
     """
 
     draw: Callable[[tuple[Effect, ...], int], tuple[Refit, FloatArray]]
@@ -141,6 +142,7 @@ class Refitter:
     splits: int = 2
     steps: int = _MOST_STEPS
     allow: Callable[[str], None] = lambda _: None
+    defects: dict[str, str] = field(default_factory=dict)
 
     def refined(
         self,
@@ -313,7 +315,7 @@ class Refitter:
             None if scatter is None else scatter[:, kept],
         )
         change = np.where(scaling, np.log1p(np.maximum(change, -_LARGEST_SHARE)), 0.0)
-        found = tuple(Hypothesis(h.effect, part) for h, part in zip(hypotheses, parts, strict=True))
+        found = tuple(replace(h, fingerprint=part) for h, part in zip(hypotheses, parts, strict=True))
         allowed = noise.of(parts)
         promised = residual - np.expm1(change) @ slopes
         return Refitted(

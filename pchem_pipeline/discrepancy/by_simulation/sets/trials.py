@@ -7,19 +7,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers, may_be_tuned, tuned
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     PRICE_OF_MORE,
     Hypothesis,
     fit_set,
+    meets_itself,
     share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import FEW_PIXELS, Witness
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import FEW_PIXELS, Witness, note_defect
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_dear
 from pchem_pipeline.discrepancy.effort import EffortSpentError
-from pchem_pipeline.discrepancy.null import CONVINCING, look_elsewhere
+from pchem_pipeline.discrepancy.null import CONVINCING
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 
 _MOST_DEAR = 4  # sets whose refit takes long
 #: Relative error of a fingerprint before its refit.
@@ -45,7 +46,6 @@ class Trials:
         held: effects that are fitted with each.
         witness: brings a set near its best.
         tried: sets at their best fit, in the order in which they were tried.
-        failed: effects of which the refit failed, and why.
         settled: tags of the sets whose numbers were tuned.
         asked: sets as they were begun.
         measured: what was measured without any of these effects, and leaves little.
@@ -55,7 +55,6 @@ class Trials:
     held: tuple[Hypothesis, ...]
     witness: Witness
     tried: list[Refitted] = field(default_factory=list)
-    failed: dict[str, str] = field(default_factory=dict)
     settled: set[frozenset[str]] = field(default_factory=set)
     asked: list[tuple[Hypothesis, ...]] = field(default_factory=list)
     measured: Refitted | None = None
@@ -114,7 +113,7 @@ class Trials:
             pass
         # whatever a stranger's effect raises must not stop the others
         except Exception as error:
-            self.failed[members[-1].tag] = error_words(error)
+            note_defect(self.refitter.defects, _words(members), error)
         return True
 
     def tune(self) -> None:
@@ -139,7 +138,7 @@ class Trials:
         except (EffortSpentError, NotFittedError):
             return one
         except Exception as error:  # of a stranger's effect, as above
-            self.failed[one.hypotheses[-1].tag] = error_words(error)
+            note_defect(self.refitter.defects, _words(one.hypotheses), error)
             return one
         if better is not one:
             self.tried.append(better)
@@ -160,7 +159,9 @@ class Trials:
         for weakest in sorted(new, key=lambda h: float(np.sum((h.fingerprint / scale) ** 2))):
             fewer = [h for h in new if h is not weakest]
             several = len(new) > 2
-            if not fewer or not (has_numbers(fewer) or (several and (self.complete or weakest.tag in gone))):
+            if not fewer or not (
+                has_numbers(self.refitter, fewer) or (several and (self.complete or weakest.tag in gone))
+            ):
                 continue
             if several and not self.refit(fewer):
                 return False
@@ -175,7 +176,8 @@ class Trials:
     def _worth_it(self, members: Sequence[Hypothesis]) -> bool:
         """Tell whether a set may come near the best one, and was not refitted before."""
         tags = frozenset(h.tag for h in (*self.held, *members))
-        if share_place(h.effect for h in (*self.held, *members)):
+        every = (*self.held, *members)
+        if share_place(h.effect for h in every) or meets_itself(every):
             return False
         dear = [one for one in self.tried if is_dear(one.effects)]
         if is_dear(h.effect for h in members) and len(dear) >= _MOST_DEAR:
@@ -275,3 +277,8 @@ def same_kinds(one: Sequence[Hypothesis], other: Sequence[Hypothesis]) -> bool:
     """Tell whether two sets differ in the strengths of their effects only."""
     own = {h.tag: h for h in one}
     return own.keys() == {h.tag for h in other} and all(alike(own[h.tag], h) for h in other)
+
+
+def _words(members: Sequence[Hypothesis]) -> str:
+    """Return the tags of a set: which of its effects failed is not known."""
+    return " + ".join(h.tag for h in members)

@@ -89,8 +89,9 @@ def test_what_is_left_where_the_effect_moves_nothing_is_no_reason_to_tune() -> N
 
 def test_effects_without_such_numbers_stay_as_they_are() -> None:
     noise = Hypothesis(RowNoise(row_noise_dn=1.0), UNIT[1])
-    assert not has_numbers([noise])
-    assert has_numbers([noise, Hypothesis(BLINKING, UNIT[0])])
+    refitter = World([TRUE]).refitter()
+    assert not has_numbers(refitter, [noise])
+    assert has_numbers(refitter, [noise, Hypothesis(BLINKING, UNIT[0])])
 
 
 def test_nothing_is_simulated_at_the_limit() -> None:
@@ -159,6 +160,9 @@ def test_what_an_effect_of_another_package_raises_ends_no_search(strange: type[D
     shifts = (world.parts[0] - world.null.mean, world.parts[1] - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
     assert choice is not None
-    found = compare(world.refitter(), [], hypotheses, choice)
+    refitter = world.refitter()
+    found = compare(refitter, [], hypotheses, choice)
     assert found is not None
     assert "dark_current_rts" in found.chosen.tags
+    assert refitter.defects
+    assert all("dark_current_rts" in failed for failed in refitter.defects)

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings
+from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings, _sentence
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.by_simulation.measured.moves import _Mixture, measured_moves, without_squares
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.discrepancy.verdict import closed_share
+from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.readout.empirical import Empirical, Move, neighbour_words
 from pchem_pipeline.model.law.mass import sample_mass
@@ -259,8 +261,29 @@ def test_a_described_sensor_is_said_so_and_keeps_the_component_in_its_model() ->
     assert found.model((), (effect,)) == (effect,)
     step = addition.step(None)
     assert (step.verdict, step.effect) == ("described", None)
-    from pchem_pipeline.discrepancy.build_verdict import _sentence
-
-    assert "0.4 % of the samples are moved after the converter by -8 DN" in _sentence(found, {})
+    assert "0.4 % of the samples differ from the model as if they were moved by -8 DN" in _sentence(found, {})
     assert "it is like that throughout" in _sentence(found, {})
     assert "not known" in _sentence(replace(found, still=True), {})
+
+
+def test_a_description_that_leaves_a_part_of_the_gap_is_proposed_and_not_in_the_model() -> None:
+    effect, named = Empirical(share=0.004, moves=(Move(shift_dn=-8),)), RowNoise(row_noise_dn=0.3)
+    first, second, third = (Gap(value, 5e-5, (0.0, 0.0), {}) for value in (4e-3, 2e-3, 4e-4))
+    steps = (
+        Addition(named, True, "", (), 1e-4, first, second, (), None, ()),
+        Addition(effect, True, "", (), 1e-4, second, third, (), None, (), described=True),
+    )
+    empty: Any = None
+    found = Findings("frames", empty, empty, empty, first, [], False, Added(steps, third))
+    assert found.state == "described"
+    assert found.model((), (named, effect)) == (named,)
+    assert found.proposed == (effect,)
+    said = _sentence(found, {})
+    assert "90 % of the gap on unseen frames is closed" in said
+    assert "proposed and not in the model" in said
+    # a gap that chance alone makes, or that only grew, has no shares
+    for before, after in ((0.0, 1e-4), (-2e-5, 1e-4), (1e-4, 3e-4)):
+        gaps = [Gap(value, 5e-5, (0.0, 0.0), {}) for value in (before, after)]
+        assert "is no smaller" in _sentence(replace(found, before=gaps[0], added=Added(steps, gaps[1])), {})
+        assert closed_share(before, after) == 0.0
+    assert closed_share(1e-4, -3e-5) == 1.0

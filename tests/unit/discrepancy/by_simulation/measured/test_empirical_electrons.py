@@ -221,6 +221,6 @@ def test_its_words_say_what_happens_to_electrons() -> None:
         ElectronMode(fate="lost", weight=0.5),
     )
     assert EmpiricalElectrons(chance=0.04, modes=modes).words() == (
-        "electrons that do not come independently (each brings 0.04 others on average to the sample one "
-        "frame later; each is lost with a chance of 0.02 for every other one in its sample)"
+        "electron numbers that are not independent (for each one the sample one frame later has 0.04 more on "
+        "average; a sample of k has 0.02 k (k - 1) fewer than independent ones would be)"
     )

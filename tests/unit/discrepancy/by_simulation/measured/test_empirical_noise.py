@@ -253,8 +253,7 @@ model:
 """
     (effect,) = parse_config(text).model.effects
     assert effect.words() == (
-        "noise of 0.7 DN that samples share before the converter "
-        "(the same in a whole row, correlated by 0.48 (1 row apart))"
+        "noise of 0.7 DN that samples share (the same in a whole row, correlated by 0.48 (1 row apart))"
     )
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.by_histograms import Histograms
+from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import placebo_for
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     PixelLikelihood,
@@ -254,3 +255,33 @@ def test_a_fit_that_went_astray_says_nothing(monkeypatch: pytest.MonkeyPatch) ->
     assert likelihood.behind([heavy], [skew]) is None
     hypothesis = Hypothesis(skew, np.ones(2))
     assert likelihood.begun([hypothesis]) == (hypothesis,)
+
+
+@pytest.mark.parametrize(
+    ("raised", "noted"),
+    [(KeyError("gone"), True), (ZeroDivisionError("zero"), True), (ValueError("apart"), False)],
+)
+def test_what_a_fit_raises_is_noted_unless_its_numbers_are_no_law(
+    monkeypatch: pytest.MonkeyPatch, raised: Exception, noted: bool
+) -> None:
+    defects: dict[str, str] = {}
+    frames = frames_of(exgaussian(np.random.default_rng(17), 0.4), 18)
+    likelihood = PixelLikelihood(frames, maps_of(0.3), (), Effort(None), 64, defects)
+
+    def broken(*_: Any) -> FittedSet:
+        raise raised
+
+    monkeypatch.setattr(SetComparison, "fit", broken)
+    assert likelihood.rise([SKEW(share=0.3)]) is None
+    assert (str(raised) in defects.get("noise_skew", "")) is noted
+
+
+def test_an_effect_that_fails_as_placebo_is_noted() -> None:
+    class Broken(SKEW):
+        @classmethod
+        def typical(cls) -> Sequence[Effect]:
+            raise RuntimeError("no such thing")
+
+    defects: dict[str, str] = {}
+    assert placebo_for([], {"noise_skew": Broken}, defects) == []
+    assert "no such thing" in defects["noise_skew"]
