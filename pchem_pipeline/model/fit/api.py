@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
@@ -355,7 +354,6 @@ class _Batch:
         answers = self._answers(n)
         packed = pack(laws, n)
         cells = limits.cells
-        engine.compile_fit(numba.typeof(given), cells)
         evaluate = cells_likelihood() if cells else density_likelihood()
         search = engine.cells_search() if cells else engine.density_search()
 
