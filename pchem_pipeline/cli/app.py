@@ -9,6 +9,7 @@ import contextlib
 import errno
 import os
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
@@ -448,6 +449,11 @@ def _root(
 
 def _fail(message: str, code: int) -> NoReturn:
     typer.echo(f"pchem: {' '.join(message.split())}", err=True)
+    if code in (ExitCode.SIGINT, ExitCode.SIGTERM) and not all(
+        each.daemon for each in threading.enumerate() if each is not threading.main_thread()
+    ):
+        sys.stdout.flush()
+        os._exit(code)  # nobody waits for what these threads have begun
     sys.exit(code)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import functools
 import multiprocessing
+import os
+import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor as Pool
@@ -14,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
-from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, PchEmError
+from pchem_pipeline.base.errors import ConfigError, ExitCode, IncompleteRunError, PchEmError
 from pchem_pipeline.compute.environment import available_workers, prepare_environment
 from pchem_pipeline.compute.settings import ComputeSettings
 
@@ -139,6 +141,19 @@ class SerialExecutor:
         """Nothing to free."""
 
 
+def _begin_worker() -> None:
+    """Prepare a worker process, which ends with its parent however that ends."""
+    prepare_environment()
+    parent = multiprocessing.parent_process()
+
+    def follow() -> None:
+        if parent is not None:
+            parent.join()
+        os._exit(ExitCode.INTERNAL)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
 class DaskPoolExecutor:
     """dask's local scheduler on a pool of threads or of spawned processes."""
 
@@ -153,7 +168,13 @@ class DaskPoolExecutor:
         if self._processes:
             # a forked child deadlocks in zarr's event loop
             context = multiprocessing.get_context("spawn")
-            return ProcessPoolExecutor(self.workers, mp_context=context, initializer=prepare_environment)
+            try:
+                return ProcessPoolExecutor(self.workers, mp_context=context, initializer=_begin_worker)
+            except OSError as error:
+                raise ConfigError(
+                    f"compute.backend: processes need shared memory ({error.strerror}), such as a "
+                    "/dev/shm that can be written; use --backend threads"
+                ) from error
         return ThreadPoolExecutor(self.workers, thread_name_prefix="tile")
 
     def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
@@ -177,14 +198,25 @@ class DaskPoolExecutor:
             get = partial(get, chunksize=1, optimize_graph=False)
         else:
             from dask.threaded import get
-        with self._pool() as pool, Callback(posttask=posttask):
-            try:
+        others, wait = set(multiprocessing.active_children()), True
+        pool = self._pool()
+        try:
+            with Callback(posttask=posttask):
                 get(graph, list(graph), num_workers=self.workers, pool=pool)
-            except BrokenProcessPool as error:
-                raise IncompleteRunError(
-                    "a worker process died (killed, or out of memory); finished tiles are kept: run again to "
-                    "resume, with fewer --workers if memory was short"
-                ) from error
+        except BrokenProcessPool as error:
+            raise IncompleteRunError(
+                "a worker process died (killed, or out of memory); finished tiles are kept: run again to "
+                "resume, with fewer --workers if memory was short"
+            ) from error
+        except Exception:
+            raise
+        except BaseException:  # an interruption, which waits for nothing that was begun
+            wait = self._processes
+            for child in set(multiprocessing.active_children()) - others:
+                child.terminate()
+            raise
+        finally:
+            pool.shutdown(wait, cancel_futures=True)
 
     def close(self) -> None:
         """The pool lives only during :meth:`map`."""

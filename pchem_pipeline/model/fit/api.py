@@ -360,18 +360,20 @@ class _Batch:
         def fit(pixels: NDArray[np.intp], quick: bool) -> None:
             answers.parameters[pixels] = np.nan
             answers.covariance[pixels] = np.nan
-            tile_numba.fit_tile(
-                given,
-                pixels,
-                packed,
-                starts,
-                limits._replace(quick=quick),
-                evaluate,
-                engine.climb(),
-                search,
-                engine.regression_basis(),
-                answers,
-            )
+            # a few at a time: a signal is heard between kernels only
+            for some in np.array_split(pixels, pixels.size // 64 + 1):
+                tile_numba.fit_tile(
+                    given,
+                    some,
+                    packed,
+                    starts,
+                    limits._replace(quick=quick),
+                    evaluate,
+                    engine.climb(),
+                    search,
+                    engine.regression_basis(),
+                    answers,
+                )
 
         def leave_out(pixels: NDArray[np.intp], gone: FloatArray) -> NDArray[np.bool_]:
             changed = np.zeros(n, np.bool_)

@@ -73,7 +73,7 @@ def run(context: StageContext) -> None:
         StoreError: the store refuses.
     """
     sensor, (before, roi) = context.sensor, _start(context)
-    with context.reporter.phases(_STAGE) as tell:
+    with context.reporter.phases(_STAGE) as tell, context.stop.at_once():
         try:
             if sensor.kind == "frames":
                 _run_frames(context, before, roi, tell)

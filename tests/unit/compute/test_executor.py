@@ -1,8 +1,12 @@
 import contextlib
 import os
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
@@ -69,6 +73,79 @@ def test_a_dead_worker_process_is_one_clear_line():
     executor = make_executor(ComputeSettings(backend="processes", workers=1))
     with pytest.raises(IncompleteRunError, match="worker process died"):
         executor.map(die, [1], lambda item, outcome: None)
+
+
+class Interrupted(BaseException):
+    """As a signal raises it."""
+
+
+def note_and_sleep(folder):
+    (folder / f"{os.getpid()}-{threading.get_ident()}").touch()
+    time.sleep(10)
+
+
+def pids(folder, n):
+    """Return the processes that have begun to work, once there are so many."""
+    deadline = time.monotonic() + 60
+    while len(found := list(folder.glob("*-*"))) < n and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return [int(path.name.split("-")[0]) for path in found]
+
+
+def gone(pid):
+    """Return whether a process ends within some seconds."""
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            return True
+        if state == "Z":
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize("backend", ["threads", "processes"])
+def test_an_interruption_waits_for_nothing_that_was_begun(tmp_path, backend):
+    executor = make_executor(ComputeSettings(backend=backend, workers=2))
+
+    def on_alarm(number, frame):
+        if len(list(tmp_path.glob("*-*"))) == 2:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            raise Interrupted
+
+    before = signal.signal(signal.SIGALRM, on_alarm)
+    signal.setitimer(signal.ITIMER_REAL, 0.1, 0.1)
+    start = time.monotonic()
+    try:
+        with pytest.raises(Interrupted):
+            executor.map(note_and_sleep, [tmp_path] * 4, lambda item, outcome: None)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert time.monotonic() - start < 8
+    assert len(pids(tmp_path, 2)) == 2
+    assert backend == "threads" or all(gone(pid) for pid in pids(tmp_path, 2))
+
+
+def test_worker_processes_end_with_a_parent_that_is_killed(tmp_path):
+    code = (
+        "import sys; from pathlib import Path; sys.path[:] = eval(sys.argv[2])\n"
+        "from test_executor import note_and_sleep\n"
+        "from pchem_pipeline.compute.executor import make_executor\n"
+        "from pchem_pipeline.compute.settings import ComputeSettings\n"
+        "make_executor(ComputeSettings(backend='processes', workers=2)).map(\n"
+        "    note_and_sleep, [Path(sys.argv[1])] * 2, lambda item, outcome: None)"
+    )
+    paths = [str(Path(__file__).parent), *sys.path]
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path), repr(paths)], stderr=subprocess.DEVNULL
+    ) as parent:
+        workers = pids(tmp_path, 2)
+        parent.kill()
+    assert len(workers) == 2
+    assert all(gone(pid) for pid in workers)
 
 
 def test_no_scheduler_at_the_address():
