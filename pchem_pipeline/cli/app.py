@@ -469,8 +469,14 @@ def _without_stdout(error: OSError) -> NoReturn:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; ends the process with the exit codes of :class:`ExitCode`."""
-    from pchem_pipeline.compute.environment import prepare_environment
+    from pchem_pipeline.compute.environment import keep_standard_streams, prepare_environment
 
+    keep_standard_streams()
+    if sys.flags.optimize:
+        _fail(
+            "Python leaves out assertions, on which libraries rely; unset PYTHONOPTIMIZE, or leave out -O",
+            ExitCode.USAGE,
+        )
     prepare_environment()
     call: Any = app
     try:

@@ -30,6 +30,50 @@ def prepare_environment() -> None:
     os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder()))
 
 
+class Dispensable:
+    """A text stream that is not needed: where it cannot be written, it goes on as ``/dev/null``."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the stream itself has."""
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write a text, or lose it."""
+        try:
+            return int(self._stream.write(text))
+        except OSError:
+            self._give_up()
+            return len(text)
+
+    def flush(self) -> None:
+        """Hand on what was written, or lose it."""
+        try:
+            self._stream.flush()
+        except OSError:
+            self._give_up()
+
+    def _give_up(self) -> None:
+        # what is still in its buffer must go somewhere, too
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+
+
+def keep_standard_streams() -> None:
+    """Open those of the standard streams that are closed, and let standard error fail without harm.
+
+    Otherwise the next file that is opened becomes standard error, and gets what is meant for it.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    stream: Any = Dispensable(sys.stderr or os.fdopen(2, "w"))
+    sys.stderr = stream
+
+
 def available_workers() -> int:
     """Return how many processors this process may use: affinity and cgroup quota."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)

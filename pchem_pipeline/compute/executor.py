@@ -10,10 +10,9 @@ import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor as Pool
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from pchem_pipeline.base.errors import ConfigError, ExitCode, IncompleteRunError, PchEmError
@@ -154,8 +153,8 @@ def _begin_worker() -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
-class DaskPoolExecutor:
-    """dask's local scheduler on a pool of threads or of spawned processes."""
+class PoolExecutor:
+    """A pool of threads or of spawned processes."""
 
     memory_limit: int | None = None
 
@@ -183,26 +182,12 @@ class DaskPoolExecutor:
         Raises:
             IncompleteRunError: a worker process died.
         """
-        from dask.callbacks import Callback
-
-        todo: Sequence[T] = list(items)
-        # the item is bound inside the callable, where dask does not look for keys
-        graph = {("tile", number): (partial(guarded, function, item),) for number, item in enumerate(todo)}
-
-        def posttask(key: tuple[str, int], value: Outcome, *_: object) -> None:
-            on_result(todo[key[1]], value)
-
-        if self._processes:
-            from dask.multiprocessing import get
-
-            get = partial(get, chunksize=1, optimize_graph=False)
-        else:
-            from dask.threaded import get
         others, wait = set(multiprocessing.active_children()), True
         pool = self._pool()
         try:
-            with Callback(posttask=posttask):
-                get(graph, list(graph), num_workers=self.workers, pool=pool)
+            item_of = {pool.submit(guarded, function, item): item for item in items}
+            for future in as_completed(item_of):
+                on_result(item_of.pop(future), future.result())
         except BrokenProcessPool as error:
             raise IncompleteRunError(
                 "a worker process died (killed, or out of memory); finished tiles are kept: run again to "
@@ -239,9 +224,9 @@ def make_executor(settings: ComputeSettings, notices: Notices | None = None) -> 
         case "serial":
             return SerialExecutor()
         case "threads":
-            return DaskPoolExecutor(workers, processes=False)
+            return PoolExecutor(workers, processes=False)
         case "processes":
-            return DaskPoolExecutor(workers, processes=True)
+            return PoolExecutor(workers, processes=True)
         case "distributed":
             from pchem_pipeline.compute.cluster import DistributedExecutor
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import contextvars
 import json
+import os
 import sys
 import threading
 import time
@@ -103,7 +104,9 @@ class Reporter:
         self._compiled = 0.0
         if log is not None:
             try:
-                self._log = log.open("a", encoding="utf-8")
+                # a pipe that nobody reads is an error, not a wait
+                file = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK, 0o666)
+                self._log = os.fdopen(file, "a", encoding="utf-8")
             except OSError as error:
                 raise ConfigError(f"--log-json {log}: cannot be written ({error.strerror})") from error
 
