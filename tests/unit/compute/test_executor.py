@@ -15,6 +15,7 @@ from pchem_pipeline.compute.environment import available_workers, peak_rss_bytes
 from pchem_pipeline.compute.executor import Stop, beside, make_executor
 from pchem_pipeline.compute.memory import BASE_BYTES, affordable, keep_to_limit, resident_bytes
 from pchem_pipeline.compute.settings import ComputeSettings
+from pchem_pipeline.config.load import make_config
 
 BACKENDS = ["serial", "threads", "processes", "distributed"]
 
@@ -154,12 +155,51 @@ def test_no_scheduler_at_the_address():
         make_executor(settings)
 
 
-def test_cluster_class_that_does_not_exist():
+def test_a_cluster_whose_package_is_missing():
     settings = ComputeSettings.model_validate(
-        {"backend": "distributed", "cluster": {"class": "nowhere.Cluster"}}
+        {"backend": "distributed", "cluster": {"class": "dask_jobqueue.MoabCluster"}}
     )
-    with pytest.raises(ConfigError, match="cannot import nowhere"):
+    with pytest.raises(ConfigError, match="cannot import dask_jobqueue"):
         make_executor(settings)
+
+
+@pytest.mark.parametrize(
+    ("changes", "cure"),
+    [
+        ({"class": "this.x"}, "start another cluster yourself"),
+        ({"class": "distributed.deploy.cluster.Cluster"}, "start another cluster yourself"),
+        ({"kwargs": {"env": {"LD_PRELOAD": "/tmp/x.so"}}}, "your own configuration of dask"),
+        ({"kwargs": {"preload": "evil"}}, "your own configuration of dask"),
+        ({"kwargs": {"worker_class": "this.x"}}, "your own configuration of dask"),
+        ({"kwargs": {"queue": "day\ntouch here"}}, "only numbers and single words"),
+        ({"kwargs": {"memory": "1GB;touch here"}}, "only numbers and single words"),
+        ({"kwargs": {"memory": ["1GB"]}}, "only numbers and single words"),
+    ],
+)
+def test_a_cluster_is_named_and_sized_but_runs_nothing_of_the_yaml(changes, cure):
+    good = {"class": "distributed.LocalCluster", "kwargs": {"n_workers": 2, "memory_limit": "1.5GB"}}
+    content = {"input": {"files": ["a.npy"]}, "compute": {"backend": "distributed", "cluster": good}}
+    make_config(content, "other.yaml")
+    content["compute"]["cluster"] = {**good, **changes}
+    with pytest.raises(ConfigError, match=cure) as caught:
+        make_config(content, "other.yaml")
+    assert str(caught.value).startswith(f"other.yaml: compute.cluster.{next(iter(changes))}: ")
+
+
+def test_a_configuration_of_dask_that_is_malformed_is_one_line(tmp_path):
+    (tmp_path / "dask.yaml").write_text("a: [b")
+    code = (
+        "from pchem_pipeline.compute.executor import make_executor\n"
+        "from pchem_pipeline.compute.settings import ComputeSettings\n"
+        "make_executor(ComputeSettings(backend='threads', workers=2)).map(abs, [-1, 2], lambda *_: None)\n"
+        "make_executor(ComputeSettings(backend='distributed'))"
+    )
+    environment = {**os.environ, "DASK_CONFIG": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    last = found.stderr.strip().splitlines()[-1]
+    assert "ConfigError: compute.backend: distributed: A dask config file at" in last
+    assert str(tmp_path / "dask.yaml") in last
+    assert last.endswith("; correct that file")
 
 
 def test_zero_workers_are_refused():
