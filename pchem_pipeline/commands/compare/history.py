@@ -201,10 +201,16 @@ def history_csv(rows: Sequence[HistoryRow]) -> str:
     for row in rows:
         of_maps = [row.run.summary.get(name, (float("nan"),) * 3) for name in maps]
         writer.writerow(
-            [row.label, row.date, "" if row.temperature is None else f"{row.temperature:.6g}"]
-            + [row.run.name, row.run.n_frames or "", *row.run.pixels, row.hot_pixels]
+            [_cell(row.label), row.date, "" if row.temperature is None else f"{row.temperature:.6g}"]
+            + [_cell(row.run.name), row.run.n_frames or "", *row.run.pixels, row.hot_pixels]
             + ["" if value != value else f"{value:.9g}" for each in of_maps for value in each]
             + [row.moved.get(name, "") for name in moved]
             + [row.any_moved, row.compared, " ".join(row.effects), *(row.flags[name] for name in flags)]
         )
     return text.getvalue()
+
+
+def _cell(text: str) -> str:
+    """Return a text such that a spreadsheet takes it for no formula; a signed number with its unit stays."""
+    formula = text[:1] in tuple("=+-@\t\r") and re.fullmatch(r"[+-]?[\d.,]+( ?[\w°%]+)?", text) is None
+    return f"'{text}" if formula else text
