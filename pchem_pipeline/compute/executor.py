@@ -20,6 +20,7 @@ from pchem_pipeline.compute.environment import available_workers, prepare_enviro
 from pchem_pipeline.compute.settings import ComputeSettings
 
 T = TypeVar("T")
+_SPAWN = multiprocessing.get_context("spawn")  # a forked child deadlocks in zarr's event loop
 
 
 @dataclass(frozen=True)
@@ -140,6 +141,15 @@ class SerialExecutor:
         """Nothing to free."""
 
 
+def can_start_processes() -> bool:
+    """Return whether worker processes can be had: they need shared memory."""
+    try:
+        _SPAWN.Lock()
+    except OSError:
+        return False
+    return True
+
+
 def _begin_worker() -> None:
     """Prepare a worker process, which ends with its parent however that ends."""
     prepare_environment()
@@ -165,15 +175,12 @@ class PoolExecutor:
 
     def _pool(self) -> Pool:
         if self._processes:
-            # a forked child deadlocks in zarr's event loop
-            context = multiprocessing.get_context("spawn")
-            try:
-                return ProcessPoolExecutor(self.workers, mp_context=context, initializer=_begin_worker)
-            except OSError as error:
+            if not can_start_processes():
                 raise ConfigError(
-                    f"compute.backend: processes need shared memory ({error.strerror}), such as a "
-                    "/dev/shm that can be written; use --backend threads"
-                ) from error
+                    "compute.backend: processes need shared memory, and there is none (on Linux: /dev/shm is "
+                    "read-only or full); use --backend threads"
+                )
+            return ProcessPoolExecutor(self.workers, mp_context=_SPAWN, initializer=_begin_worker)
         return ThreadPoolExecutor(self.workers, thread_name_prefix="tile")
 
     def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:

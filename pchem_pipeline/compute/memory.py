@@ -17,7 +17,7 @@ from pchem_pipeline.compute.executor import Executor, PoolExecutor
 BASE_BYTES = 260 << 20
 #: the least that a command needs: a run of few pixels, to its report
 LEAST_BYTES = 300 << 20
-#: a second program beside it that compiles kernels
+#: a process beside it that draws
 SECOND_PROGRAM_BYTES = 400 << 20
 
 #: parameters of mallopt: heaps, the size from which memory comes from the system and goes back to it at once,
