@@ -449,11 +449,9 @@ def _root(
 
 def _fail(message: str, code: int) -> NoReturn:
     typer.echo(f"pchem: {' '.join(message.split())}", err=True)
-    if code in (ExitCode.SIGINT, ExitCode.SIGTERM) and not all(
-        each.daemon for each in threading.enumerate() if each is not threading.main_thread()
-    ):
-        sys.stdout.flush()
-        os._exit(code)  # nobody waits for what these threads have begun
+    if code in (ExitCode.SIGINT, ExitCode.SIGTERM):
+        if any(each.name.startswith("tile") for each in threading.enumerate()):
+            os._exit(code)  # nobody waits for what these threads have begun
     sys.exit(code)
 
 

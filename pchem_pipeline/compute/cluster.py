@@ -57,7 +57,7 @@ class DistributedExecutor:
                 f"compute.backend: distributed needs another library: {install_hint('cluster')}"
             ) from error
         except ValueError as error:
-            raise ConfigError(f"compute.backend: distributed: {error}; correct that file") from error
+            raise ConfigError(f"{error}; correct that file") from error
         self._cluster: Any = None
         try:
             if settings.scheduler is not None:

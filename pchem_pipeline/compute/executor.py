@@ -177,7 +177,7 @@ class PoolExecutor:
         if self._processes:
             if not can_start_processes():
                 raise ConfigError(
-                    "compute.backend: processes need shared memory, and there is none (on Linux: /dev/shm is "
+                    "worker processes need shared memory, and there is none (on Linux: /dev/shm is "
                     "read-only or full); use --backend threads"
                 )
             return ProcessPoolExecutor(self.workers, mp_context=_SPAWN, initializer=_begin_worker)

@@ -84,7 +84,9 @@ class Interrupted(BaseException):
 
 def note_and_sleep(folder):
     (folder / f"{os.getpid()}-{threading.get_ident()}").touch()
-    time.sleep(10)
+    deadline = time.monotonic() + 20
+    while not (folder / "end").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
 
 
 def pids(folder, n):
@@ -127,7 +129,11 @@ def test_an_interruption_waits_for_nothing_that_was_begun(tmp_path, backend):
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
-    assert time.monotonic() - start < 8
+    assert time.monotonic() - start < 15
+    (tmp_path / "end").touch()
+    for thread in threading.enumerate():
+        if thread.name.startswith("tile"):
+            thread.join()
     assert len(pids(tmp_path, 2)) == 2
     assert backend == "threads" or all(gone(pid) for pid in pids(tmp_path, 2))
 
@@ -209,7 +215,7 @@ def test_a_configuration_of_dask_that_is_malformed_is_one_line(tmp_path):
     environment = {**os.environ, "DASK_CONFIG": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
     found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     last = found.stderr.strip().splitlines()[-1]
-    assert "ConfigError: compute.backend: distributed: A dask config file at" in last
+    assert "ConfigError: A dask config file at" in last
     assert str(tmp_path / "dask.yaml") in last
     assert last.endswith("; correct that file")
 
