@@ -449,9 +449,9 @@ def _root(
 
 def _fail(message: str, code: int) -> NoReturn:
     typer.echo(f"pchem: {' '.join(message.split())}", err=True)
-    if code in (ExitCode.SIGINT, ExitCode.SIGTERM):
-        if any(each.name.startswith("tile") for each in threading.enumerate()):
-            os._exit(code)  # nobody waits for what these threads have begun
+    begun = any(each.name.startswith("tile") for each in threading.enumerate())
+    if begun and code in (ExitCode.SIGINT, ExitCode.SIGTERM):
+        os._exit(code)  # nobody waits for what these threads do
     sys.exit(code)
 
 
