@@ -184,6 +184,7 @@ def test_a_cluster_whose_package_is_missing():
 @pytest.mark.parametrize(
     ("changes", "cure"),
     [
+        ({"class": "subprocess.Popen"}, "start another cluster yourself"),
         ({"class": "this.x"}, "start another cluster yourself"),
         ({"class": "distributed.deploy.cluster.Cluster"}, "start another cluster yourself"),
         ({"kwargs": {"env": {"LD_PRELOAD": "/tmp/x.so"}}}, "your own configuration of dask"),
