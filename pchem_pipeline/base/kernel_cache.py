@@ -8,6 +8,7 @@ elsewhere, and after a change only the kernels that use the changed file are com
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import functools
 import hashlib
@@ -15,11 +16,12 @@ import importlib.util
 import os
 import pickle
 import re
+import shutil
+import stat
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,9 +35,7 @@ TIGHT_MEMORY = "PCHEM_TIGHT_MEMORY"
 Listener = Callable[[str, float | None], None]
 _listeners: list[Listener] = []
 
-
-_waiting = threading.local()  # of each thread `.no`: it does not wait for other processes
-
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _PATIENCE = 300  # seconds that another process may take for one kernel
 _IMPORT = re.compile(r"^(?:from ([\w.]+) import (\([^)]*\)|[^\n]*)|import ([\w.]+))", re.MULTILINE)
 
@@ -44,8 +44,9 @@ _IMPORT = re.compile(r"^(?:from ([\w.]+) import (\([^)]*\)|[^\n]*)|import ([\w.]
 def cache_folder() -> Path:
     """Return the folder of the compiled kernels.
 
-    ``NUMBA_CACHE_DIR`` where it is set, else in the user's cache folder, or in a temporary one where the home
-    is read-only.
+    ``NUMBA_CACHE_DIR`` where it is set, else in the user's cache folder. Where the home is read-only, in
+    the folder for temporary files: one that this user alone can write, or else a new one that ends with the
+    process.
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
@@ -53,14 +54,44 @@ def cache_folder() -> Path:
     from platformdirs import user_cache_path
 
     folder = user_cache_path("pchem_pipeline") / "kernels"
+    if is_writable(folder):
+        return folder
+    folder = Path(tempfile.gettempdir()) / f"pchem_pipeline-{os.getuid()}"
+    with contextlib.suppress(OSError):
+        folder.mkdir(mode=0o700, exist_ok=True)
+    try:
+        state = folder.lstat()
+        if stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & _OTHERS_WRITE:
+            return folder
+    except OSError:
+        pass
+    folder = Path(tempfile.mkdtemp(prefix="pchem_pipeline-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def is_writable(folder: Path) -> bool:
+    """Return whether files can be made in a folder, which is made where it does not exist."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            return folder
+            return True
     except OSError:
-        folder = Path(tempfile.gettempdir()) / f"pchem_pipeline-{os.getuid()}"
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        return folder
+        return False
+
+
+def _own_bytes(path: Path) -> bytes:
+    """Read a file that nobody could have written who could not change this program: pickles run code.
+
+    Raises:
+        OSError: it cannot be read, or belongs to somebody else, or others may write it.
+    """
+    with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+        state = os.fstat(file.fileno())
+        owners = (0, os.getuid(), Path(__file__).stat().st_uid)
+        if state.st_uid not in owners or state.st_mode & _OTHERS_WRITE or not stat.S_ISREG(state.st_mode):
+            raise PermissionError(f"{path} may be another user's")
+        return file.read()
 
 
 @functools.cache
@@ -99,34 +130,12 @@ def _imports(name: str, source: str) -> Iterator[str]:
 
 @contextlib.contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Tell somebody of each kernel that has to be compiled, here or by another process."""
+    """Call a function for each kernel that is compiled meanwhile, here or by another process."""
     _listeners.append(listener)
     try:
         yield
     finally:
         _listeners.remove(listener)
-
-
-class BeingCompiledError(Exception):
-    """Another process is compiling the kernel."""
-
-
-def in_any_order(compilations: Iterable[Callable[[], Any]]) -> None:
-    """Do what compiles kernels; those that another process is compiling meanwhile come last.
-
-    Processes that need the same kernels at the same time share the work so, instead of waiting in turns.
-    """
-    others: list[Callable[[], Any]] = []
-    for compilation in compilations:
-        _waiting.no = True
-        try:
-            compilation()
-        except BeingCompiledError:
-            others.append(compilation)
-        finally:
-            _waiting.no = False
-    for compilation in others:
-        compilation()
 
 
 def values_of_closure(function: Callable[..., Any]) -> tuple[str, ...]:
@@ -159,21 +168,15 @@ class KernelCache:
         """Return the kernel for some types, or None where the caller is to compile it.
 
         What another process is compiling is waited for.
-
-        Raises:
-            BeingCompiledError: another process is compiling it, and :func:`in_any_order` has others to do.
         """
         target_context.refresh()
         path = self._path(signature, target_context.codegen())
         found = self._read(path, target_context)
         if found is not None:
             return found
-        locked = self._lock(path, 0.0)
-        if not locked and getattr(_waiting, "no", False):
-            raise BeingCompiledError
         self._begun = time.monotonic()
         self._report(None)
-        if locked or self._lock(path, _PATIENCE):
+        if self._lock(path, _PATIENCE):
             found = self._read(path, target_context)
             if found is not None:
                 self._unlock(path)
@@ -206,7 +209,6 @@ class KernelCache:
         function = self._function
         code = function.__code__
         content = (
-            source_state(function.__module__),
             (function.__qualname__, code.co_firstlineno, code.co_code, code.co_names),
             values_of_closure(function),
             [_description(each) for each in getattr(signature, "args", signature)],
@@ -215,15 +217,24 @@ class KernelCache:
             (sys.version_info[:3], numba.__version__, llvmlite.__version__),
         )
         digest = hashlib.sha256(repr(content).encode()).hexdigest()[:32]
-        name = re.sub(r"\W+", "_", f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}")
-        return cache_folder() / f"{name}-{digest}.nbc"
+        return cache_folder() / f"{self._stem()}-{digest}.nbc"
+
+    def _stem(self) -> str:
+        """Return how the names of its files begin: the name of the kernel and the state of its source."""
+        module, name = self._function.__module__, self._function.__qualname__
+        words = re.sub(r"\W+", "_", f"{module.rpartition('.')[2]}.{name}")
+        return f"{words}-{source_state(module)[:32]}"
+
+    def is_filled(self) -> bool:
+        """Return whether the kernel was compiled before, for any types."""
+        return any(cache_folder().glob(f"{self._stem()}-*.nbc"))
 
     def _read(self, path: Path, target_context: Any) -> Any:
         """Return what a file holds; None where there is none, or a damaged one."""
         from numba.core.compiler import CompileResult
 
         try:
-            payload = pickle.loads(path.read_bytes())
+            payload = pickle.loads(_own_bytes(path))
         except (OSError, EOFError, pickle.UnpicklingError):
             return None
         return CompileResult._rebuild(target_context, *payload)

@@ -9,6 +9,7 @@ import contextlib
 import errno
 import os
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
@@ -448,6 +449,9 @@ def _root(
 
 def _fail(message: str, code: int) -> NoReturn:
     typer.echo(f"pchem: {' '.join(message.split())}", err=True)
+    begun = any(each.name.startswith("tile") for each in threading.enumerate())
+    if begun and code in (ExitCode.SIGINT, ExitCode.SIGTERM):
+        os._exit(code)  # nobody waits for what these threads do
     sys.exit(code)
 
 
@@ -463,8 +467,14 @@ def _without_stdout(error: OSError) -> NoReturn:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; ends the process with the exit codes of :class:`ExitCode`."""
-    from pchem_pipeline.compute.environment import prepare_environment
+    from pchem_pipeline.compute.environment import keep_standard_streams, prepare_environment
 
+    keep_standard_streams()
+    if sys.flags.optimize:
+        _fail(
+            "Python leaves out assertions, on which libraries rely; unset PYTHONOPTIMIZE, or leave out -O",
+            ExitCode.USAGE,
+        )
     prepare_environment()
     call: Any = app
     try:

@@ -92,6 +92,21 @@ class RunView:
             raise StoreError(f"{self.store.path} has no report yet; {cure}")
         if served_page(page.read_text(encoding="utf-8")) is None:
             raise StoreError(f"{page} is of an earlier version and has no inspector; {cure}")
+        if not self._is_current("report"):
+            raise StoreError(f"{self.store.path} is not finished, or older than its stages; {cure}")
+
+    def _is_current(self, stage: str) -> bool:
+        """Return whether a stage is finished, and rests on those before it as they are now."""
+        record = self.store.records.read(stage)
+        if record is None or not record.finished:
+            return False
+        for name, fingerprint in record.content.get("upstream", {}).items():
+            above = self.store.records.read(name)
+            if above is None or above.fingerprint != fingerprint.partition("+")[0]:
+                return False
+            if not self._is_current(name):
+                return False
+        return True
 
     def answer(self, method: str, target: str, headers: Mapping[str, str], port: int) -> Answer:
         """Answer one request.
@@ -105,6 +120,13 @@ class RunView:
         refusal = _refusal(method, target, headers, port)
         if refusal is not None:
             return refusal
+        if not self._is_current("report"):
+            return _busy()
+        answer = self._answer(target)
+        # what began meanwhile may have changed what was read
+        return answer if self._is_current("report") else _busy()
+
+    def _answer(self, target: str) -> Answer:
         url = urlsplit(target)
         try:
             if url.path in ("/", "/report.html"):
@@ -174,6 +196,8 @@ def _refusal(method: str, target: str, headers: Mapping[str, str], port: int) ->
         allowed = {"Allow": "GET, HEAD"}
         text = b"this server only shows; GET and HEAD are all it knows"
         return Answer(HTTPStatus.METHOD_NOT_ALLOWED, text, headers=allowed)
+    if not target.startswith("/"):
+        return _text(HTTPStatus.BAD_REQUEST, "ask for a path, such as /")
     hosts = {f"{name}:{port}" for name in (ADDRESS, "localhost")}
     if headers.get("host") not in hosts:
         return _text(HTTPStatus.FORBIDDEN, "this server answers to its own address only")
@@ -184,6 +208,11 @@ def _refusal(method: str, target: str, headers: Mapping[str, str], port: int) ->
     if foreign and target.startswith("/api/"):
         return _text(HTTPStatus.FORBIDDEN, "this server answers to its own pages only")
     return None
+
+
+def _busy() -> Answer:
+    text = b"the run is being done again, or its report is older than its stages; ask again later\n"
+    return Answer(HTTPStatus.SERVICE_UNAVAILABLE, text, headers={"Retry-After": "5"})
 
 
 def _text(status: HTTPStatus, text: str) -> Answer:
@@ -212,7 +241,10 @@ class _Handler(BaseHTTPRequestHandler):
     def _respond(self) -> None:
         headers = {name.lower(): value for name, value in self.headers.items()}
         assert isinstance(self.server, _Server)
-        answer = self.run_view.answer(self.command, self.path, headers, self.server.server_port)
+        if len(self.headers.get_all("host", [])) > 1:
+            answer = _text(HTTPStatus.BAD_REQUEST, "name one host")
+        else:
+            answer = self.run_view.answer(self.command, self.path, headers, self.server.server_port)
         self.send_response(answer.status)
         for name, value in {**_HEADERS, **answer.headers}.items():
             self.send_header(name, value)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+from pchem_pipeline.base.errors import one_line
 from pchem_pipeline.run.fingerprint import StageState
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.session import run_status
@@ -27,7 +28,7 @@ def rows(states: Sequence[StageState], progress: Mapping[str, Any] | None) -> li
         states: of the stages, in order.
         progress: what that command tells, or None.
     """
-    label = "" if progress is None else str(progress.get("stage", ""))
+    label = "" if progress is None else one_line(str(progress.get("stage", "")))
     running = label.partition(":")[0]
     lines = []
     for state in states:
@@ -44,12 +45,12 @@ def rows(states: Sequence[StageState], progress: Mapping[str, Any] | None) -> li
 
 def pace_words(progress: Mapping[str, Any]) -> str:
     """Return how far a command is, its rate and the time that remains, in words."""
-    label, done, total = str(progress.get("stage", "")), progress.get("done"), progress.get("total")
+    label, done, total = one_line(str(progress.get("stage", ""))), progress.get("done"), progress.get("total")
     part = label.partition(": ")[2]
     words = f"running{f' ({part})' if part else ''}"
     if done is None or total is None:
         return words
-    unit = str(progress.get("unit", "unit"))
+    unit = one_line(str(progress.get("unit", "unit")))
     words += f" {done} of {total} {unit}{'s' if unit.islower() else ''}"
     rate, remaining = progress.get("rate"), progress.get("remaining")
     if rate:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import platform
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -15,11 +16,10 @@ from pchem_pipeline.base.errors import (
     ConfigError,
     IncompleteRunError,
     MissingDependencyError,
-    PchEmError,
     install_hint,
 )
 from pchem_pipeline.compute.environment import prepare_environment
-from pchem_pipeline.compute.executor import Notices, OnResult, Outcome, Stop, guarded, out_of_memory
+from pchem_pipeline.compute.executor import Notices, OnResult, Outcome, guarded, out_of_memory
 from pchem_pipeline.compute.settings import ComputeSettings
 
 T = TypeVar("T")
@@ -27,11 +27,8 @@ T = TypeVar("T")
 #: libraries that decide the bits of a result, or that must understand each other
 _LIBRARIES = ("pchem-pipeline", "numpy", "scipy", "numba", "zarr", "distributed")
 
-#: seconds between looks for results, between looks at the workers while no result comes (at first, and at
-#: most where one is on its way), and without workers before it is said
-_POLL, _LOOK, _LONGEST, _SAY = 0.01, 1.0, 16.0, 5.0
-#: seconds without a heartbeat of a worker, while others have one, before it is said
-_SILENT = 30.0
+#: seconds between looks for results, between looks at the workers, and without workers before it is said
+_POLL, _LOOK, _SAY = 0.01, 1.0, 5.0
 #: share of a worker's memory above which dask gives it no more work
 _USABLE = 0.8
 
@@ -59,6 +56,8 @@ class DistributedExecutor:
             raise MissingDependencyError(
                 f"compute.backend: distributed needs another library: {install_hint('cluster')}"
             ) from error
+        except ValueError as error:
+            raise ConfigError(f"{error}; correct that file") from error
         self._cluster: Any = None
         try:
             if settings.scheduler is not None:
@@ -77,10 +76,13 @@ class DistributedExecutor:
                 f"compute.scheduler: no scheduler answers at {settings.scheduler} ({error}); "
                 "start one with: dask scheduler"
             ) from error
-        self._name = settings.scheduler or "of this run"
-        self._patience = _Patience(f"the dask scheduler {self._name}", settings.wait_for_workers, notices)
+        self._name = f"the dask scheduler {settings.scheduler or 'of this run'}"
+        self._seconds, self._notices = settings.wait_for_workers, notices
+        self._since: float | None = None
+        self._said = False
         try:
-            self._wait()
+            while not self._can_work():
+                time.sleep(0.1)
         except BaseException:
             self.close()
             raise
@@ -92,119 +94,29 @@ class DistributedExecutor:
     def _workers(self) -> list[dict[str, Any]]:
         return list(self._client.scheduler_info(n_workers=-1)["workers"].values())
 
-    def _wait(self) -> None:
-        """Wait until there is a worker."""
-        while not self._patience.look(self._workers()):
-            time.sleep(0.1)
-
-    def _completed(self, futures: Sequence[Any]) -> Iterator[Any]:
-        """Give futures as they end, with an eye on the workers while none does."""
-        from distributed import as_completed
-
-        pending = as_completed(futures)
-        looked = time.monotonic()
-        while not pending.is_empty():
-            if batch := pending.next_batch(block=False):
-                yield from batch
-            elif time.monotonic() - looked > _LOOK:
-                self._patience.look(self._workers())
-                looked = time.monotonic()
-            else:
-                time.sleep(_POLL)
-
-    def _outcome(self, future: Any) -> Outcome:
-        """Return what became of an item; it may die with the worker that has it, so look at the workers."""
-        patience = _LOOK
-        while True:
-            try:
-                return _outcome(future, patience)
-            except TimeoutError:
-                self._patience.look(self._workers())
-                patience = min(2 * patience, _LONGEST)
-
-    def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
-        """See :class:`Executor`.
-
-        Raises:
-            IncompleteRunError: the scheduler went away, or all workers did and none came back.
-            OtherVersionsError: a worker has other versions of the libraries.
-        """
-        todo = list(items)
-        try:
-            task = functools.partial(_alike, library_versions(), function)
-            futures = self._client.map(task, todo, pure=False)
-            item_of = {future.key: item for future, item in zip(futures, todo, strict=True)}
-            for future in self._completed(futures):
-                outcome = self._outcome(future)
-                if isinstance(outcome.error, OtherVersionsError):
-                    raise outcome.error
-                on_result(item_of[future.key], outcome)
-        except (Stop, PchEmError):
-            self._client.cancel(futures)
-            raise
-        except (OSError, CancelledError) as error:  # a lost connection, and what it makes of results
-            raise self._scheduler_is_gone() from error
-
-    def _scheduler_is_gone(self) -> IncompleteRunError:
-        return IncompleteRunError(
-            f"the dask scheduler {self._name} went away; finished tiles are kept: start it again, and run "
-            "the same command to go on"
-        )
-
-    def close(self) -> None:
-        """Leave the cluster, and end it if this run made it."""
-        self._client.close(timeout=5)
-        if self._cluster is not None:
-            self._cluster.close(timeout=30)
-
-
-class _Patience:
-    """Says once that no worker can work, and gives up after a while; says that a worker is silent."""
-
-    def __init__(self, name: str, seconds: float, notices: Notices) -> None:
-        self._name, self._seconds, self._notices = name, seconds, notices
-        self._since: float | None = None
-        self._said = False
-        self._silent = 0
-
-    def look(self, workers: Sequence[dict[str, Any]]) -> bool:
-        """Tell whether a worker can work now.
-
-        Args:
-            workers: what the scheduler tells of each, with ``status``, ``memory_limit`` (bytes) and
-                ``last_seen`` (s).
+    def _can_work(self) -> bool:
+        """Return whether a worker can work now; say once that none can.
 
         Raises:
             IncompleteRunError: none could for too long.
         """
-        self._tell_silent([each["last_seen"] for each in workers if "last_seen" in each])
+        workers = self._workers()
         if any(each["status"] == "running" for each in workers):
             self._since, self._said = None, False
             return True
         self._notices.check()
         now = time.monotonic()
         self._since = now if self._since is None else self._since
-        if now - self._since >= self._seconds:
-            raise IncompleteRunError(self._last_words(workers))
-        if not self._said and now - self._since >= min(_SAY, self._seconds / 2):
+        seconds, waited = self._seconds, now - self._since
+        if waited >= seconds:
+            raise IncompleteRunError(self._given_up(workers))
+        if not self._said and waited >= min(_SAY, seconds / 2):
             self._said = True
             why = f": all {len(workers)} are paused, their memory is nearly full" if workers else ""
             self._notices.say(f"waiting for workers of {self._name}{why}")
         return False
 
-    def _tell_silent(self, seen: Sequence[float]) -> None:
-        """Say how many workers gave no sign of life for long: dask waits for them, and so does the run."""
-        silent = sum(max(seen) - each > _SILENT for each in seen)
-        if silent > self._silent:
-            many, have = (f"{silent} workers", "have") if silent > 1 else ("a worker", "has")
-            self._notices.say(
-                f"{many} of {self._name} {have} given no sign of life for {_SILENT:g} s; dask gives the work "
-                "to others up to twice its distributed.scheduler.worker-ttl later (5 minutes unless it is "
-                "set), or at once if you kill it"
-            )
-        self._silent = silent
-
-    def _last_words(self, workers: Sequence[dict[str, Any]]) -> str:
+    def _given_up(self, workers: Sequence[dict[str, Any]]) -> str:
         waited = f"for {self._seconds:g} s (compute.wait_for_workers)"
         if workers:
             return (
@@ -215,6 +127,53 @@ class _Patience:
             f"{self._name} had no worker {waited}; finished tiles are kept: start some with dask worker, or "
             "raise that time, and run the same command to go on"
         )
+
+    def _completed(self, futures: Sequence[Any]) -> Iterator[tuple[Any, Outcome]]:
+        """Yield futures and what became of them as they end, with an eye on the workers while none does."""
+        from distributed import as_completed
+
+        pending, looked = as_completed(futures), time.monotonic()
+        while not pending.is_empty():
+            for future in pending.next_batch(block=False):
+                try:
+                    yield future, _outcome(future)
+                except TimeoutError:  # the worker that had the result is gone: it is done again
+                    pending.add(future)
+            if time.monotonic() - looked > _LOOK:
+                looked = time.monotonic()
+                self._can_work()
+            time.sleep(_POLL)
+
+    def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
+        """See :class:`Executor`.
+
+        Raises:
+            IncompleteRunError: the scheduler went away, or all workers did and none came back.
+            OtherVersionsError: a worker has other versions of the libraries.
+        """
+        todo, futures = list(items), []
+        try:
+            task = functools.partial(_alike, library_versions(), function)
+            futures = self._client.map(task, todo, pure=False)
+            item_of = {future.key: item for future, item in zip(futures, todo, strict=True)}
+            for future, outcome in self._completed(futures):
+                if isinstance(outcome.error, OtherVersionsError):
+                    raise outcome.error
+                on_result(item_of[future.key], outcome)
+        except (OSError, CancelledError) as error:  # a lost connection, and what it makes of results
+            raise IncompleteRunError(
+                f"{self._name} went away; finished tiles are kept: start it again, and run the same command "
+                "to go on"
+            ) from error
+        except BaseException:
+            self._client.cancel(futures)
+            raise
+
+    def close(self) -> None:
+        """Leave the cluster, and end it if this run made it."""
+        self._client.close(timeout=5)
+        if self._cluster is not None:
+            self._cluster.close(timeout=30)
 
 
 _MORE_MEMORY = (
@@ -239,21 +198,11 @@ def _address(scheduler: str) -> dict[str, str]:
 
 
 def _cluster_class(name: str) -> Any:
-    import importlib
-
-    from distributed.deploy.cluster import Cluster
-
     module, _, attribute = name.rpartition(".")
     try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
         raise ConfigError(f"compute.cluster.class: cannot import {name} ({error})") from error
-    # the YAML may be somebody else's: it must not call just anything
-    if not (isinstance(found, type) and issubclass(found, Cluster)):
-        raise ConfigError(
-            f"compute.cluster.class: {name} is no cluster of dask; name one, such as distributed.LocalCluster"
-        )
-    return found
 
 
 def library_versions() -> dict[str, str]:
@@ -286,13 +235,17 @@ def _differences(expected: tuple[tuple[str, str], ...]) -> str:
     return f"a worker on {platform.node()} has {', '.join(other)}; install the same versions on all machines"
 
 
-def _outcome(future: Any, seconds: float) -> Outcome:
-    """Return what became of an item, also where its workers died; wait some seconds for it."""
+def _outcome(future: Any) -> Outcome:
+    """Return what became of an item, also where its workers died.
+
+    Raises:
+        TimeoutError: it is not known, or no longer.
+    """
     if future.cancelled():
         raise CancelledError
-    error = future.exception(timeout=seconds)
+    error = future.exception(timeout=_LOOK)
     if error is None:
-        outcome: Outcome = future.result(timeout=seconds)
+        outcome: Outcome = future.result(timeout=_LOOK)
         return outcome
     if type(error).__name__ == "KilledWorker":
         return Outcome(error=IncompleteRunError(_killed(error)), trace=str(error))

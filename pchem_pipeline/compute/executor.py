@@ -5,20 +5,22 @@ from __future__ import annotations
 import contextlib
 import functools
 import multiprocessing
+import os
+import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor as Pool
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Protocol, TypeVar
 
-from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, PchEmError
+from pchem_pipeline.base.errors import ConfigError, ExitCode, IncompleteRunError, PchEmError
 from pchem_pipeline.compute.environment import available_workers, prepare_environment
 from pchem_pipeline.compute.settings import ComputeSettings
 
 T = TypeVar("T")
+_SPAWN = multiprocessing.get_context("spawn")  # a forked child deadlocks in zarr's event loop
 
 
 @dataclass(frozen=True)
@@ -139,8 +141,30 @@ class SerialExecutor:
         """Nothing to free."""
 
 
-class DaskPoolExecutor:
-    """dask's local scheduler on a pool of threads or of spawned processes."""
+def can_start_processes() -> bool:
+    """Return whether worker processes can be had: they need shared memory."""
+    try:
+        _SPAWN.Lock()
+    except OSError:
+        return False
+    return True
+
+
+def _begin_worker() -> None:
+    """Prepare a worker process, which ends with its parent however that ends."""
+    prepare_environment()
+    parent = multiprocessing.parent_process()
+
+    def follow() -> None:
+        if parent is not None:
+            parent.join()
+        os._exit(ExitCode.INTERNAL)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+class PoolExecutor:
+    """A pool of threads or of spawned processes."""
 
     memory_limit: int | None = None
 
@@ -151,9 +175,12 @@ class DaskPoolExecutor:
 
     def _pool(self) -> Pool:
         if self._processes:
-            # a forked child deadlocks in zarr's event loop
-            context = multiprocessing.get_context("spawn")
-            return ProcessPoolExecutor(self.workers, mp_context=context, initializer=prepare_environment)
+            if not can_start_processes():
+                raise ConfigError(
+                    "worker processes need shared memory, and there is none (on Linux: /dev/shm is "
+                    "read-only or full); use --backend threads"
+                )
+            return ProcessPoolExecutor(self.workers, mp_context=_SPAWN, initializer=_begin_worker)
         return ThreadPoolExecutor(self.workers, thread_name_prefix="tile")
 
     def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
@@ -162,29 +189,26 @@ class DaskPoolExecutor:
         Raises:
             IncompleteRunError: a worker process died.
         """
-        from dask.callbacks import Callback
-
-        todo: Sequence[T] = list(items)
-        # the item is bound inside the callable, where dask does not look for keys
-        graph = {("tile", number): (partial(guarded, function, item),) for number, item in enumerate(todo)}
-
-        def posttask(key: tuple[str, int], value: Outcome, *_: object) -> None:
-            on_result(todo[key[1]], value)
-
-        if self._processes:
-            from dask.multiprocessing import get
-
-            get = partial(get, chunksize=1, optimize_graph=False)
-        else:
-            from dask.threaded import get
-        with self._pool() as pool, Callback(posttask=posttask):
-            try:
-                get(graph, list(graph), num_workers=self.workers, pool=pool)
-            except BrokenProcessPool as error:
-                raise IncompleteRunError(
-                    "a worker process died (killed, or out of memory); finished tiles are kept: run again to "
-                    "resume, with fewer --workers if memory was short"
-                ) from error
+        others, wait = set(multiprocessing.active_children()), True
+        pool = self._pool()
+        try:
+            item_of = {pool.submit(guarded, function, item): item for item in items}
+            for future in as_completed(item_of):
+                on_result(item_of.pop(future), future.result())
+        except BrokenProcessPool as error:
+            raise IncompleteRunError(
+                "a worker process died (killed, or out of memory); finished tiles are kept: run again to "
+                "resume, with fewer --workers if memory was short"
+            ) from error
+        except Exception:
+            raise
+        except BaseException:  # an interruption, which waits for nothing that was begun
+            wait = self._processes
+            for child in set(multiprocessing.active_children()) - others:
+                child.terminate()
+            raise
+        finally:
+            pool.shutdown(wait, cancel_futures=True)
 
     def close(self) -> None:
         """The pool lives only during :meth:`map`."""
@@ -207,9 +231,9 @@ def make_executor(settings: ComputeSettings, notices: Notices | None = None) -> 
         case "serial":
             return SerialExecutor()
         case "threads":
-            return DaskPoolExecutor(workers, processes=False)
+            return PoolExecutor(workers, processes=False)
         case "processes":
-            return DaskPoolExecutor(workers, processes=True)
+            return PoolExecutor(workers, processes=True)
         case "distributed":
             from pchem_pipeline.compute.cluster import DistributedExecutor
 

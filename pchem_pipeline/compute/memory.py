@@ -11,13 +11,13 @@ from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.kernel_cache import TIGHT_MEMORY
-from pchem_pipeline.compute.executor import DaskPoolExecutor, Executor
+from pchem_pipeline.compute.executor import Executor, PoolExecutor
 
 #: the program with its libraries and compiled kernels
 BASE_BYTES = 260 << 20
 #: the least that a command needs: a run of few pixels, to its report
 LEAST_BYTES = 300 << 20
-#: a second program beside it that compiles kernels
+#: a process beside it that draws
 SECOND_PROGRAM_BYTES = 400 << 20
 
 #: parameters of mallopt: heaps, the size from which memory comes from the system and goes back to it at once,
@@ -91,7 +91,7 @@ def affordable(executor: Executor, limit: int, unit_bytes: int, what: str) -> Ex
         ConfigError: it is not enough for one.
     """
     here, each = resident_bytes() or BASE_BYTES, unit_bytes
-    if isinstance(executor, DaskPoolExecutor) and not executor.shares_memory:
+    if isinstance(executor, PoolExecutor) and not executor.shares_memory:
         each += BASE_BYTES
     enough = (limit - here) // max(each, 1)
     if enough < 1:
@@ -99,6 +99,6 @@ def affordable(executor: Executor, limit: int, unit_bytes: int, what: str) -> Ex
             f"{what} takes {-(-(here + each) >> 20)} MiB at least, compute.max_memory (--max-memory) allows "
             f"{limit >> 20}: raise it, and run the same command to go on"
         )
-    if isinstance(executor, DaskPoolExecutor) and enough < executor.workers:
-        return DaskPoolExecutor(enough, processes=not executor.shares_memory)
+    if isinstance(executor, PoolExecutor) and enough < executor.workers:
+        return PoolExecutor(enough, processes=not executor.shares_memory)
     return executor

@@ -62,10 +62,6 @@ class Stage:
         plan: ``"module:function"`` that takes (configuration, folder, stages to be done) and returns lines
             which say what the stage will take.
         status_words: array of status words that it writes; too many failed pixels end a command in an error.
-        compiled_ahead: compile its kernels in a second process while the stages before it run; it works on
-            ready-made histograms, or has ``kernels``.
-        kernels: ``"module:function"`` that takes the configuration and compiles its kernels; None: they are
-            compiled by doing the stage on invented histograms.
     """
 
     name: str
@@ -85,5 +81,3 @@ class Stage:
     single_pass: SinglePass | None = None
     plan: str | None = None
     status_words: str | None = None
-    compiled_ahead: bool = False
-    kernels: str | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import contextvars
 import json
+import os
 import sys
 import threading
 import time
@@ -100,10 +101,12 @@ class Reporter:
         self._log: TextIO | None = None
         self._lock, self._bar = threading.Lock(), threading.RLock()
         self._told = time.monotonic()
-        self._compiled, self._to_compile = 0.0, 0.0
+        self._compiled = 0.0
         if log is not None:
             try:
-                self._log = log.open("a", encoding="utf-8")
+                # a pipe that nobody reads is an error, not a wait
+                file = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK, 0o666)
+                self._log = os.fdopen(file, "a", encoding="utf-8")
             except OSError as error:
                 raise ConfigError(f"--log-json {log}: cannot be written ({error.strerror})") from error
 
@@ -131,14 +134,9 @@ class Reporter:
                 self._end_log()
                 self._line(f"warning: --log-json ends here: {error.strerror or error}")
 
-    def compiling(self, spent: float, left: float) -> None:
-        """Hear how long kernels were compiled so far, and about how long they will be: no work is done then.
-
-        Args:
-            spent: s, of this stage.
-            left: s; 0 where it is not known.
-        """
-        self._compiled, self._to_compile = spent, left
+    def compiling(self, spent: float) -> None:
+        """Take note of how long kernels were compiled so far in this stage, s: no work is done meanwhile."""
+        self._compiled = spent
 
     @contextmanager
     def phases(self, stage: str) -> Iterator[Callable[[str], None]]:
@@ -204,10 +202,6 @@ class Reporter:
                 last = self._told = time.monotonic()
                 worked = max(last - start - (self._compiled - compiled), 1e-3)
                 pace = paced(label, unit, _short(count), total, count - done, worked)
-                if pace["remaining"] is not None:
-                    pace["remaining"] = round(pace["remaining"] + self._to_compile, 3)
-                left = f"about {self._to_compile:.0f} s to compile" if self._to_compile > 1 else ""
-                bar.set_postfix_str(left, refresh=False)
                 self.event("progress", **pace)
                 if self._file is not None:
                     self._file.show(pace)

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: finish the running tiles, write their markers, and go."""
+"""Ctrl-C and SIGTERM: finish the running tiles, write their markers, and go; or go at once."""
 
 from __future__ import annotations
 
@@ -20,11 +20,40 @@ class InterruptedRunError(PchEmError):
         self.exit_code = ExitCode.SIGTERM if number == signal.SIGTERM else ExitCode.SIGINT
 
 
+class _Interrupted(BaseException):
+    """Ends what the main thread does; no error, so that nobody who guards against errors keeps it."""
+
+
 class StopRequest:
     """Remembers the signal that asked for a stop."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
+        self._at_once = False
+
+    def ask(self, number: int) -> None:
+        """Remember a signal; raise where the main thread does what may be left half done."""
+        self.signal = number
+        if self._at_once:
+            self._at_once = False
+            raise _Interrupted
+
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Let a signal end the block wherever the main thread is, also within a unit of work.
+
+        Raises:
+            InterruptedRunError: a signal arrived.
+        """
+        before = self._at_once
+        try:
+            self._at_once = True
+            self.check()
+            yield
+        except _Interrupted:
+            self.check()
+        finally:
+            self._at_once = before and self.signal is None
 
     def check(self) -> None:
         """Raise if a stop was asked for.
@@ -52,7 +81,7 @@ def stop_on_signals() -> Iterator[StopRequest]:
         if request.signal is not None:
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
-        request.signal = number
+        request.ask(number)
 
     heard = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
     old = {number: signal.signal(number, handle) for number in heard}

@@ -14,6 +14,7 @@ parallel units has one, ``WHOLE``, which is done in this process.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -358,7 +359,8 @@ class StageContext:
             turn = None if executor.shares_memory else take_turn(self.store.turn_file)
             marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, heard, turn)
             try:
-                executor.map(marked, todo, on_result)
+                with self.stop.at_once() if undivided else contextlib.nullcontext():
+                    executor.map(marked, todo, on_result)
             except Stop:
                 if fatal:
                     raise fatal[0] from fatal[0].__cause__

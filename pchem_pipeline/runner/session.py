@@ -12,7 +12,7 @@ from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, InputErr
 from pchem_pipeline.compute.executor import Notices, SerialExecutor, make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.config.load import dump_config
-from pchem_pipeline.run.compilation import announced, compilation_lines, compiled_ahead
+from pchem_pipeline.run.compilation import announced
 from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.run.fingerprint import StageState, status
 from pchem_pipeline.run.model_versions import keep_in_force, model_in_force
@@ -90,8 +90,7 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
     _bring_samples(target, stages, command)
     if command.options.dry_run:
         return _dry_run(target, stages, command)
-    ahead = [name for name in stages if STAGES[name].compiled_ahead]
-    with working_run(target, command) as context, compiled_ahead(context.config, ahead):
+    with working_run(target, command) as context:
         states = [_execute(name, context, stages) for name in stages]
         context.reporter.event("end", states={state.stage: state.words() for state in states})
         failed = [f"{state.stage}: {state.why}" for state in states if state.state == "failed"]
@@ -230,8 +229,7 @@ def _dry_run(target: Target, stages: Sequence[str], command: Command) -> list[St
         runs = _is_to_do(states, name, command)
         reporter.info(f"{name}: {state.words()}" + (" -> would run" if runs else " -> nothing to do"))
     todo = [name for name in stages if _is_to_do(states, name, command)]
-    ahead = [name for name in stages if STAGES[name].compiled_ahead]
-    for line in [*_plan(target, todo, command), *compilation_lines(target.config, todo, ahead)]:
+    for line in _plan(target, todo, command):
         reporter.info(line)
     return [states.get(name, StageState(name, "missing")) for name in stages]
 

@@ -97,7 +97,6 @@ _ALL = (
         run=f"{_HERE}.fit.fit:run",
         identity=f"{_HERE}.identities:fit_inputs",
         summary="Fit H, g, mu and sigma of every pixel by PCH-EM.",
-        compiled_ahead=True,
         status_words="fit/fit_status",
     ),
     Stage(
@@ -121,7 +120,6 @@ _ALL = (
         run=f"{_HERE}.ensemble.ensemble:run",
         summary="Predict the ensemble from the maps; compare with the data.",
         may_write_nothing=True,
-        compiled_ahead=True,
     ),
     Stage(
         "report",
@@ -156,8 +154,6 @@ _ALL = (
         identity=f"{_HERE}.identities:search_start",
         on_demand=True,
         may_write_nothing=True,
-        compiled_ahead=True,
-        kernels=f"{_HERE}.discrepancy.discrepancy:compile_kernels",
     ),
     Stage(
         "methods",

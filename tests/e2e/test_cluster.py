@@ -203,43 +203,6 @@ def test_workers_that_all_leave_are_waited_for_and_given_up(processes, tmp_path)
     assert len(heard.lines) == 1
 
 
-def test_a_worker_that_hangs_is_said_and_may_be_killed(processes, tmp_path, monkeypatch):
-    file, (_, worker, _) = processes
-    monkeypatch.setattr(cluster, "_SILENT", 4.0)
-    heard, found = Counted(), []
-    executor = make_executor(
-        ComputeSettings(backend="distributed", scheduler=str(file)), Notices(heard.lines.append, heard.check)
-    )
-    executor._client.wait_for_workers(2, timeout=60)
-
-    def on_result(number, outcome):
-        found.append(number)
-        if len(found) == 3:
-            worker.send_signal(signal.SIGSTOP)
-
-    def say(line):
-        heard.lines.append(line)
-        worker.kill()  # as the line says
-
-    executor._patience._notices = Notices(say, heard.check)
-    try:
-        executor.map(functools.partial(slow_square, tmp_path), range(20), on_result)
-    finally:
-        executor.close()
-    assert sorted(found) == list(range(20))
-    (line,) = heard.lines
-    assert line.startswith(f"a worker of the dask scheduler {file} has given no sign of life for 4 s; ")
-
-
-def test_silent_workers_are_counted():
-    lines = []
-    patience = cluster._Patience("the dask scheduler x", 60.0, Notices(lines.append))
-    for silent in (0, 1, 1, 2, 0, 1):
-        seen = [1000.0, *([900.0] * silent), *([990.0] * (3 - silent))]
-        assert patience.look([{"status": "running", "memory_limit": 0, "last_seen": each} for each in seen])
-    assert [line.partition(" of the ")[0] for line in lines] == ["a worker", "2 workers", "a worker"]
-
-
 def test_a_signal_ends_the_wait_for_workers(processes):
     file, (_, *workers) = processes
     for worker in workers:
@@ -253,18 +216,22 @@ def test_a_signal_ends_the_wait_for_workers(processes):
         make_executor(ComputeSettings(backend="distributed", scheduler=str(file)), Notices(check=check))
 
 
-def test_paused_workers_are_not_waited_for_forever():
+def test_paused_workers_are_not_waited_for_forever(monkeypatch):
     lines = []
-    patience = cluster._Patience("the dask scheduler x", 0.05, Notices(lines.append))
+    executor = cluster.DistributedExecutor.__new__(cluster.DistributedExecutor)
+    executor._name, executor._seconds, executor._notices = "the dask scheduler x", 0.05, Notices(lines.append)
+    executor._since, executor._said = None, False
     workers = [{"status": "paused", "memory_limit": 300 << 20}] * 2
-    assert not patience.look(workers)
+    monkeypatch.setattr(executor, "_workers", lambda: workers)
+    assert not executor._can_work()
     time.sleep(0.03)
-    assert not patience.look(workers)
+    assert not executor._can_work()
     time.sleep(0.03)
     with pytest.raises(IncompleteRunError, match="all 2 workers were paused") as caught:
-        patience.look(workers)
+        executor._can_work()
     assert "300 MiB" in str(caught.value)
     assert lines == [
         "waiting for workers of the dask scheduler x: all 2 are paused, their memory is nearly full"
     ]
-    assert patience.look([*workers, {"status": "running", "memory_limit": 0}])
+    workers.append({"status": "running", "memory_limit": 0})
+    assert executor._can_work()

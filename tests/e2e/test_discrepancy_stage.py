@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import time
 
 import numpy as np
@@ -153,8 +154,8 @@ def test_an_effect_that_the_model_has_is_not_added_twice(searched, fitted, tmp_p
     assert (tmp_path / "run.yaml").read_text() == text
 
 
-@pytest.mark.parametrize("moment", [0.8, 2.0])
-def test_a_killed_search_goes_on_to_the_same_verdict(searched, fitted, tmp_path, moment):
+@pytest.mark.parametrize(("moment", "number"), [(0.8, signal.SIGTERM), (2.0, signal.SIGKILL)])
+def test_a_killed_search_goes_on_to_the_same_verdict(searched, fitted, tmp_path, moment, number):
     shell, _, _ = searched
     other = copy_of(fitted, tmp_path)
     with other.start("discrepancy", "run.yaml", "--no-refit") as process:
@@ -162,7 +163,8 @@ def test_a_killed_search_goes_on_to_the_same_verdict(searched, fitted, tmp_path,
         wanted = int(12 * moment)
         while process.poll() is None and len(list(markers.glob("*/*"))) < wanted:
             time.sleep(0.02)
-        process.kill()
+        process.send_signal(number)
+        assert process.wait(20) == (143 if number == signal.SIGTERM else -number)  # clusters wait for 30 s
     assert not (tmp_path / "run.zarr" / "discrepancy.json").exists()
     other.ok("discrepancy", "run.yaml", "--no-refit")
     assert verdict(other) == verdict(shell)

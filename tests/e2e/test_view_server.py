@@ -6,9 +6,11 @@ import base64
 import hashlib
 import http.client
 import json
+import shutil
 import signal
 import socket
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -186,6 +188,46 @@ def test_a_port_scanner_stops_nothing(client):
     for connection in held:
         connection.close()
     assert client.ask("GET", "/api/pixel?y=3&x=4")[0] == 200
+
+
+@pytest.mark.parametrize(
+    ("target", "hosts"),
+    [
+        ("http://[::1", 1),
+        ("http://127.0.0.1:PORT/api/pixel?y=0&x=0", 1),
+        ("http://evil.example/api/pixel?y=0&x=0", 1),
+        ("api/pixel?y=0&x=0", 1),
+        ("*", 1),
+        ("/", 2),
+    ],
+)
+def test_malformed_requests_are_said(client, target, hosts):
+    request = f"GET {target} HTTP/1.1\r\n" + "Host: 127.0.0.1:PORT\r\n" * hosts
+    request += "Sec-Fetch-Site: cross-site\r\nConnection: close\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", client.port), timeout=5) as connection:
+        connection.sendall(request.replace("PORT", str(client.port)).encode())
+        assert connection.makefile("rb").readline().split()[1] == b"400"
+
+
+def test_a_run_that_is_done_again_is_not_shown(finished, tmp_path):
+    store = RunStore.open(shutil.copytree(finished, tmp_path / "run.zarr"), writable=True)
+    server, _ = make_server(store.path)
+    with server:
+        view, port = server.RequestHandlerClass.run_view, server.server_port
+
+        def status():
+            asked = ("/", "/report.json", "/api/pixel?y=0&x=0", "/api/map?path=maps/bias")
+            return {view.answer("GET", each, {"host": f"localhost:{port}"}, port).status for each in asked}
+
+        assert status() == {200}
+        fit = store.records.read("fit")
+        for changed in (replace(fit, finished=False), replace(fit, fingerprint="another")):
+            store.records.write(changed)
+            assert status() == {503}
+            with pytest.raises(StoreError, match="is not finished, or older than its stages; run: pchem rep"):
+                make_server(store.path)
+        store.records.write(fit)
+        assert status() == {200}
 
 
 def test_nothing_is_written(client, finished):

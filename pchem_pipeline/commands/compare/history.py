@@ -199,10 +199,10 @@ def history_csv(rows: Sequence[HistoryRow]) -> str:
 
 def _csv_line(row: HistoryRow, maps: Sequence[str], moved: Sequence[str]) -> dict[str, object]:
     found: dict[str, object] = {
-        "label": row.label,
+        "label": _cell(row.label),
         "date": row.date,
         "temperature": "" if row.temperature is None else f"{row.temperature:.6g}",
-        "run": row.run.name,
+        "run": _cell(row.run.name),
         "frames": row.run.n_frames or "",
     }
     found |= dict(zip(("pixels_good", "pixels_caution", "pixels_no_value"), row.run.pixels, strict=True))
@@ -220,3 +220,9 @@ def _csv_line(row: HistoryRow, maps: Sequence[str], moved: Sequence[str]) -> dic
         "effects": " ".join(row.effects),
     }
     return found | {f"flag_{name}": n for name, n in row.flags.items()}
+
+
+def _cell(text: str) -> str:
+    """Return a text such that a spreadsheet takes it for no formula; a signed number with its unit stays."""
+    formula = text[:1] in tuple("=+-@\t\r") and re.fullmatch(r"[+-]?[\d.,]+( ?[\w°%]+)?", text) is None
+    return f"'{text}" if formula else text

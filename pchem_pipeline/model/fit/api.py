@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
@@ -357,25 +356,26 @@ class _Batch:
         answers = self._answers(n)
         packed = pack(laws, n)
         cells = limits.cells
-        engine.compile_fit(numba.typeof(given), cells)
         evaluate = cells_likelihood() if cells else density_likelihood()
         search = engine.cells_search() if cells else engine.density_search()
 
         def fit(pixels: NDArray[np.intp], quick: bool) -> None:
             answers.parameters[pixels] = np.nan
             answers.covariance[pixels] = np.nan
-            tile_numba.fit_tile(
-                given,
-                pixels,
-                packed,
-                starts,
-                limits._replace(quick=quick),
-                evaluate,
-                engine.climb(),
-                search,
-                engine.regression_basis(),
-                answers,
-            )
+            # a few at a time: a signal is heard between kernels only
+            for some in np.array_split(pixels, pixels.size // 256 + 1):
+                tile_numba.fit_tile(
+                    given,
+                    some,
+                    packed,
+                    starts,
+                    limits._replace(quick=quick),
+                    evaluate,
+                    engine.climb(),
+                    search,
+                    engine.regression_basis(),
+                    answers,
+                )
 
         def leave_out(pixels: NDArray[np.intp], gone: FloatArray) -> NDArray[np.bool_]:
             changed = np.zeros(n, np.bool_)

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from pchem_pipeline.base.errors import PchEmError, StoreError, error_words, quoted
-from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.by_likelihood.explainer import find_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.observed import SampleHistograms
 from pchem_pipeline.discrepancy.by_simulation.elsewhere import deviation
@@ -23,7 +22,6 @@ from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFra
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Replicate
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.effort import Effort
-from pchem_pipeline.discrepancy.observe.compilation import compile_observation
 from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
@@ -34,7 +32,6 @@ from pchem_pipeline.model.histogram.odd_frames import frame_words
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
-from pchem_pipeline.simulate.chain import dn_dtype
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
 from pchem_pipeline.stages.discrepancy.clear import fewer_samples
 from pchem_pipeline.stages.discrepancy.survey import Survey, mean_codes, survey
@@ -51,12 +48,6 @@ _STAGE = "discrepancy"
 #: Settings that the memory, or a clear disagreement, may lower.
 _TAKEN = ("max_samples", "max_pixels", "replicates", "extended_replicates")
 _USUAL_CODES = 128.0  # of the law of a pixel, where there are no histograms yet
-
-
-def compile_kernels(config: RunConfig) -> None:
-    """Compile what the search in frames calls; that in histograms alone calls little else than a fit."""
-    if not config.input.samples:
-        compile_observation(dn_dtype(config.input.bit_depth or 16))
 
 
 @dataclass(frozen=True)
@@ -84,7 +75,7 @@ def run(context: StageContext) -> None:
         StoreError: the store refuses.
     """
     sensor, (before, roi) = context.sensor, _start(context)
-    with context.reporter.phases(_STAGE) as tell:
+    with context.reporter.phases(_STAGE) as tell, context.stop.at_once():
         try:
             if sensor.kind == "frames":
                 _run_frames(context, before, roi, tell)
@@ -99,7 +90,6 @@ def _run_frames(
 ) -> None:
     source = open_source(context)
     block_length(source.shape[0], context.config.discrepancy.block_frames)
-    compile_observation(source.dtype)
     settings, seen, whole = _surveyed(context, source, before, roi, tell)
     search = _Search(context, source, before, roi, seen, tell)
     window, found = search.found(settings, "")

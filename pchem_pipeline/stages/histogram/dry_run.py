@@ -15,9 +15,7 @@ from pchem_pipeline.config.memory import allowed_bytes, band_bytes, worker_count
 from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, SummaryAccumulator, line_sums
-from pchem_pipeline.run.compilation import mark_path
 from pchem_pipeline.stages.histogram.memory import single_pass_bytes
-from pchem_pipeline.stages.table import STAGES, pipeline_of
 from pchem_pipeline.store.tiles import tile_grid, tile_shape
 
 if TYPE_CHECKING:
@@ -125,9 +123,7 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     ensemble = n if config.ensemble.frames == "all" else min(config.ensemble.frames, n)
     again = ensemble / n + (0 if single_pass else 1 + first)
     copies = config.input.mode == "copy"
-    ahead = [name for name in pipeline_of(config) if STAGES[name].compiled_ahead]
-    compiled = mark_path(config, ahead).exists()
-    counting, fitting = _speeds(config, sample, bins, n) if compiled else _USUAL_SPEEDS
+    counting, fitting = _speeds(config, sample, bins, n)
     samples = n * ny * nx
     seconds = max(samples * reading, samples * (reading + counting) / workers)
     seconds += (fitting * ny * nx + _REST_SECONDS + _REST_PIXEL_SECONDS * ny * nx) / workers
@@ -176,8 +172,12 @@ def _first_frames(config: RunConfig, frames: FrameReader) -> tuple[int, float, N
 
 def _speeds(config: RunConfig, frames: NDArray[Any], bins: int, n_frames: int) -> tuple[float, float]:
     """Return the seconds to count a sample, and to fit a pixel, both on one processor, tried on some rows."""
+    from pchem_pipeline.base.kernel import is_compiled
     from pchem_pipeline.model.fit.api import fit_histograms
+    from pchem_pipeline.model.fit.tile_numba import fit_tile
 
+    if not is_compiled(fit_tile):
+        return _USUAL_SPEEDS
     shape = (frames.shape[1], frames.shape[2])
     histograms = HistogramAccumulator(shape, bins, n_frames)
     summaries = SummaryAccumulator(shape, config.histogram.block_length(n_frames))

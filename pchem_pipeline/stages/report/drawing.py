@@ -6,8 +6,13 @@ import functools
 from collections.abc import Mapping, Sequence
 
 from pchem_pipeline.compute.environment import available_workers
-from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor
-from pchem_pipeline.compute.fresh_processes import FreshProcessExecutor
+from pchem_pipeline.compute.executor import (
+    Executor,
+    Outcome,
+    PoolExecutor,
+    SerialExecutor,
+    can_start_processes,
+)
 from pchem_pipeline.compute.memory import BASE_BYTES, SECOND_PROGRAM_BYTES
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.report.figures.figure import Figure
@@ -17,9 +22,10 @@ from pchem_pipeline.run.progress import Reporter
 
 
 def drawing_executor(workers: int, n_figures: int) -> Executor:
-    """Return who draws: processes, since drawing shares its settings within one; here, if one is enough."""
+    """Return who draws: processes, since drawing shares its settings within one; or this one alone."""
     count = min(workers, available_workers(), n_figures)
-    return FreshProcessExecutor(count) if count > 1 else SerialExecutor()
+    several = count > 1 and can_start_processes()
+    return PoolExecutor(count, processes=True) if several else SerialExecutor()
 
 
 def drawing_workers(wanted: int | None, settings: ComputeSettings) -> int:

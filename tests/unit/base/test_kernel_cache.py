@@ -6,15 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
-from filelock import FileLock
 
 import pchem_pipeline
 from pchem_pipeline.base import kernel_cache
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.base.kernel_cache import TIGHT_MEMORY, in_any_order, listening
+from pchem_pipeline.base.kernel_cache import TIGHT_MEMORY, listening
 from pchem_pipeline.model.electrons import electrons_numba
 
 INNER = """
@@ -113,26 +111,19 @@ def test_a_kernel_is_compiled_by_one_of_two_processes(sample):
     assert len(list((sample.parents[1] / "cache").iterdir())) == 3  # no locks are left
 
 
-def test_what_another_process_compiles_comes_last_in_a_list(tmp_path, monkeypatch):
-    @kernel
-    def cubed(x):
-        return x * x * x
-
-    @kernel
-    def squared(x):
-        return x * x
-
-    monkeypatch.setattr(kernel_cache, "cache_folder", lambda: tmp_path)
-    types = (numba.int64,)
-    path = cubed._cache._path(types, cubed.targetctx.codegen())
-    other = FileLock(path.with_suffix(".lock"))
-    other.acquire()
-    begun = []
-    with listening(lambda name, seconds: begun.append(name) if seconds is None else None):
-        in_any_order([lambda: cubed.compile(types), lambda: squared.compile(types), other.release])
-    assert begun == ["squared", "cubed"]
-    assert (cubed(3), squared(3), gc.isenabled()) == (27, 9, True)
-    assert len(list(tmp_path.glob("*.nbc"))) == 2
+def test_files_that_another_user_may_have_written_are_not_read(sample):
+    assert end(start(sample, "squared")) == "[8, 9] 2"
+    cache = sample.parents[1] / "cache"
+    [doubled], [squared] = (list(cache.glob(f"*{name}*.nbc")) for name in ("doubled", "raised"))
+    doubled.chmod(0o666)
+    squared.rename(cache / "elsewhere")
+    squared.symlink_to(cache / "elsewhere")
+    assert end(start(sample, "squared")) == "[8, 9] 2"
+    assert not squared.is_symlink()
+    assert end(start(sample, "squared")) == "[8, 9] 0"
+    if os.getuid() == 0:  # nobody else may give files away
+        os.chown(doubled, 4321, -1)
+        assert end(start(sample, "squared")) == "[8, 9] 1"
 
 
 @pytest.mark.parametrize("tight", [False, True])

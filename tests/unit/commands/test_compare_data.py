@@ -1,6 +1,12 @@
-"""Which runs come from the same frames."""
+"""Which runs come from the same frames, and what their history says."""
+
+import csv
+
+import numpy as np
 
 from pchem_pipeline.commands.compare.compare import _data_digest
+from pchem_pipeline.commands.compare.history import history_csv
+from pchem_pipeline.report.comparison import HistoryRow, RunFacts
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
@@ -15,3 +21,12 @@ def test_another_dataset_of_the_same_file_holds_other_frames(tmp_path):
         store.records.write(StageRecord("ingest", 1, "f", content, finished=True))
         digests.append(_data_digest(store, sensor))
     assert digests[0] == digests[1] != digests[2]
+
+
+def test_labels_are_no_formulas_of_a_spreadsheet():
+    labels = ["=1+1", "@SUM(A1)", "-2+cmd|'/C x'!A0", "+1 V (high)", "-20 °C", "-5.5", "night 3"]
+    run = RunFacts("A", "=x.zarr", (8, 8), 9, "", summary={})
+    rows = [HistoryRow(label, "", None, np.nan, run) for label in labels]
+    cells = [line[0] for line in csv.reader(history_csv(rows).splitlines()[1:])]
+    assert cells == ["'=1+1", "'@SUM(A1)", "'-2+cmd|'/C x'!A0", "'+1 V (high)", *labels[4:]]
+    assert {line["run"] for line in csv.DictReader(history_csv(rows).splitlines())} == {"'=x.zarr"}

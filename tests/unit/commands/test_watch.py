@@ -87,3 +87,8 @@ def test_the_command_looks_once_unless_asked(looks: list[float], monkeypatch: py
     assert result.stdout.splitlines() == rows([DONE, PART], PACE)
     result = CliRunner().invoke(app.app, ["status", "run.yaml", "--json"], catch_exceptions=False)
     assert json.loads(result.stdout)["progress"]["done"] == 16
+
+
+def test_codes_of_a_terminal_are_not_handed_on():
+    progress = {"stage": "fit: \x1b[2Jgone", "done": 1, "total": 2, "unit": "\x1b[31mtile"}
+    assert "\x1b" not in "".join(rows([StageState("fit", "partial")], progress))

@@ -1,16 +1,23 @@
 import contextlib
 import os
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
+from pchem_pipeline.compute import executor as executor_module
 from pchem_pipeline.compute.environment import available_workers, peak_rss_bytes
-from pchem_pipeline.compute.executor import Stop, beside, make_executor
+from pchem_pipeline.compute.executor import SerialExecutor, Stop, beside, make_executor
 from pchem_pipeline.compute.memory import BASE_BYTES, affordable, keep_to_limit, resident_bytes
 from pchem_pipeline.compute.settings import ComputeSettings
+from pchem_pipeline.config.load import make_config
+from pchem_pipeline.stages.report.drawing import drawing_executor
 
 BACKENDS = ["serial", "threads", "processes", "distributed"]
 
@@ -71,18 +78,147 @@ def test_a_dead_worker_process_is_one_clear_line():
         executor.map(die, [1], lambda item, outcome: None)
 
 
+class Interrupted(BaseException):
+    """As a signal raises it."""
+
+
+def note_and_sleep(folder):
+    (folder / f"{os.getpid()}-{threading.get_ident()}").touch()
+    deadline = time.monotonic() + 20
+    while not (folder / "end").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+
+
+def pids(folder, n):
+    """Return the processes that have begun to work, once there are so many."""
+    deadline = time.monotonic() + 60
+    while len(found := list(folder.glob("*-*"))) < n and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return [int(path.name.split("-")[0]) for path in found]
+
+
+def gone(pid):
+    """Return whether a process ends within some seconds."""
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            return True
+        if state == "Z":
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize("backend", ["threads", "processes"])
+def test_an_interruption_waits_for_nothing_that_was_begun(tmp_path, backend):
+    executor = make_executor(ComputeSettings(backend=backend, workers=2))
+
+    def on_alarm(number, frame):
+        if len(list(tmp_path.glob("*-*"))) == 2:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            raise Interrupted
+
+    before = signal.signal(signal.SIGALRM, on_alarm)
+    signal.setitimer(signal.ITIMER_REAL, 0.1, 0.1)
+    start = time.monotonic()
+    try:
+        with pytest.raises(Interrupted):
+            executor.map(note_and_sleep, [tmp_path] * 4, lambda item, outcome: None)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert time.monotonic() - start < 15
+    (tmp_path / "end").touch()
+    for thread in threading.enumerate():
+        if thread.name.startswith("tile"):
+            thread.join()
+    assert len(pids(tmp_path, 2)) == 2
+    assert backend == "threads" or all(gone(pid) for pid in pids(tmp_path, 2))
+
+
+def test_worker_processes_end_with_a_parent_that_is_killed(tmp_path):
+    code = (
+        "import sys; from pathlib import Path; sys.path[:] = eval(sys.argv[2])\n"
+        "from test_executor import note_and_sleep\n"
+        "from pchem_pipeline.compute.executor import make_executor\n"
+        "from pchem_pipeline.compute.settings import ComputeSettings\n"
+        "make_executor(ComputeSettings(backend='processes', workers=2)).map(\n"
+        "    note_and_sleep, [Path(sys.argv[1])] * 2, lambda item, outcome: None)"
+    )
+    paths = [str(Path(__file__).parent), *sys.path]
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path), repr(paths)], stderr=subprocess.DEVNULL
+    ) as parent:
+        workers = pids(tmp_path, 2)
+        parent.kill()
+    assert len(workers) == 2
+    assert all(gone(pid) for pid in workers)
+
+
+def test_without_shared_memory_there_are_no_worker_processes(monkeypatch):
+    def lock():
+        raise PermissionError
+
+    monkeypatch.setattr(executor_module._SPAWN, "Lock", lock)
+    with pytest.raises(ConfigError, match="use --backend threads"):
+        make_executor(ComputeSettings(backend="processes", workers=2)).map(abs, [1], lambda *_: None)
+    assert isinstance(drawing_executor(2, 9), SerialExecutor)
+
+
 def test_no_scheduler_at_the_address():
     settings = ComputeSettings(backend="distributed", scheduler="no/such/file.json")
     with pytest.raises(ConfigError, match="no scheduler answers"):
         make_executor(settings)
 
 
-def test_cluster_class_that_does_not_exist():
+def test_a_cluster_whose_package_is_missing():
     settings = ComputeSettings.model_validate(
-        {"backend": "distributed", "cluster": {"class": "nowhere.Cluster"}}
+        {"backend": "distributed", "cluster": {"class": "dask_jobqueue.MoabCluster"}}
     )
-    with pytest.raises(ConfigError, match="cannot import nowhere"):
+    with pytest.raises(ConfigError, match="cannot import dask_jobqueue"):
         make_executor(settings)
+
+
+@pytest.mark.parametrize(
+    ("changes", "cure"),
+    [
+        ({"class": "subprocess.Popen"}, "start another cluster yourself"),
+        ({"class": "this.x"}, "start another cluster yourself"),
+        ({"class": "distributed.deploy.cluster.Cluster"}, "start another cluster yourself"),
+        ({"kwargs": {"env": {"LD_PRELOAD": "/tmp/x.so"}}}, "your own configuration of dask"),
+        ({"kwargs": {"preload": "evil"}}, "your own configuration of dask"),
+        ({"kwargs": {"worker_class": "this.x"}}, "your own configuration of dask"),
+        ({"kwargs": {"queue": "day\ntouch here"}}, "only numbers and single words"),
+        ({"kwargs": {"memory": "1GB;touch here"}}, "only numbers and single words"),
+        ({"kwargs": {"memory": ["1GB"]}}, "only numbers and single words"),
+    ],
+)
+def test_a_cluster_is_named_and_sized_but_runs_nothing_of_the_yaml(changes, cure):
+    good = {"class": "distributed.LocalCluster", "kwargs": {"n_workers": 2, "memory_limit": "1.5GB"}}
+    content = {"input": {"files": ["a.npy"]}, "compute": {"backend": "distributed", "cluster": good}}
+    make_config(content, "other.yaml")
+    content["compute"]["cluster"] = {**good, **changes}
+    with pytest.raises(ConfigError, match=cure) as caught:
+        make_config(content, "other.yaml")
+    assert str(caught.value).startswith(f"other.yaml: compute.cluster.{next(iter(changes))}: ")
+
+
+def test_a_configuration_of_dask_that_is_malformed_is_one_line(tmp_path):
+    (tmp_path / "dask.yaml").write_text("a: [b")
+    code = (
+        "from pchem_pipeline.compute.executor import make_executor\n"
+        "from pchem_pipeline.compute.settings import ComputeSettings\n"
+        "make_executor(ComputeSettings(backend='threads', workers=2)).map(abs, [-1, 2], lambda *_: None)\n"
+        "make_executor(ComputeSettings(backend='distributed'))"
+    )
+    environment = {**os.environ, "DASK_CONFIG": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    last = found.stderr.strip().splitlines()[-1]
+    assert "ConfigError: A dask config file at" in last
+    assert str(tmp_path / "dask.yaml") in last
+    assert last.endswith("; correct that file")
 
 
 def test_zero_workers_are_refused():

@@ -12,8 +12,7 @@ import pytest
 import zarr
 from helpers.damage import frames
 
-from pchem_pipeline.base.errors import ConfigError, InputError, PchEmError, StoreError
-from pchem_pipeline.compute.cluster import _cluster_class
+from pchem_pipeline.base.errors import InputError, PchEmError, StoreError
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.run_store import RunStore, _refuse_links
@@ -130,12 +129,6 @@ def test_a_link_to_a_run_and_one_within_it(tmp_path: Path) -> None:
     (store.path / "page.html").symlink_to("report.html")
     (tmp_path / "run.zarr").symlink_to(store.path)
     assert RunStore.open(tmp_path / "run.zarr").read("fit/bias").sum() == 64.0
-
-
-def test_a_cluster_that_is_none() -> None:
-    with pytest.raises(ConfigError, match=r"subprocess\.Popen is no cluster of dask"):
-        _cluster_class("subprocess.Popen")
-    assert _cluster_class("distributed.LocalCluster").__name__ == "LocalCluster"
 
 
 SCRIPTS = "äöü Ελληνικά кириллица 日本語 한국어 عربى עברית हिन्दी ไทย ქართული አማርኛ ខ្មែរ 😀 \u202e \u0301"

@@ -1,5 +1,6 @@
 """The driver of the stages, with small stages of our own."""
 
+import contextlib
 import functools
 import json
 import signal
@@ -347,6 +348,28 @@ def test_handlers_turn_the_first_signal_into_a_request_and_are_removed():
         with pytest.raises(InterruptedRunError):
             stop.check()
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_at_once_a_signal_ends_what_guards_against_errors():
+    passed = []
+
+    def work(stop, *numbers):
+        with stop.at_once(), stop.at_once():
+            for number in numbers:
+                with contextlib.suppress(Exception):
+                    signal.raise_signal(number)
+            passed.append(numbers)
+
+    with stop_on_signals() as stop:
+        with pytest.raises(InterruptedRunError, match="stopped by SIGTERM"):
+            work(stop, signal.SIGTERM)
+        with pytest.raises(InterruptedRunError):
+            work(stop)  # not begun after the signal
+    with stop_on_signals() as stop:
+        work(stop)
+        signal.raise_signal(signal.SIGTERM)  # behind the block it is only remembered
+        assert stop.signal == signal.SIGTERM
+    assert passed == [()]
 
 
 def test_what_the_shell_ignores_stays_ignored():

@@ -98,7 +98,6 @@ def test_no_other_module_puts_files_in_their_place():
         "store/lease.py": 1,  # an object
         "run/progress.py": 1,
         "base/kernel_cache.py": None,  # compiled kernels, which may be lost
-        "commands/compile_kernels.py": None,  # an invented run in a folder that goes with the process
         # into memory
         "stages/fit/start.py": 1,
         "stages/simulate.py": 1,

@@ -17,17 +17,12 @@ from scipy.stats import norm, poisson
 
 from pchem_pipeline.model.arithmetic import simd_math_numba
 from pchem_pipeline.model.arithmetic.simd_numba import counting, least, most, simd_load, simd_store
-from pchem_pipeline.model.errors import algebra_numba, rounding_numba
-from pchem_pipeline.model.fit import api as fit_api
+from pchem_pipeline.model.errors import algebra_numba
 from pchem_pipeline.model.fit import (
     climb_numba,
-    engine,
-    guard_numba,
     search_numba,
     starts_numba,
-    tile_numba,
 )
-from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law import density_numba, pixel_numba
 from pchem_pipeline.model.law.likelihood import density_likelihood
 from pchem_pipeline.model.law.pixel_numba import (
@@ -361,24 +356,3 @@ def test_no_kernel_lets_the_compiler_choose_the_bits() -> None:
     kernels = sorted(Path(pixel_numba.__file__).parents[1].rglob("*_numba.py"))
     assert len(kernels) > 20
     assert [path.name for path in kernels if "fastmath" in path.read_text()] == []
-
-
-def test_what_is_compiled_before_a_fit_is_what_it_calls():
-    kernels = [tile_numba.fit_tile, rounding_numba.rounding_tile, guard_numba.leave_out_tile]
-    kernels.append(guard_numba.cut_tile)
-    rng = np.random.default_rng(8)
-    dn = np.rint(10 + 9.0 * (rng.poisson(2.0, (2, 900)) + 0.2 * rng.standard_normal((2, 900)))).astype(int)
-    counts = np.array([np.bincount(pixel, minlength=200) for pixel in dn])
-    counts[1, 190] += 1  # the tail guard has something to leave out
-    for kept in (np.uint16, np.uint32):
-        given = fit_api._Batch(
-            [counts.astype(kept)], [np.zeros(2, int)], [False], FitSettings(), None, None, None
-        )
-        engine.compile_fit(nb.typeof(given.given), False)
-        engine.compile_fit(nb.typeof(given.given), True)
-        compiled = [set(each.overloads) for each in kernels]
-        found = fit_api.fit_histograms(
-            counts.astype(kept), np.zeros(2, int), settings=FitSettings(likelihood="exact")
-        )
-        assert np.isfinite(found.bias).all()
-        assert [set(each.overloads) for each in kernels] == compiled

@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pchem_pipeline.base import kernel_cache
+from pchem_pipeline.base.kernel import is_compiled
 from pchem_pipeline.compute.memory import BASE_BYTES
 from pchem_pipeline.config.memory import allowed_bytes, band_bytes
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.stages.histogram import dry_run
+from pchem_pipeline.model.fit.tile_numba import fit_tile
 from pchem_pipeline.stages.histogram.dry_run import make_plan
 from pchem_pipeline.stages.histogram.memory import bytes_per_row, single_pass_bytes
 
@@ -100,8 +102,9 @@ def test_the_plan_in_words(camera):
 def test_a_plan_compiles_nothing_that_is_missing(camera, monkeypatch, tmp_path):
     path = camera(256)
     config = RunConfig.model_validate(json.loads(path.read_text()))
-    monkeypatch.setattr(dry_run, "mark_path", lambda config, stages: tmp_path / "missing")
-    monkeypatch.setattr(dry_run, "_speeds", None)
+    monkeypatch.setattr(kernel_cache, "cache_folder", lambda: tmp_path)
+    assert not is_compiled(fit_tile)
+    monkeypatch.setattr("pchem_pipeline.model.fit.api.fit_histograms", None)
     assert make_plan(config, path.parent).seconds > 0
 
 
