@@ -85,6 +85,9 @@ class SensorInfo:
         content = store.attributes("frames").get("sensor")
         if content is None:
             raise StoreError(f"{store.path} has no input yet; run: pchem ingest {quoted(store.path)}")
-        samples = tuple(Sample(**each) for each in content.get("samples", ()))
-        camera = CameraFacts(**content.get("camera", {}))
-        return cls(**{**content, "names": tuple(content["names"]), "samples": samples, "camera": camera})
+        try:
+            samples = tuple(Sample(**each) for each in content.get("samples", ()))
+            camera = CameraFacts(**content.get("camera", {}))
+            return cls(**{**content, "names": tuple(content["names"]), "samples": samples, "camera": camera})
+        except (TypeError, KeyError, AttributeError) as error:
+            raise StoreError(f"{store.path}: frames is damaged ({error}); {store.cure('frames')}") from error
