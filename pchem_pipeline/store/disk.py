@@ -66,7 +66,8 @@ def sync_folder(path: Path) -> None:
 
 def sync_all(path: Path) -> None:
     """Wait until a file, or a folder with all that is in it, is on the disk."""
-    for part in (path, *(path.rglob("*") if path.is_dir() else ())):
+    parts = [path, *(path.rglob("*") if path.is_dir() else ())]
+    for part in sorted(parts, key=Path.is_dir):  # files come before folders
         (sync_folder if part.is_dir() else sync_file)(part)
 
 

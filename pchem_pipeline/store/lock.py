@@ -7,6 +7,8 @@ is taken over only where that was a process of this machine and is gone, since c
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import json
 import os
 import socket
@@ -21,6 +23,8 @@ from pchem_pipeline.base.errors import LockedError, StoreError
 from pchem_pipeline.store.files import storage_error
 from pchem_pipeline.store.remote_path import RemotePath
 
+#: s: a look by `is_locked` is shorter
+_PATIENCE = 0.3
 _FILE, _OBJECT = "lock", "lock.json"
 
 
@@ -49,7 +53,7 @@ def locked(run: Path, private: Path) -> Iterator[None]:
     try:
         private.mkdir(parents=True, exist_ok=True)
         held = FileLock(private / _FILE)
-        held.acquire(timeout=0)
+        held.acquire(timeout=_PATIENCE)
     except Timeout as error:
         raise LockedError(
             f"{run} is in use by another pchem process; wait for it or use another --store"
@@ -66,18 +70,19 @@ def is_locked(run: Path, private: Path) -> bool:
     """Tell whether a living process holds the lock of a run, as far as this machine can know."""
     if isinstance(private, RemotePath):
         try:
-            return not _is_left_behind(json.loads((private / _OBJECT).read_bytes()))
-        except (FileNotFoundError, ValueError):
+            return not _is_left_behind(_owner(run, private / _OBJECT))
+        except FileNotFoundError:
             return False
-    if not (private / _FILE).exists():
-        return False
+        except LockedError:
+            return True
     try:
-        with FileLock(private / _FILE).acquire(timeout=0):
-            return False
-    except Timeout:
-        return True
-    except OSError:  # a store that cannot be written: nobody else's is held there by this user
+        with (private / _FILE).open("rb") as file:  # also where this user may not write
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
         return False
+    except OSError as error:
+        return error.errno in (errno.EWOULDBLOCK, errno.EACCES)
+    return False
 
 
 def _acquired(run: Path, lock: RemotePath) -> bytes:
@@ -111,12 +116,13 @@ def _owner(run: Path, lock: RemotePath) -> dict[str, Any]:
     Raises:
         LockedError: it is damaged.
     """
-    try:
-        return dict(json.loads(lock.read_bytes()))
-    except (ValueError, TypeError) as error:
-        raise LockedError(
-            f"{run}: its lock {lock} is damaged; where no pchem command works on this run: {_free(lock)}"
-        ) from error
+    with contextlib.suppress(ValueError):
+        held = json.loads(lock.read_bytes())
+        if isinstance(held, dict):
+            return held
+    raise LockedError(
+        f"{run}: its lock {lock} is damaged; where no pchem command works on this run: {_free(lock)}"
+    )
 
 
 def _free(lock: RemotePath) -> str:

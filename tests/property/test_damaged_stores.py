@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from pchem_pipeline import open_run
-from pchem_pipeline.base.errors import IncompleteRunError, PchEmError
+from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.run.stage import Options, open_store
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import Command, run_stages, run_status
@@ -26,7 +26,13 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
     content = {
         "run": {"store": "run.zarr", "tile": 8},
-        "simulate": {"shape": [8, 16], "n_frames": 600, "seed": 5, "output": "frames", "integration_time": 1.0},
+        "simulate": {
+            "shape": [8, 16],
+            "n_frames": 600,
+            "seed": 5,
+            "output": "frames",
+            "integration_time": 1.0,
+        },
         "compute": {"backend": "serial", "workers": 1},
         "model": {"effects": [{"tag": "row_noise", "row_noise_dn": 0.4}]},
     }
@@ -121,7 +127,9 @@ def same(found, expected):
 
 def files_of(folder):
     store = folder / "run.zarr"
-    return sorted(path.relative_to(folder) for path in store.rglob("*") if path.is_file() and path.name != "lock")
+    return sorted(
+        path.relative_to(folder) for path in store.rglob("*") if path.is_file() and path.name != "lock"
+    )
 
 
 @pytest.mark.parametrize("step", [31, pytest.param(1, marks=pytest.mark.long)])
