@@ -46,8 +46,8 @@ class DiskStore(LocalStore):
         """Store a value, in a call of the caller's thread."""
         self._check_writable()
         path = self.root / key
-        # an older description must not be lost with the new one; a new array may be, with its chunks
-        described = path.name == _DESCRIPTION and path.exists()
+        # the root must not be lost, nor an older description with the new one; a new array may be
+        described = path.name == _DESCRIPTION and (key == _DESCRIPTION or path.exists())
         disk.put(path, value.as_numpy_array().data, sync=described)
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:

@@ -1,4 +1,4 @@
-"""Any file of a finished store is changed, cut or removed: the same numbers, or one line and a cure that works."""
+"""Any file of a finished store is changed, cut or removed: the same numbers, or a line whose cure works."""
 
 import re
 import shutil
@@ -26,13 +26,7 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
     content = {
         "run": {"store": "run.zarr", "tile": 8},
-        "simulate": {
-            "shape": [8, 16],
-            "n_frames": 600,
-            "seed": 5,
-            "output": "frames",
-            "integration_time": 1.0,
-        },
+        "simulate": {"shape": [8, 16], "n_frames": 600, "seed": 5, "integration_time": 1.0},
         "compute": {"backend": "serial", "workers": 1},
         "model": {"effects": [{"tag": "row_noise", "row_noise_dn": 0.4}]},
     }
@@ -76,7 +70,6 @@ def asked(action):
     try:
         action()
     except PchEmError as error:
-        assert "\n" not in str(error)
         return str(error)
     return ""
 
@@ -109,7 +102,7 @@ def check(folder, victim, expected, forced):
         lambda: run(place),
     ):
         words = asked(action)
-        assert not words or (str(folder) in words and "; " in words), words
+        assert not words or (str(folder) in words and "; " in words and "\n" not in words), words
     for _ in range(8):
         words = asked(lambda: run(place)) or asked(lambda: same(numbers(folder / "run.zarr"), expected))
         if not words:
@@ -126,10 +119,8 @@ def same(found, expected):
 
 
 def files_of(folder):
-    store = folder / "run.zarr"
-    return sorted(
-        path.relative_to(folder) for path in store.rglob("*") if path.is_file() and path.name != "lock"
-    )
+    files = (path for path in (folder / "run.zarr").rglob("*") if path.is_file() and path.name != "lock")
+    return sorted(path.relative_to(folder) for path in files)
 
 
 @pytest.mark.parametrize("step", [31, pytest.param(1, marks=pytest.mark.long)])
