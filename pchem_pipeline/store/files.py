@@ -162,15 +162,6 @@ def remove_folder(path: Path) -> None:
         raise storage_error(error, path) from error
 
 
-def is_blank(path: Path) -> bool:
-    """Tell whether a file is empty or begins with a zero: its content was lost in a power cut."""
-    try:
-        with path.open("rb") as file:
-            return file.read(1) in (b"", b"\0")
-    except FileNotFoundError:
-        return False
-
-
 def sync_folder(path: Path) -> None:
     """Wait until the names in a folder are on the disk, if it is there.
 

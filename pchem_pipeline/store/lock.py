@@ -11,6 +11,7 @@ import errno
 import fcntl
 import json
 import os
+import secrets
 import socket
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -91,7 +92,8 @@ def _acquired(run: Path, lock: RemotePath) -> bytes:
         "host": socket.gethostname(),
         "machine": _machine(),
         "pid": os.getpid(),
-        "time": datetime.now(UTC).isoformat(),
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "token": secrets.token_hex(8),
     }
     content = (json.dumps(about) + "\n").encode()
     for _ in range(3):
@@ -100,6 +102,8 @@ def _acquired(run: Path, lock: RemotePath) -> bytes:
             return content
         with contextlib.suppress(FileNotFoundError):
             held = _owner(run, lock)
+            if held == about:  # the answer to the first request was lost
+                return content
             if not _is_left_behind(held):
                 raise LockedError(
                     f"{run} is in use by pchem on {held.get('host')} (process {held.get('pid')}, since "

@@ -34,7 +34,6 @@ from pchem_pipeline.base.variables import variable_at
 from pchem_pipeline.store import disk
 from pchem_pipeline.store.files import (
     cure_of,
-    is_blank,
     link_out_of,
     remove_file,
     remove_folder,
@@ -85,7 +84,6 @@ class RunStore:
         from pchem_pipeline.store.zarr_store import zarr_store
 
         path = place_of(path)
-        _remove_blank(path)
         strangers = _strangers(path)  # looked for first: another process may be making the same store
         if (path / DESCRIPTION).exists():
             return cls.open(path, writable=True)
@@ -222,13 +220,10 @@ class RunStore:
 
         from pchem_pipeline.store.zarr_store import foreign_codecs
 
-        try:
-            with _one_line(self.path, f"{self.path}: {name}"):
-                found = (self._writer if to_write else self._root)[name]
-        except KeyError as error:
-            raise StoreError(f"{self.path} has no {name}; {self.cure(name)}") from error
-        except _DAMAGE as error:
-            raise StoreError(f"{self.path}: {name} is damaged ({error}); {self.cure(name)}") from error
+        with self._translated(name):
+            found = (self._writer if to_write else self._root).get(name)
+        if found is None:
+            raise StoreError(f"{self.path} has no {name}; {self.cure(name)}")
         if not isinstance(found, zarr.Array):
             raise StoreError(f"{self.path}: {name} is no array; {self.cure(name)}")
         if foreign := foreign_codecs(found):
@@ -323,10 +318,8 @@ class RunStore:
     def attributes(self, name: str = "") -> dict[str, Any]:
         """Return the attributes of a group or array (of the root by default); empty where there is none."""
         with self._translated(name):
-            try:
-                return dict((self._root[name] if name else self._root).attrs)
-            except KeyError:
-                return {}
+            found = self._root.get(name) if name else self._root
+            return {} if found is None else dict(found.attrs)
 
     def set_attributes(self, name: str, values: Mapping[str, Any]) -> None:
         """Add attributes (JSON) to a group, making the group where needed."""
@@ -365,17 +358,13 @@ class RunStore:
             yield
 
     def _remove_unfinished(self) -> None:
-        """Remove what a killed process left, and descriptions of arrays that a power cut left empty.
-
-        Neither is part of the run: what a record or a marker stands for was on the disk before it.
-        """
+        """Remove the half files that a killed process left."""
         if isinstance(self.path, RemotePath):  # which has none
             return
         for folder, _, names in os.walk(self.path):
             for name in names:
-                path = Path(folder) / name
-                if name.endswith(".partial") or (name == DESCRIPTION and is_blank(path)):
-                    remove_file(path)
+                if name.endswith(".partial"):
+                    remove_file(Path(folder) / name)
 
     def free_bytes(self) -> int:
         """Return the free space of the disk that holds the store; an object storage is never full."""
@@ -412,10 +401,7 @@ def stored_config(path: Path) -> str | None:
             f"{place} is damaged (its content does not have its digest); give the run's own YAML file "
             "instead of its store, which writes it again"
         )
-    try:
-        return text.decode()
-    except UnicodeDecodeError as error:
-        raise StoreError(f"{place} is damaged ({error}); give the run's own YAML file instead") from error
+    return text.decode(errors="replace")
 
 
 @functools.lru_cache(maxsize=64)  # once in a process: it takes 20 ms in the largest stores
@@ -426,14 +412,6 @@ def _refuse_links(path: Path) -> None:
             f"{path}: {link} is a link out of the store, which this program never makes; put the files that "
             "it leads to in its place"
         )
-
-
-def _remove_blank(path: Path) -> None:
-    """Remove the empty beginning of a store that a power cut may leave, before anything is in it."""
-    if isinstance(path, RemotePath) or not path.is_dir():
-        return
-    if is_blank(path / DESCRIPTION) and not _strangers(path):
-        remove_file(path / DESCRIPTION)
 
 
 def _strangers(path: Path) -> bool:

@@ -1,5 +1,6 @@
 """Any file of a finished store is changed, cut or removed: the same numbers, or a line whose cure works."""
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -10,9 +11,11 @@ import yaml
 
 from pchem_pipeline import open_run
 from pchem_pipeline.base.errors import PchEmError
+from pchem_pipeline.model.maps.maps import NO_VALUE
 from pchem_pipeline.run.stage import Options, open_store
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import Command, run_stages, run_status
+from pchem_pipeline.stages import maps
 from pchem_pipeline.stages.table import pipeline_of
 
 STAGES = ("simulate", "ingest", "histogram", "fit", "maps", "ensemble", "report")
@@ -136,3 +139,43 @@ def test_any_file_is_damaged(finished, tmp_path, step):
         shutil.copytree(finished, folder)
         damaged(folder / victim, kind, rng)
         check(folder, f"{victim} {kind}", expected, FORCED[i % len(FORCED)])
+
+
+def test_pixels_of_a_tile_that_failed_have_no_value(finished, tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    do_tile = maps._do_tile
+
+    def failing(tile, **more):
+        if tile.key == "0.1":
+            raise ValueError("odd")
+        return do_tile(tile, **more)
+
+    monkeypatch.setattr(maps, "_do_tile", failing)
+    assert "maps: 1 of 2 units failed" in asked(lambda: run(folder / "run.yaml", ["maps"], force=True))
+    found = open_run(folder / "run.zarr")
+    assert found.maps.quality.values[:, 8:].tolist() == [[NO_VALUE] * 8] * 8
+    assert not found.usable[:, 8:].any()
+    assert found.good[:, :8].sum() > 32
+    assert np.isnan(found.maps.bias[:, 8:]).all()
+
+
+def test_chunks_that_0_2_left_out_are_read(finished, tmp_path):
+    """There a chunk of the fill value alone was not written, and descriptions have no digest."""
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    expected = numbers(folder / "run.zarr")
+    for place in (folder / "run.zarr").rglob("*.json"):
+        if place.name == "report.json":
+            continue
+        content = json.loads(place.read_text())
+        content.pop("digest_of_content", None)
+        content.get("attributes", {}).pop("digest_of_content", None)
+        content.pop("files", None)
+        place.write_text(json.dumps(content))
+    place = folder / "run.zarr/.pchem/config.yaml"
+    place.write_text(place.read_text().rpartition("# sha256")[0])
+    assert not np.any(expected["histogram/under"])
+    shutil.rmtree(folder / "run.zarr/histogram/under/c")
+    same(numbers(folder / "run.zarr"), expected)
+    assert {state.state for state in run_status(find_run(folder / "run.yaml"))} == {"complete"}
