@@ -13,6 +13,7 @@ from pchem_pipeline.run.declaration import Stage, imported
 from pchem_pipeline.run.model_versions import model_of_content, model_versions
 from pchem_pipeline.store.files import digest_of_file
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
+from pchem_pipeline.store.run_store import DESCRIPTION
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
@@ -101,8 +102,10 @@ def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) 
     if done and not written:
         return "stale", f"{stage.writes[0]} is no longer in the store"  # a hand took it out
     for name, digest in record.files.items():
-        if digest != digest_of_file(context.store.path / name):
-            return "stale", f"{name} is missing or was changed"
+        group = context.store.path / name.partition("/")[0] / DESCRIPTION
+        whole = not name.endswith(DESCRIPTION) or group.exists()
+        if not whole or digest != digest_of_file(context.store.path / name):
+            return "stale", f"{name if whole else group} is missing or was changed"
     content = fingerprint_content(stage, context)
     if fingerprint_of(content) != record.fingerprint and not _grew(content, record):
         numbers = {each.digest: each.number for each in (context.model, *model_versions(context.store))}

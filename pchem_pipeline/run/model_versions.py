@@ -10,7 +10,7 @@ its fingerprint by its digest, in its record by its number.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
@@ -119,16 +119,9 @@ class ModelVersion:
 
 
 def _version(number: int, settings: ModelSettings, added: AddedArrays | None, **facts: Any) -> ModelVersion:
-    return _version_of(number, settings.model_dump(mode="json"), added, **facts)
-
-
-def _version_of(number: int, model: dict[str, Any], added: AddedArrays | None, **facts: Any) -> ModelVersion:
-    digest = _digest(model, None if added is None else added.digest)
+    model = settings.model_dump(mode="json")
+    digest = fingerprint_of({"model": model, "added_exposure": None if added is None else added.digest})
     return ModelVersion(number, model, digest, added=added, **facts)
-
-
-def _digest(model: Mapping[str, Any], added: str | None) -> str:
-    return fingerprint_of({"model": model, "added_exposure": added})
 
 
 def model_versions(store: RunStore) -> tuple[ModelVersion, ...]:

@@ -211,9 +211,9 @@ def without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write_json(path: Path, value: Any, *, sync: bool = True) -> None:
+def write_json(path: Path, value: Any) -> None:
     """Write a value as indented JSON, atomically; see `write_atomic`."""
-    write_atomic(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode(), sync=sync)
+    write_atomic(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: Path, cure: str = "delete it and run the stage again") -> Any | None:
@@ -284,12 +284,11 @@ def read_record(path: Path, cure: str = "delete it and run again") -> dict[str, 
 
 def with_digest(content: dict[str, Any], *, inside: bool = False) -> dict[str, Any]:
     """Return JSON data with a digest of it; ``inside`` its attributes, as zarr needs it."""
-    content = {key: value for key, value in content.items() if key != _DIGEST}
-    if not inside:
-        return {**content, _DIGEST: _digest(content)}
-    attributes = {key: value for key, value in content.get("attributes", {}).items() if key != _DIGEST}
-    content["attributes"] = attributes
-    return {**content, "attributes": {**attributes, _DIGEST: _digest(content)}}
+    content = json.loads(json.dumps(content))  # as it will be read: keys are text
+    holder = content.setdefault("attributes", {}) if inside else content
+    holder.pop(_DIGEST, None)
+    holder[_DIGEST] = _digest(content)
+    return content
 
 
 def checked(data: bytes, path: Path, cure: str, *, inside: bool = False) -> tuple[dict[str, Any], bool]:
