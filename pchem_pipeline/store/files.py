@@ -305,7 +305,7 @@ def checked(data: bytes, path: Path, cure: str, *, inside: bool = False) -> tupl
     except (ValueError, RecursionError, AttributeError) as error:
         raise StoreError(f"{path} is damaged ({error}); {cure}") from error
     if not same:
-        raise StoreError(f"{path} is damaged (its content does not have its digest); {cure}")
+        raise StoreError(f"{path} is damaged (checksum mismatch); {cure}")
     return content, digest is not None
 
 

@@ -398,7 +398,7 @@ def stored_config(path: Path) -> str | None:
         text = content
     elif hashlib.sha256(text).hexdigest() != digest.decode(errors="replace").strip():
         raise StoreError(
-            f"{place} is damaged (its content does not have its digest); give the run's own YAML file "
+            f"{place} is damaged (checksum mismatch); give the run's own YAML file "
             "instead of its store, which writes it again"
         )
     return text.decode(errors="replace")

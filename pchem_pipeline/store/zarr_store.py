@@ -99,7 +99,7 @@ class CheckedStore(WrapperStore[Store]):
             description = await self._store.get(place, default_buffer_prototype())
             if description is not None and self._description(place, description)[1]:
                 raise StoreError(
-                    f"{self._path / key} is missing: it was removed, or its tile was never done; "
+                    f"{self._path / key} is missing (deleted, or its tile was never done); "
                     f"{cure_of(self._path, array)}"
                 )
         return found
