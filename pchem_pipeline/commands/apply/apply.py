@@ -270,8 +270,8 @@ def _output_store(place: Path, content: dict[str, Any], *, force: bool) -> tuple
     """
     if place.exists() and not (place / "zarr.json").exists() and (not place.is_dir() or any(place.iterdir())):
         raise _exists(place, ours=False)
-    is_new = not (place / "zarr.json").exists()
-    if not is_new:
+    begun = {each.name for each in place.iterdir()} if place.exists() else set()
+    if not begun <= {"zarr.json", ".pchem"}:
         try:
             there = RunStore.open(place).attributes("applied").get("provenance", {})
         except StoreError:
