@@ -296,7 +296,12 @@ _ALL: list[Variable] = [
     Variable("fit/log_likelihood", _MAP, "float64", "nat", "log-likelihood at the estimate"),
     Variable("fit/likelihood_gap", _MAP, "float64", "nat", "log-likelihood minus that of the runner-up"),
     Variable(
-        "fit/fit_status", _MAP, "uint16", "1", "reasons for caution or failure, as bits; 0 is fine", fill=4
+        "fit/fit_status",
+        _MAP,
+        "uint16",
+        "1",
+        "reasons for caution or failure, as bits; 0 is fine",
+        fill=16384,
     ),
     Variable("fit/n_iterations", _MAP, "int32", "1", "evaluations of the likelihood used on the pixel"),
     Variable("fit/goodness_chi2", _MAP, "float64", "1", "Pearson chi-square of the histogram, bins merged"),

@@ -102,8 +102,8 @@ def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) 
     if done and not written:
         return "stale", f"{stage.writes[0]} is no longer in the store"  # a hand took it out
     for name, digest in record.files.items():
-        group = context.store.path / name.partition("/")[0] / DESCRIPTION
-        whole = not name.endswith(DESCRIPTION) or group.exists()
+        group = f"{name.partition('/')[0]}/{DESCRIPTION}"
+        whole = not name.endswith(DESCRIPTION) or (context.store.path / group).exists()
         if not whole or digest != digest_of_file(context.store.path / name):
             return "stale", f"{name if whole else group} is missing or was changed"
     content = fingerprint_content(stage, context)

@@ -24,6 +24,7 @@ class FitStatus(IntFlag):
     POOR_FIT = 512
     COARSE_STEPS = 1024
     WEAKLY_IDENTIFIED = 2048
+    NOT_FITTED = 16384
 
 
 #: Bits for which the parameters of the pixel are NaN.
@@ -33,6 +34,7 @@ FAILED = (
     | FitStatus.NOT_CONVERGED
     | FitStatus.GAIN_NOT_IDENTIFIED
     | FitStatus.EXPOSURE_AT_BOUND
+    | FitStatus.NOT_FITTED
 )
 
 #: Bits of pixels whose value the data leave open by whole electrons, or altogether, whatever its standard
@@ -43,6 +45,7 @@ FLAGGED = FitStatus.BIAS_AMBIGUOUS | FitStatus.NOT_INFORMATIVE | FitStatus.WEAKL
 MEANINGS: dict[FitStatus, str] = {
     FitStatus.NO_DATA: "no frame inside the histogram window",
     FitStatus.TOO_FEW_BINS: "fewer than 3 occupied bins",
+    FitStatus.NOT_FITTED: "not fitted: the tile failed or was not chosen",
     FitStatus.NOT_CONVERGED: "the fit did not converge",
     FitStatus.GAIN_NOT_IDENTIFIED: "one Gaussian fits as well: the conversion gain is not identified",
     FitStatus.EXPOSURE_AT_BOUND: "quanta exposure at its lower bound: no electrons seen",

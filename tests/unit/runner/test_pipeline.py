@@ -105,7 +105,7 @@ def test_what_a_hand_took_out_of_the_store_is_made_again(make, monkeypatch):
     # one that may write nothing is stale without what it wrote, and complete where it wrote nothing
     context.store.delete("maps")
     monkeypatch.setitem(FAKES, "maps", replace(FAKES["maps"], may_write_nothing=True))
-    assert status(FAKES["maps"], context).words() == "stale - maps/bias/zarr.json is missing or was changed"
+    assert status(FAKES["maps"], context).words() == "stale - maps/zarr.json is missing or was changed"
     record = context.store.records.read("maps")
     context.store.records.write(replace(record, files={}))
     assert status(FAKES["maps"], context).state == "complete"
