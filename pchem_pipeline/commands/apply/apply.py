@@ -339,6 +339,7 @@ def _do(context: StageContext, job: Job, made: _Made) -> None:
     """
     record = context.store.records.read(STAGE)
     if record is not None and record.finished and not context.fresh:
+        context.store.delete("applied_parts")  # what a failure after the last step may have left
         context.reporter.info(f"apply: {context.store.path} is up to date")
         return
     job, made = _with_moments(context, job, made)
