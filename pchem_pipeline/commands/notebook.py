@@ -350,22 +350,12 @@ class Run:
 
     def _arrays(self, group: str, names: Sequence[str]) -> Mapping[str, Any]:
         """Return arrays of the store that read the pixels asked for alone."""
-        return {name: StoredArray(self._store, f"{group}/{name}") for name in names}
+        found = self.group(group)
+        return {name: found[name] for name in names}
 
     @cached_property
     def _data(self) -> ReportData:
         return gather_run(self._target)
-
-
-@dataclass(frozen=True)
-class StoredArray:
-    """An array of a store that reads the region asked for."""
-
-    store: RunStore
-    name: str
-
-    def __getitem__(self, region: Any) -> NDArray[Any]:
-        return self.store.read(self.name, region)
 
 
 def lazy_dataset(store: RunStore, group: str) -> xr.Dataset:
@@ -380,10 +370,13 @@ def lazy_dataset(store: RunStore, group: str) -> xr.Dataset:
     class Lazy(BackendArray):
         def __init__(self, name: str) -> None:
             array = store.array(name)
-            self.stored, self.shape, self.dtype = StoredArray(store, name), array.shape, array.dtype
+            self.name, self.shape, self.dtype = name, array.shape, array.dtype
 
         def __getitem__(self, key: Any) -> Any:
-            return explicit_indexing_adapter(key, self.shape, IndexingSupport.BASIC, self.stored.__getitem__)
+            return explicit_indexing_adapter(key, self.shape, IndexingSupport.BASIC, self.read)
+
+        def read(self, region: Any) -> NDArray[Any]:
+            return store.read(self.name, region)
 
     found = {}
     for name in store.arrays(group):

@@ -50,11 +50,6 @@ class DiskStore(LocalStore):
         described = path.name == _DESCRIPTION and (key == _DESCRIPTION or path.exists())
         disk.put(path, value.as_numpy_array().data, sync=described)
 
-    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        """Store a value where there is none; the run's lock lets only one process in."""
-        if not await self.exists(key):
-            await self.set(key, value)
-
     async def delete(self, key: str) -> None:
         """Remove a value."""
         await asyncio.to_thread(self.delete_sync, key)
@@ -119,7 +114,7 @@ class CheckedStore(WrapperStore[Store]):
         await self._store.set(key, value)
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        """Store a value where there is none."""
+        """Store a value where there is none; the run's lock lets only one process in."""
         if not await self.exists(key):
             await self.set(key, value)
 
