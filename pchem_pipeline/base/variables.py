@@ -6,7 +6,7 @@ Nothing is written that is not listed here; the attributes in the store come fro
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 #: The four parameters of the PCD, in the order of every (…, parameter) axis.
 PARAMETERS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
@@ -40,6 +40,7 @@ class Variable:
         unit: physical unit; ``"1"`` where there is none.
         long_name: one sentence for people.
         symbol: the symbol of the paper, if it has one.
+        fill: value of pixels that no tile was done for; of floating-point arrays it is NaN.
     """
 
     path: str
@@ -48,6 +49,7 @@ class Variable:
     unit: str
     long_name: str
     symbol: str = ""
+    fill: int = field(default=0, kw_only=True)
 
     @property
     def group(self) -> str:
@@ -294,7 +296,14 @@ _ALL: list[Variable] = [
     *_ends("fit", INTERVALS),
     Variable("fit/log_likelihood", _MAP, "float64", "nat", "log-likelihood at the estimate"),
     Variable("fit/likelihood_gap", _MAP, "float64", "nat", "log-likelihood minus that of the runner-up"),
-    Variable("fit/fit_status", _MAP, "uint16", "1", "reasons for caution or failure, as bits; 0 is fine"),
+    Variable(
+        "fit/fit_status",
+        _MAP,
+        "uint16",
+        "1",
+        "reasons for caution or failure, as bits; 0 is fine",
+        fill=16384,
+    ),
     Variable("fit/n_iterations", _MAP, "int32", "1", "evaluations of the likelihood used on the pixel"),
     Variable("fit/goodness_chi2", _MAP, "float64", "1", "Pearson chi-square of the histogram, bins merged"),
     Variable("fit/goodness_dof", _MAP, "float64", "1", "degrees of freedom of goodness_chi2"),
@@ -312,7 +321,7 @@ _ALL: list[Variable] = [
     ),
     *_both("maps", ("spurious_charge", "charge_per_level", "dark_signal")),  # of several exposures
     *_samples(),
-    Variable("maps/quality", _MAP, "uint8", "1", "0 good, 1 use with caution, 2 no value"),
+    Variable("maps/quality", _MAP, "uint8", "1", "0 good, 1 use with caution, 2 no value", fill=2),
     # raw ensemble (paper, Sec. II-C): axis `dn`
     Variable("ensemble/dn", ("dn",), "int32", "DN", "digital number"),
     Variable("ensemble/counts", ("dn",), "int64", "1", "ensemble histogram of the chosen frames"),

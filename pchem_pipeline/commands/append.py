@@ -28,7 +28,7 @@ from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.stages.histogram.single_pass import PREPARED, prepared, stream_rows, whole_mebibytes
 from pchem_pipeline.stages.table import STAGES
-from pchem_pipeline.store.files import remove_file, write_json
+from pchem_pipeline.store.files import remove_file, write_record
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -180,7 +180,7 @@ def _go_on(context: StageContext, frames: FrameSequence, added: list[Path]) -> d
     ):
         counter = StackCounter(job, stream.bands, workers)
         counter.resume(done)
-        write_json(store.path / _BEGUN, {"frames": done})
+        write_record(store.path / _BEGUN, {"frames": done})
         for name in PREPARED:
             store.records.forget(name)
         extend_arrays(context, frames.shape, bins)

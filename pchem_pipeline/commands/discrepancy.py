@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.commands.model import adopt_verdict, yaml_of
 from pchem_pipeline.config.edit import check_writable
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, read_verdict
@@ -54,13 +55,14 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
         if stages:
             run_stages(target, stages, without_choice(command))
     found = read_verdict(target.store)
-    assert found is not None
+    if found is None:
+        raise StoreError(f"{target.store / VERDICT_FILE} is missing; run pchem discrepancy again")
     return f"{verdict_text(found)}\n\n{target.store / VERDICT_FILE}"
 
 
 def _of_histograms(target: Target) -> bool:
     """Tell whether the search looks at histograms, not at frames: ready-made ones, or several samples'."""
-    if not (target.store / "zarr.json").exists():
+    if not target.store.exists():
         return False
     store = target.stored()
     return store.has("frames") and SensorInfo.read(store).kind != "frames"

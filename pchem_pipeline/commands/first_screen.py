@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -13,6 +12,7 @@ from pchem_pipeline.base.errors import IncompleteRunError, NotBelievedError, quo
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.session import Command, run_stages
+from pchem_pipeline.store.files import read_json
 from pchem_pipeline.store.remote_path import RemotePath
 
 _WIDTH = 100
@@ -58,11 +58,10 @@ def _tell(
     target: Target, stages: Sequence[str], command: Command, say: Callable[[str], None], *, warn: bool
 ) -> str:
     """Tell the first screen and the path; return what is serious in one line, or nothing."""
-    path = target.store / "report.json"
-    if "report" not in stages or not path.exists():
+    numbers = read_json(target.store / "report.json", "run again, which writes it again")
+    if "report" not in stages or numbers is None:
         say(str(target.store))
         return ""
-    numbers = json.loads(path.read_text(encoding="utf-8"))
     reporter = Reporter("off", quiet=command.quiet, log=command.log_json)
     try:
         reporter.event("verdict", answers=numbers["answers"], next=numbers["next"])

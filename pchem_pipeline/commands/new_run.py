@@ -197,7 +197,7 @@ def _came_to_nothing(place: Path, path: Path) -> bool:
     if not (place / ".pchem").is_dir():
         return False
     store = RunStore.open(place)
-    records = [store.records.read(name) for name in STAGES]
+    records = [store.records.known(name) for name in STAGES]
     untouched = store.config_text() == path.read_text(encoding="utf-8")
     return untouched and not any(record is not None and record.finished for record in records)
 

@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError, install_hint, quoted
-from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.base.variables import PARAMETERS, variable_at
 from pchem_pipeline.commands.figures import gather_run
 from pchem_pipeline.commands.notebook_plots import Plots, width_of
 from pchem_pipeline.model.fit.result import html_table
@@ -39,6 +38,9 @@ from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.stages.report.pixels import bin_masses, pixel_fits, pixel_index
 from pchem_pipeline.stages.report.stored import read_histograms, read_model
+from pchem_pipeline.stages.table import STAGES
+from pchem_pipeline.store.files import read_json
+from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -106,12 +108,11 @@ class Run:
 
     def _repr_html_(self) -> str:
         """Return what the first screen of the report says, for a notebook."""
-        path = self.path / "report.json"
+        found = read_json(self.path / "report.json", "run again, which writes it again")
         states = ", ".join(f"{name} {words}" for name, words in self.status().items())
         head = f"<b>{escape(self.path.name)}</b>: {escape(self._size())}"
-        if not path.exists():
+        if found is None:
             return f"<p>{head}<br>{escape(states)}</p>"
-        found = json.loads(path.read_text(encoding="utf-8"))
         answers = "".join(
             f"<p>{escape(each['question'])} <b>{escape(each['word'])}</b>. {escape(each['text'])}</p>"
             for each in found["answers"]
@@ -160,13 +161,15 @@ class Run:
         return self._groups[name]
 
     def _opened(self, name: str) -> xr.Dataset:
-        import xarray as xr
-
         if not self._store.has(name):
             raise StoreError(
                 f"{self.path} has no {name} yet; see what is missing with: pchem status {quoted(self.path)}"
             )
-        found: xr.Dataset = xr.open_zarr(str(self.path), group=name, consolidated=False, chunks=None)
+        for record in filter(None, map(self._store.records.known, STAGES)):
+            for file in record.files:
+                if file.startswith(f"{name}/") and not (self.path / file).exists():
+                    raise StoreError(f"{self.path / file} is missing; {self._store.cure(name)}")
+        found = lazy_dataset(self._store, name)
         for axis, length in zip(("y", "x"), self.shape, strict=True):
             if found.sizes.get(axis) == length:
                 found = found.assign_coords({axis: (axis, np.arange(length), {"units": "pixel"})})
@@ -258,8 +261,6 @@ class Run:
             InputError: the frames do not fit the run.
             ConfigError: the output is something else.
         """
-        import xarray as xr
-
         from pchem_pipeline.commands.apply.apply import apply_to_frames
         from pchem_pipeline.commands.apply.settings import ApplySettings, kinds_of
         from pchem_pipeline.run.stage import Options
@@ -269,8 +270,7 @@ class Run:
         command = Command(Options(force=force), quiet=True, progress="off")
         wanted = ApplySettings(kinds_of(what), prior)
         [place] = apply_to_frames(self._target, [str(f) for f in files], Path(output), wanted, command)
-        found: xr.Dataset = xr.open_zarr(str(place), group="applied", consolidated=False, chunks=None)
-        return found
+        return lazy_dataset(RunStore.open(place), "applied")
 
     @property
     def verdict(self) -> Verdict | None:
@@ -350,11 +350,41 @@ class Run:
 
     def _arrays(self, group: str, names: Sequence[str]) -> Mapping[str, Any]:
         """Return arrays of the store that read the pixels asked for alone."""
-        return {name: self._store.array(f"{group}/{name}") for name in names}
+        found = self.group(group)
+        return {name: found[name] for name in names}
 
     @cached_property
     def _data(self) -> ReportData:
         return gather_run(self._target)
+
+
+def lazy_dataset(store: RunStore, group: str) -> xr.Dataset:
+    """Return a group of a store as a dataset that reads when it is used; damage is one line then.
+
+    xarray's own way reads a chunk that is missing as NaN or 0, and raises the errors of zarr.
+    """
+    import xarray as xr
+    from xarray.backends import BackendArray
+    from xarray.core.indexing import IndexingSupport, LazilyIndexedArray, explicit_indexing_adapter
+
+    class Lazy(BackendArray):
+        def __init__(self, name: str) -> None:
+            array = store.array(name)
+            self.name, self.shape, self.dtype = name, array.shape, array.dtype
+
+        def __getitem__(self, key: Any) -> Any:
+            return explicit_indexing_adapter(key, self.shape, IndexingSupport.BASIC, self.read)
+
+        def read(self, region: Any) -> NDArray[Any]:
+            return store.read(self.name, region)
+
+    found = {}
+    for name in store.arrays(group):
+        array = store.array(f"{group}/{name}")
+        lazy = LazilyIndexedArray(Lazy(f"{group}/{name}"))
+        dims = variable_at(f"{group}/{name}").dims
+        found[name] = xr.Variable(dims, lazy, dict(array.attrs))
+    return xr.Dataset(found, attrs=store.attributes(group))
 
 
 @dataclass(frozen=True, repr=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import sys
 from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any, get_args
@@ -106,63 +105,9 @@ def make_config(content: Mapping[str, Any], name: str, folder: Path | None = Non
         ConfigError: a setting is wrong.
     """
     try:
-        renamed, lines = present_keys(content)
-        sys.stderr.writelines(f"pchem: {name}: {line}\n" for line in lines)
-        settings = _of_earlier_version(renamed, name)
-        return RunConfig.model_validate(settings, context={"folder": folder})
+        return RunConfig.model_validate(content, context={"folder": folder})
     except ValidationError as error:
         raise ConfigError(f"{name}: {complaints(error)}") from error
-
-
-#: Keys of version 0.1, and what they are called now; None for one that did nothing.
-_OLD_KEYS: Mapping[str, str | None] = {
-    "discrepancy.grown_replicates": "discrepancy.extended_replicates",
-    "discrepancy.material": None,
-    "fit.allowed_failed_fraction": None,  # run.allowed_failed_pixels is read
-}
-
-
-def present_keys(content: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Return settings under the keys of now, and a line about each key of version 0.1 among them."""
-    result = {key: dict(value) if isinstance(value, dict) else value for key, value in content.items()}
-    lines: list[str] = []
-    for old, new in _OLD_KEYS.items():
-        section, key = old.split(".")
-        if not isinstance(result.get(section), dict) or key not in result[section]:
-            continue
-        value = result[section].pop(key)
-        if new is None:
-            lines.append(f"{old} did nothing and is gone; remove it")
-            continue
-        lines.append(f"{old} is now called {new}")
-        section, key = new.split(".")
-        result.setdefault(section, {}).setdefault(key, value)
-    return result, lines
-
-
-def _of_earlier_version(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """Turn the YAML of a joint fit of version 0.1 into that of a run of several samples, and say so."""
-    if "samples" not in content:
-        return content
-    joint = dict(content.get("joint") or {})
-    known = {**_OLD_JOINT, **{key: value for key, value in joint.items() if value is not None}}
-    samples = [_sample(each) for each in content["samples"] or ()]
-    rest = {key: value for key, value in content.items() if key not in ("samples", "joint")}
-    sys.stderr.write(
-        f"pchem: {name}: samples and joint are now input.samples, input.against and run; kind: bias is bias: "
-        "true\n"
-    )
-    return {"run": known, "input": {"samples": samples, "against": known.pop("against")}, **rest}
-
-
-_OLD_JOINT = {"store": "joint.zarr", "against": "integration_time"}
-
-
-def _sample(given: Any) -> Any:
-    """Turn a sample of version 0.1 into one of now; what is wrong with it is said by its section."""
-    if not isinstance(given, dict) or given.get("kind") not in ("bias", "exposed"):
-        return given
-    return {**{key: value for key, value in given.items() if key != "kind"}, "bias": given["kind"] == "bias"}
 
 
 def dump_config(config: RunConfig) -> str:

@@ -2,14 +2,14 @@
 
 The keys of the JSON are the names of the fields; a number that is not known is ``null`` there and NaN here.
 Whoever adds a key adds it here, and nowhere else; one that older files lack has a default, or raises
-:data:`SCHEMA_VERSION` and is filled in by :func:`_from_2` or a function like it.
+:data:`SCHEMA_VERSION`, and files of another schema are refused.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -497,14 +497,14 @@ class Verdict(_Part):
 
     @classmethod
     def from_json(cls, text: str, source: str = VERDICT_FILE) -> Verdict:
-        """Read the content of ``discrepancy.json``, of this schema or an earlier one.
+        """Read the content of ``discrepancy.json``.
 
         Args:
             text: the content.
             source: where it comes from, for the message.
 
         Raises:
-            StoreError: it is damaged, or of a later schema.
+            StoreError: it is damaged, or of another schema.
         """
         cure = "run pchem discrepancy with --force"
         try:
@@ -514,13 +514,13 @@ class Verdict(_Part):
         if not isinstance(content, dict):
             raise StoreError(f"{source} holds no verdict; {cure}")
         version = content.get("schema_version", content.get("schema"))
-        if isinstance(version, int) and version > SCHEMA_VERSION:
+        if isinstance(version, int) and version != SCHEMA_VERSION:
             raise StoreError(
-                f"{source} holds a verdict of schema {version}, this program knows those up to "
-                f"{SCHEMA_VERSION}; use the version that wrote it, or {cure}"
+                f"{source} holds a verdict of schema {version}, this program reads schema {SCHEMA_VERSION}; "
+                f"use the version that wrote it, or {cure}"
             )
         try:
-            return cls.model_validate(_up_to_date(content, version))
+            return cls.model_validate(content)
         except ValidationError as error:
             first = error.errors()[0]
             place = ".".join(str(part) for part in first["loc"])
@@ -624,42 +624,6 @@ def read_verdict(folder: Path) -> Verdict | None:
     except (OSError, UnicodeDecodeError) as error:
         raise StoreError(f"{path} is damaged ({error}); run pchem discrepancy with --force") from error
     return Verdict.from_json(text, str(path))
-
-
-def _up_to_date(content: Mapping[str, Any], version: Any) -> dict[str, Any]:
-    """Return the content of a file of some schema as the present one has it."""
-    found = dict(content)
-    if version == 1:
-        found = _from_1(found)
-    return _from_2(found) if version in (1, 2) else found
-
-
-def _from_1(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a file of version 0.1 as the second schema has it."""
-    found = {key: value for key, value in content.items() if key not in ("schema", "untestable_reasons")}
-    reasons = content.get("untestable_reasons") or {}
-    found["untestable"] = {tag: reasons.get(tag, "") for tag in content.get("untestable", ())}
-    for key in ("where", "unexplained"):
-        found[key] = [{**place, "dn": place.get("dn") or None} for place in content.get(key, ())]
-    return found
-
-
-def _from_2(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of the second schema: there 'named' said nothing of the gap that was left."""
-    found = {**content, "schema_version": SCHEMA_VERSION, "steps": []}
-    if "left_out" in found:
-        found["defects"] = found.pop("left_out")
-    for step in content.get("steps", ()):
-        first = step.get("runner_up")
-        kept = {key: value for key, value in step.items() if key != "runner_up"}
-        found["steps"].append({**kept, "rivals": [] if first is None else [first]})
-    gap = content.get("gap") or {}
-    after, floor = gap.get("after"), gap.get("floor")
-    left = after is not None and floor is not None and after > floor
-    said = content.get("verdict")
-    if content.get("effects") and (said == "unexplained" or (said == "named" and left)):
-        found["verdict"] = "named_in_part"
-    return found
 
 
 def parameters_of(effect: Effect, stderr: float) -> dict[str, Measured]:

@@ -50,6 +50,8 @@ class Stage:
         settings: dotted config keys that it reads; a change of any makes its results stale.
         reads: arrays or whole groups of the store (``"fit"`` or ``"fit/bias"``).
         writes: likewise; what it writes is removed when it starts anew.
+        files: what it writes beside arrays, in the folder of the run, all or some of them; one that is
+            missing or was changed makes the stage stale.
         run: ``"module:function"`` that takes the context and does the stage.
         identity: likewise; returns JSON data that joins its fingerprint (the content of the camera files).
         summary: help of its command; empty where the command line gives it options of its own.
@@ -72,6 +74,7 @@ class Stage:
     writes: tuple[str, ...]
     run: str
     identity: str | None = None
+    files: tuple[str, ...] = ()
     summary: str = ""
     applies: Callable[[RunConfig], bool] = _every_run
     on_demand: bool = False

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.config.load import setting_of, states
 from pchem_pipeline.run.declaration import Stage, imported
-from pchem_pipeline.run.model_versions import model_of_content, model_versions, present_content
+from pchem_pipeline.run.model_versions import model_of_content, model_versions
+from pchem_pipeline.store.files import digest_of_file
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
+from pchem_pipeline.store.run_store import DESCRIPTION
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
@@ -50,7 +53,7 @@ def fingerprint_content(stage: Stage, context: StageContext) -> dict[str, Any]:
     """Return all that decides the result of a stage, as JSON data."""
     upstream: dict[str, str | None] = {}
     for name in stage.upstream:
-        record = context.store.records.read(name)
+        record = context.store.records.known(name)
         upstream[name] = None if record is None else _state_of_record(context.store, record)
     return {
         "stage": stage.name,
@@ -80,11 +83,14 @@ def _state_of_record(store: RunStore, record: StageRecord) -> str:
 
 def status(stage: Stage, context: StageContext) -> StageState:
     """Return how far a stage is under the present configuration and input."""
-    record = context.store.records.read(stage.name)
-    if record is None:
-        return StageState(stage.name, "missing")
-    done = len(context.store.records.done(stage.name, record.fingerprint))
-    state, why = _state(stage, context, record, done)
+    try:
+        record = context.store.records.read(stage.name)
+        if record is None:
+            return StageState(stage.name, "missing")
+        done = len(context.store.records.done(stage.name, record.fingerprint))
+        state, why = _state(stage, context, record, done)
+    except StoreError as error:  # a description or a record is damaged: what rests on it is done again
+        return StageState(stage.name, "stale", str(error).partition("; ")[0])
     return StageState(stage.name, state, why, done, record.keys, rests_on(record, context.store))
 
 
@@ -95,12 +101,15 @@ def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) 
     written = not stage.writes or stage.may_write_nothing or context.store.has(stage.writes[0])
     if done and not written:
         return "stale", f"{stage.writes[0]} is no longer in the store"  # a hand took it out
+    for name, digest in record.files.items():
+        group = f"{name.partition('/')[0]}/{DESCRIPTION}"
+        whole = not name.endswith(DESCRIPTION) or (context.store.path / group).exists()
+        if not whole or digest != digest_of_file(context.store.path / name):
+            return "stale", f"{name if whole else group} is missing or was changed"
     content = fingerprint_content(stage, context)
-    before = present_content(context.store, record.content)
-    same = fingerprint_of(content) in (record.fingerprint, fingerprint_of(before))
-    if not same and not _grew(content, replace(record, content=before)):
+    if fingerprint_of(content) != record.fingerprint and not _grew(content, record):
         numbers = {each.digest: each.number for each in (context.model, *model_versions(context.store))}
-        return "stale", "; ".join(differences(before, content, numbers, context.config))
+        return "stale", "; ".join(differences(record.content, content, numbers, context.config))
     if done < record.keys or record.keys == 0:
         reason = f"{len(record.failed)} failed: {next(iter(record.failed.values()))}" if record.failed else ""
         return "partial", reason
@@ -118,7 +127,7 @@ def rests_on(record: StageRecord, store: RunStore) -> int | None:
     if version is not None:
         return version.number
     for name, fingerprint in record.content.get("upstream", {}).items():
-        upstream = store.records.read(name)
+        upstream = store.records.known(name)
         if upstream is not None and _base(fingerprint) == upstream.fingerprint:
             number = rests_on(upstream, store)
             if number is not None:

@@ -46,10 +46,12 @@ def open_source(context: StageContext) -> FrameSource:
     """Return the frames of the run.
 
     Raises:
-        StoreError: ``ingest`` has not finished.
-        InputError: the camera files are not those that were ingested.
+        StoreError: ``ingest`` has not finished, or its frames are damaged.
+        InputError: the camera files are not those that were ingested, by their content.
     """
+    from pchem_pipeline.frames.identity import digest_of
     from pchem_pipeline.frames.open import open_frames
+    from pchem_pipeline.run.input_identity import known_identity
 
     sensor, store = context.sensor, context.store
     record = store.records.read("ingest")
@@ -58,9 +60,14 @@ def open_source(context: StageContext) -> FrameSource:
     expected = (sensor.n_frames, *sensor.shape)
     if sensor.mode == "copy":
         array = store.array("frames/dn")
+        if array.shape != expected or array.dtype != np.dtype(sensor.dtype):
+            raise StoreError(f"{store.path}: frames/dn is not what was ingested; {store.cure('frames/dn')}")
         return StoredFrames(store.path, expected, np.dtype(sensor.dtype), array.chunks[1])
     reader = open_frames(context.config.input, context.base_dir, check_duplicates=False)
-    if reader.shape != expected or reader.dtype != np.dtype(sensor.dtype):
+    files = known_identity(context)["files"]  # hashed again where names, sizes or times changed
+    content = digest_of([file["xxh3_128"] for file in files])
+    other = content != (record.content.get("input") or {}).get("content", content)
+    if other or reader.shape != expected or reader.dtype != np.dtype(sensor.dtype):
         raise InputError(
             f"{reader.paths[0]}: the camera files changed since they were ingested (now {reader.shape} "
             f"{reader.dtype}, then {expected} {sensor.dtype}); run: pchem ingest {quoted(store.path)}"

@@ -11,7 +11,7 @@ from pchem_pipeline.base.errors import InputError, StoreError
 from pchem_pipeline.frames.identity import content_identity, quick_identity
 from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.store.files import read_json, write_json
+from pchem_pipeline.store.files import cure_of, read_record, write_record
 
 _LISTED_FILES = 64
 
@@ -27,7 +27,9 @@ def known_identity(context: StageContext) -> dict[str, Any]:
         InputError: files are missing or bad, and nothing is known of them from before.
     """
     settings = context.config.input
-    known: dict[str, Any] = read_json(_place(context)) or {}
+    known: dict[str, Any] = {}
+    with suppress(StoreError):  # one that is damaged is as good as none: the files are hashed again
+        known = read_record(_place(context)) or {}
     same_files = known.get("files") == list(settings.files)
     try:
         paths = input_paths(settings, context.base_dir)
@@ -49,19 +51,23 @@ def known_identity(context: StageContext) -> dict[str, Any]:
 
 def identity_is_new(context: StageContext) -> bool:
     """Tell whether nothing is known of the input yet."""
-    return read_json(_place(context)) is None
+    return not _place(context).exists()
 
 
 def keep_ingested(context: StageContext) -> None:
     """Remember the input as known now as that which the run holds, whatever is found in its place later."""
-    known = read_json(_place(context))
+    known = read_record(_place(context))
     if known is not None:
-        write_json(_ingested(context), known)
+        write_record(_ingested(context), known)
 
 
 def ingested_identity(context: StageContext) -> dict[str, Any] | None:
-    """Return the input that the run holds, ``quick`` and ``identity``; None where that was not kept."""
-    return read_json(_ingested(context))
+    """Return the input that the run holds, ``quick`` and ``identity``; None where that was not kept.
+
+    Raises:
+        StoreError: what was kept is damaged.
+    """
+    return read_record(_ingested(context), cure_of(context.store.path, "frames"))
 
 
 def _ingested(context: StageContext) -> Path:
@@ -75,7 +81,7 @@ def keep_identity(context: StageContext, quick: dict[str, Any], identity: dict[s
         StoreError: the store cannot be written.
     """
     files = list(context.config.input.files)
-    write_json(_place(context), {"files": files, "quick": quick, "identity": identity})
+    write_record(_place(context), {"files": files, "quick": quick, "identity": identity})
 
 
 def _place(context: StageContext) -> Path:

@@ -10,7 +10,7 @@ its fingerprint by its digest, in its record by its number.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
-from pchem_pipeline.config.load import present_keys
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.settings import ModelSettings
-from pchem_pipeline.store.files import read_json, write_json
+from pchem_pipeline.store.files import read_record, write_record
 from pchem_pipeline.store.records import fingerprint_of
 
 if TYPE_CHECKING:
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
 
 _GROUP = "model"
 _EXPOSURE, _WEIGHT = "added_exposure", "added_weight"
+_CURE = "delete it: the model is taken from the YAML"
 Region = tuple[slice, slice]
 
 
@@ -119,20 +119,13 @@ class ModelVersion:
 
 
 def _version(number: int, settings: ModelSettings, added: AddedArrays | None, **facts: Any) -> ModelVersion:
-    return _version_of(number, settings.model_dump(mode="json"), added, **facts)
-
-
-def _version_of(number: int, model: dict[str, Any], added: AddedArrays | None, **facts: Any) -> ModelVersion:
-    digest = _digest(model, None if added is None else added.digest)
+    model = settings.model_dump(mode="json")
+    digest = fingerprint_of({"model": model, "added_exposure": None if added is None else added.digest})
     return ModelVersion(number, model, digest, added=added, **facts)
 
 
-def _digest(model: Mapping[str, Any], added: str | None) -> str:
-    return fingerprint_of({"model": model, "added_exposure": added})
-
-
 def model_versions(store: RunStore) -> tuple[ModelVersion, ...]:
-    """Return the versions of a run, by number; of a run of 0.1 those that its records tell of.
+    """Return the versions of a run, by number.
 
     Raises:
         StoreError: a version is damaged.
@@ -141,17 +134,15 @@ def model_versions(store: RunStore) -> tuple[ModelVersion, ...]:
     places = sorted(folder.glob("[0-9]*.json")) if folder.is_dir() else []
     found = []
     for place in places:
-        content: Any = read_json(place)
+        content: Any = read_record(place, _CURE)
         try:
             added = content["added"]
             found.append(
                 ModelVersion(**{**content, "added": None if added is None else AddedArrays(**added)})
             )
         except (KeyError, TypeError) as error:
-            raise StoreError(
-                f"{place} is damaged ({error}); delete it: the model is taken from the YAML"
-            ) from error
-    return tuple(found) or _versions_of_0_1(store)
+            raise StoreError(f"{place} is damaged ({error}); {_CURE}") from error
+    return tuple(found)
 
 
 def version_with(store: RunStore, number: int) -> ModelVersion:
@@ -184,7 +175,7 @@ def model_in_force(store: RunStore, settings: ModelSettings) -> ModelVersion:
         settings: the section.
     """
     versions = model_versions(store)
-    number = (read_json(store.path / _GROUP / "current.json") or {}).get("number")
+    number = (read_record(store.path / _GROUP / "current.json") or {}).get("number")
     fitting = [version for version in versions if version.holds(settings)]
     for version in fitting:
         if version.number == number:
@@ -233,8 +224,8 @@ def keep_in_force(store: RunStore, version: ModelVersion) -> ModelVersion:
     found = {each.number: each for each in (*model_versions(store), version)}
     found = {number: each if each.made else _keep(store, each) for number, each in found.items()}
     place = store.path / _GROUP / "current.json"
-    if read_json(place) != {"number": version.number}:
-        write_json(place, {"number": version.number})
+    if read_record(place) != {"number": version.number}:
+        write_record(place, {"number": version.number})
     return found[version.number]
 
 
@@ -248,7 +239,7 @@ def _keep(store: RunStore, version: ModelVersion) -> ModelVersion:
             store.write_array(f"{name}/{array}", values, _attributes(version.added))
         version = replace(version, added=replace(version.added, group=name))
     version = replace(version, made=datetime.now(UTC).isoformat(timespec="seconds"))
-    write_json(store.path / f"{name}.json", asdict(version))
+    write_record(store.path / f"{name}.json", asdict(version))
     return version
 
 
@@ -268,65 +259,20 @@ def model_of(store: RunStore, stage: str) -> ModelVersion | None:
     """Return the version that the stored result of a stage which reads the model rests on.
 
     That is the model of its maps, whatever the configuration says by now.
+
+    Raises:
+        StoreError: the result is there, but not what it rests on.
     """
     record = store.records.read(stage)
+    if record is None and store.has(stage):
+        raise StoreError(f"{store.path}: {stage} has lost its record; {store.cure(stage)}")
     return None if record is None else model_of_content(store, record.content)
 
 
 def model_of_content(store: RunStore, content: dict[str, Any]) -> ModelVersion | None:
     """Return the version that stands in what decided a result; None where none does."""
-    given = present_content(store, content).get("input") or {}
+    given = content.get("input") or {}
     return with_digest(model_versions(store), given["model"]) if "model" in given else None
-
-
-def present_content(store: RunStore, content: dict[str, Any]) -> dict[str, Any]:
-    """Return what decided a result as this version of the program says it, keys of settings included.
-
-    0.1 had no versions of the model: there the fit read the section of the YAML and the digest of the arrays,
-    the search a list of effects.
-    """
-    given = dict(content.get("input") or {})
-    settings, _ = present_keys(content.get("settings") or {})
-    content = {**content, "settings": settings}
-    if content.get("stage") == "fit" and "model" in settings:
-        given["model"] = _digest(_section(settings.pop("model")), given.pop("added_exposure", None))
-        return {**content, "settings": settings, "input": given}
-    if isinstance(given.get("model"), list):
-        found = [v for v in model_versions(store) if v.model["effects"] == given["model"]]
-        return {**content, "input": {**given, "model": found[0].digest if found else None}}
-    return content
-
-
-def _section(model: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the JSON data of a section as it would be written now."""
-    try:
-        return ModelSettings.model_validate(model).model_dump(mode="json")
-    except ValidationError:
-        return dict(model)
-
-
-def _versions_of_0_1(store: RunStore) -> tuple[ModelVersion, ...]:
-    """Return the models that a run of 0.1 had: before its verdict, after it, and that of its fit."""
-    record = store.records.read("fit")
-    fit = {} if record is None else dict(record.content)
-    fitted = (fit.get("settings") or {}).get("model")
-    kept = store.attributes("discrepancy")
-    found: list[ModelVersion] = []
-    arrays = AddedArrays.of_group(store, "discrepancy")
-    aside = (fitted or {}).get("set_aside_e", [])
-    told: list[tuple[dict[str, Any], AddedArrays | None, dict[str, Any]]] = []
-    if "model_before" in kept:
-        told.append(({"effects": kept["model_before"], "set_aside_e": aside}, None, {}))
-        facts = {"source": "verdict", "parent": 1}
-        told.append(({"effects": kept["model_after"], "set_aside_e": aside}, arrays, facts))
-    if fitted is not None:
-        taken = (fit.get("input") or {}).get("added_exposure")
-        told.append((fitted, arrays if arrays is not None and arrays.digest == taken else None, {}))
-    for model, added, facts in told:
-        version = _version_of(_next(found), _section(model), added, **facts)
-        if with_digest(found, version.digest) is None:
-            found.append(version)
-    return tuple(found)
 
 
 # -- exposure that effects add to single pixels ---------------------------------------------------

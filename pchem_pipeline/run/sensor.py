@@ -87,8 +87,11 @@ class SensorInfo:
         content = store.attributes("frames").get("sensor")
         if content is None:
             raise StoreError(f"{store.path} has no input yet; run: pchem ingest {quoted(store.path)}")
-        samples = tuple(Sample(**each) for each in content.get("samples", ()))
-        camera = CameraFacts(**content.get("camera", {}))
-        whole = content.get("whole")
-        given = {"names": tuple(content["names"]), "samples": samples, "camera": camera}
-        return cls(**{**content, **given, "whole": None if whole is None else tuple(whole)})
+        try:
+            samples = tuple(Sample(**each) for each in content.get("samples", ()))
+            camera = CameraFacts(**content.get("camera", {}))
+            whole = content.get("whole")
+            given = {"names": tuple(content["names"]), "samples": samples, "camera": camera}
+            return cls(**{**content, **given, "whole": None if whole is None else tuple(whole)})
+        except (TypeError, KeyError, AttributeError) as error:
+            raise StoreError(f"{store.path}: frames is damaged ({error}); {store.cure('frames')}") from error

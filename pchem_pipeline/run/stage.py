@@ -34,9 +34,9 @@ from pchem_pipeline.run.progress import Reporter, telling_parts
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.store.files import is_fatal
+from pchem_pipeline.store.records import check_work, working
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import Tile, parse_tiles, roi_tiles, tile_grid, tile_shape
-from pchem_pipeline.store.turn import check_turn, in_turn, take_turn
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
@@ -98,7 +98,7 @@ class MarkedTask:
     """A task that sets the markers of its unit once it is done, in the worker.
 
     ``tell`` hears by key what share of a unit is done, where the worker shares the memory. Where it does not,
-    it may be overtaken: ``turn`` is the number of the turn that it writes in.
+    it may be ``overtaken`` by a later command, and writes no more then.
     """
 
     store: Path
@@ -106,15 +106,15 @@ class MarkedTask:
     fingerprint: str
     task: Callable[[Any], Mapping[str, Any] | None]
     tell: Callable[[str, float], None] | None = None
-    turn: str | None = None
+    overtaken: bool = False
 
     def __call__(self, unit: Unit) -> Mapping[str, Any]:
         """Do the unit, then mark it."""
         store = open_store(self.store)
-        with in_turn(store.turn_file, self.turn):
+        with working(store.records, self.stage, self.fingerprint if self.overtaken else None):
             with telling_parts(None if self.tell is None else functools.partial(self.tell, unit.key)):
                 summary = dict(self.task(unit) or {})
-            check_turn()
+            check_work(self.store)
             for key in unit.keys:
                 store.records.mark(self.stage, self.fingerprint, key, summary)
         return summary
@@ -165,6 +165,7 @@ class StageContext:
         begin: gives up what the running stage left before, at the first call: :meth:`create` and
             :meth:`run_units` call it, a stage that writes before those does so itself. What is refused until
             then costs nothing.
+        created: the arrays that :meth:`create` made or found, with their stages.
     """
 
     config: RunConfig
@@ -183,6 +184,7 @@ class StageContext:
     notes: list[str] = field(default_factory=list)
     prepared: Mapping[str, Prepared] = field(default_factory=dict)
     begin: Callable[[], None] = _nothing
+    created: dict[str, str] = field(default_factory=dict)
 
     @property
     def is_prepared(self) -> bool:
@@ -228,7 +230,7 @@ class StageContext:
     def tile(self) -> tuple[int, int]:
         """Rows and columns of a tile, as configured; with ``auto`` those that the run has already."""
         size: Any = self.config.run.tile
-        record = self.store.records.read("histogram") if size == "auto" else None
+        record = self.store.records.known("histogram") if size == "auto" else None
         if record is not None:
             size = record.content.get("settings", {}).get("run.tile", size)
         return tile_shape(tuple(size) if isinstance(size, list) else size, self.sensor.shape)
@@ -244,7 +246,7 @@ class StageContext:
 
     def tiles_done(self, stage: str) -> set[str]:
         """Return the keys of the tiles that an upstream stage has finished."""
-        record = self.store.records.read(stage)
+        record = self.store.records.known(stage)
         return set() if record is None else self.store.records.done(stage, record.fingerprint)
 
     def note(self, text: str) -> None:
@@ -264,6 +266,7 @@ class StageContext:
     ) -> None:
         """Make an array of this stage, unless the stage resumes and has it."""
         self.begin()
+        self.created[name] = self.stage
         if self.fresh or not self.store.has(name):
             self.store.create_array(
                 name, shape, chunks=chunks, shards=shards, dtype=dtype, attributes=attributes
@@ -331,7 +334,6 @@ class StageContext:
         self._know_total(sum(len(unit.keys) for unit in units) if total is None else total)
         todo = self._ready(self._pending_of(units, by_tiles, total), needs)
         self.store.records.unmark(self.stage, self.fingerprint, (key for unit in todo for key in unit.keys))
-        self.store.sync()  # what was made for the units, by this process, lies below their markers
         fatal: list[BaseException] = []
         shown = len(self.selected(units) if by_tiles else units)
         undivided = list(units) == [WHOLE]
@@ -355,17 +357,27 @@ class StageContext:
                     raise Stop
 
             self.stop.check()
-            heard = tell if executor.shares_memory else None
-            turn = None if executor.shares_memory else take_turn(self.store.turn_file)
-            marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, heard, turn)
+            here = executor.shares_memory
+            heard = tell if here else None
+            marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, heard, not here)
             try:
                 with self.stop.at_once() if undivided else contextlib.nullcontext():
                     executor.map(marked, todo, on_result)
             except Stop:
                 if fatal:
                     raise fatal[0] from fatal[0].__cause__
+        self._fill(units)
         self.stop.check()
         return self.store.records.summaries(self.stage, self.fingerprint)
+
+    def _fill(self, units: Sequence[AnyUnit]) -> None:
+        """Where units are left undone, write "no value" for their pixels into the maps of the stage."""
+        done = self.store.records.done(self.stage, self.fingerprint)
+        if all(set(unit.keys) <= done for unit in units):
+            return
+        for name, stage in self.created.items():
+            if stage == self.stage and "frame" not in VARIABLES[name].dims:
+                self.store.fill(name)
 
     def _affordable(self, executor: Executor, unit_bytes: int) -> Executor:
         limit = self.config.compute.max_memory

@@ -8,9 +8,9 @@ from pathlib import Path
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.config.load import load_config, make_config, parse_config
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.store.files import read_json
+from pchem_pipeline.store.files import read_record
 from pchem_pipeline.store.remote_path import place_of
-from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore, stored_config
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Target:
         Raises:
             StoreError: it was never run, or its store cannot be used.
         """
-        if self.config_path is not None and not (self.store / "zarr.json").exists():
+        if self.config_path is not None and not self.store.exists():
             raise StoreError(
                 f"there is no run at {self.store} yet; run: pchem run {quoted(self.config_path)}"
             )
@@ -50,11 +50,12 @@ def find_run(path: Path) -> Target:
     """
     path = place_of(path)
     if path.is_dir():
-        store = RunStore.open(path)
-        text = store.config_text()
+        text = stored_config(path)
         if text is None:
+            RunStore.open(path)  # says so where it is no run at all
             raise StoreError(f"{path} holds no configuration; give the YAML file that made it")
-        location = read_json(path / ".pchem" / "location.json") or {}
+        cure = "give the run's own YAML file instead of its store, which writes it again"
+        location = read_record(path / ".pchem" / "location.json", cure) or {}
         written = location.get("config")
         return Target(
             parse_config(text, str(path)),

@@ -7,6 +7,7 @@ import time
 from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.compute.environment import cpu_seconds, peak_rss_bytes
@@ -14,7 +15,10 @@ from pchem_pipeline.run.declaration import Stage, imported
 from pchem_pipeline.run.fingerprint import StageState, fingerprint_content, rests_on, status
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.table import STAGES
+from pchem_pipeline.store.files import digest_of_file
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
+from pchem_pipeline.store.remote_path import RemotePath
+from pchem_pipeline.store.run_store import DESCRIPTION
 
 _LIBRARIES = ("numpy", "scipy", "numba", "zarr", "dask", "tifffile", "astropy", "h5py", "matplotlib")
 
@@ -37,7 +41,7 @@ def execute(name: str, context: StageContext) -> StageState:
         context.reporter.info(f"{name}: up to date")
         return before
     for upstream in stage.upstream:
-        if context.store.records.read(upstream) is None:
+        if context.store.records.known(upstream) is None:
             place = quoted(context.config_path or context.store.path)
             raise StoreError(f"{name} needs {upstream} first; run: pchem {upstream} {place}")
     if chosen and stage.upstream:
@@ -67,7 +71,7 @@ def _perform(
     """
     records = context.store.records
     content = fingerprint_content(stage, context)
-    old = records.read(stage.name)
+    old = records.known(stage.name)
     # a stage that was stopped before its first unit may lack arrays
     resumes = before.state in ("partial", "complete") and old is not None and old.keys > 0
     if resumes and context.options.force and restart:
@@ -103,7 +107,7 @@ def _perform(
     try:
         imported(stage.run)(context)
         begin()
-        record = replace(record, finished=True)
+        record = replace(record, finished=True, files=written_files(stage, context.store.path))
     finally:
         record = replace(
             record,
@@ -142,6 +146,17 @@ def _finish(
     why = f"{len(context.failed)} of {record.keys} units failed, first {key}: {reason}"
     context.reporter.warning(f"{stage.name}: {why}")
     return StageState(stage.name, "failed", why, done, record.keys)
+
+
+def written_files(stage: Stage, folder: Path) -> dict[str, str]:
+    """Return the files beside arrays that a stage wrote and the descriptions of its arrays, with digests."""
+    places = [folder / name for name in stage.files]
+    if not isinstance(folder, RemotePath):  # where each would be a request
+        for name in stage.writes:
+            below = DESCRIPTION if "/" in name else f"*/{DESCRIPTION}"
+            places += (folder / name).glob(below)
+    found = {place.relative_to(folder).as_posix(): digest_of_file(place) for place in places}
+    return {name: digest for name, digest in found.items() if digest is not None}
 
 
 def _versions() -> dict[str, str]:

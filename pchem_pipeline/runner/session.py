@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, InputError, StoreError
 from pchem_pipeline.compute.executor import Notices, SerialExecutor, make_executor
@@ -23,7 +24,7 @@ from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.samples import SAMPLES_UNTIL, check_samples, sample_targets
 from pchem_pipeline.stages.table import STAGES, pipeline_of
-from pchem_pipeline.store.files import write_json
+from pchem_pipeline.store.files import write_record
 from pchem_pipeline.store.progress_file import ProgressFile
 from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
@@ -118,7 +119,7 @@ def _is_empty(place: Path) -> bool:
     if not (place / ".pchem").is_dir():
         return not place.exists() or {each.name for each in place.iterdir()} <= {"zarr.json"}
     records = RunStore.open(place).records
-    return all(records.read(name) is None for name in STAGES)
+    return all(records.known(name) is None for name in STAGES)
 
 
 def _bring_samples(target: Target, stages: Sequence[str], command: Command) -> None:
@@ -171,7 +172,7 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
         stop = stack.enter_context(stop_on_signals())
         store.write_config(dump_config(own))  # what a single command was given is no setting of the run
         keep_in_force(store, model_in_force(store, target.config.model))
-        write_json(store.path / ".pchem" / "location.json", _location(target))
+        write_record(store.path / ".pchem" / "location.json", _location(target))
         executor = make_executor(target.config.compute, Notices(reporter.warning, stop.check))
         stack.callback(executor.close)
         yield StageContext(
@@ -186,7 +187,7 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
         )
 
 
-def _location(target: Target) -> dict[str, str]:
+def _location(target: Target) -> dict[str, Any]:
     """Return where the run's paths refer to, and its YAML file."""
     place = {"base_dir": str(target.base_dir)}
     return place if target.config_path is None else {**place, "config": str(target.config_path)}
@@ -200,11 +201,11 @@ def run_status(target: Target, options: Options | None = None) -> list[StageStat
         options: of a command that is about to work on it; None: nothing is asked for.
     """
     stages = pipeline_of(target.config)
-    if not (target.store / "zarr.json").exists():
+    if not any((target.store / each).exists() for each in ("zarr.json", ".pchem/stages")):
         return [StageState(name, "missing") for name in stages]
     context = _reading_context(target, Reporter("off", quiet=True), options or Options())
-    done = (name for name in STAGES if context.store.records.read(name) is not None)
-    stages += tuple(name for name in done if STAGES[name].on_demand)
+    done = (target.store / ".pchem" / "stages" / f"{name}.json" for name in STAGES if STAGES[name].on_demand)
+    stages += tuple(place.stem for place in done if place.exists())
     states: list[StageState] = []
     stale: set[str] = set()
     for name in stages:
@@ -253,7 +254,9 @@ def _reading_context(target: Target, reporter: Reporter, options: Options) -> St
 
 
 def _check_failed_pixels(context: StageContext, name: str) -> None:
-    """Raise an error if more pixels have no value than the configuration allows."""
+    """Raise an error if more pixels have no value than allowed, unless only some tiles were chosen."""
+    if context.options.tiles is not None or context.options.roi is not None:
+        return
     from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 
     words = context.store.read(name)

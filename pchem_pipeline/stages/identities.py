@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from pchem_pipeline.run.input_identity import known_identity
-from pchem_pipeline.run.model_versions import model_versions, present_content, with_digest
+from pchem_pipeline.run.model_versions import model_versions, with_digest
 
 if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
@@ -38,7 +38,7 @@ def _sample_content(context: StageContext) -> dict[str, Any]:
     try:
         return sample_facts(context.config, context.base_dir)
     except (ConfigError, StoreError):
-        record = context.store.records.read("ingest")
+        record = context.store.records.known("ingest")
         if record is None or not record.content.get("input"):
             raise
         known: dict[str, Any] = record.content["input"]
@@ -74,7 +74,7 @@ def verdict(context: StageContext) -> dict[str, str] | None:
 
     state = discrepancy_state(context.store)
     found = {} if state is None else {"discrepancy": state}
-    compared = context.store.records.read("methods")
+    compared = context.store.records.known("methods")
     if compared is not None and compared.finished:
         found["methods"] = f"{compared.fingerprint[:8]}, {compared.started}"
     return found or None
@@ -95,8 +95,8 @@ def search_start(context: StageContext) -> dict[str, Any]:
     Where the model in force came from a search that started as the one in the store did, it is the model
     before. The region of a search stays that of the next one, unless this is to be done by force.
     """
-    record, model = context.store.records.read("discrepancy"), context.model
-    kept = {} if record is None else present_content(context.store, record.content)["input"]
+    record, model = context.store.records.known("discrepancy"), context.model
+    kept = {} if record is None else record.content["input"]
     before = with_digest(model_versions(context.store), kept.get("model"))
     own = model.source == "verdict" and before is not None and before.number == model.parent
     start = before if own and before is not None else model

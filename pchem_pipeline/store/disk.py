@@ -1,25 +1,18 @@
-"""The few operations by which files of this machine change, and what a power cut leaves of them.
+"""The few operations by which files of this machine change, so that tests can let each of them fail.
 
-All writing goes through here, so that tests can let each operation fail, and replay what was not yet synced
-in other orders. A file appears by its rename; that its content outlives a power cut is certain only after
-`sync_file`, and the rename after `sync_folder`.
+A file appears by its rename; that its content outlives a power cut is certain only after `sync_file`, and the
+rename after `sync_folder`. Records and markers are synced, chunks are not: one that a power cut took is found
+missing or without its checksum by whoever reads it.
 """
 
 from __future__ import annotations
 
-import contextlib
-import functools
 import os
 import secrets
 import shutil
-import threading
-from collections.abc import Callable, Collection, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 Data = bytes | bytearray | memoryview
-
-_SYNCS_AT_ONCE = 8
 
 
 def aside(path: Path) -> Path:
@@ -73,21 +66,14 @@ def sync_folder(path: Path) -> None:
 
 def sync_all(path: Path) -> None:
     """Wait until a file, or a folder with all that is in it, is on the disk."""
-    below = list(path.rglob("*")) if path.is_dir() else []
-    _each(sync_file, [part for part in (path, *below) if part.is_file()])
-    _each(sync_folder, [part for part in (path, *below) if part.is_dir()])
+    parts = [path, *(path.rglob("*") if path.is_dir() else ())]
+    for part in sorted(parts, key=Path.is_dir):  # files come before folders
+        (sync_folder if part.is_dir() else sync_file)(part)
 
 
-def put(path: Path, data: Data, *, sync: bool = False) -> list[Path]:
-    """Write a file, so that whoever reads it finds the old or the new one, whole.
-
-    Returns:
-        The folders in which names changed: its own, and those above it that were not there.
-    """
+def put(path: Path, data: Data, *, sync: bool = False) -> None:
+    """Write a file, so that whoever reads it finds the old or the new one, whole."""
     part = aside(path)
-    folders = [path.parent]
-    while not folders[-1].exists():
-        folders.append(folders[-1].parent)
     make_folder(path.parent)
     try:
         write(part, data)
@@ -97,61 +83,3 @@ def put(path: Path, data: Data, *, sync: bool = False) -> list[Path]:
     except BaseException:
         remove(part)
         raise
-    return folders
-
-
-class Unsynced:
-    """What this process has changed below a folder since it was last synced: files, and folders of names."""
-
-    def __init__(self) -> None:
-        self._files: set[Path] = set()
-        self._folders: set[Path] = set()
-        self._lock = threading.Lock()
-        self._waiting = threading.Lock()
-
-    def note(self, file: Path | None, folders: Iterable[Path]) -> None:
-        """Remember a file that was written, if any, and folders in which names changed."""
-        with self._lock:
-            self._files |= set() if file is None else {file}
-            self._folders |= set(folders)
-
-    def sync(self, part: Path | None = None) -> None:
-        """Wait until all that was noted, and one more file, is on the disk; nothing else is waited for.
-
-        Files come before folders. Several at once: the journal of a file system takes them together, in the
-        time of a few. Threads that come meanwhile wait, since what they noted may be on its way.
-        """
-        with self._waiting:
-            with self._lock:
-                files, folders = self._files, self._folders
-                self._files, self._folders = set(), set()
-            try:
-                _each(sync_file, [*files, *([part] if part is not None else [])])
-                _each(sync_folder, folders)
-            except BaseException:
-                with self._lock:
-                    self._files |= files
-                    self._folders |= folders
-                raise
-
-
-def _each(sync: Callable[[Path], None], paths: Collection[Path]) -> None:
-    """Sync files or folders, but for those that were removed since."""
-
-    def one(path: Path) -> None:
-        with contextlib.suppress(FileNotFoundError):
-            sync(path)
-
-    if len(paths) < 2:
-        for path in paths:
-            one(path)
-        return
-    with ThreadPoolExecutor(min(_SYNCS_AT_ONCE, len(paths)), thread_name_prefix="sync") as pool:
-        for _ in pool.map(one, paths):
-            pass
-
-
-@functools.cache
-def unsynced(folder: Path) -> Unsynced:
-    """Return what is known of a folder, the same object for all that write to it."""
-    return Unsynced()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import json
 import math
 import os
@@ -13,7 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.base.errors import StoreError
+from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.store import disk
 from pchem_pipeline.store.remote_path import RemotePath
 
@@ -52,7 +53,7 @@ def is_fatal(error: BaseException) -> bool:
     return isinstance(error, OSError) and error.errno in _CURES
 
 
-def write_atomic(path: Path, data: bytes, *, sync: bool | Callable[[Path], None] = True) -> None:
+def write_atomic(path: Path, data: bytes, *, sync: bool = True) -> None:
     """Write a small file, so that whoever reads it finds the old or the new one, whole.
 
     A file that is there keeps its mode.
@@ -63,18 +64,15 @@ def write_atomic(path: Path, data: bytes, *, sync: bool | Callable[[Path], None]
         path: the file; folders above it are made.
         data: its content.
         sync: it is on the disk before it takes its place, so that a power cut cannot leave it empty, and the
-            place is on the disk on return. A function brings it there (and what else it has to) before it
-            takes its place.
+            place is on the disk on return.
 
     Raises:
         StoreError: the file system, or the object storage, refused.
     """
     if isinstance(path, RemotePath):
-        if callable(sync):
-            sync(path)
         path.write_bytes(data)
         return
-    before, after = (disk.sync_file, disk.sync_folder) if sync is True else (sync or None, None)
+    before, after = (disk.sync_file, disk.sync_folder) if sync else (None, None)
     with _put_in_place(path, disk.aside(path), before, after) as part:
         disk.write(part, data)
 
@@ -164,15 +162,6 @@ def remove_folder(path: Path) -> None:
         raise storage_error(error, path) from error
 
 
-def is_blank(path: Path) -> bool:
-    """Tell whether a file is empty or begins with a zero: its content was lost in a power cut."""
-    try:
-        with path.open("rb") as file:
-            return file.read(1) in (b"", b"\0")
-    except FileNotFoundError:
-        return False
-
-
 def sync_folder(path: Path) -> None:
     """Wait until the names in a folder are on the disk, if it is there.
 
@@ -222,12 +211,12 @@ def without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write_json(path: Path, value: Any, *, sync: bool | Callable[[Path], None] = True) -> None:
+def write_json(path: Path, value: Any) -> None:
     """Write a value as indented JSON, atomically; see `write_atomic`."""
-    write_atomic(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode(), sync=sync)
+    write_atomic(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
-def read_json(path: Path) -> Any | None:
+def read_json(path: Path, cure: str = "delete it and run the stage again") -> Any | None:
     """Return the value of a JSON file, or None where there is no file.
 
     Raises:
@@ -238,4 +227,87 @@ def read_json(path: Path) -> Any | None:
     except FileNotFoundError:
         return None
     except (ValueError, RecursionError) as error:
-        raise StoreError(f"{path} is damaged ({error}); delete it and run the stage again") from error
+        raise StoreError(f"{path} is damaged ({error}); {cure}") from error
+
+
+def digest_of_file(path: Path) -> str | None:
+    """Return the SHA-256 of a file or an object, None where there is none."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except FileNotFoundError:
+        return None
+
+
+# -- records of a run: JSON with a digest of itself ------------------------------------------------
+
+_DIGEST = "digest_of_content"
+#: groups of arrays that are not called like the stage which writes them
+_STAGE_OF = {
+    "frames": "ingest",
+    "summary": "histogram",
+    "truth": "simulate",
+    "samples": "fit",
+    "ensemble_tiles": "ensemble",
+}
+_COMMANDS = frozenset({"histogram", "fit", "maps", "ensemble", "electrons", "discrepancy", "methods"})
+
+
+def cure_of(run: Path, name: str) -> str:
+    """Return what to do where an array or a group of a run is damaged."""
+    group = name.partition("/")[0]
+    stage = _STAGE_OF.get(group, group)
+    if stage in _COMMANDS or group in _STAGE_OF:
+        return f"do it again: pchem {stage} {quoted(run)} --force"
+    if group == "model":
+        return f"delete {run / group} and run again: the model is taken from the configuration"
+    return "do it again with --force" if group else "delete it and run again"
+
+
+def write_record(path: Path, value: dict[str, Any]) -> None:
+    """Write a record of a run as JSON with a digest of itself, atomically; see `write_atomic`."""
+    write_json(path, with_digest(value))
+
+
+def read_record(path: Path, cure: str = "delete it and run again") -> dict[str, Any] | None:
+    """Return what `write_record` wrote, or None where there is no file.
+
+    Raises:
+        StoreError: it is damaged.
+    """
+    try:
+        return checked(path.read_bytes(), path, cure)[0]
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise storage_error(error, path) from error
+
+
+def with_digest(content: dict[str, Any], *, inside: bool = False) -> dict[str, Any]:
+    """Return JSON data with a digest of it; ``inside`` its attributes, as zarr needs it."""
+    content = json.loads(json.dumps(content))  # as it will be read: keys are text
+    holder = content.setdefault("attributes", {}) if inside else content
+    holder.pop(_DIGEST, None)
+    holder[_DIGEST] = _digest(content)
+    return content
+
+
+def checked(data: bytes, path: Path, cure: str, *, inside: bool = False) -> tuple[dict[str, Any], bool]:
+    """Return JSON data without their digest, and whether they had one; those of version 0.2 had none.
+
+    Raises:
+        StoreError: they are damaged.
+    """
+    try:
+        content = json.loads(data)
+        holder = content.get("attributes", {}) if inside else content
+        digest = holder.pop(_DIGEST, None)
+        same = digest is None or digest == _digest(content)
+    except (ValueError, RecursionError, AttributeError) as error:
+        raise StoreError(f"{path} is damaged ({error}); {cure}") from error
+    if not same:
+        raise StoreError(f"{path} is damaged (checksum mismatch); {cure}")
+    return content, digest is not None
+
+
+def _digest(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

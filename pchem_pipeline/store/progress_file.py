@@ -11,8 +11,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.base.errors import StoreError
+from pchem_pipeline.base.errors import StoreError, one_line
 from pchem_pipeline.store.files import write_atomic
+from pchem_pipeline.store.lock import is_locked
+
+_WORDS = ("stage", "unit", "time", "host")
+_NUMBERS = ("done", "total", "elapsed", "rate", "remaining", "pid")
+_MOST = 1e15  # of what can be counted here
 
 
 class ProgressFile:
@@ -46,27 +51,24 @@ class ProgressFile:
 
 
 def read_progress(store: Path) -> dict[str, Any] | None:
-    """Return what the command that works on a run tells, or None where none does.
+    """Return what the command that works on a run tells, or None where none does: its lock decides.
 
-    A file that a killed process of this machine left counts as none.
+    Numbers and words of other types, and control characters, do not get through.
     """
+    place = _place(store)
     try:
-        content: dict[str, Any] = dict(json.loads(_place(store).read_text(encoding="utf-8")))
-        here = content["host"] == socket.gethostname()
-        return content if not here or process_lives(int(content["pid"])) else None
-    except (OSError, ValueError, KeyError, TypeError):
+        content = json.loads(place.read_bytes())
+        if not isinstance(content, dict) or not is_locked(store, place.parent):
+            return None
+    except (OSError, ValueError, RecursionError):
         return None
+    words = {name: one_line(text) for name in _WORDS if isinstance(text := content.get(name), str)}
+    numbers = {name: value for name in _NUMBERS if _is_number(value := content.get(name))}
+    return {**words, **numbers}
 
 
-def process_lives(pid: int) -> bool:
-    """Tell whether a process of this machine is there."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # somebody else's
-        return True
-    return True
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 <= value < _MOST
 
 
 def _place(store: Path) -> Path:

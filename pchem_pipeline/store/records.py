@@ -2,21 +2,68 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Iterable, Iterator
+from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pchem_pipeline.base.errors import LockedError, StoreError
 from pchem_pipeline.store.files import (
     canonical_json,
-    read_json,
+    read_record,
     remove_file,
     remove_folder,
     sync_folder,
-    write_json,
+    write_record,
 )
 from pchem_pipeline.store.remote_path import RemotePath
+
+#: seconds for which a look at the record holds: a worker that hung for less was not overtaken
+_LOOK = 1.0
+
+
+@dataclass
+class _Work:
+    records: Records
+    stage: str
+    fingerprint: str
+    looked: float = float("-inf")
+
+
+_WORK: ContextVar[_Work | None] = ContextVar("work", default=None)
+
+
+@contextlib.contextmanager
+def working(records: Records, stage: str, fingerprint: str | None) -> Iterator[None]:
+    """Let this thread write only while a stage is done in this form; None: it may always write.
+
+    A worker that hangs, or whose parent was killed, still has its unit. When it wakes up, the run may have
+    been done anew with other settings, in whose place it must not put what it was once asked for.
+    """
+    token = _WORK.set(None if fingerprint is None else _Work(records, stage, fingerprint))
+    try:
+        yield
+    finally:
+        _WORK.reset(token)
+
+
+def check_work(path: Path) -> None:
+    """Refuse to write into a run where the work of this thread was overtaken.
+
+    Raises:
+        LockedError: it was.
+    """
+    work = _WORK.get()
+    if work is None or time.monotonic() - work.looked < _LOOK:
+        return
+    record = work.records.known(work.stage)
+    if record is None or record.fingerprint != work.fingerprint:
+        raise LockedError(f"{path}: work was taken over by a later pchem command; it writes no more")
+    work.looked = time.monotonic()
 
 
 def fingerprint_of(content: dict[str, Any]) -> str:
@@ -43,6 +90,7 @@ class StageRecord:
         notes: one-line remarks that the report repeats.
         versions: versions of Python and of the libraries.
         model: number of the version of the run's model that the result rests on; None: of none.
+        files: names of the files of the run that it wrote, beside arrays, with their digests.
     """
 
     stage: str
@@ -59,26 +107,40 @@ class StageRecord:
     notes: tuple[str, ...] = ()
     versions: dict[str, str] = field(default_factory=dict)
     model: int | None = None
+    files: dict[str, str] = field(default_factory=dict)
 
 
 class Records:
     """The stage records and unit markers below one folder."""
 
-    def __init__(self, folder: Path, sync: Callable[[Path], None]) -> None:
-        """Take the folder, and what waits until a file, and the arrays written before it, are on the disk."""
+    def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._sync = sync
 
     def read(self, stage: str) -> StageRecord | None:
-        """Return the record of a stage, or None if it never started."""
-        content = read_json(self._folder / "stages" / f"{stage}.json")
+        """Return the record of a stage, or None if it never started.
+
+        Raises:
+            StoreError: it is damaged.
+        """
+        path, cure = self._folder / "stages" / f"{stage}.json", "run the stage again, which replaces it"
+        content = read_record(path, cure)
         if content is None:
             return None
-        return StageRecord(**{**content, "notes": tuple(content.get("notes", ()))})
+        try:
+            return StageRecord(**{**content, "notes": tuple(content.get("notes", ()))})
+        except TypeError as error:
+            raise StoreError(f"{path} is damaged ({error}); {cure}") from error
+
+    def known(self, stage: str) -> StageRecord | None:
+        """Return the record of a stage, None also where it is damaged and the stage is to be done again."""
+        try:
+            return self.read(stage)
+        except StoreError:
+            return None
 
     def write(self, record: StageRecord) -> None:
         """Store the record of a stage."""
-        write_json(self._folder / "stages" / f"{record.stage}.json", asdict(record), sync=self._sync)
+        write_record(self._folder / "stages" / f"{record.stage}.json", asdict(record))
 
     def forget(self, stage: str) -> None:
         """Drop the record and all markers of a stage."""
@@ -98,7 +160,7 @@ class Records:
         """
         if "/" in key or key.startswith("."):
             raise ValueError(f"stage {stage}: the key {key!r} of a unit is no name of a file")
-        write_json(self._marker(stage, fingerprint, key), summary, sync=self._sync)
+        write_record(self._marker(stage, fingerprint, key), summary)
 
     def unmark(self, stage: str, fingerprint: str, keys: Iterable[str]) -> None:
         """Say that units have to be done again."""
@@ -124,7 +186,7 @@ class Records:
     def summaries(self, stage: str, fingerprint: str) -> dict[str, dict[str, Any]]:
         """Return the summary that each finished unit left, in the order of the keys."""
         keys = sorted(self.done(stage, fingerprint))
-        return {key: read_json(self._marker(stage, fingerprint, key)) or {} for key in keys}
+        return {key: read_record(self._marker(stage, fingerprint, key)) or {} for key in keys}
 
     def _marker(self, stage: str, fingerprint: str, key: str) -> Path:
         return self._folder / "done" / stage / fingerprint[:16] / f"{key}.json"

@@ -10,10 +10,8 @@ once, and its errors, which differ by storage, would have to be made one line al
 from __future__ import annotations
 
 import functools
-import hashlib
 import re
 from collections.abc import Callable, Generator
-from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path, PosixPath, PurePosixPath
 from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar, cast
@@ -192,12 +190,6 @@ class RemotePath(_Pure):
                 raise FileExistsError(str(self)) from error
             self.write_bytes(data)
 
-    @_asked
-    def modified(self) -> datetime:
-        """Return when the object was put, by the clock of the storage."""
-        found: datetime = self.storage.modified(str(self))
-        return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
-
     def __getattr__(self, name: str) -> NoReturn:
         """Refuse what a disk can do and an object storage cannot.
 
@@ -238,12 +230,3 @@ def _storage(protocol: str) -> Any:
         raise MissingDependencyError(
             f"{protocol}://: a store there needs another library ({error}); install it: {install_hint('s3')}"
         ) from error
-
-
-def lock_folder(path: Path, private: str) -> Path:
-    """Return where the lock of a run lies: in its private folder; in the user's cache if that is no disk."""
-    if not isinstance(path, RemotePath):
-        return path / private
-    from platformdirs import user_cache_path
-
-    return user_cache_path("pchem_pipeline") / "locks" / hashlib.sha256(str(path).encode()).hexdigest()[:16]

@@ -6,45 +6,44 @@ run.zarr/
   frames/ histogram/ summary/ fit/ maps/ ensemble/ electrons/ truth/
   model/                 0001.json ...: versions of the model, their arrays in groups; current.json
   report.html, report.json, figures/
-  .pchem/                config.yaml, stages/<stage>.json, done/<stage>/<fingerprint>/<unit>.json, lock, turn,
+  .pchem/                config.yaml, stages/<stage>.json, done/<stage>/<fingerprint>/<unit>.json, lock,
                          progress.json while a command works on it
 ```
 
-The same objects make a run on an object storage, whose path is a URL; there ``lock.json`` is the lock for all
-machines, beside one of this machine in the user's cache.
+The same objects make a run on an object storage, whose path is a URL; there ``lock.json`` is the lock.
 """
 
 from __future__ import annotations
 
 import functools
+import hashlib
 import math
 import os
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import LockedError, PchEmError, StoreError, quoted
+from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
 from pchem_pipeline.base.variables import variable_at
 from pchem_pipeline.store import disk
 from pchem_pipeline.store.files import (
-    is_blank,
+    cure_of,
     link_out_of,
     remove_file,
     remove_folder,
     storage_error,
+    sync_folder,
     write_atomic,
 )
-from pchem_pipeline.store.lease import check_lease, leased
-from pchem_pipeline.store.records import Records
-from pchem_pipeline.store.remote_path import RemotePath, lock_folder, place_of, refused
-from pchem_pipeline.store.turn import check_turn
+from pchem_pipeline.store.lock import locked
+from pchem_pipeline.store.records import Records, check_work
+from pchem_pipeline.store.remote_path import RemotePath, place_of, refused
 
 if TYPE_CHECKING:
     import zarr
@@ -53,7 +52,10 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = 1
 
 _PRIVATE = ".pchem"
-_DESCRIPTION = "zarr.json"
+DESCRIPTION = "zarr.json"
+_DIGEST_LINE = "# sha256 of the above: "
+#: what zarr and its codecs raise over wrong content
+_DAMAGE = (ValueError, RuntimeError, TypeError, AttributeError, AssertionError, IndexError)
 _Region = tuple[slice | int, ...]
 #: Pixels about each that is wanted which are rather read than left out.
 _SPARSE = 16
@@ -65,7 +67,7 @@ class RunStore:
     def __init__(self, path: Path, root: zarr.Group) -> None:
         self.path = path
         self._root = root
-        self.records = Records(path / _PRIVATE, self.sync)
+        self.records = Records(path / _PRIVATE)
 
     # -- opening ------------------------------------------------------------------------------
 
@@ -82,9 +84,8 @@ class RunStore:
         from pchem_pipeline.store.zarr_store import zarr_store
 
         path = place_of(path)
-        _remove_blank(path)
         strangers = _strangers(path)  # looked for first: another process may be making the same store
-        if (path / _DESCRIPTION).exists():
+        if (path / DESCRIPTION).exists():
             return cls.open(path, writable=True)
         if strangers:
             raise StoreError(f"{path} exists and is not a run; choose another --store or remove it")
@@ -93,7 +94,9 @@ class RunStore:
             attributes = {"pchem_schema": SCHEMA_VERSION}
             zarr.create_group(zarr_store(path, writable=True), zarr_format=3, attributes=attributes)
         store = cls.open(path, writable=True)
-        store.sync()
+        if not isinstance(path, RemotePath):
+            for folder in (path, path.parent):
+                sync_folder(folder)
         return store
 
     @classmethod
@@ -108,7 +111,9 @@ class RunStore:
         from pchem_pipeline.store.zarr_store import zarr_store
 
         path = place_of(path)
-        if not (path / "zarr.json").exists():
+        if not (path / DESCRIPTION).exists():
+            if (path / _PRIVATE / "stages").is_dir():
+                raise StoreError(f"{path / DESCRIPTION} is missing; run again, which writes it")
             raise StoreError(
                 f"there is no run at {path}; make one with: pchem run FILES --store {quoted(path)}"
             )
@@ -117,8 +122,8 @@ class RunStore:
             with _one_line(path, path):
                 root = zarr.open_group(zarr_store(path, writable=writable), mode="r+" if writable else "r")
                 schema = root.attrs.get("pchem_schema")
-        except (ValueError, KeyError, TypeError) as error:
-            raise StoreError(f"{path} is damaged ({error}); restore it, or remove and redo it") from error
+        except (KeyError, *_DAMAGE) as error:
+            raise StoreError(f"{path / DESCRIPTION} is damaged ({error}); {cure_of(path, '')}") from error
         if schema is None:
             raise StoreError(
                 f"{path} is a zarr store but no run; to read its frames: "
@@ -135,8 +140,16 @@ class RunStore:
 
     def has(self, name: str) -> bool:
         """Tell whether the array or group ``name`` exists."""
-        with _one_line(self.path, self.path):
+        with self._translated(name):
             return name in self._root
+
+    def arrays(self, group: str) -> list[str]:
+        """Return the names of the arrays of a group, sorted."""
+        import zarr
+
+        with self._translated(group):
+            found = self._root[group]
+            return sorted(found.array_keys()) if isinstance(found, zarr.Group) else []
 
     def create_array(
         self,
@@ -174,7 +187,7 @@ class RunStore:
                 chunks=tuple(max(1, min(c, s)) for c, s in zip(chunks, shape, strict=True)),
                 shards=shards,
                 dtype=kind,
-                fill_value=np.nan if kind.kind == "f" else 0,
+                fill_value=np.nan if kind.kind == "f" else variable.fill,
                 compressors=_compressors(name, kind),
                 dimension_names=variable.dims,
                 attributes={**attrs, **(attributes or {})},
@@ -188,7 +201,16 @@ class RunStore:
         self.create_array(name, data.shape, chunks=data.shape, dtype=dtype, attributes=attributes)
         self.write(name, (slice(None),) * data.ndim, data)
 
-    def array(self, name: str) -> zarr.Array[Any]:
+    @functools.cached_property
+    def _writer(self) -> zarr.Group:
+        """The root through which chunks are written: zarr looks for what is in their place before."""
+        import zarr
+
+        from pchem_pipeline.store.zarr_store import zarr_store
+
+        return zarr.open_group(zarr_store(self.path, writable=True, begins=True), mode="r+")
+
+    def array(self, name: str, *, to_write: bool = False) -> zarr.Array[Any]:
         """Return the zarr array ``name``, for its shape, chunks and attributes.
 
         Raises:
@@ -198,25 +220,22 @@ class RunStore:
 
         from pchem_pipeline.store.zarr_store import foreign_codecs
 
-        try:
-            with _one_line(self.path, f"{self.path}: {name}"):
-                found = self._root[name]
-        except KeyError as error:
-            raise StoreError(
-                f"{self.path} has no {name}; run the stage that writes it, with --force if that is up to date"
-            ) from error
-        except (ValueError, TypeError) as error:
-            raise StoreError(
-                f"{self.path}: {name} is damaged ({error}); redo the stage that writes it with --force"
-            ) from error
+        with self._translated(name):
+            found = (self._writer if to_write else self._root).get(name)
+        if found is None:
+            raise StoreError(f"{self.path} has no {name}; {self.cure(name)}")
         if not isinstance(found, zarr.Array):
-            raise StoreError(f"{self.path}: {name} is no array; redo the stage that writes it with --force")
+            raise StoreError(f"{self.path}: {name} is no array; {self.cure(name)}")
         if foreign := foreign_codecs(found):
             raise StoreError(
                 f"{self.path}: {name} is coded by {', '.join(foreign)}, which this program never writes and "
                 "which may run code; do not use this store"
             )
-        return found
+        return found.with_config({"write_empty_chunks": True})
+
+    def cure(self, name: str) -> str:
+        """Return what to do where an array or a group is damaged."""
+        return cure_of(self.path, name)
 
     def read(self, name: str, region: _Region | None = None) -> NDArray[Any]:
         """Return the array ``name``, or a region of it.
@@ -260,12 +279,25 @@ class RunStore:
         """Write ``data`` into a region made of whole chunks.
 
         Raises:
-            LockedError: the work of this thread was overtaken, see :mod:`.turn`.
+            LockedError: the work of this thread was overtaken by a later command.
             StoreError: the file system refused.
         """
-        check_turn()
+        check_work(self.path)
         with self._translated(name, region):
-            self.array(name)[region] = data
+            self.array(name, to_write=True)[region] = data
+
+    def fill(self, name: str) -> None:
+        """Write the fill value wherever nothing was written: a chunk that is missing is damage.
+
+        Raises:
+            StoreError: it is missing, or the file system refused.
+        """
+        array, sizes = self.array(name, to_write=True), self.file_shape(name)
+        for place in np.ndindex(*(-(-n // size) for n, size in zip(array.shape, sizes, strict=True))):
+            if not self.path.joinpath(name, "c", *map(str, place)).exists():
+                region = tuple(slice(i * size, (i + 1) * size) for i, size in zip(place, sizes, strict=True))
+                with self._translated(name, region):
+                    array[region] = array.fill_value
 
     def resize(self, name: str, length: int) -> None:
         """Make an array longer (or shorter) along its first axis; what it holds stays.
@@ -279,20 +311,15 @@ class RunStore:
 
     def delete(self, name: str) -> None:
         """Remove an array or a group, if it exists, also one whose description a power cut has lost."""
-        if not isinstance(self.path, RemotePath):
-            remove_folder(self.path / name)
-            disk.unsynced(self.path).note(None, [(self.path / name).parent])
-        elif self.has(name):
-            with self._translated(name):
-                del self._root[name]
+        remove_folder(self.path / name)
+        if not isinstance(self.path, RemotePath):  # a power cut must not bring it back among what is new
+            sync_folder((self.path / name).parent)
 
     def attributes(self, name: str = "") -> dict[str, Any]:
         """Return the attributes of a group or array (of the root by default); empty where there is none."""
-        with _one_line(self.path, self.path):
-            try:
-                return dict((self._root[name] if name else self._root).attrs)
-            except KeyError:
-                return {}
+        with self._translated(name):
+            found = self._root.get(name) if name else self._root
+            return {} if found is None else dict(found.attrs)
 
     def set_attributes(self, name: str, values: Mapping[str, Any]) -> None:
         """Add attributes (JSON) to a group, making the group where needed."""
@@ -308,84 +335,36 @@ class RunStore:
         return path
 
     def write_config(self, text: str) -> None:
-        """Keep the resolved YAML of the run."""
-        write_atomic(self.path / _PRIVATE / "config.yaml", text.encode())
+        """Keep the resolved YAML of the run, with a digest behind it."""
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        write_atomic(self.path / _PRIVATE / "config.yaml", f"{text}{_DIGEST_LINE}{digest}\n".encode())
 
     def config_text(self) -> str | None:
-        """Return the resolved YAML that made the run, or None."""
-        try:
-            return (self.path / _PRIVATE / "config.yaml").read_text(encoding="utf-8")
-        except FileNotFoundError:
-            return None
-
-    @property
-    def turn_file(self) -> Path:
-        """The file that says whose turn it is to write, see :mod:`.turn`."""
-        return self.path / _PRIVATE / "turn"
-
-    def sync(self, part: Path | None = None) -> None:
-        """Wait until the arrays that this process wrote are on the disk, before a marker says that they are.
-
-        Args:
-            part: the marker, or another file that is to be on the disk with them before it takes its place.
-
-        Raises:
-            StoreError: the disk could not take them.
-        """
-        if isinstance(self.path, RemotePath):  # an object that was put is stored
-            check_lease(self.path)
-            return
-        try:
-            disk.unsynced(self.path).sync(part)
-        except OSError as error:
-            raise storage_error(error, self.path) from error
+        """Return the resolved YAML that made the run, or None; see `stored_config`."""
+        return stored_config(self.path)
 
     # -- housekeeping -------------------------------------------------------------------------
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the run's lock; the kernel frees it when the process ends, however it ends.
+        """Hold the run's lock, see :mod:`.lock`.
 
         Raises:
             LockedError: another process holds it.
             StoreError: the lock file cannot be written.
         """
-        private = lock_folder(self.path, _PRIVATE)
-        try:
-            private.mkdir(parents=True, exist_ok=True)
-            lock = FileLock(private / "lock")
-            lock.acquire(timeout=0)
-        except Timeout as error:
-            raise LockedError(
-                f"{self.path} is in use by another pchem process; wait for it or use another --store"
-            ) from error
-        except OSError as error:
-            raise storage_error(error, private) from error
-        try:
-            with self._leased():
-                self._remove_unfinished()
-                yield
-        finally:
-            lock.release()
-
-    def _leased(self) -> AbstractContextManager[None]:
-        """Return the lock for all machines that an object storage needs; a lock of files is one."""
-        if not isinstance(self.path, RemotePath):
-            return nullcontext()
-        return leased(self.path / _PRIVATE / "lock.json", self.path)
+        with locked(self.path, self.path / _PRIVATE):
+            self._remove_unfinished()
+            yield
 
     def _remove_unfinished(self) -> None:
-        """Remove what a killed process left, and descriptions of arrays that a power cut left empty.
-
-        Neither is part of the run: what a record or a marker stands for was on the disk before it.
-        """
+        """Remove the half files that a killed process left."""
         if isinstance(self.path, RemotePath):  # which has none
             return
         for folder, _, names in os.walk(self.path):
             for name in names:
-                path = Path(folder) / name
-                if name.endswith(".partial") or (name == _DESCRIPTION and is_blank(path)):
-                    remove_file(path)
+                if name.endswith(".partial"):
+                    remove_file(Path(folder) / name)
 
     def free_bytes(self) -> int:
         """Return the free space of the disk that holds the store; an object storage is never full."""
@@ -399,10 +378,30 @@ class RunStore:
         try:
             with _one_line(self.path, where):
                 yield
-        except (ValueError, RuntimeError) as error:
-            raise StoreError(
-                f"{where} cannot be read ({error}); redo that stage with --force, or those tiles with --tiles"
-            ) from error
+        except _DAMAGE as error:
+            raise StoreError(f"{where} is damaged ({error}); {self.cure(name)}") from error
+
+
+def stored_config(path: Path) -> str | None:
+    """Return the resolved YAML that made a run, or None.
+
+    Raises:
+        StoreError: it was changed since.
+    """
+    place = path / _PRIVATE / "config.yaml"
+    try:
+        content = place.read_bytes()
+    except FileNotFoundError:
+        return None
+    text, mark, digest = content.rpartition(_DIGEST_LINE.encode())
+    if not mark:  # of version 0.2
+        text = content
+    elif hashlib.sha256(text).hexdigest() != digest.decode(errors="replace").strip():
+        raise StoreError(
+            f"{place} is damaged (checksum mismatch); give the run's own YAML file "
+            "instead of its store, which writes it again"
+        )
+    return text.decode(errors="replace")
 
 
 @functools.lru_cache(maxsize=64)  # once in a process: it takes 20 ms in the largest stores
@@ -415,20 +414,14 @@ def _refuse_links(path: Path) -> None:
         )
 
 
-def _remove_blank(path: Path) -> None:
-    """Remove the empty beginning of a store that a power cut may leave, before anything is in it."""
-    if isinstance(path, RemotePath) or not path.is_dir():
-        return
-    if is_blank(path / _DESCRIPTION) and not _strangers(path):
-        remove_file(path / _DESCRIPTION)
-
-
 def _strangers(path: Path) -> bool:
-    """Tell whether there is more at a path than a store that has just begun, or is being made."""
+    """Tell whether there is more at a path than a store that has just begun, or is being made, or a run."""
     if not path.is_dir():
         return path.exists() and not path.is_dir()  # another process may make the folder meanwhile
+    if (path / _PRIVATE).is_dir():  # its description was lost
+        return False
     names = (each.name for each in path.iterdir())
-    return any(name != _DESCRIPTION and not name.startswith(f".{_DESCRIPTION}.") for name in names)
+    return any(name != DESCRIPTION and not name.startswith(f".{DESCRIPTION}.") for name in names)
 
 
 @contextmanager

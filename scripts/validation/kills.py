@@ -26,7 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
+
+from pchem_pipeline.store.run_store import RunStore
 
 PCHEM = str(Path(sys.executable).with_name("pchem"))
 
@@ -59,7 +60,7 @@ PATIENCE = 60.0
 
 #: numbers that tell when and how long, or where
 _PASSING = re.compile(
-    r"second|time|date|made|rss|cpu|started|path|version|elapsed|host|base_dir|config$|memory", re.I
+    r"second|time|date|made|rss|cpu|started|path|version|elapsed|host|base_dir|config$|memory|digest_of", re.I
 )
 
 
@@ -160,10 +161,12 @@ class Bench:
 def results(store: Path) -> dict[str, Any]:
     """Return all arrays of a run, its verdict, and the numbers of its report."""
     found: dict[str, Any] = {}
+    run = RunStore.open(store)
     for path in sorted(store.rglob("zarr.json")):
         record = json.loads(path.read_text())
         if record["node_type"] == "array":
-            found[str(path.parent.relative_to(store))] = zarr.open_array(path.parent, mode="r")[...]
+            name = path.parent.relative_to(store).as_posix()
+            found[name] = run.read(name)
     for path in (*store.glob("*.json"), *store.glob("model/*.json")):
         if path.name != "zarr.json":
             found |= lasting(str(path.relative_to(store)), json.loads(path.read_text()))

@@ -2,6 +2,7 @@
 
 import errno
 import functools
+import re
 import threading
 from collections import Counter
 from pathlib import Path
@@ -17,7 +18,7 @@ from pchem_pipeline.run.declaration import Stage
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import StopRequest
-from pchem_pipeline.run.stage import WHOLE, StageContext, open_store
+from pchem_pipeline.run.stage import WHOLE, Options, StageContext, open_store
 from pchem_pipeline.runner import execute as runner
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.store import disk
@@ -73,24 +74,41 @@ def stages(monkeypatch):
     monkeypatch.setattr(runner, "STAGES", STAGES)
 
 
-def run(path: Path, threshold: float = 0.5):
+def run(path: Path, threshold: float = 0.5, forced: str = ""):
     """Bring a run of two tiles and three stages up to date; return its results."""
     open_store.cache_clear()
-    disk.unsynced.cache_clear()
     with RunStore.create(path).locked():
-        return _run(RunStore.open(path, writable=True), threshold)
+        return _run(RunStore.open(path, writable=True), threshold, forced)
 
 
-def _run(store: RunStore, threshold: float):
+def gone_on(path: Path):
+    """Return the results of a run after a power cut, and how often a line named the stage to be forced."""
+    forced = ""
+    for refused in range(5):
+        try:
+            return run(path, forced=forced), refused
+        except StoreError as error:
+            words = str(error)
+            assert str(path) in words
+            forced = re.search(r"do it again: pchem (\w+) \S+ --force", words)[1]
+    raise AssertionError(words)
+
+
+def _run(store: RunStore, threshold: float, forced: str):
     path = store.path
-    if "sensor" not in store.attributes("frames"):
+    try:
+        known = "sensor" in store.attributes("frames")
+    except StoreError:
+        known = False
+    if not known:
+        store.delete("frames")
         SENSOR.write(store)
-        store.sync()
     write_json(path / "number.json", {"number": threshold})
     config = parse_config(f"input: {{files: [a]}}\nrun: {{tile: 8}}\nfit: {{gap_threshold: {threshold}}}")
     reporter = Reporter("off", quiet=True)
     context = StageContext(config, path.parent, store, SerialExecutor(), reporter, StopRequest())
     for name in STAGES:
+        context.options = Options(force=name == forced)
         state = execute(name, context)
         if state.state == "failed":
             raise StoreError(f"{name}: {state.why}; cure")
@@ -145,9 +163,13 @@ def test_a_power_cut_at_any_moment(tmp_path, monkeypatch, before, step):
         start = len(forgetful.log)
         run(old)
     rng = np.random.default_rng(8)
+    lost = 0
     for end in range(start, len(forgetful.log) + 1, step):
-        found = run(materialised(forgetful.after_power_cut(end, rng), old, tmp_path / "cut.zarr"))
+        left = forgetful.after_power_cut(end, rng)
+        found, refused = gone_on(materialised(left, old, tmp_path / "cut.zarr"))
         assert_same(found, expected)
+        lost += refused
+    assert lost > 0 or step > 1  # chunks are not synced: their loss is found by whoever reads them
 
 
 def test_a_power_cut_knows_files_by_their_whole_paths(tmp_path, monkeypatch):
@@ -159,23 +181,6 @@ def test_a_power_cut_knows_files_by_their_whole_paths(tmp_path, monkeypatch):
         disk.sync_folder(tmp_path)
     left = forgetful.after_power_cut(len(forgetful.log), np.random.default_rng(1))
     assert left == {tmp_path / "out.zarr" / "a": b"x"}
-
-
-def test_the_power_cut_would_be_seen(tmp_path, monkeypatch):
-    """With a disk that does not keep what it was told to keep, the same test fails."""
-    old = tmp_path / "run.zarr"
-    with monkeypatch.context() as patch:
-        forgetful = ForgetfulDisk(patch)
-        expected = run(old)
-    rng = np.random.default_rng(9)
-    wrong = 0
-    for end in range(60, len(forgetful.log), 5):
-        files = forgetful.after_power_cut(end, rng, honest=False)
-        try:
-            assert_same(run(materialised(files, old, tmp_path / "cut.zarr")), expected)
-        except (AssertionError, StoreError):
-            wrong += 1
-    assert wrong > 3
 
 
 def test_readers_while_a_writer_works(tmp_path):

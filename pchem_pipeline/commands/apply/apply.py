@@ -271,8 +271,8 @@ def _output_store(place: Path, content: dict[str, Any], *, force: bool) -> tuple
     """
     if place.exists() and not (place / "zarr.json").exists() and (not place.is_dir() or any(place.iterdir())):
         raise _exists(place, ours=False)
-    is_new = not (place / "zarr.json").exists()
-    if not is_new:
+    begun = {each.name for each in place.iterdir()} if place.exists() else set()
+    if not begun <= {"zarr.json", ".pchem"}:
         try:
             there = RunStore.open(place).attributes("applied").get("provenance", {})
         except StoreError:
@@ -339,6 +339,7 @@ def _do(context: StageContext, job: Job, made: _Made) -> None:
     """
     record = context.store.records.read(STAGE)
     if record is not None and record.finished and not context.fresh:
+        context.store.delete("applied_parts")  # what a failure after the last step may have left
         context.reporter.info(f"apply: {context.store.path} is up to date")
         return
     job, made = _with_moments(context, job, made)

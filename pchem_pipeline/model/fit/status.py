@@ -31,6 +31,7 @@ class FitStatus(IntFlag):
     WEAKLY_IDENTIFIED = 2048
     GAIN_AMBIGUOUS = 4096
     BIAS_UNSURE = 8192
+    NOT_FITTED = 16384
 
 
 #: Bits for which the parameters of the pixel are NaN.
@@ -40,6 +41,7 @@ FAILED = (
     | FitStatus.NOT_CONVERGED
     | FitStatus.GAIN_NOT_IDENTIFIED
     | FitStatus.EXPOSURE_AT_BOUND
+    | FitStatus.NOT_FITTED
 )
 
 #: Bits of pixels with a rival maximum that is nearly as likely.
@@ -99,6 +101,7 @@ def moves_gain(exposure: NDArray[np.float64], noise: NDArray[np.float64]) -> NDA
 MEANINGS: dict[FitStatus, str] = {
     FitStatus.NO_DATA: "no frame inside the histogram window",
     FitStatus.TOO_FEW_BINS: "fewer than 3 occupied bins",
+    FitStatus.NOT_FITTED: "not fitted: the tile failed or was not chosen",
     FitStatus.NOT_CONVERGED: "the fit did not converge",
     FitStatus.GAIN_NOT_IDENTIFIED: "one Gaussian fits as well: the conversion gain is not identified",
     FitStatus.EXPOSURE_AT_BOUND: "quanta exposure at its lower bound: no electrons seen",

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
 from pchem_pipeline.report.data import DiscrepancyData
@@ -19,11 +20,17 @@ _VECTORS = ("z_before", "z_after")  # a number for each statistic
 
 
 def discrepancy_state(store: RunStore) -> str | None:
-    """Return in words which verdict a run has, None without one: changes whenever the verdict was redone."""
-    found = read_verdict(store.path)
+    """Return in words which verdict a run has, None without one that can be read.
+
+    It changes whenever the verdict was redone.
+    """
+    try:
+        found = read_verdict(store.path)
+    except StoreError:  # the stage that wrote it is stale
+        return None
     if found is None:
         return None
-    record = store.records.read(_STAGE)
+    record = store.records.known(_STAGE)
     when = f" ({record.fingerprint[:8]}, {record.started})" if record is not None else ""
     return f"{found.verdict}{when}"
 

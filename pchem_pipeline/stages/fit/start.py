@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.run.fingerprint import setting_values
-from pchem_pipeline.run.model_versions import present_content
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath
@@ -51,7 +50,6 @@ def keep_fit(context: StageContext) -> None:
 
 def _same_fit(content: dict[str, Any], context: StageContext) -> bool:
     """Tell whether a fit was made with the present settings and model."""
-    content = present_content(context.store, content)
     if content["settings"] != setting_values(STAGES["fit"], context):
         return False
     return bool(content["input"]["model"] == context.model.digest)

@@ -20,7 +20,7 @@ def chosen_settings(context: StageContext) -> dict[str, Any]:
     if context.options.settings is not None:
         chosen: dict[str, Any] = to_jsonable_python(dict(context.options.settings))
         return chosen
-    record = context.store.records.read("methods")
+    record = context.store.records.known("methods")
     kept = {} if record is None else record.content.get("input") or {}
     return dict(kept.get("chosen", {}))
 

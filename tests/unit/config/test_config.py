@@ -91,19 +91,6 @@ def test_settings_are_read_by_dotted_name():
     assert yaml.safe_dump(setting_of(config, "fit"))
 
 
-def test_old_keys_are_read_and_the_new_ones_told(capsys):
-    old = "input: {files: [a.tif]}\ndiscrepancy: {grown_replicates: 24, material: 0.1}\n"
-    old += "fit: {allowed_failed_fraction: 0.1}\n"
-    assert parse_config(old, "old.yaml").discrepancy.extended_replicates == 24
-    assert capsys.readouterr().err.splitlines() == [
-        "pchem: old.yaml: discrepancy.grown_replicates is now called discrepancy.extended_replicates",
-        "pchem: old.yaml: discrepancy.material did nothing and is gone; remove it",
-        "pchem: old.yaml: fit.allowed_failed_fraction did nothing and is gone; remove it",
-    ]
-    both = "input: {files: [a.tif]}\ndiscrepancy: {grown_replicates: 24, extended_replicates: 30}\n"
-    assert parse_config(both).discrepancy.extended_replicates == 30
-
-
 @pytest.mark.parametrize(
     "url",
     [

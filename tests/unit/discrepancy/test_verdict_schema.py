@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin
 
 import pytest
-from helpers.discrepancy_material import UNTESTABLE, VERDICTS, result, verdict_of
+from helpers.discrepancy_material import VERDICTS, result, verdict_of
 
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.discrepancy.verdict import (
@@ -57,51 +57,9 @@ def test_numbers_that_are_not_known_are_null_in_the_file() -> None:
     assert math.isnan(Verdict.from_json(json.dumps(content)).gap.floor)
 
 
-def test_a_verdict_of_the_first_schema_is_read() -> None:
-    old = {**_as_2(result("unexplained")), "schema": 1}
-    del old["schema_version"]
-    old |= {"untestable": list(UNTESTABLE), "untestable_reasons": UNTESTABLE}
-    for place in old["where"]:
-        place["dn"] = place["dn"] or []
-    now = json.loads(verdict_of("unexplained").to_json())
-    now["steps"][0]["rivals"] = now["steps"][0]["rivals"][:1]
-    assert json.loads(Verdict.from_json(json.dumps(old)).to_json()) == now
-
-
-def _as_2(content: dict[str, Any]) -> dict[str, Any]:
-    """Return what a verdict of the second schema was: one runner-up, and candidates that were left out."""
-    steps = [{k: v for k, v in step.items() if k != "rivals"} for step in content["steps"]]
-    steps = [
-        step | {"runner_up": next(iter(new["rivals"]), None)}
-        for step, new in zip(steps, content["steps"], strict=True)
-    ]
-    found = {k: v for k, v in content.items() if k != "defects"} | {"left_out": content["defects"]}
-    return found | {"schema_version": 2, "steps": steps}
-
-
-@pytest.mark.parametrize(
-    ("said", "after", "now"),
-    [
-        ("named", 0.5e-6, "named"),
-        ("named", 31e-6, "named_in_part"),
-        ("unexplained", 31e-6, "named_in_part"),
-    ],
-)
-def test_a_verdict_of_the_second_schema_says_how_much_of_its_names_is_all(
-    said: str, after: float, now: str
-) -> None:
-    gap = {**result("named")["gap"], "after": after}
-    old = {**_as_2(result("named")), "verdict": said, "gap": gap}
-    found = Verdict.from_json(json.dumps(old))
-    assert found.verdict == now
-    assert found.word == now.replace("_", " ")
-    assert found.defects == {"odd_plugin": "ValueError: boom"}
-    assert found.steps[0].runner_up is not None
-    assert found.steps[0].runner_up.effect == "periodic_pickup"
-
-
-def test_a_verdict_of_a_later_schema_is_refused_with_the_cure() -> None:
-    later = json.dumps({**result("named"), "schema_version": SCHEMA_VERSION + 1, "new": 1})
+@pytest.mark.parametrize("version", [1, SCHEMA_VERSION - 1, SCHEMA_VERSION + 1])
+def test_a_verdict_of_another_schema_is_refused_with_the_cure(version: int) -> None:
+    later = json.dumps({**result("named"), "schema_version": version, "new": 1})
     with pytest.raises(StoreError, match=r"run.zarr holds a verdict of schema \d, .*--force"):
         Verdict.from_json(later, "run.zarr")
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
+from pchem_pipeline.commands.watch import rows
+from pchem_pipeline.run.fingerprint import StageState
 from pchem_pipeline.run.progress import Reporter, paced, parts_told, telling_parts
 from pchem_pipeline.store.progress_file import ProgressFile, read_progress
+from pchem_pipeline.store.run_store import RunStore
 
 
 def test_rate_and_remaining_time_are_means_of_this_run() -> None:
@@ -66,10 +66,10 @@ def test_phases_are_named_and_named_again_where_nothing_else_is_heard(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pchem_pipeline.run.progress._SILENCE", 0.5)
-    store = tmp_path / "run.zarr"
-    (store / ".pchem").mkdir(parents=True)
+    run = RunStore.create(tmp_path / "run.zarr")
+    store = run.path
     reporter = Reporter("off", log=tmp_path / "run.log", progress_file=ProgressFile(store))
-    with reporter.phases("discrepancy") as tell:
+    with run.locked(), reporter.phases("discrepancy") as tell:
         tell("drawing the fitted model")
         tell("comparing candidates")
         time.sleep(2.3)
@@ -96,34 +96,59 @@ def test_a_bar_shows_rate_and_remaining_time(capsys: pytest.CaptureFixture[str])
 
 
 def test_others_see_how_far_it_is_until_it_ends(tmp_path: Path) -> None:
-    store = tmp_path / "run.zarr"
-    (store / ".pchem").mkdir(parents=True)
+    run = RunStore.create(tmp_path / "run.zarr")
+    store = run.path
     assert read_progress(store) is None
     reporter = Reporter("off", quiet=True, progress_file=ProgressFile(store))
-    with reporter.progress("fit", 2) as advance:
+    with run.locked(), reporter.progress("fit", 2) as advance:
         advance()
         advance()
         seen = read_progress(store)
         assert seen is not None
         assert (seen["stage"], seen["done"], seen["total"], seen["pid"]) == ("fit", 2, 2, os.getpid())
     ProgressFile(store).remove()  # not its own file
-    assert read_progress(store) is not None
+    assert (store / ".pchem" / "progress.json").exists()
+    assert read_progress(store) is None  # nobody works on it any more
     reporter.close()
-    assert list((store / ".pchem").iterdir()) == []
+    assert [path.name for path in (store / ".pchem").iterdir()] == ["lock"]
 
 
 def test_what_a_killed_process_left_counts_as_nothing(tmp_path: Path) -> None:
-    place = tmp_path / ".pchem" / "progress.json"
+    """The lock decides, not a number of a process, which another one may have by now."""
+    store = RunStore.create(tmp_path / "run.zarr")
+    place = store.path / ".pchem" / "progress.json"
+    left = {"stage": "fit", "pid": os.getpid(), "host": "another machine"}
     place.parent.mkdir()
-    child = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True)
-    dead = {"stage": "fit", "pid": int(child.stdout), "host": socket.gethostname()}
-    place.write_text(json.dumps(dead))
-    assert read_progress(tmp_path) is None
-    place.write_text(json.dumps({**dead, "host": "another machine"}))
-    assert read_progress(tmp_path) is not None
-    for text in ("", "[1]", "{", json.dumps({"host": socket.gethostname(), "pid": "x"})):
-        place.write_text(text)
-        assert read_progress(tmp_path) is None
+    place.write_text(json.dumps(left))
+    assert read_progress(store.path) is None
+    with store.locked():
+        assert read_progress(store.path) == left
+        for text in ("", "[1]", "{", "3"):
+            place.write_text(text)
+            assert read_progress(store.path) is None
+
+
+def test_what_is_wrong_or_moves_the_cursor_does_not_get_through(tmp_path: Path) -> None:
+    store = RunStore.create(tmp_path / "run.zarr")
+    content = {
+        "stage": "fit\x1b[2J\x07: now",
+        "unit": ["tile"],
+        "done": "5",
+        "total": None,
+        "rate": float("nan"),
+        "remaining": -3,
+        "elapsed": 1e300,
+        "more": 1,
+    }
+    with store.locked():
+        (store.path / ".pchem" / "progress.json").write_text(json.dumps(content))
+        seen = read_progress(store.path)
+    assert seen is not None
+    assert seen.keys() == {"stage"}
+    assert seen["stage"].isprintable()
+    assert rows([StageState("fit", "partial")], {"stage": "fit: now", "rate": 2.0}) == [
+        "fit         running (now)"
+    ]
 
 
 def test_a_folder_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:

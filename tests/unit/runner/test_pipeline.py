@@ -103,9 +103,12 @@ def test_what_a_hand_took_out_of_the_store_is_made_again(make, monkeypatch):
     assert status(FAKES["maps"], context).words() == "stale - maps is no longer in the store"
     assert execute("maps", context).state == "complete"
     assert context.store.read("maps/bias").shape == (20, 30)
-    # one that found nothing to write is complete without it
+    # one that may write nothing is stale without what it wrote, and complete where it wrote nothing
     context.store.delete("maps")
     monkeypatch.setitem(FAKES, "maps", replace(FAKES["maps"], may_write_nothing=True))
+    assert status(FAKES["maps"], context).words() == "stale - maps/zarr.json is missing or was changed"
+    record = context.store.records.read("maps")
+    context.store.records.write(replace(record, files={}))
     assert status(FAKES["maps"], context).state == "complete"
 
 

@@ -20,6 +20,7 @@ from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run import input_identity
 from pchem_pipeline.run.fingerprint import StageState, status
+from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
@@ -112,6 +113,16 @@ def test_reference_copies_nothing(tmp_path: Path) -> None:
     assert not context.store.has("frames/dn")
     assert context.sensor.mode == "reference"
     assert (context.sensor.n_frames, context.sensor.shape) == (40, (30, 26))
+    assert open_source(context).shape == STACK.shape
+    place = tmp_path / "cam" / "f9.tif"
+    for change, refused in ((0, False), (1, True)):  # touched; other frames of the same shape
+        tifffile.imwrite(place, STACK[10:20] ^ change, photometric="minisblack")
+        os.utime(place, ns=(change, change))
+        if refused:
+            with pytest.raises(InputError, match=r"files changed since they were ingested .*; run: pchem"):
+                open_source(context)
+        else:
+            assert open_source(context).shape == STACK.shape
 
 
 def test_tiles_of_the_command_line_do_not_cut_the_input(tmp_path: Path) -> None:

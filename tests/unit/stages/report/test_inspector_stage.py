@@ -149,6 +149,7 @@ def test_a_sensor_of_the_papers_size_takes_three_to_four_megabytes(tmp_path: Pat
     store.create_array("histogram/counts", (*shape, 128), chunks=(64, 64, 128), dtype=np.uint16)
     for y, x in ((0, 0), (256, 320)):
         store.write("histogram/counts", (slice(y, y + 64), slice(x, x + 64)), np.tile(counts, (8, 8, 1)))
+    store.fill("histogram/counts")
     shown = inspector_of(store, maps, fit, [(1, 1)])
     size = sum(len(text) for _, text in embedded(replace(base, shape=shape, inspector=lambda: shown)).blobs)  # type: ignore[union-attr]
     assert 2.5e6 < size < 4.2e6

@@ -1,0 +1,181 @@
+"""Any file of a finished store is changed, cut or removed: the same numbers, or a line whose cure works."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from pchem_pipeline import open_run
+from pchem_pipeline.base.errors import PchEmError
+from pchem_pipeline.model.maps.maps import NO_VALUE
+from pchem_pipeline.run.stage import Options, open_store
+from pchem_pipeline.run.target import find_run
+from pchem_pipeline.runner.session import Command, run_stages, run_status
+from pchem_pipeline.stages import maps
+from pchem_pipeline.stages.table import pipeline_of
+
+STAGES = ("simulate", "ingest", "histogram", "fit", "maps", "ensemble", "report")
+FORCED = STAGES[2:]  # what comes before them looks at the camera files
+GROUPS = ("histogram", "summary", "fit", "maps", "ensemble")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A folder with run.yaml and its finished run.zarr; do not change it."""
+    folder = tmp_path_factory.mktemp("finished")
+    content = {
+        "run": {"store": "run.zarr", "tile": 8},
+        "simulate": {"shape": [8, 16], "n_frames": 600, "seed": 5, "integration_time": 1.0},
+        "compute": {"backend": "serial", "workers": 1},
+        "model": {"effects": [{"tag": "row_noise", "row_noise_dn": 0.4}]},
+    }
+    (folder / "run.yaml").write_text(yaml.safe_dump(content))
+    run_stages(find_run(folder / "run.yaml"), STAGES, Command(quiet=True, progress="off"))
+    return folder
+
+
+def run(path, stages=None, *, force=False):
+    open_store.cache_clear()
+    target = find_run(path)
+    command = Command(Options(force=force), quiet=True, progress="off")
+    run_stages(target, stages or pipeline_of(target.config), command)
+
+
+def numbers(path):
+    """Return what a notebook finds in a run: every array, the medians over good pixels, a pixel."""
+    found = open_run(path)
+    arrays = {f"{group}/{name}": each.values for group in GROUPS for name, each in found.group(group).items()}
+    arrays["good"] = found.maps.where(found.good).median().to_array().values
+    arrays["frames/dn"] = found.group("frames").dn.values
+    arrays["pixel"] = np.array([*found.pixel(3, 5).parameters.values(), found.pixel(3, 5).goodness_p])
+    arrays["expected"] = found.pixel(3, 5).expected.values  # under the model of the fit
+    found._repr_html_()
+    return arrays
+
+
+def damaged(path, kind, rng):
+    content = bytearray(path.read_bytes())
+    if kind == "delete":
+        path.unlink()
+    elif kind == "cut":
+        path.write_bytes(content[: int(rng.integers(len(content)))])
+    elif content:
+        content[int(rng.integers(len(content)))] ^= 1 << int(rng.integers(8))
+        path.write_bytes(content)
+
+
+def asked(action):
+    """Do something with a run; return the line that refuses it, or nothing."""
+    try:
+        action()
+    except PchEmError as error:
+        return str(error)
+    return ""
+
+
+def cured(folder, words):
+    """Do what a line says."""
+    forced = re.search(r"pchem (\w+) \S+ --force", words)
+    removed = re.search(r"(?:delete (/\S+)|(/\S+) (?:is damaged|is missing).*; delete it)", words)
+    if removed:
+        place = Path(removed[1] or removed[2])
+        assert folder in place.parents
+        shutil.rmtree(place) if place.is_dir() else place.unlink()
+    elif forced:
+        run(folder / "run.yaml", [forced[1]], force=True)
+    else:
+        assert re.search("run again|writes it again|run the stage again", words), words
+
+
+def check(folder, victim, expected, forced):
+    """Ask status, notebook, run and a stage; follow each line; the numbers are the same in the end."""
+    place = folder / "run.yaml"
+
+    def forced_stage():
+        run(place, [forced], force=True)
+
+    for action in (
+        lambda: run_status(find_run(folder / "run.zarr")),
+        lambda: same(numbers(folder / "run.zarr"), expected),
+        forced_stage,
+        lambda: run(place),
+    ):
+        words = asked(action)
+        assert not words or (str(folder) in words and "; " in words and "\n" not in words), words
+    for _ in range(8):
+        words = asked(lambda: run(place)) or asked(lambda: same(numbers(folder / "run.zarr"), expected))
+        if not words:
+            break
+        asked(lambda words=words: cured(folder, words))
+    assert not words, f"{victim}: {words}"
+    assert {state.state for state in run_status(find_run(place))} == {"complete"}, victim
+
+
+def same(found, expected):
+    assert found.keys() == expected.keys()
+    for name, values in found.items():
+        np.testing.assert_array_equal(values, expected[name], err_msg=name)
+
+
+def files_of(folder):
+    files = (path for path in (folder / "run.zarr").rglob("*") if path.is_file() and path.name != "lock")
+    return sorted(path.relative_to(folder) for path in files)
+
+
+@pytest.mark.parametrize("step", [61, pytest.param(1, marks=pytest.mark.long)])
+def test_any_file_is_damaged(finished, tmp_path, step):
+    expected = numbers(finished / "run.zarr")
+    files, rng = files_of(finished), np.random.default_rng(step)
+    # all kinds of files early: the arrays of a group are alike
+    cases = [(file, kind) for file in files for kind in ("flip", "cut", "delete")]
+    for i in range(int(rng.integers(step)), len(cases), step):
+        victim, kind = cases[i]
+        folder = tmp_path / "case"
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(finished, folder)
+        damaged(folder / victim, kind, rng)
+        check(folder, f"{victim} {kind}", expected, FORCED[i % len(FORCED)])
+
+
+def test_pixels_of_a_tile_that_failed_have_no_value(finished, tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    do_tile = maps._do_tile
+
+    def failing(tile, **more):
+        if tile.key == "0.1":
+            raise ValueError("odd")
+        return do_tile(tile, **more)
+
+    monkeypatch.setattr(maps, "_do_tile", failing)
+    assert "maps: 1 of 2 units failed" in asked(lambda: run(folder / "run.yaml", ["maps"], force=True))
+    found = open_run(folder / "run.zarr")
+    assert found.maps.quality.values[:, 8:].tolist() == [[NO_VALUE] * 8] * 8
+    assert not found.usable[:, 8:].any()
+    assert found.good[:, :8].sum() > 32
+    assert np.isnan(found.maps.bias[:, 8:]).all()
+
+
+def test_chunks_that_0_2_left_out_are_read(finished, tmp_path):
+    """There a chunk of the fill value alone was not written, and descriptions have no digest."""
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    expected = numbers(folder / "run.zarr")
+    for place in (folder / "run.zarr").rglob("*.json"):
+        if place.name == "report.json":
+            continue
+        content = json.loads(place.read_text())
+        content.pop("digest_of_content", None)
+        content.get("attributes", {}).pop("digest_of_content", None)
+        content.pop("files", None)
+        place.write_text(json.dumps(content))
+    place = folder / "run.zarr/.pchem/config.yaml"
+    place.write_text(place.read_text().rpartition("# sha256")[0])
+    assert not np.any(expected["histogram/under"])
+    shutil.rmtree(folder / "run.zarr/histogram/under/c")
+    same(numbers(folder / "run.zarr"), expected)
+    assert {state.state for state in run_status(find_run(folder / "run.yaml"))} == {"complete"}
