@@ -37,6 +37,7 @@ class FrameReader(ABC):
         bit_depth: bits of the ADC, where the file says so.
         bit_shift: bits by which the samples are left-justified, where the file says so.
         integration_time: s, where the file says so.
+        time_words: what the file states of it, and in what unit.
         camera: its name, serial number, temperature and time, as far as the file says.
         timestamps: start of each frame, s since 1970-01-01 UTC, (frames,), where the file says so.
         notes: remarks for the user on what was left out or assumed.
@@ -55,6 +56,7 @@ class FrameReader(ABC):
     bit_depth: int | None = None
     bit_shift: int = 0
     integration_time: float | None = None
+    time_words: str = ""
     camera: CameraFacts = CameraFacts()
     timestamps: NDArray[np.float64] | None = None
     notes: tuple[str, ...] = ()
@@ -96,11 +98,8 @@ class FrameReader(ABC):
 
     def take_facts(self, facts: StatedFacts) -> None:
         """Take what the file says beside its frames."""
-        self.camera, self.integration_time, self.bit_depth = (
-            facts.camera,
-            facts.integration_time,
-            facts.bit_depth,
-        )
+        self.camera, self.bit_depth = facts.camera, facts.bit_depth
+        self.integration_time, self.time_words = facts.duration or (None, "")
 
     def identity(self) -> dict[str, Any]:
         """Return name, size and xxh3_128 content hash of every file, and one digest over all; for JSON."""

@@ -83,6 +83,7 @@ class FrameSequence(FrameReader):
         self.stated_integration_time = times.pop() if len(times) == 1 else None
         time = settings.integration_time
         self.integration_time = _agreed(readers, "integration_time") if time is None else time
+        self.time_words = _time_words(readers[0], self.integration_time)
         stamps = [reader.timestamps for reader in readers]
         if all(each is not None for each in stamps):
             self.timestamps = np.concatenate([each for each in stamps if each is not None])[self._first : end]
@@ -169,6 +170,17 @@ class FrameSequence(FrameReader):
         """Close all readers."""
         for reader in self._readers:
             reader.close()
+
+
+def _time_words(first: FrameReader, taken: float | None) -> str:
+    """Return a remark on the integration time that the first file states; empty where it states none."""
+    if not first.time_words:
+        return ""
+    if taken is None:
+        words = "integration time unknown; give it by --integration-time SECONDS"
+    else:
+        words = f"integration time {taken:g} s"
+    return f"{words}: {first.paths[0].name} states {first.time_words}"
 
 
 def _where(paths: Sequence[Path]) -> str:

@@ -80,6 +80,8 @@ def run(context: StageContext) -> None:
     done = context.prepared.get(context.stage)
     reader = open_frames(settings, context.base_dir) if done is None else done.frames
     context.begin()
+    if reader.time_words:
+        (context.note if reader.integration_time is None else context.reporter.info)(reader.time_words)
     if message := reader.report.message():
         context.note(message)
     sensor_of(reader, context, shortened(known_identity(context))).write(context.store)

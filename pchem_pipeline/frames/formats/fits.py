@@ -12,7 +12,7 @@ import itertools
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -26,6 +26,8 @@ from pchem_pipeline.frames.camera import (
     bits_of,
     celsius,
     duration_of,
+    first_duration,
+    first_of,
     seconds_of,
     text_of,
 )
@@ -38,6 +40,7 @@ from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 _TIME_KEYWORDS = ("EXPTIME", "EXPOSURE", "TELAPSE", "INTTIME", "ITIME", "XPOSURE")
+_UNIT_KEYWORDS = ("TIMEUNIT", "EXPUNIT", "EXPTUNIT")
 _DEPTH_KEYWORDS = ("BITDEPTH", "ADCBITS")
 _CAMERA_KEYWORDS = ("CAMERA", "DETNAM", "DETECTOR", "INSTRUME")
 _SERIAL_KEYWORDS = ("SERIALNO", "SERNO", "SERIAL", "CAMSERNO", "DETSERNO")
@@ -113,8 +116,15 @@ class FitsReader(ContiguousReader):
     def _read_facts(self, *headers: Any) -> None:
         """Take each fact from the last header that has it."""
         last = [*reversed(headers)]
-        times, depths = _stated(last, _TIME_KEYWORDS, _duration), _stated(last, _DEPTH_KEYWORDS, _bits)
-        self.take_facts(StatedFacts(_camera(last), next(times, None), next(depths, None)))
+        units = [str(header[name]) for name in _UNIT_KEYWORDS for header in last if name in header][:1]
+        times = (
+            duration_of(name, header[name], *units, comment=str(header.comments[name]))
+            for header in last
+            for name in _TIME_KEYWORDS
+            if name in header
+        )
+        depths = (bits_of(header.get(name)) for header in last for name in _DEPTH_KEYWORDS)
+        self.take_facts(StatedFacts(_camera(last), first_duration(times), first_of(depths)))
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`."""
@@ -240,23 +250,6 @@ def _camera(headers: Sequence[Any]) -> CameraFacts:
         celsius(hot, "K" if kelvin else "C"),
         seconds_of(taken),
     )
-
-
-def _stated(headers: Sequence[Any], names: Sequence[str], read: Callable[[Any, str], Any]) -> Iterator[Any]:
-    """Yield the values that can be read, header by header."""
-    found = ((header, name) for header in headers for name in names if name in header)
-    values = (read(header[name], str(header.comments[name])) for header, name in found)
-    return (value for value in values if value is not None)
-
-
-def _duration(value: Any, comment: str) -> float | None:
-    """Return a duration in s; its unit stands in brackets at the beginning of the comment, else it is s."""
-    unit = re.match(r"\s*\[(\w+)\]", comment)
-    return duration_of(value, unit[1] if unit else "s")
-
-
-def _bits(value: Any, comment: str) -> int | None:
-    return bits_of(value)
 
 
 def _keyword(headers: Sequence[Any], names: Sequence[str]) -> tuple[Any, str]:

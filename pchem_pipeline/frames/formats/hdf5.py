@@ -246,7 +246,7 @@ def _stated_facts(dataset: Any, groups: list[Any]) -> StatedFacts:
             other = group.get(stored)
             if getattr(other, "size", 0) == 1 and name not in beside:
                 beside[name] = np.ravel(other[()])[0]
-                units[name] = other.attrs.get("units")
+                units[name] = other.attrs.get("units", other.attrs.get("unit"))
     return facts_from_names({**beside, **values}, units)
 
 

@@ -27,9 +27,9 @@ from pchem_pipeline.store.files import whole_file
 
 
 class _Sidecar(BaseModel):
-    """What a sidecar can say."""
+    """What a sidecar can say of the layout; other keys may be facts of the camera."""
 
-    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
     shape: tuple[int, ...] | None = None
     dtype: Literal["uint8", "uint16", "uint32"] | None = None
@@ -39,10 +39,6 @@ class _Sidecar(BaseModel):
     bit_shift: int | None = None
     bit_depth: int | None = None
     integration_time: float | None = None
-    camera: str | None = None
-    serial_number: str | None = None
-    sensor_temperature: float | None = None
-    start_time: str | None = None
 
 
 def find_sidecar(path: Path) -> Path | None:
@@ -101,7 +97,7 @@ class RawReader(ContiguousReader):
             )
         reader = cls()
         reader.bit_shift = facts["bit_shift"] or 0
-        reader.take_facts(facts_from_names({**side.model_dump(), **facts}))
+        reader.take_facts(facts_from_names({**side.model_dump(), "bit_depth": facts["bit_depth"]}))
         reader._lay_out(path, facts)
         return reader
 
