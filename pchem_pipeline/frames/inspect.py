@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 from pchem_pipeline.base.errors import ConfigError, InputError
-from pchem_pipeline.frames.axis_order import last_axis_note
 from pchem_pipeline.frames.identity import file_size, hash_file, sample_hash
 from pchem_pipeline.frames.reader import FrameReader, shared_notes
 from pchem_pipeline.frames.registry import detect_format, reader_class
@@ -98,9 +97,6 @@ def survey(
         _mark_duplicates(report.good)
     readers = [reader for entry, reader in opened if not entry.problem]
     report.notes += shared_notes(readers)
-    report.notes += [
-        note for reader in readers[:1] if reader.order_by_habit for note in last_axis_note(reader)
-    ]
     report.notes += _gaps([entry.path for entry in report.files])
     return readers, report
 

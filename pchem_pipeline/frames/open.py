@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pchem_pipeline.frames.first_look import first_look
 from pchem_pipeline.frames.inspect import survey
 from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.settings import InputSettings
@@ -17,7 +18,8 @@ def open_frames(
     Args:
         settings: the section ``input``.
         base_dir: folder to which relative paths refer.
-        check_duplicates: also look for files with the same content (reads a little of each file).
+        check_duplicates: also look for files with the same content (reads a little of each file), and at
+            some samples.
         least: frames that there must be.
 
     Returns:
@@ -30,4 +32,7 @@ def open_frames(
     """
     readers, report = survey(settings, base_dir, check_duplicates=check_duplicates)
     report.raise_if_refused(settings.on_bad_file)
-    return FrameSequence(readers, settings, report, least)
+    frames = FrameSequence(readers, settings, report, least)
+    if check_duplicates:
+        report.notes += first_look(frames, settings)
+    return frames

@@ -41,6 +41,8 @@ class FrameReader(ABC):
         camera: its name, serial number, temperature and time, as far as the file says.
         timestamps: start of each frame, s since 1970-01-01 UTC, (frames,), where the file says so.
         notes: remarks for the user on what was left out or assumed.
+        byte_order: of the bytes of a sample, little or big, where ``input.byte_order`` decides it.
+        unwritten: samples of the file were never written, and are read as a fill value.
         rows_per_read: rows that are decoded together, so that they come at no more cost than one; 1 where
             any rows can be read alone.
         order_by_habit: whether the format has arrays that do not say which axis is time.
@@ -60,6 +62,8 @@ class FrameReader(ABC):
     camera: CameraFacts = CameraFacts()
     timestamps: NDArray[np.float64] | None = None
     notes: tuple[str, ...] = ()
+    byte_order: str | None = None
+    unwritten: bool = False
     rows_per_read: int = 1
     order_by_habit: ClassVar[bool] = False
 
@@ -158,6 +162,21 @@ def shared_notes(readers: Sequence[FrameReader]) -> list[str]:
         more = f" and {len(about) - 1} more: " if len(about) > 1 else ": "
         notes.append(about[0].removesuffix(": ") + more + words if about else words)
     return notes
+
+
+def unwritten_notes(path: Path, missing: int, wanted: int, what: str = "chunks") -> tuple[str, ...]:
+    """Return a remark on parts of a file that were never written; empty where all were.
+
+    Raises:
+        InputError: none was written.
+    """
+    if missing >= wanted > 0:
+        raise InputError(
+            f"{path}: none of its {wanted} {what} was ever written; copy it again or leave it out"
+        )
+    were = "was" if missing == 1 else "were"
+    words = f"{path.name}: {missing} of {wanted} {what} {were} never written and read as the fill value"
+    return (words,) if missing > 0 else ()
 
 
 def changed(path: Path, what: str) -> InputError:

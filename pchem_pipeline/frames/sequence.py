@@ -29,6 +29,11 @@ class FrameSequence(FrameReader):
 
     format_name = "sequence"
 
+    @property
+    def order_by_habit(self) -> bool:  # type: ignore[override]
+        """The format of the files does not say which axis is time."""
+        return self._readers[0].order_by_habit
+
     def __init__(
         self, readers: Sequence[FrameReader], settings: InputSettings, report: InputReport, least: int = 2
     ) -> None:
@@ -57,6 +62,8 @@ class FrameSequence(FrameReader):
         self.shape = (end - self._first, y1 - self._y0, self._x1 - self._x0)
         self.dtype = readers[0].dtype
         self.rows_per_read = max(reader.rows_per_read for reader in readers)
+        self.byte_order = readers[0].byte_order
+        self.unwritten = any(reader.unwritten for reader in readers)
         self._set_facts(readers, settings, end)
 
     def _set_facts(self, readers: Sequence[FrameReader], settings: InputSettings, end: int) -> None:
@@ -103,11 +110,25 @@ class FrameSequence(FrameReader):
             InputError: also where dropped bits are not zero, or a value does not fit the bit depth.
         """
         y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
-        rows = (y0 + self._y0, y1 + self._y0)
+        for reader, part in self._parts(buffer, t0, t1, (y0, y1)):
+            self.check_bits(reader, part)
+
+    def stored(self, t0: int, t1: int, y0: int, y1: int) -> NDArray[Any]:
+        """Return frames t0..t1 and rows y0..y1 (frame, y, x) as they are in the files."""
+        buffer = np.empty((t1 - t0, y1 - y0, self.shape[2]), self.dtype)
+        for _ in self._parts(buffer, t0, t1, (y0, y1)):
+            pass
+        return buffer
+
+    def _parts(
+        self, buffer: NDArray[Any], t0: int, t1: int, rows: tuple[int, int]
+    ) -> Iterator[tuple[FrameReader, NDArray[Any]]]:
+        """Fill a buffer, and yield each file with the part that is from it."""
+        rows = (rows[0] + self._y0, rows[1] + self._y0)
         for reader, first, end, offset in self.pieces(t0, t1):
             part = buffer[offset : offset + end - first]
             self._read_part(reader, part, first, end, rows)
-            self.check_bits(reader, part)
+            yield reader, part
 
     @property
     def whole_frames(self) -> bool:

@@ -29,7 +29,7 @@ from pchem_pipeline.frames.formats.hdf5_parts import (
     external_links,
 )
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
-from pchem_pipeline.frames.reader import changed, check_window
+from pchem_pipeline.frames.reader import changed, check_window, unwritten_notes
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
@@ -97,8 +97,10 @@ class Hdf5Reader(ContiguousReader):
         self.notes = check_sources(path, dataset) + _reversed_axes(path, dataset)
         if dataset.chunks is not None:
             check_coded(path, self.shape, dataset.chunks, self.dtype.itemsize, size)
-            self.notes += _missing_chunks(path, dataset)
             _check_chunk_sizes(path, dataset)
+        missing = _missing_chunks(path, dataset)
+        self.notes += missing
+        self.unwritten = bool(missing)
         offsets = _plain_offsets(path, file, dataset, self.shape)
         if offsets is not None:
             layout = Layout(offsets, *self.shape[1:], dataset.dtype, signed=self._signed)
@@ -143,12 +145,17 @@ class Hdf5Reader(ContiguousReader):
 
 
 def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
-    """Say how many chunks of a dataset were never written; the library reads them as the fill value."""
+    """Say how many chunks of a dataset were never written; the library reads them as the fill value.
+
+    Raises:
+        InputError: none was written, or the file has no place for them at all.
+    """
+    if dataset.chunks is None:
+        plain = not (dataset.is_virtual or dataset.external) and dataset.id.get_storage_size() == 0
+        return unwritten_notes(path, int(plain and dataset.size > 0), 1, "datasets")
     pairs = zip(dataset.shape, dataset.chunks, strict=True)
     wanted = math.prod(-(-length // chunk) for length, chunk in pairs)
-    missing = wanted - dataset.id.get_num_chunks()
-    words = f"{path.name}: {missing} of {wanted} chunks were never written; they are read as its fill value"
-    return (words,) if missing > 0 else ()
+    return unwritten_notes(path, wanted - dataset.id.get_num_chunks(), wanted)
 
 
 def _check_chunk_sizes(path: Path, dataset: Any) -> None:

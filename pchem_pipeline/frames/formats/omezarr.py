@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from pchem_pipeline.frames.formats.choice import choose_dataset
 from pchem_pipeline.frames.formats.contiguous import unsigned_type
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
 from pchem_pipeline.frames.identity import file_size
-from pchem_pipeline.frames.reader import FrameReader, changed, check_window
+from pchem_pipeline.frames.reader import FrameReader, changed, check_window, unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import link_out_of, whole_file
@@ -77,7 +78,9 @@ class ZarrReader(FrameReader):
         piece = getattr(array, "shards", None) or array.chunks
         check_coded(path, self.shape, piece, self.dtype.itemsize, file_size(path))
         self.take_facts(facts_from_names(attributes))
-        self.notes = _channel_notes(path, _axes(node), self._full)
+        missing = _unwritten(path, path / self._name, self._full, piece)
+        self.unwritten = bool(missing)
+        self.notes = _channel_notes(path, _axes(node), self._full) + missing
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`."""
@@ -110,6 +113,17 @@ class ZarrReader(FrameReader):
             self._array = node[self._name] if self._name else node
         except Exception as error:
             raise changed(self.paths[0], "the store vanished or broke") from error
+
+
+def _unwritten(path: Path, folder: Path, shape: Sequence[int], piece: Sequence[int]) -> tuple[str, ...]:
+    """Say how many files of chunks are missing; the library reads them as the fill value.
+
+    Not its ``nchunks_initialized``, whose time grows as the square of their number.
+    """
+    wanted = math.prod(-(-length // chunk) for length, chunk in zip(shape, piece, strict=True))
+    described = ("zarr.json", ".zarray", ".zattrs")
+    stored = sum(part.is_file() and part.name not in described for part in folder.rglob("*"))
+    return unwritten_notes(path, wanted - stored, wanted)
 
 
 def _full_resolution(group: Any, settings: InputSettings) -> str | None:

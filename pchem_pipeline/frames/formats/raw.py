@@ -108,8 +108,8 @@ class RawReader(ContiguousReader):
                 f"{path}: shape {list(shape)}, header_bytes {header}, frame_padding_bytes {padding} make no "
                 "sense; shape is [rows, columns] or [frames, rows, columns]; correct the sidecar"
             )
-        order = ">" if facts["byte_order"] == "big" else "<"
-        stored = np.dtype(facts["dtype"]).newbyteorder(order)
+        self.byte_order = facts["byte_order"] or "little"
+        stored = np.dtype(facts["dtype"]).newbyteorder(self.byte_order)
         rows, columns = shape[-2:]
         frame = rows * columns * stored.itemsize
         step = frame + padding

@@ -57,11 +57,11 @@ class SerReader(ContiguousReader):
                 f"{path}: damaged header ({n} frames, {rows} x {columns}, {depth} bits); copy it again"
             )
         order = settings.byte_order or ("big" if flag else "little")
-        stored = np.dtype("u1" if depth <= 8 else (">u2" if order == "big" else "<u2"))
+        stored = np.dtype("u1" if depth <= 8 else "u2").newbyteorder(order)
         offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=_HEADER.size)
         reader = cls()
         reader.set_layout(path, Layout(offsets, rows, columns, stored), size)
-        reader.bit_depth = depth
+        reader.bit_depth, reader.byte_order = depth, order
         reader._read_times()
         taken = _seconds(ticks) if reader.timestamps is None else float(reader.timestamps[0])
         reader.camera = CameraFacts(text_of(instrument), taken=taken)

@@ -35,7 +35,7 @@ from pchem_pipeline.frames.formats.tiff_facts import (
     stated_channels,
     stated_facts,
 )
-from pchem_pipeline.frames.reader import check_window
+from pchem_pipeline.frames.reader import check_window, unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -259,13 +259,8 @@ def _value_notes(path: Path, pages: Sequence[Any]) -> list[str]:
             f"{path.name}: {', '.join(sorted(lossy))} coding can lose information; noise and histograms "
             "may no longer be those of the camera"
         )
-    unwritten = sum(page.databytecounts.count(0) for page in pages)
-    if unwritten:
-        total = sum(len(page.databytecounts) for page in pages)
-        notes.append(
-            f"{path.name}: {unwritten} of {total} strips or tiles were never written; they are read as "
-            f"{pages[0].nodata}"
-        )
+    counts = [count for page in pages for count in page.databytecounts]
+    notes += unwritten_notes(path, counts.count(0), len(counts), "strips or tiles")
     if getattr(pages[0].photometric, "name", "") == "MINISWHITE":
         notes.append(
             f"{path.name}: its tags call 0 white; samples are read as stored: if more light makes them "

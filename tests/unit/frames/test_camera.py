@@ -277,7 +277,7 @@ def test_bits(value: Any, bits: int | None) -> None:
 
 def test_every_format_with_attributes_takes_the_same_names(tmp_path: Path) -> None:
     """HDF5 as a program that stores each number as an array of one; zarr with the unit beside."""
-    frames = np.zeros((2, 3, 4), np.uint16)
+    frames = np.ones((2, 3, 4), np.uint16)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         attributes = file.create_dataset("frames", data=frames).attrs
         attributes["exposure_time"], attributes["exposure_time_units"] = np.array([20.0]), "ms"
