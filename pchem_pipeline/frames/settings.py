@@ -86,9 +86,17 @@ class InputSettings(Section):
         description="raw: type of a sample; other formats: reads signed samples of that size as unsigned, "
         "negative values being refused; null: from the file or its sidecar",
     )
+    offset: int | None = Field(
+        default=None,
+        ge=0,
+        le=1 << 31,
+        description="DN to be added to signed samples: 32768 where 16 bits are stored as -32768 to 32767; "
+        "null: from the file (FITS: BZERO), else none",
+    )
     byte_order: Literal["little", "big"] | None = Field(
         default=None,
-        description="raw and SER: order of the bytes of a sample; null: from the file, else little",
+        description="raw and SER: order of the bytes of a sample; null: from the file, else little, "
+        "and refused where the samples look otherwise",
     )
     header_bytes: int | None = Field(
         default=None,

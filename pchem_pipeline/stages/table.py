@@ -22,6 +22,7 @@ _INPUT_SETTINGS = (
     "mode",
     "shape",
     "dtype",
+    "offset",
     "byte_order",
     "header_bytes",
     "frame_padding_bytes",

@@ -37,17 +37,15 @@ class Layout:
         offsets: byte offset of each frame, (frames,).
         rows: rows of a frame.
         columns: columns of a frame.
-        stored: numpy type of a stored sample with its byte order; signed if ``biased`` or ``signed``.
-        biased: samples are signed integers with 2**(bits - 1) added to them by the header (FITS BZERO).
-        signed: samples are signed integers declared to be never negative; this is checked on reading.
+        stored: numpy type of a stored sample with its byte order.
+        offset: what is added to signed samples, DN; sums must not be negative. None: they are unsigned.
     """
 
     offsets: NDArray[np.int64]
     rows: int
     columns: int
     stored: np.dtype[Any]
-    biased: bool = False
-    signed: bool = False
+    offset: int | None = None
 
     @property
     def frame_bytes(self) -> int:
@@ -216,7 +214,7 @@ class ContiguousReader(FrameReader):
                 for target in targets:
                     hasher.feed(target)
         for part in parts:
-            unstore(part, layout.stored, biased=layout.biased, signed=layout.signed, path=self.paths[0])
+            unstore(part, layout.stored, layout.offset, self.paths[0])
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`."""
@@ -231,7 +229,7 @@ class ContiguousReader(FrameReader):
             for first, count in _runs(layout.offsets[t0:t1], band if band == layout.frame_bytes else -1):
                 start = int(layout.offsets[t0 + first]) + skip
                 file.read_into(target[first * band : (first + count) * band], start)
-        unstore(buffer, layout.stored, biased=layout.biased, signed=layout.signed, path=self.paths[0])
+        unstore(buffer, layout.stored, layout.offset, self.paths[0])
 
 
 def _runs(offsets: NDArray[np.int64], frame_bytes: int) -> list[tuple[int, int]]:
@@ -241,23 +239,32 @@ def _runs(offsets: NDArray[np.int64], frame_bytes: int) -> list[tuple[int, int]]
     return [(a, b - a) for a, b in pairwise(edges)]
 
 
-def unstore(buffer: NDArray[Any], stored: np.dtype[Any], *, biased: bool, signed: bool, path: Path) -> None:
+def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, path: Path) -> None:
     """Turn stored bytes into native unsigned samples, in place.
 
     Args:
         buffer: unsigned native type of the size of ``stored``, holding the bytes of the file.
         stored: type in the file, with its byte order.
-        biased: add 2**(bits - 1) to signed samples, which flips the sign bit.
-        signed: samples must not be negative.
+        offset: what is added to signed samples, 0 to 2**(bits - 1); None: they are unsigned.
         path: the file, for the message.
 
     Raises:
-        InputError: a negative sample.
+        InputError: a sample is negative, with the offset.
     """
     if not stored.isnative:
         buffer.byteswap(inplace=True)
-    top = buffer.dtype.type(1 << (8 * stored.itemsize - 1))
-    if biased:
-        np.bitwise_xor(buffer, top, out=buffer)
-    elif signed and buffer.size and int(np.bitwise_or.reduce(buffer, axis=None)) & int(top):
-        raise InputError(f"{path}: signed samples with negative values; counts of an ADC must be 0 or more")
+    if offset is None or not buffer.size:
+        return
+    top = 1 << (8 * stored.itemsize - 1)
+    if offset < top:
+        lowest = int(buffer.view(f"i{stored.itemsize}").min()) + offset
+        if lowest < 0:
+            raise InputError(
+                f"{path}: signed samples with negative values (down to {lowest} DN"
+                f"{f', with the offset of {offset}' if offset else ''}), where 0 or more are needed; set "
+                f"input.offset: {top} (--offset {top}), if 0 DN is stored as -{top}"
+            )
+    if offset:
+        np.add(
+            buffer, buffer.dtype.type(offset), out=buffer
+        )  # modulo 2**bits, which is right for signed ones

@@ -31,7 +31,13 @@ from pchem_pipeline.frames.camera import (
     seconds_of,
     text_of,
 )
-from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, unsigned_type
+from pchem_pipeline.frames.formats.contiguous import (
+    ContiguousReader,
+    Layout,
+    even_offsets,
+    unsigned_type,
+    unstore,
+)
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
 from pchem_pipeline.frames.reader import changed, check_window
 from pchem_pipeline.frames.registry import check_unpacked, require
@@ -89,13 +95,13 @@ class FitsReader(ContiguousReader):
             number, hdu, primary = _image(path, hdus, settings)
             header = hdu.header
             sizes = [header[f"NAXIS{axis}"] for axis in range(header["NAXIS"], 0, -1)]
-            stored, biased = _samples(path, header)
-            signed = False if biased else check_samples(path, stored, settings)
-            n, rows, columns = stack_shape(path, sizes, "image")
             compressed = isinstance(hdu, fits.CompImageHDU)
+            stored, zero = _samples(path, header, compressed)
+            offset = zero or check_samples(path, stored, settings)
+            n, rows, columns = stack_shape(path, sizes, "image")
             self.notes = _value_notes(path, header, n)
             if compressed:
-                self.notes += _coding_notes(path, number, biased=biased)
+                self.notes += _coding_notes(path, number, biased=bool(zero))
                 self.rows_per_read = min(rows, int(hdu.tile_shape[-2]))
             start = 0 if compressed else int(hdu.fileinfo()["datLoc"])
             end = hdus[-1].fileinfo()["datLoc"] + hdus[-1].fileinfo()["datSpan"]
@@ -106,12 +112,12 @@ class FitsReader(ContiguousReader):
                     f"{path}: truncated: {end} bytes are needed, the file has {size}; copy it again"
                 )
             self.paths, self.shape, self.dtype = (path,), (n, rows, columns), unsigned_type(stored)
-            self._compressed, self._size, self._signed = number, size, signed
+            self._compressed, self._size, self._offset = number, size, None if zero else offset
             self._full = tuple(sizes)
             check_coded(path, self.shape, hdu.tile_shape, stored.itemsize, size)
             return
         offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=start)
-        self.set_layout(path, Layout(offsets, rows, columns, stored, biased=biased, signed=signed), size)
+        self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
 
     def _read_facts(self, *headers: Any) -> None:
         """Take each fact from the last header that has it."""
@@ -134,12 +140,8 @@ class FitsReader(ContiguousReader):
         y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
         if buffer.size == 0:
             return
-        values = self._section(t0, t1, y0, y1).reshape(buffer.shape)
-        if self._signed and int(values.min()) < 0:
-            raise InputError(
-                f"{self.paths[0]}: signed samples with negative values; counts of an ADC must be 0 or more"
-            )
-        buffer[...] = values
+        buffer[...] = self._section(t0, t1, y0, y1).reshape(buffer.shape)
+        unstore(buffer, self.dtype, self._offset, self.paths[0])
 
     def _section(self, t0: int, t1: int, y0: int, y1: int) -> NDArray[Any]:
         """Decode a window of a compressed image."""
@@ -261,19 +263,21 @@ def _keyword(headers: Sequence[Any], names: Sequence[str]) -> tuple[Any, str]:
     return None, ""
 
 
-def _samples(path: Path, header: Any) -> tuple[np.dtype[Any], bool]:
-    """Return the stored type, and whether BZERO makes it unsigned."""
+def _samples(path: Path, header: Any, compressed: bool) -> tuple[np.dtype[Any], int]:
+    """Return the stored type, and what BZERO adds to signed samples, 0 where nothing is."""
     bits = int(header["BITPIX"])
     zero, scale = header.get("BZERO", 0), header.get("BSCALE", 1)
     if bits < 0:
-        return np.dtype(f">f{-bits // 8}"), False
+        return np.dtype(f">f{-bits // 8}"), 0
     stored = np.dtype("u1") if bits == 8 else np.dtype(f">i{bits // 8}")
-    if scale != 1 or zero not in (0, _UNSIGNED_ZERO.get(bits, 0)):
+    top = _UNSIGNED_ZERO.get(bits, 0)
+    plain = not compressed and not isinstance(zero, str) and zero == int(zero)
+    if scale != 1 or not (zero in (0, top) or (plain and 0 < zero < top)):
         raise InputError(
             f"{path}: scaled data (BSCALE {scale}, BZERO {zero}), which are no digital numbers; write raw "
             "integers"
         )
-    return stored, zero != 0
+    return stored, int(zero)
 
 
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:

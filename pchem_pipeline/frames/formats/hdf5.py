@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError, quoted
 from pchem_pipeline.frames.camera import FACT_NAMES, StatedFacts, facts_from_names, text_of
 from pchem_pipeline.frames.formats.choice import choose_dataset
-from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, unsigned_type
+from pchem_pipeline.frames.formats.contiguous import (
+    ContiguousReader,
+    Layout,
+    even_offsets,
+    unsigned_type,
+    unstore,
+)
 from pchem_pipeline.frames.formats.hdf5_parts import (
     check_filters,
     check_links,
@@ -87,7 +93,7 @@ class Hdf5Reader(ContiguousReader):
             check_links(path, external_links(file), wanted)
         self._name = choose_dataset(path, found, settings.dataset)
         dataset = file[self._name]
-        self._signed = check_samples(path, dataset.dtype, settings)
+        self._offset = check_samples(path, dataset.dtype, settings)
         self.paths = (path,)
         self.shape = stack_shape(path, dataset.shape, f"dataset {self._name}")
         self.dtype = unsigned_type(dataset.dtype)
@@ -103,7 +109,7 @@ class Hdf5Reader(ContiguousReader):
         self.unwritten = bool(missing)
         offsets = _plain_offsets(path, file, dataset, self.shape)
         if offsets is not None:
-            layout = Layout(offsets, *self.shape[1:], dataset.dtype, signed=self._signed)
+            layout = Layout(offsets, *self.shape[1:], dataset.dtype, self._offset)
             self.set_layout(path, layout, size)
         elif dataset.chunks is not None:
             self.rows_per_read = min(self.shape[1], int(dataset.chunks[-2]))
@@ -137,11 +143,8 @@ class Hdf5Reader(ContiguousReader):
             raise
         except Exception as error:
             raise InputError(f"{path}: {self._name} cannot be read ({error}); copy the file again") from error
-        if self._signed and int(values.min()) < 0:
-            raise InputError(
-                f"{path}: signed samples with negative values; counts of an ADC must be 0 or more"
-            )
         buffer[...] = values.reshape(buffer.shape)
+        unstore(buffer, self.dtype, self._offset, path)
 
 
 def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:

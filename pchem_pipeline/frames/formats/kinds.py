@@ -18,8 +18,8 @@ _MOST_PIXELS = 1 << 20
 _MOST_CODED, _MOST_PIECE, _MOST_RATIO = 1 << 30, 1 << 28, 10_000
 
 
-def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> bool:
-    """Check that samples can be digital numbers: unsigned, or declared unsigned by ``input.dtype``.
+def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> int | None:
+    """Check that samples can be digital numbers: unsigned, or signed as the settings say.
 
     Args:
         path: the file, for the message.
@@ -27,7 +27,7 @@ def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> 
         settings: the section ``input``; its ``dtype`` names the unsigned type that is meant.
 
     Returns:
-        Whether the samples are signed, to be checked for negative values on reading.
+        What is to be added to signed samples, DN; None for unsigned ones.
 
     Raises:
         InputError: float, complex, boolean, object, 64-bit or undeclared signed samples, or ``input.dtype``
@@ -39,13 +39,21 @@ def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> 
             raise InputError(
                 f"{path}: has {dtype.name} samples, input.dtype says {wanted}; correct input.dtype"
             )
-        return False
+        if settings.offset is not None:
+            raise InputError(f"{path}: has unsigned samples ({dtype.name}); remove input.offset (--offset)")
+        return None
     if dtype.kind == "i" and dtype.itemsize in (1, 2, 4):
-        unsigned = f"uint{8 * dtype.itemsize}"
-        if wanted == unsigned:
-            return True
+        unsigned, top = f"uint{8 * dtype.itemsize}", 1 << (8 * dtype.itemsize - 1)
+        if wanted not in (None, unsigned) or (settings.offset or 0) > top:
+            raise InputError(
+                f"{path}: has {dtype.name} samples; they are read as {unsigned}, with an offset of at most "
+                f"{top} DN; correct input.dtype or input.offset"
+            )
+        if settings.offset is not None or wanted is not None:
+            return settings.offset or 0
         raise InputError(
-            f"{path}: signed samples ({dtype.name}); if they are never negative, set input.dtype: {unsigned}"
+            f"{path}: signed samples ({dtype.name}); if they are never negative, set input.dtype: {unsigned} "
+            f"(--dtype {unsigned}); if 0 DN is stored as -{top}, set input.offset: {top} (--offset {top})"
         )
     if dtype.kind in "fc":
         raise InputError(

@@ -50,7 +50,7 @@ class NpyReader(ContiguousReader):
                 f"{path}: an object array, whose pickle is never opened; save a plain array of uint8, "
                 "uint16 or uint32"
             )
-        signed = check_samples(path, dtype, settings)
+        offset = check_samples(path, dtype, settings)
         n, rows, columns = stack_shape(path, shape)
         if fortran and n * rows > 1 and n * columns > 1 and rows * columns > 1:
             raise InputError(
@@ -58,7 +58,7 @@ class NpyReader(ContiguousReader):
             )
         offsets = even_offsets(path, n, rows * columns * dtype.itemsize, size, start=start)
         reader = cls()
-        reader.set_layout(path, Layout(offsets, rows, columns, dtype, signed=signed), size)
+        reader.set_layout(path, Layout(offsets, rows, columns, dtype, offset), size)
         behind = size - max(start, reader._layout.end)
         if behind:
             reader.notes = (

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.choice import choose_dataset
-from pchem_pipeline.frames.formats.contiguous import unsigned_type
+from pchem_pipeline.frames.formats.contiguous import unsigned_type, unstore
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
 from pchem_pipeline.frames.identity import file_size
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window, unwritten_notes
@@ -68,7 +68,7 @@ class ZarrReader(FrameReader):
                 f"{path}: {self._name or 'the array'} is coded by {', '.join(foreign)}, which may run code; "
                 "write it again with blosc, gzip or zstd"
             )
-        self._signed = check_samples(path, np.dtype(array.dtype), settings)
+        self._offset = check_samples(path, np.dtype(array.dtype), settings)
         self.paths = (path,)
         self.shape = stack_shape(path, array.shape, f"array {self._name}".strip())
         self.dtype = unsigned_type(np.dtype(array.dtype))
@@ -94,11 +94,8 @@ class ZarrReader(FrameReader):
             values = np.asarray(self._array[full_window(self._full, t0, t1, y0, y1)])
         except Exception as error:
             raise InputError(f"{path}: {self._name} has a damaged chunk ({error}); copy it again") from error
-        if self._signed and int(values.min()) < 0:
-            raise InputError(
-                f"{path}: signed samples with negative values; counts of an ADC must be 0 or more"
-            )
         buffer[...] = values.reshape(buffer.shape)
+        unstore(buffer, self.dtype, self._offset, path)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the array, which holds the event loop's locks; it is opened again."""

@@ -1,10 +1,9 @@
 """Raw binary frames, described by a sidecar file or by the settings.
 
 The sidecar lies beside ``frames.raw`` as ``frames.raw.json`` (or ``frames.json``, ``.yaml``, ``.yml``) with
-the keys
-``shape`` ([rows, columns] or [frames, rows, columns]), ``dtype``, ``byte_order``, ``header_bytes``,
-``frame_padding_bytes``, ``bit_shift``,
-``bit_depth``, ``integration_time`` (s). Other keys are left alone.
+the keys ``shape`` ([rows, columns] or [frames, rows, columns]), ``dtype``, ``offset``, ``byte_order``,
+``header_bytes``, ``frame_padding_bytes``, ``bit_shift``, ``bit_depth``, ``integration_time`` (s). Other keys
+are left alone, but for those of the camera.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
+from pchem_pipeline.frames.formats.kinds import check_samples
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -32,7 +32,8 @@ class _Sidecar(BaseModel):
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
     shape: tuple[int, ...] | None = None
-    dtype: Literal["uint8", "uint16", "uint32"] | None = None
+    dtype: Literal["uint8", "uint16", "uint32", "int16", "int32"] | None = None
+    offset: int | None = None
     byte_order: Literal["little", "big"] | None = None
     header_bytes: int | None = None
     frame_padding_bytes: int | None = None
@@ -109,7 +110,11 @@ class RawReader(ContiguousReader):
                 "sense; shape is [rows, columns] or [frames, rows, columns]; correct the sidecar"
             )
         self.byte_order = facts["byte_order"] or "little"
-        stored = np.dtype(facts["dtype"]).newbyteorder(self.byte_order)
+        stored = np.dtype(facts["dtype"])
+        if facts["offset"] is not None:
+            stored = np.dtype(f"i{stored.itemsize}")
+        offset = check_samples(path, stored, InputSettings(offset=facts["offset"]))
+        stored = stored.newbyteorder(self.byte_order)
         rows, columns = shape[-2:]
         frame = rows * columns * stored.itemsize
         step = frame + padding
@@ -128,7 +133,7 @@ class RawReader(ContiguousReader):
         if n < whole:
             self.notes = (f"{path.name} holds {whole} frames, of which the first {n} are used (shape)",)
         offsets = even_offsets(path, n, frame, size, start=header, step=step)
-        self.set_layout(path, Layout(offsets, rows, columns, stored), size)
+        self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
 
 
 def _size(path: Path) -> int:

@@ -108,7 +108,7 @@ class TiffReader(ContiguousReader):
         notes = [f"{path.name}: {reduced} reduced pages (previews) are left out"] if reduced else []
         first = pages[0]
         _check_pages(path, pages)
-        signed = check_samples(path, np.dtype(first.dtype), settings)
+        offset = check_samples(path, np.dtype(first.dtype), settings)
         count = len(pages) if len(pages) > 1 else images_behind_one_page(file)
         notes += _channel_notes(path, *stated_channels(file), count) + _value_notes(path, pages)
         self.notes = tuple(notes)
@@ -116,12 +116,12 @@ class TiffReader(ContiguousReader):
         offsets = _contiguous_offsets(path, file, pages, size)
         rows, columns = first.shape[-2:]
         if offsets is not None:
-            self.set_layout(path, Layout(offsets, rows, columns, stored, signed=signed), size)
+            self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
         else:
-            self._set_segments(path, pages, size, signed)
+            self._set_segments(path, pages, size, offset)
         self.take_facts(stated_facts(file, first))
 
-    def _set_segments(self, path: Path, pages: Sequence[Any], size: int, signed: bool) -> None:
+    def _set_segments(self, path: Path, pages: Sequence[Any], size: int, offset: int | None) -> None:
         """Remember where the coded strips or tiles of each page are."""
         most = max(len(page.dataoffsets) for page in pages)
         offsets = np.zeros((len(pages), most), np.int64)
@@ -150,7 +150,7 @@ class TiffReader(ContiguousReader):
         self.shape = (len(pages), rows, columns)
         self.dtype = unsigned_type(np.dtype(first.dtype))
         self._size = size
-        self._signed = signed
+        self._offset = offset
         self.rows_per_read = min(rows, int(height.max()))
         self._segments = _Segments(offsets, counts, model, -(-columns // width), height)
 
@@ -165,8 +165,7 @@ class TiffReader(ContiguousReader):
         with OpenedFile(self.paths[0], self._size) as file:
             for t in range(t0, t1):
                 self._decode(file, buffer[t - t0], t, y0, y1)
-        if self._signed:
-            unstore(buffer, self.dtype, biased=False, signed=True, path=self.paths[0])
+        unstore(buffer, self.dtype, self._offset, self.paths[0])
 
     def _decode(self, file: OpenedFile, frame: NDArray[Any], t: int, y0: int, y1: int) -> None:
         """Decode the segments of page t that touch rows y0..y1 into ``frame``."""
