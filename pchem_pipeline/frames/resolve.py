@@ -55,19 +55,31 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
 
 
 def input_paths(settings: InputSettings, base_dir: Path) -> list[Path]:
-    """Return all files that decide what is read: those of `resolve_files`, each with its sidecar.
+    """Return all files that decide what is read: mask, camera files, each with its sidecar.
 
     Raises:
         ConfigError: no files are named.
         InputError: as in `resolve_files`.
     """
-    paths: list[Path] = []
+    mask = mask_path(settings, base_dir)
+    paths = [] if mask is None else [mask]
     for path in resolve_files(settings, base_dir):
         paths.append(path)
         if settings.format == "raw" or path.suffix.lower() in RawReader.suffixes:
             sidecar = find_sidecar(path)
             paths += [sidecar] if sidecar is not None else []
     return paths
+
+
+def mask_path(settings: InputSettings, base_dir: Path) -> Path | None:
+    """Return the file of ``input.mask``, fetched where it is remote.
+
+    Raises:
+        InputError: there is none.
+    """
+    if settings.mask is None:
+        return None
+    return resolve_files(settings.model_copy(update={"files": (settings.mask,)}), base_dir)[0]
 
 
 def _is_zarr(path: Path) -> bool:

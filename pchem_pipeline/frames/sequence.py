@@ -24,10 +24,12 @@ class FrameSequence(FrameReader):
 
     Attributes:
         report: what was found in the files and what was done about it.
+        excluded: pixels (y, x) whose samples are replaced by one that is the same in all frames; None: none.
         stated_integration_time: s, as the files say, whatever the settings say; None if they do not agree.
     """
 
     format_name = "sequence"
+    excluded: NDArray[np.bool_] | None = None
 
     @property
     def order_by_habit(self) -> bool:  # type: ignore[override]
@@ -111,7 +113,20 @@ class FrameSequence(FrameReader):
         """
         y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
         for reader, part in self._parts(buffer, t0, t1, (y0, y1)):
-            self.check_bits(reader, part)
+            self.check_bits(reader, part, y0)
+
+    def exclude(self, pixels: NDArray[np.bool_]) -> None:
+        """Exclude pixels (y, x): their samples become the median of the others in the first frame.
+
+        Raises:
+            InputError: no pixel is left.
+        """
+        if pixels.all():
+            raise InputError(f"{_where(self.paths)}: every pixel is excluded; correct input.mask (--mask)")
+        if pixels.any():
+            self.excluded, self._places = pixels, np.nonzero(pixels)
+            others = self.stored(0, 1, 0, self.shape[1])[0][~pixels]
+            self._filler = np.quantile(others, 0.5, method="lower")
 
     def stored(self, t0: int, t1: int, y0: int, y1: int) -> NDArray[Any]:
         """Return frames t0..t1 and rows y0..y1 (frame, y, x) as they are in the files."""
@@ -161,8 +176,18 @@ class FrameSequence(FrameReader):
             reader.read_into(scratch[: stop - t], t, stop, *rows)
             part[t - t0 : stop - t0] = scratch[: stop - t, :, self._x0 : self._x1]
 
-    def check_bits(self, reader: FrameReader, part: NDArray[Any]) -> None:
-        """Shift left-justified samples, refusing to lose bits; check that values fit the bit depth."""
+    def check_bits(self, reader: FrameReader, part: NDArray[Any], y0: int) -> None:
+        """Replace excluded samples; shift left-justified ones, refusing to lose bits; check the bit depth.
+
+        Args:
+            reader: of the file.
+            part: frames of it, (frame, y, x).
+            y0: their first row.
+        """
+        if self.excluded is not None:
+            ys, xs = self._places
+            a, b = np.searchsorted(ys, [y0, y0 + part.shape[1]])
+            part[:, ys[a:b] - y0, xs[a:b]] = self._filler
         size = 8 * self.dtype.itemsize
         depth = size - self.bit_shift if self.bit_depth is None else self.bit_depth
         if part.size == 0 or (self.bit_shift == 0 and depth == size):

@@ -126,6 +126,11 @@ class InputSettings(Section):
         "saturation at the "
         "top of the range cannot be told from a clipped histogram)",
     )
+    mask: Place | None = Field(
+        default=None,
+        description="image file (npy, TIFF, FITS) of the shape of the frames or of roi, relative to this "
+        "YAML file: pixels other than 0 are excluded, and so are those that always hold the marker 2^32-1",
+    )
     roi: tuple[int, int, int, int] | None = Field(
         default=None, description="region of interest [y0, y1, x0, x1] in pixels, ends excluded; null: all"
     )

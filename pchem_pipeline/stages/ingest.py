@@ -85,6 +85,12 @@ def run(context: StageContext) -> None:
     if message := reader.report.message():
         context.note(message)
     sensor_of(reader, context, shortened(known_identity(context))).write(context.store)
+    if reader.excluded is not None:
+        context.create("frames/excluded", reader.shape[1:], chunks=reader.shape[1:])
+        context.store.write("frames/excluded", (slice(None),) * 2, reader.excluded.astype(np.uint8))
+        context.note(
+            f"{np.count_nonzero(reader.excluded)} pixels are excluded by the mask or the marker 2^32-1"
+        )
     keep_ingested(context)
     if settings.mode == "reference":
         _run_whole(context)

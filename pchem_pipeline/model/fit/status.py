@@ -24,6 +24,7 @@ class FitStatus(IntFlag):
     POOR_FIT = 512
     COARSE_STEPS = 1024
     WEAKLY_IDENTIFIED = 2048
+    EXCLUDED = 4096
 
 
 #: Bits for which the parameters of the pixel are NaN.
@@ -33,6 +34,7 @@ FAILED = (
     | FitStatus.NOT_CONVERGED
     | FitStatus.GAIN_NOT_IDENTIFIED
     | FitStatus.EXPOSURE_AT_BOUND
+    | FitStatus.EXCLUDED
 )
 
 #: Bits of pixels whose value the data leave open by whole electrons, or altogether, whatever its standard
@@ -54,6 +56,7 @@ MEANINGS: dict[FitStatus, str] = {
     FitStatus.COARSE_STEPS: "DN too coarse (sigma < 0.6 DN or g > 0.4 e-/DN): rounding biases the estimates",
     FitStatus.WEAKLY_IDENTIFIED: "too few frames at this sensor's read noise: the bias is clear by chance "
     "only, or the standard errors are rough",
+    FitStatus.EXCLUDED: "excluded by input.mask, or by the camera's marker",
 }
 
 
