@@ -32,7 +32,10 @@ from pchem_pipeline.frames.formats.hdf5_parts import (
     check_filters,
     check_links,
     check_sources,
+    check_virtual,
     external_links,
+    is_own,
+    opened,
 )
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
 from pchem_pipeline.frames.reader import changed, check_window, unwritten_notes
@@ -42,6 +45,8 @@ from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 _LOCK = threading.Lock()
+#: items of a file, and groups within each other
+_MOST_ITEMS, _DEEPEST = 100_000, 64
 
 
 class Hdf5Reader(ContiguousReader):
@@ -56,14 +61,16 @@ class Hdf5Reader(ContiguousReader):
     def open(cls, path: Path, settings: InputSettings) -> Self:
         """See `FrameReader.open`."""
         _require()
-        import h5py
-
         reader = cls()
         try:
-            with _LOCK, h5py.File(path, "r") as file:
+            with _LOCK, opened(path) as file:
                 reader._inspect(path, file, settings)
         except InputError:
             raise
+        except BlockingIOError as error:
+            raise InputError(
+                f"{path}: is locked by the program that writes it; wait until it is done"
+            ) from error
         except Exception as error:  # a damaged file can break the library anywhere
             if "already open for write" in str(error):
                 raise InputError(
@@ -79,18 +86,24 @@ class Hdf5Reader(ContiguousReader):
         import h5py
 
         found: dict[str, tuple[int, ...]] = {}
-        detectors = []
+        detectors: list[Any] = []
 
         def visit(name: str, item: Any) -> None:
+            if len(found) > _MOST_ITEMS or name.count("/") > _DEEPEST:
+                raise InputError(
+                    f"{path}: holds more than {_MOST_ITEMS} items, or groups too deep; leave it out"
+                )
             if isinstance(item, h5py.Dataset):
+                if item.is_virtual and wanted in (None, name, f"/{name}"):
+                    check_virtual(path, item)  # the library may look at its parts for the shape
                 found[name] = item.shape or ()
             elif _is_detector(item):
                 detectors.append(item)
 
-        file.visititems(visit)
         wanted = settings.dataset
+        file.visititems(visit)
         if not any(len(shape) >= 3 for shape in found.values()) or wanted is not None:
-            check_links(path, external_links(file), wanted)
+            check_links(path, external_links(path, file), wanted)
         self._name = choose_dataset(path, found, settings.dataset)
         dataset = file[self._name]
         self._offset = check_samples(path, dataset.dtype, settings)
@@ -121,15 +134,13 @@ class Hdf5Reader(ContiguousReader):
         if self.layout is not None:
             super().read_into(buffer, t0, t1, y0, y1)
             return
-        import h5py
-
         y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
         if buffer.size == 0:
             return
         path = self.paths[0]
         window = full_window(self._full, t0, t1, y0, y1)
         try:
-            with _LOCK, h5py.File(path, "r") as file:
+            with _LOCK, opened(path) as file:
                 dataset = file[self._name]
                 if tuple(dataset.shape) != self._full:
                     raise changed(path, "the dataset changed its shape")
@@ -253,7 +264,7 @@ def _stated_facts(dataset: Any, groups: list[Any]) -> StatedFacts:
         if _is_detector(group):
             names["description"] = "camera"  # so NeXus calls make and model
         for stored, name in names.items():
-            other = group.get(stored)
+            other: Any = group.get(stored) if is_own(group, stored) else None
             if getattr(other, "size", 0) == 1 and name not in beside:
                 beside[name] = np.ravel(other[()])[0]
                 units[name] = other.attrs.get("units", other.attrs.get("unit"))
