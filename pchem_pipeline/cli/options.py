@@ -19,10 +19,15 @@ if TYPE_CHECKING:
 
 
 def on_this_machine(path: Path | None) -> Path | None:
-    """Return a path that a command writes to, as typer's callback; a URL is refused."""
+    """Return a path that a command writes to, as typer's callback; a URL or a pipe is refused."""
     from pchem_pipeline.store.remote_path import local_path
 
-    return None if path is None else local_path(path)
+    if path is None:
+        return None
+    path = local_path(path)
+    if path.is_fifo() or path.is_socket():
+        raise ConfigError(f"{path} is no regular file; choose another name")
+    return path
 
 
 Target = Annotated[Path, typer.Argument(help="a config.yaml, or the store of a run (run.zarr)")]

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 
 _LONGEST = 80
 _ZERO_CELSIUS = 273.15
+#: integration times of cameras, s
+SHORTEST, LONGEST = 1e-12, 1e9
 #: names that programs give to the facts in attributes, sidecars and JSON records, the usual one first
 _NAMES = ("camera", "camera_model", "camera_name")
 _SERIALS = ("serial_number", "camera_serial", "serial")
@@ -157,7 +159,7 @@ def duration_of(name: str, value: Any, *units: Any, comment: str = "") -> Durati
         seconds = float(number)
     except (TypeError, ValueError, OverflowError):
         return None
-    if not (math.isfinite(seconds) and seconds > 0):
+    if not (math.isfinite(seconds) and SHORTEST <= seconds <= LONGEST / SHORTEST):
         return None
     stated = [each for each in map(text_of, (unit, *units)) if each]
     scales = {scale for text in stated for scale in _scales(text) or {None}} | _scales(comment)
@@ -165,6 +167,8 @@ def duration_of(name: str, value: Any, *units: Any, comment: str = "") -> Durati
     if not scales:
         return Duration(seconds, f"{words}, no unit stated, taken as s")
     scale = scales.pop() if len(scales) == 1 else None
+    if scale is not None and not SHORTEST <= seconds * scale <= LONGEST:
+        return None
     return (
         Duration(None, f"{words}, whose unit is in doubt")
         if scale is None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+from contextlib import suppress
 from pathlib import Path
 
 from pchem_pipeline.base.errors import ConfigError, InputError
@@ -41,16 +43,23 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
         if is_remote(entry):
             found += fetch(entry)
             continue
-        path = Path(entry).expanduser()
-        path = path if path.is_absolute() else base_dir / path
+        path = Path(entry)
+        with suppress(RuntimeError):  # a file called ~x.tif
+            path = path.expanduser()
+        path = base_dir / path
         if path.is_dir() and not _is_zarr(path):
             found += _folder(path, settings)
         elif path.exists():
             found.append(path)
         elif _GLOB.search(entry):
-            found += _glob(Path(entry).expanduser(), base_dir, entry)
+            found += _glob(path, base_dir, entry)
         else:
             raise InputError(f"{path}: no such file or folder; correct the path (input.files)")
+    for path in found:
+        if not (path.is_file() or path.is_dir()):
+            raise InputError(f"{path}: no regular file; write what comes from there to a file first")
+        if not str(path).isascii() and str(path) != os.fsencode(path).decode("utf-8", "replace"):
+            raise InputError(f"{path}: its name is not in UTF-8; rename it")
     return sorted(found, key=natural_key)
 
 

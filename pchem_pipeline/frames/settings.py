@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from pchem_pipeline.base.settings import Place, Section
+from pchem_pipeline.frames.camera import LONGEST, SHORTEST
 
 
 class SampleSettings(Section):
@@ -17,7 +18,10 @@ class SampleSettings(Section):
         default=False, description="frames without any electrons, H = 0; they pin the bias and the read noise"
     )
     integration_time: float | None = Field(
-        default=None, ge=0, description="s; null: what the run says. 0 is allowed: no time to integrate"
+        default=None,
+        ge=0,
+        le=LONGEST,
+        description="s; null: what the run says. 0 is allowed: no time to integrate",
     )
     light_level: float | None = Field(
         default=None, ge=0, description="exposure in any unit, for input.against: light_level"
@@ -141,7 +145,8 @@ class InputSettings(Section):
     )
     integration_time: float | None = Field(
         default=None,
-        gt=0,
+        ge=SHORTEST,
+        le=LONGEST,
         description="integration time of a frame, s; null: from the file, else unknown (no charge rate then)",
     )
     on_bad_file: Literal["error", "skip"] = Field(

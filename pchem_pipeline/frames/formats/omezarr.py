@@ -22,6 +22,9 @@ from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import link_out_of, whole_file
 
+#: folders within each other, and chunks of a shard
+_DEEPEST, _MOST_IN_A_SHARD = 64, 1 << 16
+
 
 class ZarrReader(FrameReader):
     """A zarr array, the only stack of a zarr group, or the full resolution of an OME-Zarr image."""
@@ -53,6 +56,11 @@ class ZarrReader(FrameReader):
 
         if link := link_out_of(path):
             raise InputError(f"{path}: {link} is a link out of the store; copy its files into it")
+        parts = [*path.rglob("*")]
+        if special := next((part for part in parts if not (part.is_file() or part.is_dir())), None):
+            raise InputError(f"{path}: {special.relative_to(path)} is no regular file; copy the store again")
+        if max((len(part.relative_to(path).parts) for part in parts), default=0) > _DEEPEST:
+            raise InputError(f"{path}: groups more than {_DEEPEST} deep; copy the array out of them")
         node = zarr.open(path, mode="r")
         if isinstance(node, zarr.Array):
             array: Any = node
@@ -76,6 +84,8 @@ class ZarrReader(FrameReader):
         self.rows_per_read = min(self.shape[1], int(array.chunks[-2]))
         self._array = array
         piece = getattr(array, "shards", None) or array.chunks
+        if math.prod(piece) > _MOST_IN_A_SHARD * math.prod(array.chunks):
+            raise InputError(f"{path}: shards of more than {_MOST_IN_A_SHARD} chunks; write larger chunks")
         check_coded(path, self.shape, piece, self.dtype.itemsize, file_size(path))
         self.take_facts(facts_from_names(attributes))
         missing = _unwritten(path, path / self._name, self._full, piece)

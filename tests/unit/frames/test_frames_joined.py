@@ -506,3 +506,19 @@ def test_fits_adds_what_its_header_says(tmp_path: Path) -> None:
     image.writeto(tmp_path / "a.fits")
     with open_frames(InputSettings(files=("a.fits",)), tmp_path) as frames:
         np.testing.assert_array_equal(frames.read(), stack)
+
+
+def test_files_with_names_that_are_special_and_files_that_are_none(tmp_path: Path) -> None:
+    for name in ("~root.npy", "~x.npy"):
+        np.save(tmp_path / name, STACK)
+        assert open_frames(InputSettings(files=(name,)), tmp_path).paths == (tmp_path / name,)
+    os.mkfifo(tmp_path / "a.npy")
+    refused(InputSettings(files=("a.npy",)), tmp_path, r"a\.npy: no regular file")
+    refused(InputSettings(files=("~x.npy",), mask="a.npy"), tmp_path, r"a\.npy: no regular file")
+    zarr.create_array(tmp_path / "a.zarr", data=STACK, chunks=(6, 17, 19))
+    (tmp_path / "a.zarr/c/1/0/0").unlink()
+    os.mkfifo(tmp_path / "a.zarr/c/1/0/0")
+    refused(InputSettings(files=("a.zarr",)), tmp_path, r"c/1/0/0 is no regular file")
+    latin = os.fsdecode(b"caf\xe9.npy")
+    np.save(tmp_path / latin, STACK)
+    refused(InputSettings(files=(latin,)), tmp_path, r"caf.*\.npy: its name is not in UTF-8; rename it")
