@@ -26,6 +26,7 @@ from pchem_pipeline.frames.settings import InputSettings
 #: more bins than any ADC of interest has codes; a wider span is a mistake in the file
 _MOST_BINS = 1 << 24
 _MOST_BINS_OF_ALL = 1 << 27
+_MOST_UNPACKED = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -188,6 +189,9 @@ def _split_npz(path: Path, archive: Any) -> tuple[NDArray[Any], NDArray[Any]]:
     if not {"dn", "counts"} <= held:
         listed = ", ".join(sorted(held)) or "nothing"
         raise InputError(f"{path}: needs the arrays dn and counts, holds {listed}; save it with these names")
+    unpacked = sum(part.file_size for part in archive.zip.infolist())
+    if unpacked > max(_MOST_UNPACKED, 100 * path.stat().st_size):
+        raise InputError(f"{path}: {unpacked} bytes unpacked, which cannot be histograms; save it again")
     return archive["dn"], np.atleast_2d(archive["counts"])
 
 

@@ -271,7 +271,7 @@ def _frame_range(settings: InputSettings, total: int, least: int) -> tuple[int, 
     if end > total or end - first < least:
         raise InputError(
             f"input.frame_range [{first}, {end}] does not hold at least {least} of the {total} frames; "
-            "correct it"
+            "correct it (--frames)"
         )
     return first, end
 

@@ -25,6 +25,7 @@ from pchem_pipeline.frames.identity import FileHasher
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window
 
 _MOST_BYTES = 1 << 30
+_MOST_FRAMES = 1 << 26
 #: targets of one call of preadv
 _MOST_VECTORS = 1024
 
@@ -85,6 +86,10 @@ def even_offsets(
         InputError: they do not fit into the file. The numbers of a damaged header must not take memory.
     """
     step = frame_bytes if step is None else step
+    if n_frames > _MOST_FRAMES:
+        raise InputError(
+            f"{path}: {n_frames} frames, more than {_MOST_FRAMES}; correct the header or input.shape"
+        )
     if n_frames and frame_bytes < 1:
         raise InputError(f"{path}: holds no frames; leave it out")
     if n_frames and start + step * (n_frames - 1) + frame_bytes > size:

@@ -8,6 +8,7 @@ wait for each other, and the bytes would be read a second time for the hash of t
 
 from __future__ import annotations
 
+import heapq
 import math
 import threading
 from collections.abc import Iterator
@@ -36,8 +37,16 @@ from pchem_pipeline.frames.formats.hdf5_parts import (
     external_links,
     is_own,
     opened,
+    virtual_files,
 )
-from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
+from pchem_pipeline.frames.formats.kinds import (
+    LARGEST_PIECES,
+    check_coded,
+    check_samples,
+    check_unpacked_size,
+    full_window,
+    stack_shape,
+)
 from pchem_pipeline.frames.reader import changed, check_window, unwritten_notes
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
@@ -113,10 +122,14 @@ class Hdf5Reader(ContiguousReader):
         self._full = tuple(dataset.shape)
         size = path.stat().st_size
         check_filters(path, dataset)
+        if dataset.is_virtual:
+            held = sum(part.stat().st_size for part in virtual_files(path, dataset))
+            check_coded(path, self.shape, self.shape[1:], self.dtype.itemsize, size + held)
         self.notes = check_sources(path, dataset) + _reversed_axes(path, dataset)
         if dataset.chunks is not None:
             check_coded(path, self.shape, dataset.chunks, self.dtype.itemsize, size)
             _check_chunk_sizes(path, dataset)
+            _check_deflated(path, dataset)
         missing = _missing_chunks(path, dataset)
         self.notes += missing
         self.unwritten = bool(missing)
@@ -187,6 +200,27 @@ def _check_chunk_sizes(path: Path, dataset: Any) -> None:
         raise InputError(
             f"{path}: damaged: a chunk of {min(sizes - {size})} bytes, where {size} are needed; copy it again"
         )
+
+
+def _check_deflated(path: Path, dataset: Any) -> None:
+    """Refuse chunks that were deflated twice, or that hold more than their shape says.
+
+    Raises:
+        InputError: there is one.
+    """
+    from h5py import h5z
+
+    record = dataset.id.get_create_plist()
+    codes = [record.get_filter(number)[0] for number in range(record.get_nfilters())]
+    if len(codes) > len(set(codes)):
+        raise InputError(f"{path}: {dataset.name} is coded twice by the same filter; write it again")
+    if codes[-1:] != [h5z.FILTER_DEFLATE] or not hasattr(dataset.id, "chunk_iter"):
+        return
+    chunks: list[tuple[int, tuple[int, ...]]] = []
+    dataset.id.chunk_iter(lambda chunk: chunks.append((chunk.size, chunk.chunk_offset)))
+    largest = heapq.nlargest(LARGEST_PIECES, chunks)
+    pieces = (dataset.id.read_direct_chunk(place)[1] for _, place in largest)
+    check_unpacked_size(path, pieces, 4 * math.prod(dataset.chunks) * dataset.dtype.itemsize)
 
 
 def _plain_offsets(

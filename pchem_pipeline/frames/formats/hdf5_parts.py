@@ -158,6 +158,15 @@ def check_virtual(path: Path, dataset: Any, above: tuple[tuple[Path, str], ...] 
     return list(sources)
 
 
+def virtual_files(path: Path, dataset: Any) -> list[Path]:
+    """Return the files that the parts of a virtual dataset are in, as far as they are there."""
+    files: set[Path] = set()
+    for name in {source.file_name for source in dataset.virtual_sources()} - {"."}:
+        other = path.parent / name
+        files.update(other.parent.glob(re.sub(r"%\d*b", "*", other.name)) if "%" in name else [other])
+    return [file for file in files if file.is_file()]
+
+
 def _plain(file: Any, name: str) -> Any:
     """Return what a file itself has under a name, or None: links into other files are not followed."""
     import h5py

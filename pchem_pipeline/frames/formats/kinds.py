@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import zlib
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from pchem_pipeline.frames.settings import InputSettings
 _MOST_PIXELS = 1 << 20
 #: a file of coded frames, and a coded piece of it, that may hold much in little
 _MOST_CODED, _MOST_PIECE, _MOST_RATIO = 1 << 30, 1 << 28, 10_000
+#: the largest coded pieces, as many as are unpacked to see how much they hold
+LARGEST_PIECES = 64
 
 
 def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> int | None:
@@ -117,6 +120,33 @@ def check_coded(
         raise InputError(
             f"{path}: damaged header: pieces of {' x '.join(map(str, piece))} samples; copy the file again"
         )
+
+
+def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int) -> None:
+    """Check that coded pieces (gzip, zlib) hold no more than their shape says, in no more memory.
+
+    Args:
+        path: the file, for the message.
+        pieces: coded bytes.
+        expected: bytes of a piece by shape and type.
+
+    Raises:
+        InputError: one holds more; the library would unpack it whole.
+    """
+    for data in pieces:
+        held, found = data, 0
+        while held and found <= expected:
+            unpack = zlib.decompressobj(wbits=47)  # gzip or zlib
+            try:
+                found += len(unpack.decompress(held, expected + 1 - found))
+            except zlib.error:
+                break  # it is told where the frames are read
+            held = unpack.unused_data
+        if found > expected:
+            raise InputError(
+                f"{path}: damaged: a piece of {len(data)} bytes unpacks to more than the {expected} of its "
+                "shape; copy it again"
+            )
 
 
 def full_window(full: tuple[int, ...], t0: int, t1: int, y0: int, y1: int) -> tuple[Any, ...]:

@@ -15,7 +15,14 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.choice import choose_dataset
 from pchem_pipeline.frames.formats.contiguous import unsigned_type, unstore
-from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
+from pchem_pipeline.frames.formats.kinds import (
+    LARGEST_PIECES,
+    check_coded,
+    check_samples,
+    check_unpacked_size,
+    full_window,
+    stack_shape,
+)
 from pchem_pipeline.frames.identity import file_size
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window, unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
@@ -87,6 +94,12 @@ class ZarrReader(FrameReader):
         if math.prod(piece) > _MOST_IN_A_SHARD * math.prod(array.chunks):
             raise InputError(f"{path}: shards of more than {_MOST_IN_A_SHARD} chunks; write larger chunks")
         check_coded(path, self.shape, piece, self.dtype.itemsize, file_size(path))
+        if any(f"'{name}'" in str(array.metadata.to_dict()) for name in ("gzip", "zlib")):
+            chunks = sorted(filter(Path.is_file, parts), key=lambda part: -part.stat().st_size)[
+                :LARGEST_PIECES
+            ]
+            some = (part.read_bytes() for part in chunks if part.suffix != ".json")
+            check_unpacked_size(path, some, 4 * math.prod(array.chunks) * self.dtype.itemsize)
         self.take_facts(facts_from_names(attributes))
         missing = _unwritten(path, path / self._name, self._full, piece)
         self.unwritten = bool(missing)

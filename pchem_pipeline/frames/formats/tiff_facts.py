@@ -38,6 +38,7 @@ class _Kind(NamedTuple):
 _CLASSIC, _BIG = _Kind(2, 12, 4, 4), _Kind(8, 20, 8, 8)
 #: tags of a directory, as in tifffile
 _MOST_TAGS = 4096
+_MOST_PAGES = 100_000
 _EXPOSURE_TAG, _EXIF_TAG = 33434, 34665
 _MICRO_MANAGER_TAG = 51123
 _STK_PLANES_TAG = 33629
@@ -60,6 +61,10 @@ def check_chain(path: Path, size: int) -> None:
         following = int.from_bytes(head[kind.first : kind.first + kind.pointer], order)
         seen: set[int] = set()
         while following:
+            if len(seen) > _MOST_PAGES:
+                raise InputError(
+                    f"{path}: more than {_MOST_PAGES} pages; write several files, or an npy array"
+                )
             if following in seen:
                 raise InputError(
                     f"{path}: damaged: after {len(seen)} pages the chain of pages runs in a circle; copy it "
