@@ -43,7 +43,7 @@ FLAGGED = FitStatus.BIAS_AMBIGUOUS | FitStatus.NOT_INFORMATIVE | FitStatus.WEAKL
 
 #: A sentence for every bit.
 MEANINGS: dict[FitStatus, str] = {
-    FitStatus.NO_DATA: "no frame inside the histogram window",
+    FitStatus.NO_DATA: "too few frames inside the histogram window",
     FitStatus.TOO_FEW_BINS: "fewer than 3 occupied bins",
     FitStatus.NOT_CONVERGED: "the fit did not converge",
     FitStatus.GAIN_NOT_IDENTIFIED: "one Gaussian fits as well: the conversion gain is not identified",

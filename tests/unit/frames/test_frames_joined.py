@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from pchem_pipeline.base.errors import ConfigError, ExitCode, InputError
 from pchem_pipeline.frames.identity import hash_file
+from pchem_pipeline.frames.inspect import _gaps
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import natural_key, resolve_files
 from pchem_pipeline.frames.settings import InputSettings
@@ -522,3 +523,20 @@ def test_files_with_names_that_are_special_and_files_that_are_none(tmp_path: Pat
     latin = os.fsdecode(b"caf\xe9.npy")
     np.save(tmp_path / latin, STACK)
     refused(InputSettings(files=(latin,)), tmp_path, r"caf.*\.npy: its name is not in UTF-8; rename it")
+
+
+@pytest.mark.parametrize(
+    ("names", "missing"),
+    [
+        ([f"a_{i:06d}.npy" for i in range(50, 75)], 0),
+        ([f"a_{i:06d}.npy" for i in range(50, 75) if i not in (52, 70)], 2),
+        ([f"a_{i:06d}.npy" for i in range(10, 40) if i != 20], 1),
+        ([f"n7_{i}.npy" for i in (2, 4, 6, 10, 12)], 1),
+        ([f"20260131_12{i // 60:02d}{i % 60:02d}.npy" for i in range(0, 200, 5)], 0),
+        ([f"cam 2026-01-31T12:00:{i:02d}.npy" for i in (1, 2, 3, 7, 8, 9)], 0),
+        ([f"f{1_706_700_000_123 + i}.npy" for i in (0, 97, 199, 295, 400, 602)], 0),
+    ],
+)
+def test_numbers_that_are_missing_and_clocks(names: list[str], missing: int) -> None:
+    notes = _gaps([Path(name) for name in names])
+    assert [note.split(" ")[0] for note in notes] == [str(missing)] * (missing > 0)
