@@ -6,8 +6,10 @@ Readers from elsewhere come through the entry point group ``pchem_pipeline.reade
 
 from __future__ import annotations
 
+import errno
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar, Self
@@ -15,7 +17,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.camera import CameraFacts, StatedFacts
 from pchem_pipeline.frames.identity import content_identity, quick_identity
 from pchem_pipeline.frames.settings import InputSettings
@@ -177,6 +179,27 @@ def unwritten_notes(path: Path, missing: int, wanted: int, what: str = "chunks")
     were = "was" if missing == 1 else "were"
     words = f"{path.name}: {missing} of {wanted} {what} {were} never written and read as the fill value"
     return (words,) if missing > 0 else ()
+
+
+@contextmanager
+def sound(path: Path, what: str) -> Iterator[None]:
+    """Turn what a library says of a damaged file into one line: damage can break it anywhere.
+
+    Raises:
+        InputError: always in place of another error, but for those of settings and missing libraries.
+    """
+    try:
+        yield
+    except (InputError, ConfigError):
+        raise
+    except Exception as error:
+        if (
+            isinstance(error, OSError)
+            and error.strerror
+            and error.errno in (errno.ENOENT, errno.EACCES, errno.EPERM)
+        ):
+            raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+        raise InputError(f"{path}: not a sound {what}, or truncated ({error}); copy it again") from error
 
 
 def changed(path: Path, what: str) -> InputError:

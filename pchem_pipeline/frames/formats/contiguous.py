@@ -172,7 +172,9 @@ class OpenedFile:
 
 
 class ContiguousReader(FrameReader):
-    """A reader that needs nothing but a `Layout`."""
+    """A reader that needs nothing but a `Layout`; of files without one it decodes by `decode_into`."""
+
+    _offset: int | None = None
 
     def set_layout(self, path: Path, layout: Layout, size: int) -> None:
         """Take the layout; ``size`` is the size of the file.
@@ -226,7 +228,18 @@ class ContiguousReader(FrameReader):
         y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
         if buffer.size == 0:
             return
-        layout = self._layout
+        layout, path = self.layout, self.paths[0]
+        if layout is None:
+            try:
+                self.decode_into(buffer, t0, t1, y0, y1)
+            except FileNotFoundError as error:
+                raise changed(path, "the file vanished") from error
+            except InputError:
+                raise
+            except Exception as error:
+                raise InputError(f"{path}: cannot be decoded ({error}); copy it again") from error
+            unstore(buffer, self.dtype, self._offset, path)
+            return
         skip = y0 * layout.columns * layout.stored.itemsize
         target = buffer.data.cast("B")
         band = len(target) // (t1 - t0)
@@ -234,7 +247,11 @@ class ContiguousReader(FrameReader):
             for first, count in _runs(layout.offsets[t0:t1], band if band == layout.frame_bytes else -1):
                 start = int(layout.offsets[t0 + first]) + skip
                 file.read_into(target[first * band : (first + count) * band], start)
-        unstore(buffer, layout.stored, layout.offset, self.paths[0])
+        unstore(buffer, layout.stored, layout.offset, path)
+
+    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
+        """Fill the buffer from a file without a layout, with samples as they are stored."""
+        raise NotImplementedError
 
 
 def _runs(offsets: NDArray[np.int64], frame_bytes: int) -> list[tuple[int, int]]:

@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import InputError, MissingDependencyError
+from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
     CameraFacts,
     StatedFacts,
@@ -38,7 +38,6 @@ from pchem_pipeline.frames.formats.contiguous import (
     Layout,
     even_offsets,
     unsigned_type,
-    unstore,
 )
 from pchem_pipeline.frames.formats.kinds import (
     LARGEST_PIECES,
@@ -48,7 +47,7 @@ from pchem_pipeline.frames.formats.kinds import (
     full_window,
     stack_shape,
 )
-from pchem_pipeline.frames.reader import changed, check_window
+from pchem_pipeline.frames.reader import changed, sound
 from pchem_pipeline.frames.registry import check_unpacked, require
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
@@ -80,21 +79,11 @@ class FitsReader(ContiguousReader):
         """See `FrameReader.open`."""
         require("astropy.io.fits", "fits", "FITS files")
         reader = cls()
-        try:
-            size = path.stat().st_size
+        with sound(path, "FITS file"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # truncation and sloppy headers are reported below
             with path.open("rb") as stream:
                 check_unpacked(path, stream.read(8))
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # truncation and sloppy headers are reported below
-                reader._inspect(path, size, settings)
-        except (InputError, MissingDependencyError):
-            raise
-        except OSError as error:
-            raise InputError(
-                f"{path}: not a sound FITS file, or truncated ({error}); copy it again"
-            ) from error
-        except Exception as error:  # a damaged header can break the parser anywhere
-            raise InputError(f"{path}: not a sound FITS file ({error}); copy it again") from error
+            reader._inspect(path, path.stat().st_size, settings)
         return reader
 
     def _inspect(self, path: Path, size: int, settings: InputSettings) -> None:
@@ -143,34 +132,16 @@ class FitsReader(ContiguousReader):
         depths = (bits_of(header.get(name)) for header in last for name in _DEPTH_KEYWORDS)
         self.take_facts(StatedFacts(_camera(last), first_duration(times), first_of(depths)))
 
-    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
-        """See `FrameReader.read_into`."""
-        if self._compressed is None:
-            super().read_into(buffer, t0, t1, y0, y1)
-            return
-        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
-        if buffer.size == 0:
-            return
-        buffer[...] = self._section(t0, t1, y0, y1).reshape(buffer.shape)
-        unstore(buffer, self.dtype, self._offset, self.paths[0])
-
-    def _section(self, t0: int, t1: int, y0: int, y1: int) -> NDArray[Any]:
-        """Decode a window of a compressed image."""
+    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
+        """See `ContiguousReader.decode_into`."""
         from astropy.io import fits
 
         path = self.paths[0]
-        window = full_window(self._full, t0, t1, y0, y1)
-        try:
-            if path.stat().st_size != self._size:
-                raise changed(path, "the file changed its size")
-            with _LOCK, fits.open(path, memmap=False) as hdus:
-                return np.asarray(hdus[self._compressed].section[window])
-        except FileNotFoundError as error:
-            raise changed(path, "the file vanished") from error
-        except InputError:
-            raise
-        except Exception as error:
-            raise InputError(f"{path}: cannot be decoded ({error}); copy the file again") from error
+        if path.stat().st_size != self._size:
+            raise changed(path, "the file changed its size")
+        with _LOCK, fits.open(path, memmap=False) as hdus:
+            values = hdus[self._compressed].section[full_window(self._full, t0, t1, y0, y1)]
+        buffer[...] = np.asarray(values).reshape(buffer.shape)
 
 
 def _image(path: Path, hdus: Any, settings: InputSettings) -> tuple[int, Any, Any]:

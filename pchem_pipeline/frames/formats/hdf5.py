@@ -27,7 +27,6 @@ from pchem_pipeline.frames.formats.contiguous import (
     Layout,
     even_offsets,
     unsigned_type,
-    unstore,
 )
 from pchem_pipeline.frames.formats.hdf5_parts import (
     check_filters,
@@ -47,7 +46,7 @@ from pchem_pipeline.frames.formats.kinds import (
     full_window,
     stack_shape,
 )
-from pchem_pipeline.frames.reader import changed, check_window, unwritten_notes
+from pchem_pipeline.frames.reader import changed, sound, unwritten_notes
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
@@ -71,24 +70,17 @@ class Hdf5Reader(ContiguousReader):
         """See `FrameReader.open`."""
         _require()
         reader = cls()
-        try:
-            with _LOCK, opened(path) as file:
-                reader._inspect(path, file, settings)
-        except InputError:
-            raise
-        except BlockingIOError as error:
-            raise InputError(
-                f"{path}: is locked by the program that writes it; wait until it is done"
-            ) from error
-        except Exception as error:  # a damaged file can break the library anywhere
-            if "already open for write" in str(error):
-                raise InputError(
-                    f"{path}: is being written, or was never closed; wait for its program, or free it by: "
-                    f"h5clear -s {quoted(path)}"
-                ) from error
-            raise InputError(
-                f"{path}: not a sound HDF5 file, or truncated ({error}); copy it again"
-            ) from error
+        with sound(path, "HDF5 file"):
+            try:
+                with _LOCK, opened(path) as file:
+                    reader._inspect(path, file, settings)
+            except OSError as error:
+                words = "is being written, or was never closed; wait for its program"
+                if "already open for write" in str(error):
+                    raise InputError(f"{path}: {words}, or free it by: h5clear -s {quoted(path)}") from error
+                if isinstance(error, BlockingIOError):
+                    raise InputError(f"{path}: {words}") from error
+                raise
         return reader
 
     def _inspect(self, path: Path, file: Any, settings: InputSettings) -> None:
@@ -142,33 +134,17 @@ class Hdf5Reader(ContiguousReader):
         parent = dataset.parent
         self.take_facts(_stated_facts(dataset, [parent, *(detectors if len(detectors) == 1 else [])]))
 
-    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
-        """See `FrameReader.read_into`."""
-        if self.layout is not None:
-            super().read_into(buffer, t0, t1, y0, y1)
-            return
-        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
-        if buffer.size == 0:
-            return
-        path = self.paths[0]
+    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
+        """See `ContiguousReader.decode_into`."""
         window = full_window(self._full, t0, t1, y0, y1)
-        try:
-            with _LOCK, opened(path) as file:
-                dataset = file[self._name]
-                if tuple(dataset.shape) != self._full:
-                    raise changed(path, "the dataset changed its shape")
-                if len(self._full) == buffer.ndim and dataset.dtype == buffer.dtype:
-                    dataset.read_direct(buffer, window)
-                    return
-                values = dataset[window]
-        except FileNotFoundError as error:
-            raise changed(path, "the file vanished") from error
-        except InputError:
-            raise
-        except Exception as error:
-            raise InputError(f"{path}: {self._name} cannot be read ({error}); copy the file again") from error
-        buffer[...] = values.reshape(buffer.shape)
-        unstore(buffer, self.dtype, self._offset, path)
+        with _LOCK, opened(self.paths[0]) as file:
+            dataset = file[self._name]
+            if tuple(dataset.shape) != self._full:
+                raise changed(self.paths[0], "the dataset changed its shape")
+            if len(self._full) == buffer.ndim and dataset.dtype == buffer.dtype:
+                dataset.read_direct(buffer, window)
+            else:
+                buffer[...] = dataset[window].reshape(buffer.shape)
 
 
 def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.choice import choose_dataset
-from pchem_pipeline.frames.formats.contiguous import unsigned_type, unstore
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, unsigned_type
 from pchem_pipeline.frames.formats.kinds import (
     LARGEST_PIECES,
     check_coded,
@@ -24,7 +24,7 @@ from pchem_pipeline.frames.formats.kinds import (
     stack_shape,
 )
 from pchem_pipeline.frames.identity import file_size
-from pchem_pipeline.frames.reader import FrameReader, changed, check_window, unwritten_notes
+from pchem_pipeline.frames.reader import changed, sound, unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import link_out_of, whole_file
@@ -33,7 +33,7 @@ from pchem_pipeline.store.files import link_out_of, whole_file
 _DEEPEST, _MOST_IN_A_SHARD = 64, 1 << 16
 
 
-class ZarrReader(FrameReader):
+class ZarrReader(ContiguousReader):
     """A zarr array, the only stack of a zarr group, or the full resolution of an OME-Zarr image."""
 
     format_name = "zarr"
@@ -48,12 +48,8 @@ class ZarrReader(FrameReader):
     def open(cls, path: Path, settings: InputSettings) -> Self:
         """See `FrameReader.open`."""
         reader = cls()
-        try:
+        with sound(path, "zarr store"):
             reader._inspect(path, settings)
-        except InputError:
-            raise
-        except Exception as error:  # damaged metadata can break the library anywhere
-            raise InputError(f"{path}: not a sound zarr store ({error}); copy it again") from error
         return reader
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:
@@ -105,20 +101,11 @@ class ZarrReader(FrameReader):
         self.unwritten = bool(missing)
         self.notes = _channel_notes(path, _axes(node), self._full) + missing
 
-    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
-        """See `FrameReader.read_into`."""
-        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
-        if buffer.size == 0:
-            return
-        path = self.paths[0]
-        if not path.exists():  # missing chunks would read as the fill value
-            raise changed(path, "the store vanished")
-        try:
-            values = np.asarray(self._array[full_window(self._full, t0, t1, y0, y1)])
-        except Exception as error:
-            raise InputError(f"{path}: {self._name} has a damaged chunk ({error}); copy it again") from error
-        buffer[...] = values.reshape(buffer.shape)
-        unstore(buffer, self.dtype, self._offset, path)
+    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
+        """See `ContiguousReader.decode_into`."""
+        if not self.paths[0].exists():  # missing chunks would read as the fill value
+            raise changed(self.paths[0], "the store vanished")
+        buffer[...] = np.asarray(self._array[full_window(self._full, t0, t1, y0, y1)]).reshape(buffer.shape)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the array, which holds the event loop's locks; it is opened again."""

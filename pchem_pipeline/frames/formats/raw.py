@@ -21,6 +21,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.formats.kinds import check_samples
+from pchem_pipeline.frames.reader import sound
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -99,7 +100,8 @@ class RawReader(ContiguousReader):
         reader = cls()
         reader.bit_shift = facts["bit_shift"] or 0
         reader.take_facts(facts_from_names({**side.model_dump(), "bit_depth": facts["bit_depth"]}))
-        reader._lay_out(path, facts)
+        with sound(path, "raw file"):
+            reader._lay_out(path, facts)
         return reader
 
     def _lay_out(self, path: Path, facts: dict[str, Any]) -> None:
@@ -118,7 +120,7 @@ class RawReader(ContiguousReader):
         rows, columns = shape[-2:]
         frame = rows * columns * stored.itemsize
         step = frame + padding
-        size = _size(path)
+        size = path.stat().st_size
         whole, rest = divmod(size - header, step) if size >= header else (0, size)
         if rest == frame:  # the padding of the last frame may be missing
             whole, rest = whole + 1, 0
@@ -134,13 +136,6 @@ class RawReader(ContiguousReader):
             self.notes = (f"{path.name} holds {whole} frames, of which the first {n} are used (shape)",)
         offsets = even_offsets(path, n, frame, size, start=header, step=step)
         self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
 
 
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:

@@ -26,7 +26,6 @@ from pchem_pipeline.frames.formats.contiguous import (
     OpenedFile,
     even_offsets,
     unsigned_type,
-    unstore,
 )
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples
 from pchem_pipeline.frames.formats.tiff_facts import (
@@ -35,7 +34,7 @@ from pchem_pipeline.frames.formats.tiff_facts import (
     stated_channels,
     stated_facts,
 )
-from pchem_pipeline.frames.reader import check_window, unwritten_notes
+from pchem_pipeline.frames.reader import sound, unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -82,19 +81,11 @@ class TiffReader(ContiguousReader):
         reader = cls()
         reader._guard = threading.Lock()
         reader._decoders = {}
-        try:
+        with sound(path, "TIFF file"):
             size = path.stat().st_size
             check_chain(path, size)
             with tifffile.TiffFile(path) as file:
                 reader._inspect(path, file, size, settings)
-        except InputError:
-            raise
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the file") from error
-        except Exception as error:  # a damaged file can break the parser anywhere
-            raise InputError(
-                f"{path}: not a sound TIFF file, or truncated ({error}); copy it again"
-            ) from error
         return reader
 
     _guard: threading.Lock
@@ -154,18 +145,11 @@ class TiffReader(ContiguousReader):
         self.rows_per_read = min(rows, int(height.max()))
         self._segments = _Segments(offsets, counts, model, -(-columns // width), height)
 
-    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
-        """See `FrameReader.read_into`."""
-        if self._segments is None:
-            super().read_into(buffer, t0, t1, y0, y1)
-            return
-        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
-        if buffer.size == 0:
-            return
+    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
+        """See `ContiguousReader.decode_into`."""
         with OpenedFile(self.paths[0], self._size) as file:
             for t in range(t0, t1):
                 self._decode(file, buffer[t - t0], t, y0, y1)
-        unstore(buffer, self.dtype, self._offset, self.paths[0])
 
     def _decode(self, file: OpenedFile, frame: NDArray[Any], t: int, y0: int, y1: int) -> None:
         """Decode the segments of page t that touch rows y0..y1 into ``frame``."""

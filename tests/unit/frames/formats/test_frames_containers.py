@@ -278,7 +278,7 @@ def test_hdf5_where_files_cannot_be_locked(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(h5py, "File", without_locks)
     np.testing.assert_array_equal(read(tmp_path / "a.h5"), STACK)
     wrong = BlockingIOError(11, "unable to lock file")
-    with pytest.raises(InputError, match="is locked by the program that writes it; wait"):
+    with pytest.raises(InputError, match="is being written, or was never closed; wait"):
         read(tmp_path / "a.h5")
 
 
@@ -370,7 +370,7 @@ def test_hdf5_damaged_chunk(tmp_path: Path) -> None:
     data[place : place + 60] = bytes(60)
     path.write_bytes(data)
     np.testing.assert_array_equal(reader.read(0, 3), STACK[:3])
-    with pytest.raises(InputError, match=r"a\.h5: frames cannot be read"):
+    with pytest.raises(InputError, match=r"a\.h5: cannot be decoded"):
         reader.read()
     with h5py.File(path, "w") as file:
         file["frames"] = STACK[:4]
@@ -454,7 +454,7 @@ def test_zarr_damage(tmp_path: Path) -> None:
     reader = open_frames(InputSettings(files=("a.zarr",)), tmp_path)
     chunk = sorted(file for file in path.rglob("*") if file.is_file() and file.name != "zarr.json")[0]
     chunk.write_bytes(chunk.read_bytes()[:20])
-    with pytest.raises(InputError, match=r"a\.zarr: .*damaged chunk"):
+    with pytest.raises(InputError, match=r"a\.zarr: cannot be decoded"):
         reader.read()
     (path / "zarr.json").write_text("{")
     with pytest.raises(InputError, match="not a sound zarr store"):
