@@ -14,7 +14,7 @@ import math
 import re
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -271,26 +271,50 @@ def _samples(path: Path, header: Any, compressed: bool) -> tuple[np.dtype[Any], 
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
     """Write frames as one cube (one frame: one image); see `frames.writing.write_frames`."""
     shape, dtype, integration_time, bit_depth = stack
+    cards: dict[str, Any] = {}
+    if integration_time is not None:
+        cards["EXPTIME"] = (integration_time, "[s] integration time")
+    if bit_depth is not None:
+        cards["BITDEPTH"] = (bit_depth, "bits of the ADC")
+    write_image(path, blocks, shape if shape[0] > 1 else shape[1:], dtype, cards)
+    return [path]
+
+
+def write_image(
+    path: Path,
+    blocks: Iterable[NDArray[Any]],
+    shape: Sequence[int],
+    dtype: np.dtype[Any],
+    cards: dict[str, Any],
+) -> None:
+    """Write an array that comes by blocks as the primary image.
+
+    Args:
+        path: the file.
+        blocks: of its images, in order.
+        shape: of the whole.
+        dtype: floating point or unsigned.
+        cards: further keywords.
+
+    Raises:
+        StoreError: the folder cannot be written.
+        MissingDependencyError: astropy is not installed.
+    """
     require("astropy.io.fits", "fits", "FITS files")
     from astropy.io import fits
 
-    header = fits.Header()
-    header["SIMPLE"], header["BITPIX"] = True, 8 * dtype.itemsize
-    sizes = shape if shape[0] > 1 else shape[1:]
-    header["NAXIS"] = len(sizes)
-    for axis, length in enumerate(reversed(sizes), 1):
-        header[f"NAXIS{axis}"] = length
-    if dtype.itemsize > 1:
-        header["BSCALE"], header["BZERO"] = 1, _UNSIGNED_ZERO[8 * dtype.itemsize]
-    if integration_time is not None:
-        header["EXPTIME"] = (integration_time, "[s] integration time")
-    if bit_depth is not None:
-        header["BITDEPTH"] = (bit_depth, "bits of the ADC")
-    top = dtype.type(1 << (8 * dtype.itemsize - 1))
+    bits, zero = 8 * dtype.itemsize, 0 if dtype.kind == "f" else _UNSIGNED_ZERO.get(8 * dtype.itemsize, 0)
+    header = fits.Header(
+        [("SIMPLE", True), ("BITPIX", -bits if dtype.kind == "f" else bits), ("NAXIS", len(shape))]
+    )
+    header.update({f"NAXIS{axis}": length for axis, length in enumerate(reversed(shape), 1)})
+    header.update({"BSCALE": 1, "BZERO": zero} if zero else {})
+    for name, value in cards.items():
+        header[name] = value
     with whole_file(path) as part, part.open("wb") as stream:
         stream.write(header.tostring().encode("ascii"))
         for block in blocks:
-            values = np.asarray(block, dtype) if dtype.itemsize == 1 else np.asarray(block, dtype) ^ top
+            values = np.asarray(block, dtype)
+            values = values ^ dtype.type(zero) if zero else values
             stream.write(np.ascontiguousarray(values, dtype.newbyteorder(">")).data)
-        stream.write(bytes(-int(np.prod(shape)) * dtype.itemsize % 2880))
-    return [path]
+        stream.write(bytes(-math.prod(shape) * dtype.itemsize % 2880))
