@@ -86,15 +86,15 @@ def even_offsets(
         InputError: they do not fit into the file. The numbers of a damaged header must not take memory.
     """
     step = frame_bytes if step is None else step
-    if n_frames > _MOST_FRAMES:
-        raise InputError(
-            f"{path}: {n_frames} frames, more than {_MOST_FRAMES}; correct the header or input.shape"
-        )
     if n_frames and frame_bytes < 1:
         raise InputError(f"{path}: holds no frames; leave it out")
     if n_frames and start + step * (n_frames - 1) + frame_bytes > size:
         whole = max(0, (size - start - frame_bytes) // step + 1)
         raise _truncated(path, n_frames, start + step * (n_frames - 1) + frame_bytes, size, whole)
+    if n_frames > _MOST_FRAMES:
+        raise InputError(
+            f"{path}: {n_frames} frames, more than {_MOST_FRAMES}; correct the header or input.shape"
+        )
     return start + step * np.arange(n_frames, dtype=np.int64)
 
 
