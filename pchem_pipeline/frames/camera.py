@@ -214,9 +214,11 @@ def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] | None 
         return [given.get(name), *(values.get(name + suffix) for suffix in _UNIT_SUFFIXES)]
 
     temperatures = (celsius(values.get(name), first_of(units_of(name))) for name in _TEMPERATURES)
+    # those first whose unit is known by their name; integration_time is in s as sidecars have it
+    named = {_DURATIONS[0]: "s", **_DURATIONS_IN}
     durations = (
-        duration_of(name, values.get(name), *units_of(name), _DURATIONS_IN.get(name))
-        for name in (*_DURATIONS_IN, *_DURATIONS)
+        duration_of(name, values.get(name), *(list(filter(None, units_of(name))) or [named.get(name)]))
+        for name in dict.fromkeys((*named, *_DURATIONS))
     )
     camera = CameraFacts(
         first_of(text_of(values.get(name)) for name in _NAMES),

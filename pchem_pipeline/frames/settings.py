@@ -163,6 +163,8 @@ class InputSettings(Section):
             raise ValueError("files and samples: give one of them; samples are runs of their own")
         if all(sample.bias for sample in self.samples):
             raise ValueError("samples: every sample is a bias; list at least one that holds electrons")
+        if any(0 < (sample.integration_time or 0) < SHORTEST for sample in self.samples):
+            raise ValueError(f"samples: integration_time is 0 or at least {SHORTEST:g} s")
         shown = self.shown_sample
         if shown is not None and (shown >= len(self.samples) or self.samples[shown].bias):
             raise ValueError(f"shown_sample: {shown} is no sample that holds electrons; choose another")

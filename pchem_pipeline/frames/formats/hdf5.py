@@ -190,7 +190,9 @@ def _check_deflated(path: Path, dataset: Any) -> None:
     codes = [record.get_filter(number)[0] for number in range(record.get_nfilters())]
     if len(codes) > len(set(codes)):
         raise InputError(f"{path}: {dataset.name} is coded twice by the same filter; write it again")
-    if codes[-1:] != [h5z.FILTER_DEFLATE] or not hasattr(dataset.id, "chunk_iter"):
+    if [code for code in codes if code != h5z.FILTER_FLETCHER32][-1:] != [h5z.FILTER_DEFLATE] or not hasattr(
+        dataset.id, "chunk_iter"
+    ):
         return
     chunks: list[tuple[int, tuple[int, ...]]] = []
     dataset.id.chunk_iter(lambda chunk: chunks.append((chunk.size, chunk.chunk_offset)))

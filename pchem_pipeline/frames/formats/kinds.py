@@ -122,31 +122,53 @@ def check_coded(
         )
 
 
-def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int) -> None:
-    """Check that coded pieces (gzip, zlib) hold no more than their shape says, in no more memory.
+def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int, codecs: str = "gzip") -> None:
+    """Check that coded pieces hold no more than their shape says, before the library unpacks them whole.
 
     Args:
         path: the file, for the message.
         pieces: coded bytes.
         expected: bytes of a piece by shape and type.
+        codecs: names of those that may be in use; gzip and zlib are unpacked, the headers of others read.
 
     Raises:
-        InputError: one holds more; the library would unpack it whole.
+        InputError: one holds more.
     """
     for data in pieces:
-        held, found = data, 0
-        while held and found <= expected:
-            unpack = zlib.decompressobj(wbits=47)  # gzip or zlib
-            try:
-                found += len(unpack.decompress(held, expected + 1 - found))
-            except zlib.error:
-                break  # it is told where the frames are read
-            held = unpack.unused_data
+        found = 0
+        if "blosc" in codecs:
+            found = int.from_bytes(data[4:8], "little")
+        elif "zstd" in codecs and data[:4] == b"\x28\xb5\x2f\xfd":
+            found = _zstd_size(data)
+        elif "gzip" in codecs or "zlib" in codecs:
+            found = _inflated(data, expected)
         if found > expected:
             raise InputError(
                 f"{path}: damaged: a piece of {len(data)} bytes unpacks to more than the {expected} of its "
                 "shape; copy it again"
             )
+
+
+def _zstd_size(data: bytes) -> int:
+    """Return the bytes that the header of a zstd frame declares (RFC 8878, 3.1.1.1); 0 where it does not."""
+    flags = data[4]
+    single = flags >> 5 & 1
+    length = (single, 2, 4, 8)[flags >> 6]
+    start = 6 - single + (0, 1, 2, 4)[flags & 3]
+    return int.from_bytes(data[start : start + length], "little") + (256 if length == 2 else 0)
+
+
+def _inflated(data: bytes, most: int) -> int:
+    """Return the bytes that gzip or zlib data hold, or one more than ``most``."""
+    found = 0
+    while data and found <= most:
+        unpack = zlib.decompressobj(wbits=47)  # gzip or zlib
+        try:
+            found += len(unpack.decompress(data, most + 1 - found))
+        except zlib.error:
+            break  # it is told where the frames are read
+        data = unpack.unused_data
+    return found
 
 
 def full_window(full: tuple[int, ...], t0: int, t1: int, y0: int, y1: int) -> tuple[Any, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 import warnings
 from collections.abc import Iterator, Sequence
@@ -31,6 +32,7 @@ from pchem_pipeline.store.files import link_out_of, whole_file
 
 #: folders within each other, and chunks of a shard
 _DEEPEST, _MOST_IN_A_SHARD = 64, 1 << 16
+_DESCRIBED = ("zarr.json", ".zarray", ".zattrs", ".zgroup", ".zmetadata")
 
 
 class ZarrReader(ContiguousReader):
@@ -87,17 +89,9 @@ class ZarrReader(ContiguousReader):
         self.rows_per_read = min(self.shape[1], int(array.chunks[-2]))
         self._array = array
         piece = getattr(array, "shards", None) or array.chunks
-        if math.prod(piece) > _MOST_IN_A_SHARD * math.prod(array.chunks):
-            raise InputError(f"{path}: shards of more than {_MOST_IN_A_SHARD} chunks; write larger chunks")
         check_coded(path, self.shape, piece, self.dtype.itemsize, file_size(path))
-        if any(f"'{name}'" in str(array.metadata.to_dict()) for name in ("gzip", "zlib")):
-            chunks = sorted(filter(Path.is_file, parts), key=lambda part: -part.stat().st_size)[
-                :LARGEST_PIECES
-            ]
-            some = (part.read_bytes() for part in chunks if part.suffix != ".json")
-            check_unpacked_size(path, some, 4 * math.prod(array.chunks) * self.dtype.itemsize)
         self.take_facts(facts_from_names(attributes))
-        missing = _unwritten(path, path / self._name, self._full, piece)
+        missing = _check_chunks(path, path / self._name, array, parts)
         self.unwritten = bool(missing)
         self.notes = _channel_notes(path, _axes(node), self._full) + missing
 
@@ -122,15 +116,24 @@ class ZarrReader(ContiguousReader):
             raise changed(self.paths[0], "the store vanished or broke") from error
 
 
-def _unwritten(path: Path, folder: Path, shape: Sequence[int], piece: Sequence[int]) -> tuple[str, ...]:
-    """Say how many files of chunks are missing; the library reads them as the fill value.
+def _check_chunks(path: Path, folder: Path, array: Any, parts: Sequence[Path]) -> tuple[str, ...]:
+    """Refuse chunks that hold more than their shape; say how many are missing, and read as the fill value.
 
-    Not its ``nchunks_initialized``, whose time grows as the square of their number.
+    Not by ``nchunks_initialized`` of the library, whose time grows as the square of their number.
     """
-    wanted = math.prod(-(-length // chunk) for length, chunk in zip(shape, piece, strict=True))
-    described = ("zarr.json", ".zarray", ".zattrs")
-    stored = sum(part.is_file() and part.name not in described for part in folder.rglob("*"))
-    return unwritten_notes(path, wanted - stored, wanted)
+    shards, size = getattr(array, "shards", None), math.prod(array.chunks)
+    files = [p for p in parts if folder in p.parents and p.is_file() and p.name not in _DESCRIBED]
+    if shards is None:
+        record = array.metadata.to_dict()
+        some = heapq.nlargest(LARGEST_PIECES, files, lambda part: part.stat().st_size)
+        codecs = str(record.get("codecs", record.get("compressor")))
+        expected = 4 * size * array.dtype.itemsize
+        check_unpacked_size(path, (part.read_bytes() for part in some), expected, codecs)
+    elif math.prod(shards) > _MOST_IN_A_SHARD * size:
+        raise InputError(f"{path}: shards of more than {_MOST_IN_A_SHARD} chunks; write larger chunks")
+    pairs = zip(array.shape, shards or array.chunks, strict=True)
+    wanted = math.prod(-(-length // piece) for length, piece in pairs)
+    return unwritten_notes(path, wanted - len(files), wanted)
 
 
 def _full_resolution(group: Any, settings: InputSettings) -> str | None:

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
+import numcodecs
 import numpy as np
 import pytest
 import zarr
@@ -45,17 +46,33 @@ def deflated() -> bytes:
     return zlib.compress(bytes(BOMB), 9)
 
 
-@pytest.mark.parametrize("version", [2, 3])
-def test_zarr(tmp_path: Path, version: int) -> None:
-    kind = "numcodecs.zlib" if version == 2 else "gzip"
-    coded = {"id": "zlib", "level": 1} if version == 2 else {"name": kind, "configuration": {"level": 1}}
-    path = tmp_path / "a.zarr"
-    zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=coded, zarr_format=version)
+@pytest.mark.parametrize("codec", ["zlib", "gzip", "zstd", "blosc"])
+def test_zarr(tmp_path: Path, codec: str) -> None:
+    path, old = tmp_path / "a.zarr", codec == "zlib"
+    coded = {"id": "zlib", "level": 1} if old else {"name": codec, "configuration": {}}
+    zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=coded, zarr_format=2 if old else 3)
     read(path)
-    chunk = path / ("1.0.0" if version == 2 else "c/1/0/0")
-    chunk.write_bytes(gzip.compress(bytes(BOMB)) if version == 3 else zlib.compress(bytes(BOMB)))
+    bomb = {"zlib": zlib, "gzip": gzip, "zstd": numcodecs.Zstd(), "blosc": numcodecs.Blosc()}[codec]
+    coder = bomb.encode if hasattr(bomb, "encode") else bomb.compress
+    (path / ("1.0.0" if old else "c/1/0/0")).write_bytes(coder(bytes(BOMB)))
     with refused_at_once(r"a\.zarr: damaged: a piece of \d+ bytes unpacks to more than"):
         read(path)
+
+
+@pytest.mark.parametrize("codec", ["gzip", "zstd", "blosc"])
+def test_shards_are_many_pieces(tmp_path: Path, codec: str) -> None:
+    coded = {"name": codec, "configuration": {}}
+    zarr.create_array(
+        tmp_path / "a.zarr", data=STACK, chunks=(2, 16, 16), shards=(40, 16, 16), compressors=coded
+    )
+    read(tmp_path / "a.zarr")
+
+
+def test_another_array_of_the_store_is_no_piece(tmp_path: Path) -> None:
+    group = zarr.create_group(tmp_path / "a.zarr")
+    group.create_array("frames", data=STACK, chunks=(1, 4, 4))
+    group.create_array("dark", data=STACK[0].repeat(50, axis=0))
+    read(tmp_path / "a.zarr")
 
 
 def test_zarr_of_many_chunks_in_a_shard(tmp_path: Path) -> None:
