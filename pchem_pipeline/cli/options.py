@@ -25,7 +25,7 @@ def on_this_machine(path: Path | None) -> Path | None:
     if path is None:
         return None
     path = local_path(path)
-    if path.is_fifo() or path.is_socket():
+    if Path.is_fifo(path) or Path.is_socket(path):
         raise ConfigError(f"{path} is no regular file; choose another name")
     return path
 

@@ -88,9 +88,8 @@ def run(context: StageContext) -> None:
     if reader.excluded is not None:
         context.create("frames/excluded", reader.shape[1:], chunks=reader.shape[1:])
         context.store.write("frames/excluded", (slice(None),) * 2, reader.excluded.astype(np.uint8))
-        context.note(
-            f"{np.count_nonzero(reader.excluded)} pixels are excluded by the mask or the marker 2^32-1"
-        )
+        number = np.count_nonzero(reader.excluded)
+        context.note(f"excluded by the mask or the marker 2^32-1: {number} of {reader.excluded.size} pixels")
     keep_ingested(context)
     if settings.mode == "reference":
         _run_whole(context)
