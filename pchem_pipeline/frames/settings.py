@@ -145,7 +145,7 @@ class InputSettings(Section):
     )
     integration_time: float | None = Field(
         default=None,
-        ge=SHORTEST,
+        gt=0,
         le=LONGEST,
         description="integration time of a frame, s; null: from the file, else unknown (no charge rate then)",
     )
@@ -163,8 +163,6 @@ class InputSettings(Section):
             raise ValueError("files and samples: give one of them; samples are runs of their own")
         if all(sample.bias for sample in self.samples):
             raise ValueError("samples: every sample is a bias; list at least one that holds electrons")
-        if any(0 < (sample.integration_time or 0) < SHORTEST for sample in self.samples):
-            raise ValueError(f"samples: integration_time is 0 or at least {SHORTEST:g} s")
         shown = self.shown_sample
         if shown is not None and (shown >= len(self.samples) or self.samples[shown].bias):
             raise ValueError(f"shown_sample: {shown} is no sample that holds electrons; choose another")
@@ -172,6 +170,9 @@ class InputSettings(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        times = [self.integration_time, *(sample.integration_time for sample in self.samples)]
+        if any(0 < (time or 0) < SHORTEST for time in times):
+            raise ValueError(f"integration_time must be at least {SHORTEST:g} s")
         if self.shape is not None and (len(self.shape) not in (2, 3) or min(self.shape) < 1):
             raise ValueError("shape must be [rows, columns] or [frames, rows, columns], each at least 1")
         if self.roi is not None:
