@@ -85,7 +85,7 @@ def init(
 
 
 @app.command()
-@takes_command()
+@takes_command(reads_files=True)
 def ingest(
     target: Target,
     append: Annotated[
@@ -95,6 +95,7 @@ def ingest(
         ),
     ] = False,
     *,
+    given: dict[str, Any],
     command: Command,
 ) -> None:
     """Check the camera files; copy or reference their frames."""
@@ -102,12 +103,14 @@ def ingest(
     from pchem_pipeline.runner.session import cropped, run_stages
 
     run = find_run(target)
+    if append and given:
+        raise ConfigError("--append: the further files are read as the others were; leave out the options")
     if append:
         from pchem_pipeline.commands.append import append_frames
 
         append_frames(run, command)
     else:
-        run, command = cropped(run, command)
+        run, command = cropped(run.changed("input", **given) if given else run, command)
         run_stages(run, ["ingest"], command)
 
 
@@ -117,7 +120,7 @@ for _stage in STAGES.values():
 
 
 @app.command()
-@takes_command()
+@takes_command(reads_files=True)
 def run(
     targets: Annotated[
         list[Path], typer.Argument(help="a config.yaml, a store, or camera files and folders")
@@ -125,31 +128,12 @@ def run(
     store: Annotated[
         Path | None, typer.Option(help="camera files: store of the run [default: run.zarr]")
     ] = None,
-    integration_time: Annotated[
-        float | None, typer.Option(help="camera files: integration time of a frame, s")
-    ] = None,
-    bit_depth: Annotated[int | None, typer.Option(help="camera files: bits of the ADC")] = None,
-    bit_shift: Annotated[
-        int | None, typer.Option(help="camera files: bits to shift right, of left-justified samples")
-    ] = None,
-    dataset: Annotated[
-        str | None, typer.Option(help="camera files: which frames inside an HDF5, zarr or FITS file")
-    ] = None,
-    kind: Annotated[
-        Literal["dark", "light", "unknown"] | None,
-        typer.Option(
-            help="camera files: what made the charge; H over time is dark current in the dark alone"
-        ),
-    ] = None,
-    mode: Annotated[
-        Literal["copy", "reference"] | None,
-        typer.Option(help="camera files: copy them into the store, or leave them where they are"),
-    ] = None,
     until: Annotated[
         str, typer.Option(help="last stage to be done", metavar=f"[{'|'.join(pipeline())}]")
     ] = pipeline()[-1],
     strict: Strict = False,
     *,
+    given: dict[str, Any],
     command: Command,
 ) -> None:
     """Do every stage, from camera files to the report, and say what its first screen says.
@@ -160,17 +144,8 @@ def run(
     from pchem_pipeline.commands.new_run import find_or_start, first_try, unwritten
     from pchem_pipeline.runner.session import cropped, up_to
 
-    given = {
-        "integration_time": integration_time,
-        "bit_depth": bit_depth,
-        "bit_shift": bit_shift,
-        "dataset": dataset,
-        "kind": kind,
-        "mode": mode,
-    }
-    known = {name: value for name, value in given.items() if value is not None}
     wanted = command.options
-    target, is_new = find_or_start(targets, store, known, wanted.roi, write=False)
+    target, is_new = find_or_start(targets, store, given, wanted.roi, write=False)
     text = unwritten(target) if is_new else None
     if is_new:
         target, command = cropped(target, command)

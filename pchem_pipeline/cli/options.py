@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 import inspect
+import re
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -18,10 +19,15 @@ if TYPE_CHECKING:
 
 
 def on_this_machine(path: Path | None) -> Path | None:
-    """Return a path that a command writes to, as typer's callback; a URL is refused."""
+    """Return a path that a command writes to, as typer's callback; a URL or a pipe is refused."""
     from pchem_pipeline.store.remote_path import local_path
 
-    return None if path is None else local_path(path)
+    if path is None:
+        return None
+    path = local_path(path)
+    if Path.is_fifo(path) or Path.is_socket(path):
+        raise ConfigError(f"{path} is no regular file; choose another name")
+    return path
 
 
 Target = Annotated[Path, typer.Argument(help="a config.yaml, or the store of a run (run.zarr)")]
@@ -87,30 +93,66 @@ _COMMON: tuple[tuple[str, Any, Any], ...] = (
     ("quiet", Quiet, False),
 )
 
+#: Settings of the section ``input`` that have an option: name, type, help.
+_INPUT: tuple[tuple[str, Any, str], ...] = (
+    ("integration_time", float, "integration time of a frame, s"),
+    ("bit_depth", int, "bits of the ADC"),
+    ("bit_shift", int, "bits to shift right, of left-justified samples"),
+    (
+        "dtype",
+        Literal["uint8", "uint16", "uint32"],
+        "raw: type of a sample; else what signed samples are read as",
+    ),
+    ("offset", int, "DN to be added to signed samples, such as 32768"),
+    ("byte_order", Literal["little", "big"], "raw and SER: order of the bytes of a sample"),
+    ("frames", str, "first:end of the frames, end excluded, such as 5: or :1000"),
+    ("mask", Path, "image (npy, TIFF, FITS) whose pixels other than 0 are excluded"),
+    ("dataset", str, "which frames inside an HDF5, zarr or FITS file"),
+    (
+        "kind",
+        Literal["dark", "light", "unknown"],
+        "what made the charge; H over time is dark current in the dark alone",
+    ),
+    ("mode", Literal["copy", "reference"], "copy the frames into the store, or leave them where they are"),
+)
 
-def takes_command(*, without: tuple[str, ...] = ()) -> Callable[[Callable[..., None]], Callable[..., None]]:
+
+def takes_command(
+    *, without: tuple[str, ...] = (), reads_files: bool = False
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Decorate a command of a run: it takes the common options too, as one argument ``command``.
 
     Args:
         without: names of common options that the command does not have, or has in a wording of its own.
+        reads_files: it takes those of camera files too, as one argument ``given``: settings of ``input``.
     """
     common = [each for each in _COMMON if each[0] not in without]
+    of_input = [
+        (name, Annotated[kind | None, typer.Option(help=f"camera files: {words}")], None)
+        for name, kind, words in _INPUT
+        if reads_files
+    ]
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(function)
         def wrapper(**given: Any) -> None:
             options = {name: given.pop(name) for name, _, _ in common}
+            if reads_files:
+                given["given"] = _settings_of_input({name: given.pop(name) for name, _, _ in of_input})
             function(**given, command=_command(**options))
 
-        hints = typing.get_type_hints(function, localns={"Command": object}, include_extras=True)
+        hints = typing.get_type_hints(
+            function, localns={"Command": object, "Mapping": Mapping}, include_extras=True
+        )
         kind = inspect.Parameter.KEYWORD_ONLY
         own = [
             parameter.replace(annotation=hints[name], kind=kind)
             for name, parameter in inspect.signature(function).parameters.items()
-            if name != "command"
+            if name not in ("command", "given")
         ]
         added = [
-            inspect.Parameter(name, kind, default=default, annotation=hint) for name, hint, default in common
+            inspect.Parameter(name, kind, default=default, annotation=hint)
+            for name, hint, default in [*of_input, *common]
         ]
         signature: Any = wrapper
         signature.__signature__ = inspect.Signature([*own, *added])
@@ -119,6 +161,23 @@ def takes_command(*, without: tuple[str, ...] = ()) -> Callable[[Callable[..., N
         return wrapper
 
     return decorate
+
+
+def _settings_of_input(options: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of the section ``input`` that options state.
+
+    Raises:
+        ConfigError: ``--frames`` is not written as first:end.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    if (text := given.pop("frames", None)) is not None:
+        found = re.fullmatch(r"(\d{0,18}):(\d{0,18})", text)
+        if found is None:
+            raise ConfigError(f"--frames {text!r}: write first:end, end excluded, such as 5: or 5:1000")
+        given["frame_range"] = int(found[1] or 0), int(found[2]) if found[2] else None
+    if "mask" in given:
+        given["mask"] = str(given["mask"].absolute())
+    return given
 
 
 def region_of(text: str | None) -> tuple[int, int, int, int] | None:

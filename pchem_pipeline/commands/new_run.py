@@ -74,7 +74,8 @@ def find_or_start(
     if len(targets) == 1 and (first.suffix.lower() in _YAML or (first / ".pchem").is_dir()):
         if store is not None or given:
             names = [*(["store"] if store is not None else []), *given]
-            options = ", ".join("--" + name.replace("_", "-") for name in names)
+            words = (name.replace("frame_range", "frames").replace("_", "-") for name in names)
+            options = ", ".join(f"--{name}" for name in words)
             raise ConfigError(
                 f"{options}: only for camera files; {first} has its own settings, change them there"
             )
@@ -183,7 +184,7 @@ def first_try(target: Target, text: str | None) -> Iterator[None]:
         if had_yaml or path is None:
             raise
         path.unlink(missing_ok=True)
-        if _SETTING.search(str(error)) is None:
+        if _SETTING.search(str(error)) is None or "(--" in str(error):
             raise
         name = shlex.quote(path.name)
         raise type(error)(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any, get_args
@@ -16,24 +17,38 @@ from pchem_pipeline.base.settings import SECRET
 from pchem_pipeline.config.tree import RunConfig
 
 #: values of a configuration: 100,000 named files are not unusual
-_MOST_VALUES = 1_000_000
+_MOST_VALUES, _MOST_KEYS = 1_000_000, 1000
 #: complaints that are listed, and characters of a key or value in them
 _MOST_LISTED, _MOST_SHOWN = 20, 200
 
 
-class _StrictLoader(yaml.SafeLoader):
-    """A safe loader that refuses a key given twice."""
+class _StrictLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """A safe loader that refuses a key given twice, and numbers of hundreds of digits."""
+
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        if len(node.value) > _MOST_SHOWN:
+            raise _refused(node, f"a number of {len(node.value)} digits")
+        return int(super().construct_yaml_int(node))
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        if len(node.value) > _MOST_KEYS:
+            raise _refused(node, f"a section of {len(node.value)} keys")
         seen: set[Any] = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, Hashable):
+                raise _refused(key_node, "a key is a list or a mapping")
             if key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} is given twice", key_node.start_mark
-                )
+                raise _refused(key_node, f"the key {key!r} is given twice")
             seen.add(key)
-        return super().construct_mapping(node, deep)
+        return dict(super().construct_mapping(node, deep))
+
+
+def _refused(node: yaml.Node, words: str) -> yaml.YAMLError:
+    return yaml.constructor.ConstructorError(None, None, words, node.start_mark)
+
+
+_StrictLoader.add_constructor("tag:yaml.org,2002:int", _StrictLoader.construct_yaml_int)
 
 
 def load_config(path: Path) -> RunConfig:
@@ -42,6 +57,8 @@ def load_config(path: Path) -> RunConfig:
     Raises:
         ConfigError: the file is missing, is not YAML, or a setting is wrong.
     """
+    if path.exists() and not path.is_file():
+        raise ConfigError(f"{path}: no regular file; write the settings to one")
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -79,23 +96,27 @@ def yaml_content(text: str, name: str) -> dict[str, Any]:
         raise ConfigError(f"{name}: not valid YAML: brackets within brackets too deep to read") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{name}: holds no settings; write a commented default with: pchem init")
-    if _holds_too_much(content):
-        raise ConfigError(
-            f"{name}: holds more than {_MOST_VALUES} values, or an alias (*) within what it stands for; "
-            "write the settings out"
-        )
+    if fault := _fault(content):
+        raise ConfigError(f"{name}: {fault}")
     return content
 
 
-def _holds_too_much(content: Any) -> bool:
-    """Tell whether there are too many values for settings: a few lines of aliases can stand for billions."""
+def _fault(content: Any) -> str:
+    """Return what cannot be settings in values: a few lines of aliases can stand for billions."""
     found, held = 0, [content]
     while held and found <= _MOST_VALUES:
         value = held.pop()
         found += 1
         if isinstance(value, (dict, list)):
             held += value.values() if isinstance(value, dict) else value
-    return found > _MOST_VALUES
+        elif isinstance(value, str) and re.search("[\0\ud800-\udfff]", value):
+            return f"holds a text that can be no name: {_shown(ascii(value))}; correct it"
+    if found <= _MOST_VALUES:
+        return ""
+    return (
+        f"holds more than {_MOST_VALUES} values, or an alias (*) within what it stands for; write the "
+        "settings out"
+    )
 
 
 def make_config(content: Mapping[str, Any], name: str, folder: Path | None = None) -> RunConfig:

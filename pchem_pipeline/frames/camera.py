@@ -8,10 +8,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from numbers import Integral
-from typing import Any
+from typing import Any, NamedTuple
 
 _LONGEST = 80
 _ZERO_CELSIUS = 273.15
+#: integration times of cameras, s
+SHORTEST, LONGEST = 1e-12, 1e9
 #: names that programs give to the facts in attributes, sidecars and JSON records, the usual one first
 _NAMES = ("camera", "camera_model", "camera_name")
 _SERIALS = ("serial_number", "camera_serial", "serial")
@@ -19,9 +21,34 @@ _TEMPERATURES = ("sensor_temperature", "detector_temperature", "temperature")
 _TIMES = ("start_time", "acquisition_date", "date")
 _DURATIONS = ("integration_time", "exposure_time", "count_time")
 _DEPTHS = ("bit_depth", "bit_depth_readout")
+_UNIT_SUFFIXES = ("_units", "_unit")
+#: durations whose name says the unit
+_DURATIONS_IN = {
+    f"{name}_{unit}": unit for name in ("exposure", *_DURATIONS) for unit in ("s", "ms", "us", "ns")
+}
 #: All of them.
-FACT_NAMES = (*_NAMES, *_SERIALS, *_TEMPERATURES, *_TIMES, *_DURATIONS, *_DEPTHS)
-_SECONDS = {"": 1.0, "s": 1.0, "min": 60.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "ns": 1e-9}
+FACT_NAMES = (
+    *(*_NAMES, *_SERIALS, *_TEMPERATURES, *_TIMES, *_DURATIONS, *_DEPTHS, *_DURATIONS_IN),
+    *(name + suffix for name in (*_DURATIONS, *_TEMPERATURES) for suffix in _UNIT_SUFFIXES),
+)
+#: seconds -> words for the unit; those of three letters and more (and ms) also count within a sentence
+_UNITS = {
+    1.0: "s sec secs second seconds",
+    1e-3: "ms msec msecs millisec millisecs millisecond milliseconds",
+    1e-6: "us usec usecs microsec microsecs microsecond microseconds",
+    1e-9: "ns nsec nsecs nanosec nanosecond nanoseconds",
+    60.0: "min mins minute minutes",
+}
+_SECONDS = {word: scale for scale, words in _UNITS.items() for word in words.split()}
+_IN_SENTENCES = "|".join(
+    word for word in _SECONDS if word == "ms" or (len(word) > 2 and word not in ("min", "second"))
+)
+#: where a comment states a unit: in brackets, after "in", at the end after a comma, or in full
+_STATED = re.compile(
+    rf"[\[(]\s*([a-z]+)\.?\s*[\])]|\bin\s+([a-z]+)\.?\s*$|[,:/]\s*({'|'.join(_SECONDS)})\.?\s*$|\b({_IN_SENTENCES})\b",
+    re.IGNORECASE,
+)
+_SCALED = re.compile(rf"\d\s*({'|'.join(_SECONDS)})\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -47,18 +74,30 @@ class CameraFacts:
         return ", ".join(part for part in parts if part)
 
 
+class Duration(NamedTuple):
+    """An integration time as a file states it.
+
+    Attributes:
+        seconds: s; None where its unit is in doubt.
+        words: what the file states.
+    """
+
+    seconds: float | None
+    words: str
+
+
 @dataclass(frozen=True)
 class StatedFacts:
     """What a file says beside its frames; None where it does not.
 
     Attributes:
         camera: that took the frames.
-        integration_time: s.
+        duration: the integration time.
         bit_depth: bits of the ADC.
     """
 
     camera: CameraFacts = CameraFacts()
-    integration_time: float | None = None
+    duration: Duration | None = None
     bit_depth: int | None = None
 
 
@@ -100,21 +139,60 @@ def seconds_of(value: Any) -> float | None:
     return seconds if seconds > 0 else None
 
 
-def duration_of(value: Any, unit: Any = "s") -> float | None:
-    """Return a duration in s; None where it is no positive number, or its unit is not known.
+def duration_of(name: str, value: Any, *units: Any, comment: str = "") -> Duration | None:
+    """Return a duration; None where the value is no positive number. Without a unit it is s.
 
     Args:
-        value: the number.
-        unit: s, ms, us, ns or min; s where there is none.
+        name: of the value.
+        value: the number; a text may have its unit behind it.
+        units: of the value, None or empty where there is none.
+        comment: words beside it, which may state a unit.
+
+    The seconds are None where the units contradict each other, or one is not known.
     """
-    scale = _SECONDS.get(text_of(unit) or "")
-    if scale is None or isinstance(value, bool):
+    if isinstance(value, bool):
         return None
+    number, _, unit = (
+        str(text_of(value) or "").partition(" ") if isinstance(value, str | bytes) else (value, "", "")
+    )
     try:
-        seconds = float(value) * scale
+        seconds = float(number)
     except (TypeError, ValueError, OverflowError):
         return None
-    return seconds if math.isfinite(seconds) and seconds > 0 else None
+    if not (math.isfinite(seconds) and SHORTEST <= seconds <= LONGEST / SHORTEST):
+        return None
+    stated = [each for each in map(text_of, (unit, *units)) if each]
+    scales = {scale for text in stated for scale in _scales(text) or {None}} | _scales(comment)
+    words = f"{name} = {seconds:g}" + (f" ({'; '.join(filter(None, [*stated, comment]))})" if scales else "")
+    if not scales:
+        return Duration(seconds, f"{words}, no unit stated, taken as s")
+    scale = scales.pop() if len(scales) == 1 else None
+    if scale is not None and not SHORTEST <= seconds * scale <= LONGEST:
+        return None
+    return (
+        Duration(None, f"{words}, whose unit is in doubt")
+        if scale is None
+        else Duration(seconds * scale, words)
+    )
+
+
+def _scales(text: str) -> set[float | None]:
+    """Return the units that a word or comment states, in s; None stands for one that is not known."""
+    text = re.sub("[\u00b5\u03bc]", "u", text)
+    if text.lower() in _SECONDS:
+        return {_SECONDS[text.lower()]}
+    if _SCALED.search(text):
+        return {None}  # such as "in units of 10 us"
+    found = {
+        _SECONDS.get(word.lower()) for match in _STATED.finditer(text) for word in match.groups() if word
+    }
+    return found - {None} or found
+
+
+def first_duration(found: Iterable[Duration | None]) -> Duration | None:
+    """Return the first duration that is known; else the first one, whose words say why it is not."""
+    there = [each for each in found if each is not None]
+    return next((each for each in there if each.seconds is not None), there[0] if there else None)
 
 
 def bits_of(value: Any) -> int | None:
@@ -130,16 +208,27 @@ def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] | None 
         values: attributes.
         units: of them, by name.
     """
-    stated = {**{f"{name}_units": unit for name, unit in (units or {}).items()}, **values}
-    temperatures = (celsius(values.get(name), stated.get(f"{name}_units")) for name in _TEMPERATURES)
-    durations = (duration_of(values.get(name), stated.get(f"{name}_units")) for name in _DURATIONS)
+    given = units or {}
+
+    def units_of(name: str) -> list[Any]:
+        return [given.get(name), *(values.get(name + suffix) for suffix in _UNIT_SUFFIXES)]
+
+    temperatures = (celsius(values.get(name), first_of(units_of(name))) for name in _TEMPERATURES)
+    # those first whose unit is known by their name; integration_time is in s as sidecars have it
+    named = {_DURATIONS[0]: "s", **_DURATIONS_IN}
+    durations = (
+        duration_of(name, values.get(name), *(list(filter(None, units_of(name))) or [named.get(name)]))
+        for name in dict.fromkeys((*named, *_DURATIONS))
+    )
     camera = CameraFacts(
         first_of(text_of(values.get(name)) for name in _NAMES),
         first_of(text_of(values.get(name)) for name in _SERIALS),
         first_of(temperatures),
         first_of(seconds_of(values.get(name)) for name in _TIMES),
     )
-    return StatedFacts(camera, first_of(durations), first_of(bits_of(values.get(name)) for name in _DEPTHS))
+    return StatedFacts(
+        camera, first_duration(durations), first_of(bits_of(values.get(name)) for name in _DEPTHS)
+    )
 
 
 def first_of(found: Iterable[Any]) -> Any:

@@ -25,6 +25,8 @@ from pchem_pipeline.frames.settings import InputSettings
 
 #: more bins than any ADC of interest has codes; a wider span is a mistake in the file
 _MOST_BINS = 1 << 24
+_MOST_BINS_OF_ALL = 1 << 27
+_MOST_UNPACKED = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,10 @@ def read_histograms(settings: InputSettings, base_dir: Path) -> HistogramInput:
 
 def _assemble(channels: Sequence[_Channel], paths: Sequence[Path], notes: Sequence[str]) -> HistogramInput:
     bins = max(channel.counts.size for channel in channels)
+    if bins * len(channels) > _MOST_BINS_OF_ALL:
+        raise InputError(
+            f"{paths[0]} and others: {len(channels)} channels of {bins} bins are too many; give fewer"
+        )
     largest = max(int(channel.counts.max()) for channel in channels)
     counts = np.zeros((1, len(channels), bins), np.uint32 if largest < 1 << 32 else np.uint64)
     for i, channel in enumerate(channels):
@@ -134,11 +140,23 @@ def _read(path: Path) -> list[_Channel]:
             dn, columns, names = _read_text(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the file") from error
+    except csv.Error as error:
+        raise InputError(
+            f"{path}: no table of numbers ({error}); histograms have columns DN, count"
+        ) from error
     if len(names) == 1:
         names = [path.stem]
     else:
         names = [f"{path.stem}:{name}" for name in names]
-    return [_channel(path, name, dn, column) for name, column in zip(names, columns, strict=True)]
+    channels: list[_Channel] = []
+    for name, column in zip(names, columns, strict=True):
+        channels.append(_channel(path, name, dn, column))
+        if max(each.counts.size for each in channels) * len(channels) > _MOST_BINS_OF_ALL:
+            raise InputError(
+                f"{path}: its channels span more than {_MOST_BINS_OF_ALL} DN together; correct the DN "
+                "column, or give fewer channels"
+            )
+    return channels
 
 
 def _read_numpy(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]:
@@ -171,6 +189,9 @@ def _split_npz(path: Path, archive: Any) -> tuple[NDArray[Any], NDArray[Any]]:
     if not {"dn", "counts"} <= held:
         listed = ", ".join(sorted(held)) or "nothing"
         raise InputError(f"{path}: needs the arrays dn and counts, holds {listed}; save it with these names")
+    unpacked = sum(part.file_size for part in archive.zip.infolist())
+    if unpacked > max(_MOST_UNPACKED, 100 * path.stat().st_size):
+        raise InputError(f"{path}: {unpacked} bytes unpacked, which cannot be histograms; save it again")
     return archive["dn"], np.atleast_2d(archive["counts"])
 
 
@@ -226,7 +247,7 @@ def _is_number(text: str) -> bool:
         float(text)
     except ValueError:
         return False
-    return True
+    return "_" not in text
 
 
 def _channel(path: Path, name: str, dn: NDArray[Any], counts: NDArray[Any]) -> _Channel:

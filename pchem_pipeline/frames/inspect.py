@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
 from pchem_pipeline.base.errors import ConfigError, InputError
-from pchem_pipeline.frames.axis_order import last_axis_note
 from pchem_pipeline.frames.identity import file_size, hash_file, sample_hash
 from pchem_pipeline.frames.reader import FrameReader, shared_notes
 from pchem_pipeline.frames.registry import detect_format, reader_class
@@ -98,9 +98,6 @@ def survey(
         _mark_duplicates(report.good)
     readers = [reader for entry, reader in opened if not entry.problem]
     report.notes += shared_notes(readers)
-    report.notes += [
-        note for reader in readers[:1] if reader.order_by_habit for note in last_axis_note(reader)
-    ]
     report.notes += _gaps([entry.path for entry in report.files])
     return readers, report
 
@@ -171,25 +168,44 @@ def _mark_equal(alike: list[FileReport]) -> None:
 
 
 _LAST_NUMBER = re.compile(r"(\d+)(?=\D*$)")
+#: hours, minutes and seconds, as the end of a name's last number or with signs between them
+_CLOCK = re.compile(r"([01]\d|2[0-3])([-_.:h]?)([0-5]\d)([-_.:m]?)([0-5]\d)(\d{0,9})(?=\D*$)")
 
 
 def _gaps(paths: list[Path]) -> list[str]:
-    """Say which numbers are missing in the names of a numbered sequence of files."""
-    groups: defaultdict[tuple[Path, str], list[int]] = defaultdict(list)
+    """Say which numbers are missing in the names of a numbered sequence of files.
+
+    A clock is no such number: its steps vary, or are those of a counter only if minutes have 60 seconds.
+    """
+    groups: defaultdict[tuple[Path, str], list[Path]] = defaultdict(list)
     for path in paths:
-        match = _LAST_NUMBER.search(path.name)
-        if match:
-            groups[path.parent, _LAST_NUMBER.sub("#", path.name)].append(int(match[1]))
+        if _LAST_NUMBER.search(path.name):
+            groups[path.parent, _LAST_NUMBER.sub("#", path.name)].append(path)
     notes = []
-    for (_, pattern), numbers in groups.items():
-        if len(numbers) < 3:
-            continue
-        steps = Counter(b - a for a, b in zip(sorted(numbers), sorted(numbers)[1:], strict=False) if b > a)
-        usual = min(steps, default=1)
-        missing = sum((step // usual - 1) * count for step, count in steps.items())
+    for (_, pattern), files in groups.items():
+        missing = _missing([int(_LAST_NUMBER.findall(path.name)[0]) for path in files])
+        clocks = [_CLOCK.search(path.name) for path in files]
+        if all(clocks) and missing:
+            times = [3600 * int(c[1]) + 60 * int(c[3]) + int(c[5]) for c in clocks if c and not c[6]]
+            if len(times) < len(files) or any(c[2] or c[4] for c in clocks if c) or _missing(times) < missing:
+                continue
         if missing:
             are = "is" if missing == 1 else "are"
             notes.append(
                 f"{missing} of the numbered files {pattern} {are} missing between the first and the last"
             )
     return notes
+
+
+def _missing(numbers: list[int]) -> int:
+    """Return how many are missing in numbers of equal steps; 0 where their steps are not equal."""
+    steps = Counter(b - a for a, b in pairwise(sorted(set(numbers))))
+    usual = min(steps, default=0)
+    if (
+        len(numbers) < 3
+        or usual == 0
+        or any(step % usual for step in steps)
+        or 2 * steps[usual] < steps.total()
+    ):
+        return 0
+    return sum((step // usual - 1) * count for step, count in steps.items())

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.first_look import first_look
+from pchem_pipeline.frames.formats.map_files import read_image
 from pchem_pipeline.frames.inspect import survey
+from pchem_pipeline.frames.resolve import mask_path
 from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.settings import InputSettings
 
@@ -17,7 +24,8 @@ def open_frames(
     Args:
         settings: the section ``input``.
         base_dir: folder to which relative paths refer.
-        check_duplicates: also look for files with the same content (reads a little of each file).
+        check_duplicates: also look for files with the same content (reads a little of each file), and at
+            some samples.
         least: frames that there must be.
 
     Returns:
@@ -30,4 +38,38 @@ def open_frames(
     """
     readers, report = survey(settings, base_dir, check_duplicates=check_duplicates)
     report.raise_if_refused(settings.on_bad_file)
-    return FrameSequence(readers, settings, report, least)
+    frames = FrameSequence(readers, settings, report, least)
+    frames.exclude(_excluded(frames, settings, base_dir))
+    if check_duplicates:
+        report.notes += first_look(frames, settings)
+    return frames
+
+
+#: what cameras write for pixels that they mask, 32 bits
+_MARKER = (1 << 32) - 1
+
+
+def _excluded(frames: FrameSequence, settings: InputSettings, base_dir: Path) -> NDArray[np.bool_]:
+    """Return the pixels (y, x) that ``input.mask`` excludes, or that hold the marker at both ends of the run.
+
+    Raises:
+        InputError: the mask is no image of the shape of the frames.
+    """
+    n, rows, columns = frames.shape
+    excluded = np.zeros((rows, columns), np.bool_)
+    if frames.dtype.itemsize == 4:
+        first, last = (frames.stored(t, t + 1, 0, rows)[0] for t in (0, n - 1))
+        excluded |= (first == _MARKER) & (last == _MARKER)
+    path = mask_path(settings, base_dir)
+    if path is None:
+        return excluded
+    mask: NDArray[np.bool_] = read_image(path) != 0
+    if settings.roi is not None and mask.shape != excluded.shape and mask.ndim == 2:
+        y0, y1, x0, x1 = settings.roi
+        mask = mask[y0:y1, x0:x1]
+    if mask.shape != excluded.shape:
+        raise InputError(
+            f"{path}: mask of shape {mask.shape}, frames of {excluded.shape}; correct input.mask (--mask)"
+        )
+    excluded |= mask
+    return excluded

@@ -6,8 +6,10 @@ Readers from elsewhere come through the entry point group ``pchem_pipeline.reade
 
 from __future__ import annotations
 
+import errno
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar, Self
@@ -15,7 +17,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.camera import CameraFacts, StatedFacts
 from pchem_pipeline.frames.identity import content_identity, quick_identity
 from pchem_pipeline.frames.settings import InputSettings
@@ -37,9 +39,12 @@ class FrameReader(ABC):
         bit_depth: bits of the ADC, where the file says so.
         bit_shift: bits by which the samples are left-justified, where the file says so.
         integration_time: s, where the file says so.
+        time_words: what the file states of it, and in what unit.
         camera: its name, serial number, temperature and time, as far as the file says.
         timestamps: start of each frame, s since 1970-01-01 UTC, (frames,), where the file says so.
         notes: remarks for the user on what was left out or assumed.
+        byte_order: of the bytes of a sample, little or big, where ``input.byte_order`` decides it.
+        unwritten: samples of the file were never written, and are read as a fill value.
         rows_per_read: rows that are decoded together, so that they come at no more cost than one; 1 where
             any rows can be read alone.
         order_by_habit: whether the format has arrays that do not say which axis is time.
@@ -55,9 +60,12 @@ class FrameReader(ABC):
     bit_depth: int | None = None
     bit_shift: int = 0
     integration_time: float | None = None
+    time_words: str = ""
     camera: CameraFacts = CameraFacts()
     timestamps: NDArray[np.float64] | None = None
     notes: tuple[str, ...] = ()
+    byte_order: str | None = None
+    unwritten: bool = False
     rows_per_read: int = 1
     order_by_habit: ClassVar[bool] = False
 
@@ -96,11 +104,8 @@ class FrameReader(ABC):
 
     def take_facts(self, facts: StatedFacts) -> None:
         """Take what the file says beside its frames."""
-        self.camera, self.integration_time, self.bit_depth = (
-            facts.camera,
-            facts.integration_time,
-            facts.bit_depth,
-        )
+        self.camera, self.bit_depth = facts.camera, facts.bit_depth
+        self.integration_time, self.time_words = facts.duration or (None, "")
 
     def identity(self) -> dict[str, Any]:
         """Return name, size and xxh3_128 content hash of every file, and one digest over all; for JSON."""
@@ -159,6 +164,42 @@ def shared_notes(readers: Sequence[FrameReader]) -> list[str]:
         more = f" and {len(about) - 1} more: " if len(about) > 1 else ": "
         notes.append(about[0].removesuffix(": ") + more + words if about else words)
     return notes
+
+
+def unwritten_notes(path: Path, missing: int, wanted: int, what: str = "chunks") -> tuple[str, ...]:
+    """Return a remark on parts of a file that were never written; empty where all were.
+
+    Raises:
+        InputError: none was written.
+    """
+    if missing >= wanted > 0:
+        raise InputError(
+            f"{path}: none of its {wanted} {what} was ever written; copy it again or leave it out"
+        )
+    were = "was" if missing == 1 else "were"
+    words = f"{path.name}: {missing} of {wanted} {what} {were} never written and read as the fill value"
+    return (words,) if missing > 0 else ()
+
+
+@contextmanager
+def sound(path: Path, what: str) -> Iterator[None]:
+    """Turn what a library says of a damaged file into one line: damage can break it anywhere.
+
+    Raises:
+        InputError: always in place of another error, but for those of settings and missing libraries.
+    """
+    try:
+        yield
+    except (InputError, ConfigError):
+        raise
+    except Exception as error:
+        if (
+            isinstance(error, OSError)
+            and error.strerror
+            and error.errno in (errno.ENOENT, errno.EACCES, errno.EPERM)
+        ):
+            raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+        raise InputError(f"{path}: not a sound {what}, or truncated ({error}); copy it again") from error
 
 
 def changed(path: Path, what: str) -> InputError:

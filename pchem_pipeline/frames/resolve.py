@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+from contextlib import suppress
 from pathlib import Path
 
 from pchem_pipeline.base.errors import ConfigError, InputError
@@ -41,33 +43,52 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
         if is_remote(entry):
             found += fetch(entry)
             continue
-        path = Path(entry).expanduser()
-        path = path if path.is_absolute() else base_dir / path
+        path = Path(entry)
+        with suppress(RuntimeError):  # a file called ~x.tif
+            path = path.expanduser()
+        path = base_dir / path
         if path.is_dir() and not _is_zarr(path):
             found += _folder(path, settings)
         elif path.exists():
             found.append(path)
         elif _GLOB.search(entry):
-            found += _glob(Path(entry).expanduser(), base_dir, entry)
+            found += _glob(path, base_dir, entry)
         else:
             raise InputError(f"{path}: no such file or folder; correct the path (input.files)")
+    for path in found:
+        if not (path.is_file() or path.is_dir()):
+            raise InputError(f"{path}: no regular file; write what comes from there to a file first")
+        if not str(path).isascii() and str(path) != os.fsencode(path).decode("utf-8", "replace"):
+            raise InputError(f"{path}: its name is not in UTF-8; rename it")
     return sorted(found, key=natural_key)
 
 
 def input_paths(settings: InputSettings, base_dir: Path) -> list[Path]:
-    """Return all files that decide what is read: those of `resolve_files`, each with its sidecar.
+    """Return all files that decide what is read: mask, camera files, each with its sidecar.
 
     Raises:
         ConfigError: no files are named.
         InputError: as in `resolve_files`.
     """
-    paths: list[Path] = []
+    mask = mask_path(settings, base_dir)
+    paths = [] if mask is None else [mask]
     for path in resolve_files(settings, base_dir):
         paths.append(path)
         if settings.format == "raw" or path.suffix.lower() in RawReader.suffixes:
             sidecar = find_sidecar(path)
             paths += [sidecar] if sidecar is not None else []
     return paths
+
+
+def mask_path(settings: InputSettings, base_dir: Path) -> Path | None:
+    """Return the file of ``input.mask``, fetched where it is remote.
+
+    Raises:
+        InputError: there is none.
+    """
+    if settings.mask is None:
+        return None
+    return resolve_files(settings.model_copy(update={"files": (settings.mask,)}), base_dir)[0]
 
 
 def _is_zarr(path: Path) -> bool:

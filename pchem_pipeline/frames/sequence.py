@@ -24,10 +24,17 @@ class FrameSequence(FrameReader):
 
     Attributes:
         report: what was found in the files and what was done about it.
+        excluded: pixels (y, x) whose samples are replaced by one that is the same in all frames; None: none.
         stated_integration_time: s, as the files say, whatever the settings say; None if they do not agree.
     """
 
     format_name = "sequence"
+    excluded: NDArray[np.bool_] | None = None
+
+    @property
+    def order_by_habit(self) -> bool:  # type: ignore[override]
+        """The format of the files does not say which axis is time."""
+        return self._readers[0].order_by_habit
 
     def __init__(
         self, readers: Sequence[FrameReader], settings: InputSettings, report: InputReport, least: int = 2
@@ -57,6 +64,8 @@ class FrameSequence(FrameReader):
         self.shape = (end - self._first, y1 - self._y0, self._x1 - self._x0)
         self.dtype = readers[0].dtype
         self.rows_per_read = max(reader.rows_per_read for reader in readers)
+        self.byte_order = readers[0].byte_order
+        self.unwritten = any(reader.unwritten for reader in readers)
         self._set_facts(readers, settings, end)
 
     def _set_facts(self, readers: Sequence[FrameReader], settings: InputSettings, end: int) -> None:
@@ -83,6 +92,7 @@ class FrameSequence(FrameReader):
         self.stated_integration_time = times.pop() if len(times) == 1 else None
         time = settings.integration_time
         self.integration_time = _agreed(readers, "integration_time") if time is None else time
+        self.time_words = _time_words(readers[0], self.integration_time)
         stamps = [reader.timestamps for reader in readers]
         if all(each is not None for each in stamps):
             self.timestamps = np.concatenate([each for each in stamps if each is not None])[self._first : end]
@@ -102,11 +112,38 @@ class FrameSequence(FrameReader):
             InputError: also where dropped bits are not zero, or a value does not fit the bit depth.
         """
         y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
-        rows = (y0 + self._y0, y1 + self._y0)
+        for reader, part in self._parts(buffer, t0, t1, (y0, y1)):
+            self.check_bits(reader, part, y0)
+
+    def exclude(self, pixels: NDArray[np.bool_]) -> None:
+        """Exclude pixels (y, x): their samples become the median of the others in the first frame.
+
+        Raises:
+            InputError: no pixel is left.
+        """
+        if pixels.all():
+            raise InputError(f"{_where(self.paths)}: every pixel is excluded; correct input.mask (--mask)")
+        if pixels.any():
+            self.excluded, self._places = pixels, np.nonzero(pixels)
+            others = self.stored(0, 1, 0, self.shape[1])[0][~pixels]
+            self._filler = np.quantile(others, 0.5, method="lower")
+
+    def stored(self, t0: int, t1: int, y0: int, y1: int) -> NDArray[Any]:
+        """Return frames t0..t1 and rows y0..y1 (frame, y, x) as they are in the files."""
+        buffer = np.empty((t1 - t0, y1 - y0, self.shape[2]), self.dtype)
+        for _ in self._parts(buffer, t0, t1, (y0, y1)):
+            pass
+        return buffer
+
+    def _parts(
+        self, buffer: NDArray[Any], t0: int, t1: int, rows: tuple[int, int]
+    ) -> Iterator[tuple[FrameReader, NDArray[Any]]]:
+        """Fill a buffer, and yield each file with the part that is from it."""
+        rows = (rows[0] + self._y0, rows[1] + self._y0)
         for reader, first, end, offset in self.pieces(t0, t1):
             part = buffer[offset : offset + end - first]
             self._read_part(reader, part, first, end, rows)
-            self.check_bits(reader, part)
+            yield reader, part
 
     @property
     def whole_shape(self) -> tuple[int, int]:
@@ -145,8 +182,18 @@ class FrameSequence(FrameReader):
             reader.read_into(scratch[: stop - t], t, stop, *rows)
             part[t - t0 : stop - t0] = scratch[: stop - t, :, self._x0 : self._x1]
 
-    def check_bits(self, reader: FrameReader, part: NDArray[Any]) -> None:
-        """Shift left-justified samples, refusing to lose bits; check that values fit the bit depth."""
+    def check_bits(self, reader: FrameReader, part: NDArray[Any], y0: int) -> None:
+        """Replace excluded samples; shift left-justified ones, refusing to lose bits; check the bit depth.
+
+        Args:
+            reader: of the file.
+            part: frames of it, (frame, y, x).
+            y0: their first row.
+        """
+        if self.excluded is not None:
+            ys, xs = self._places
+            a, b = np.searchsorted(ys, [y0, y0 + part.shape[1]])
+            part[:, ys[a:b] - y0, xs[a:b]] = self._filler
         size = 8 * self.dtype.itemsize
         depth = size - self.bit_shift if self.bit_depth is None else self.bit_depth
         if part.size == 0 or (self.bit_shift == 0 and depth == size):
@@ -175,6 +222,17 @@ class FrameSequence(FrameReader):
         """Close all readers."""
         for reader in self._readers:
             reader.close()
+
+
+def _time_words(first: FrameReader, taken: float | None) -> str:
+    """Return a remark on the integration time that the first file states; empty where it states none."""
+    if not first.time_words:
+        return ""
+    if taken is None:
+        words = "integration time unknown; give it by --integration-time SECONDS"
+    else:
+        words = f"integration time {taken:g} s"
+    return f"{words}: {first.paths[0].name} states {first.time_words}"
 
 
 def _where(paths: Sequence[Path]) -> str:
@@ -219,7 +277,7 @@ def _frame_range(settings: InputSettings, total: int, least: int) -> tuple[int, 
     if end > total or end - first < least:
         raise InputError(
             f"input.frame_range [{first}, {end}] does not hold at least {least} of the {total} frames; "
-            "correct it"
+            "correct it (--frames)"
         )
     return first, end
 

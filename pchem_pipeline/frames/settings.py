@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from pchem_pipeline.base.settings import Place, Section
+from pchem_pipeline.frames.camera import LONGEST, SHORTEST
 
 
 class SampleSettings(Section):
@@ -17,7 +18,10 @@ class SampleSettings(Section):
         default=False, description="frames without any electrons, H = 0; they pin the bias and the read noise"
     )
     integration_time: float | None = Field(
-        default=None, ge=0, description="s; null: what the run says. 0 is allowed: no time to integrate"
+        default=None,
+        ge=0,
+        le=LONGEST,
+        description="s; null: what the run says. 0 is allowed: no time to integrate",
     )
     light_level: float | None = Field(
         default=None, ge=0, description="exposure in any unit, for input.against: light_level"
@@ -86,9 +90,17 @@ class InputSettings(Section):
         description="raw: type of a sample; other formats: reads signed samples of that size as unsigned, "
         "negative values being refused; null: from the file or its sidecar",
     )
+    offset: int | None = Field(
+        default=None,
+        ge=0,
+        le=1 << 31,
+        description="DN to be added to signed samples: 32768 where 16 bits are stored as -32768 to 32767; "
+        "null: from the file (FITS: BZERO), else none",
+    )
     byte_order: Literal["little", "big"] | None = Field(
         default=None,
-        description="raw and SER: order of the bytes of a sample; null: from the file, else little",
+        description="raw and SER: order of the bytes of a sample; null: from the file, else little, "
+        "and refused where the samples look otherwise",
     )
     header_bytes: int | None = Field(
         default=None,
@@ -118,6 +130,11 @@ class InputSettings(Section):
         "saturation at the "
         "top of the range cannot be told from a clipped histogram)",
     )
+    mask: Place | None = Field(
+        default=None,
+        description="image file (npy, TIFF, FITS) of the shape of the frames or of roi, relative to this "
+        "YAML file: pixels other than 0 are excluded, and so are those that always hold the marker 2^32-1",
+    )
     roi: tuple[int, int, int, int] | None = Field(
         default=None, description="region of interest [y0, y1, x0, x1] in pixels, ends excluded; null: all"
     )
@@ -129,6 +146,7 @@ class InputSettings(Section):
     integration_time: float | None = Field(
         default=None,
         gt=0,
+        le=LONGEST,
         description="integration time of a frame, s; null: from the file, else unknown (no charge rate then)",
     )
     on_bad_file: Literal["error", "skip"] = Field(
@@ -152,6 +170,9 @@ class InputSettings(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        times = [self.integration_time, *(sample.integration_time for sample in self.samples)]
+        if any(0 < (time or 0) < SHORTEST for time in times):
+            raise ValueError(f"integration_time must be at least {SHORTEST:g} s")
         if self.shape is not None and (len(self.shape) not in (2, 3) or min(self.shape) < 1):
             raise ValueError("shape must be [rows, columns] or [frames, rows, columns], each at least 1")
         if self.roi is not None:

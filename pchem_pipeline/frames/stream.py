@@ -196,8 +196,8 @@ class HashedFrameStream(FrameStream):
                 bands = [part[offset : offset + end - first] for part in parts]
                 assert isinstance(reader, ContiguousReader)
                 reader.scatter(bands, first, end, hasher)
-                for band in bands:
-                    self._stack.check_bits(reader, band)
+                for band, (y0, _) in zip(bands, self.bands, strict=True):
+                    self._stack.check_bits(reader, band, y0)
             else:
                 hasher.read_to(self._size(reader.paths[0]) * end // reader.shape[0])
                 decode.append((t0 + offset, t0 + offset + end - first))

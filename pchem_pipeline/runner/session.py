@@ -257,9 +257,10 @@ def _check_failed_pixels(context: StageContext, name: str) -> None:
     """Raise an error if more pixels have no value than allowed, unless only some tiles were chosen."""
     if context.options.tiles is not None or context.options.roi is not None:
         return
-    from pchem_pipeline.model.fit.status import FAILED, MEANINGS
+    from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
 
     words = context.store.read(name)
+    words = words[(words & int(FitStatus.EXCLUDED)) == 0]
     failed = int(((words & int(FAILED)) != 0).sum())
     allowed = context.config.run.allowed_failed_pixels
     if failed > allowed * words.size:

@@ -80,9 +80,16 @@ def run(context: StageContext) -> None:
     done = context.prepared.get(context.stage)
     reader = open_frames(settings, context.base_dir) if done is None else done.frames
     context.begin()
+    if reader.time_words:
+        (context.note if reader.integration_time is None else context.reporter.info)(reader.time_words)
     if message := reader.report.message():
         context.note(message)
     sensor_of(reader, context, shortened(known_identity(context))).write(context.store)
+    if reader.excluded is not None:
+        context.create("frames/excluded", reader.shape[1:], chunks=reader.shape[1:])
+        context.store.write("frames/excluded", (slice(None),) * 2, reader.excluded.astype(np.uint8))
+        number = np.count_nonzero(reader.excluded)
+        context.note(f"excluded by the mask or the marker 2^32-1: {number} of {reader.excluded.size} pixels")
     keep_ingested(context)
     if settings.mode == "reference":
         _run_whole(context)

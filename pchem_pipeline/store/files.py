@@ -34,6 +34,10 @@ _CURES_OF_A_PLACE = {
     errno.ENOTDIR: "there is a file where a folder is meant: choose another place",
     errno.EISDIR: "there is a folder where a file is meant: choose another place",
     errno.ENAMETOOLONG: "choose a shorter name",
+    **dict.fromkeys(
+        (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP),
+        "the file system lacks what a store needs, such as file locks: choose another place for the store",
+    ),
 }
 
 _ERRNO = re.compile(r"errno = (\d+)")

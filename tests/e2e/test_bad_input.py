@@ -11,6 +11,7 @@ import tifffile
 from astropy.io import fits
 from helpers.commands import RUN
 
+from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.store.run_store import RunStore
 
 GOOD = np.random.default_rng(2).integers(90, 130, (40, 8, 9), dtype=np.uint16)
@@ -107,13 +108,17 @@ def test_degenerate_pixels_get_a_word_and_stop_nothing(shell):
     stack[:, 0, 3] = 0
     stack[:, 0, 4] = np.minimum(stack[:, 0, 4], 120)
     np.save(shell.folder / "a.npy", stack)
-    shell.ok("run", "a.npy", "--bit-depth", "14", "--until", "fit")
+    np.save(shell.folder / "mask.npy", np.arange(64).reshape(8, 8) // 8 == 7)
+    shell.ok("run", "a.npy", "--bit-depth", "14", "--until", "fit", "--mask", "mask.npy", "--frames", "5:")
     store = RunStore.open(shell.folder / "run.zarr")
     words, gain = store.read("fit/fit_status"), store.read("fit/conversion_gain")
     assert (words[0, :5] != 0).all()
     assert np.isnan(gain[0, [0, 1, 2, 3]]).all()
-    assert np.isfinite(gain[1:]).all()
-    assert (words[1:] == 0).mean() > 0.8
+    assert np.isfinite(gain[1:7]).all()
+    assert (words[1:7] == 0).mean() > 0.8
+    assert (words[7] == FitStatus.EXCLUDED).all()
+    assert np.isnan(gain[7]).all()
+    assert store.read("histogram/counts")[1, 1].sum() == 2995
 
 
 def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell):
@@ -121,6 +126,8 @@ def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell):
     stack = np.rint(rng.poisson(2, (2000, 8, 8)) * 10 + rng.normal(100, 3, (2000, 8, 8))).astype(np.uint16)
     stack[:, :3] = 100
     np.save(shell.folder / "a.npy", stack)
+    np.save(shell.folder / "mask.npy", np.repeat([[1.0], [0.0]], [3, 5], axis=0).repeat(8, axis=1))
+    shell.ok("run", "a.npy", "--mask", "mask.npy", "--store", "masked.zarr", "--until", "fit")
     (shell.folder / "run.yaml").write_text(OF_ONE_FILE)
     result = shell("run", "run.yaml")
     assert result.code == 3

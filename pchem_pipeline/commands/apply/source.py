@@ -47,7 +47,7 @@ def open_like_run(
     if sensor.kind == "histograms":
         raise ConfigError(f"{target.store} was made from ready-made histograms, whose channels are no frames")
     settings = _settings(target).model_copy(
-        update={"files": tuple(str(each) for each in files), "frame_range": None, "samples": ()}
+        update={"files": tuple(str(each) for each in files), "frame_range": None, "mask": None, "samples": ()}
     )
     if dataset is not None:
         settings = settings.model_copy(update={"dataset": dataset})

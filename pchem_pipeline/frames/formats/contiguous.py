@@ -25,6 +25,7 @@ from pchem_pipeline.frames.identity import FileHasher
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window
 
 _MOST_BYTES = 1 << 30
+_MOST_FRAMES = 1 << 26
 #: targets of one call of preadv
 _MOST_VECTORS = 1024
 
@@ -37,17 +38,15 @@ class Layout:
         offsets: byte offset of each frame, (frames,).
         rows: rows of a frame.
         columns: columns of a frame.
-        stored: numpy type of a stored sample with its byte order; signed if ``biased`` or ``signed``.
-        biased: samples are signed integers with 2**(bits - 1) added to them by the header (FITS BZERO).
-        signed: samples are signed integers declared to be never negative; this is checked on reading.
+        stored: numpy type of a stored sample with its byte order.
+        offset: what is added to signed samples, DN; sums must not be negative. None: they are unsigned.
     """
 
     offsets: NDArray[np.int64]
     rows: int
     columns: int
     stored: np.dtype[Any]
-    biased: bool = False
-    signed: bool = False
+    offset: int | None = None
 
     @property
     def frame_bytes(self) -> int:
@@ -92,6 +91,10 @@ def even_offsets(
     if n_frames and start + step * (n_frames - 1) + frame_bytes > size:
         whole = max(0, (size - start - frame_bytes) // step + 1)
         raise _truncated(path, n_frames, start + step * (n_frames - 1) + frame_bytes, size, whole)
+    if n_frames > _MOST_FRAMES:
+        raise InputError(
+            f"{path}: {n_frames} frames, more than {_MOST_FRAMES}; correct the header or input.shape"
+        )
     return start + step * np.arange(n_frames, dtype=np.int64)
 
 
@@ -169,7 +172,9 @@ class OpenedFile:
 
 
 class ContiguousReader(FrameReader):
-    """A reader that needs nothing but a `Layout`."""
+    """A reader that needs nothing but a `Layout`; of files without one it decodes by `decode_into`."""
+
+    _offset: int | None = None
 
     def set_layout(self, path: Path, layout: Layout, size: int) -> None:
         """Take the layout; ``size`` is the size of the file.
@@ -216,14 +221,25 @@ class ContiguousReader(FrameReader):
                 for target in targets:
                     hasher.feed(target)
         for part in parts:
-            unstore(part, layout.stored, biased=layout.biased, signed=layout.signed, path=self.paths[0])
+            unstore(part, layout.stored, layout.offset, self.paths[0])
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`."""
         y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
         if buffer.size == 0:
             return
-        layout = self._layout
+        layout, path = self.layout, self.paths[0]
+        if layout is None:
+            try:
+                self.decode_into(buffer, t0, t1, y0, y1)
+            except FileNotFoundError as error:
+                raise changed(path, "the file vanished") from error
+            except InputError:
+                raise
+            except Exception as error:
+                raise InputError(f"{path}: cannot be decoded ({error}); copy it again") from error
+            unstore(buffer, self.dtype, self._offset, path)
+            return
         skip = y0 * layout.columns * layout.stored.itemsize
         target = buffer.data.cast("B")
         band = len(target) // (t1 - t0)
@@ -231,7 +247,11 @@ class ContiguousReader(FrameReader):
             for first, count in _runs(layout.offsets[t0:t1], band if band == layout.frame_bytes else -1):
                 start = int(layout.offsets[t0 + first]) + skip
                 file.read_into(target[first * band : (first + count) * band], start)
-        unstore(buffer, layout.stored, biased=layout.biased, signed=layout.signed, path=self.paths[0])
+        unstore(buffer, layout.stored, layout.offset, path)
+
+    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
+        """Fill the buffer from a file without a layout, with samples as they are stored."""
+        raise NotImplementedError
 
 
 def _runs(offsets: NDArray[np.int64], frame_bytes: int) -> list[tuple[int, int]]:
@@ -241,23 +261,32 @@ def _runs(offsets: NDArray[np.int64], frame_bytes: int) -> list[tuple[int, int]]
     return [(a, b - a) for a, b in pairwise(edges)]
 
 
-def unstore(buffer: NDArray[Any], stored: np.dtype[Any], *, biased: bool, signed: bool, path: Path) -> None:
+def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, path: Path) -> None:
     """Turn stored bytes into native unsigned samples, in place.
 
     Args:
         buffer: unsigned native type of the size of ``stored``, holding the bytes of the file.
         stored: type in the file, with its byte order.
-        biased: add 2**(bits - 1) to signed samples, which flips the sign bit.
-        signed: samples must not be negative.
+        offset: what is added to signed samples, 0 to 2**(bits - 1); None: they are unsigned.
         path: the file, for the message.
 
     Raises:
-        InputError: a negative sample.
+        InputError: a sample is negative, with the offset.
     """
     if not stored.isnative:
         buffer.byteswap(inplace=True)
-    top = buffer.dtype.type(1 << (8 * stored.itemsize - 1))
-    if biased:
-        np.bitwise_xor(buffer, top, out=buffer)
-    elif signed and buffer.size and int(np.bitwise_or.reduce(buffer, axis=None)) & int(top):
-        raise InputError(f"{path}: signed samples with negative values; counts of an ADC must be 0 or more")
+    if offset is None or not buffer.size:
+        return
+    top = 1 << (8 * stored.itemsize - 1)
+    if offset < top:
+        lowest = int(buffer.view(f"i{stored.itemsize}").min()) + offset
+        if lowest < 0:
+            raise InputError(
+                f"{path}: signed samples with negative values (down to {lowest} DN"
+                f"{f', with the offset of {offset}' if offset else ''}), where 0 or more are needed; set "
+                f"input.offset: {top} (--offset {top}), if 0 DN is stored as -{top}"
+            )
+    if offset:
+        np.add(
+            buffer, buffer.dtype.type(offset), out=buffer
+        )  # modulo 2**bits, which is right for signed ones

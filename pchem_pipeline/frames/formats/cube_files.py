@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.frames.registry import require
+from pchem_pipeline.frames.formats.fits import write_image
 from pchem_pipeline.store.files import whole_file
 
 #: Bytes above which a TIFF file needs offsets of 64 bits.
 _LARGEST_TIFF = 1 << 32
-_UNSIGNED_ZERO = {2: 1 << 15, 4: 1 << 31}
-_FITS_BLOCK = 2880
 
 
 @dataclass(frozen=True)
@@ -75,26 +73,11 @@ def write_fits_cube(path: Path, cube: Cube) -> None:
         StoreError: the folder cannot be written.
         MissingDependencyError: astropy is not installed.
     """
-    require("astropy.io.fits", "fits", "FITS files")
-    from astropy.io import fits
-
-    header = fits.Header()
-    size, is_float = cube.dtype.itemsize, cube.dtype.kind == "f"
-    header["SIMPLE"], header["BITPIX"] = True, -8 * size if is_float else 8 * size
-    header["NAXIS"] = len(cube.shape)
-    for axis, length in enumerate(reversed(cube.shape), 1):
-        header[f"NAXIS{axis}"] = length
-    zero = 0 if is_float else _UNSIGNED_ZERO.get(size, 0)
-    if zero:
-        header["BSCALE"], header["BZERO"] = 1, zero
-    header["BUNIT"], header["OBJECT"] = cube.unit, cube.name
-    header["COMMENT"] = cube.long_name
-    header["CREATOR"] = "pchem-pipeline"
-    header["HISTORY"] = json.dumps(dict(cube.facts))
-    with whole_file(path) as part, part.open("wb") as stream:
-        stream.write(header.tostring().encode("ascii"))
-        for block in cube.blocks:
-            values = np.asarray(block, cube.dtype)
-            values = values ^ cube.dtype.type(zero) if zero else values
-            stream.write(np.ascontiguousarray(values, cube.dtype.newbyteorder(">")).data)
-        stream.write(bytes(-int(np.prod(cube.shape)) * size % _FITS_BLOCK))
+    cards = {
+        "BUNIT": cube.unit,
+        "OBJECT": cube.name,
+        "COMMENT": cube.long_name,
+        "CREATOR": "pchem-pipeline",
+        "HISTORY": json.dumps(dict(cube.facts)),
+    }
+    write_image(path, cube.blocks, cube.shape, cube.dtype, cards)

@@ -8,6 +8,7 @@ wait for each other, and the bytes would be read a second time for the hash of t
 
 from __future__ import annotations
 
+import heapq
 import math
 import threading
 from collections.abc import Iterator
@@ -21,21 +22,39 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError, quoted
 from pchem_pipeline.frames.camera import FACT_NAMES, StatedFacts, facts_from_names, text_of
 from pchem_pipeline.frames.formats.choice import choose_dataset
-from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, unsigned_type
+from pchem_pipeline.frames.formats.contiguous import (
+    ContiguousReader,
+    Layout,
+    even_offsets,
+    unsigned_type,
+)
 from pchem_pipeline.frames.formats.hdf5_parts import (
     check_filters,
     check_links,
     check_sources,
+    check_virtual,
     external_links,
+    is_own,
+    opened,
+    virtual_files,
 )
-from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
-from pchem_pipeline.frames.reader import changed, check_window
+from pchem_pipeline.frames.formats.kinds import (
+    LARGEST_PIECES,
+    check_coded,
+    check_samples,
+    check_unpacked_size,
+    full_window,
+    stack_shape,
+)
+from pchem_pipeline.frames.reader import changed, sound, unwritten_notes
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 _LOCK = threading.Lock()
+#: items of a file, and groups within each other
+_MOST_ITEMS, _DEEPEST = 100_000, 64
 
 
 class Hdf5Reader(ContiguousReader):
@@ -50,105 +69,96 @@ class Hdf5Reader(ContiguousReader):
     def open(cls, path: Path, settings: InputSettings) -> Self:
         """See `FrameReader.open`."""
         _require()
-        import h5py
-
         reader = cls()
-        try:
-            with _LOCK, h5py.File(path, "r") as file:
-                reader._inspect(path, file, settings)
-        except InputError:
-            raise
-        except Exception as error:  # a damaged file can break the library anywhere
-            if "already open for write" in str(error):
-                raise InputError(
-                    f"{path}: is being written, or was never closed; wait for its program, or free it by: "
-                    f"h5clear -s {quoted(path)}"
-                ) from error
-            raise InputError(
-                f"{path}: not a sound HDF5 file, or truncated ({error}); copy it again"
-            ) from error
+        with sound(path, "HDF5 file"):
+            try:
+                with _LOCK, opened(path) as file:
+                    reader._inspect(path, file, settings)
+            except OSError as error:
+                words = "is being written, or was never closed; wait for its program"
+                if "already open for write" in str(error):
+                    raise InputError(f"{path}: {words}, or free it by: h5clear -s {quoted(path)}") from error
+                if isinstance(error, BlockingIOError):
+                    raise InputError(f"{path}: {words}") from error
+                raise
         return reader
 
     def _inspect(self, path: Path, file: Any, settings: InputSettings) -> None:
         import h5py
 
         found: dict[str, tuple[int, ...]] = {}
-        detectors = []
+        detectors: list[Any] = []
 
         def visit(name: str, item: Any) -> None:
+            if len(found) > _MOST_ITEMS or name.count("/") > _DEEPEST:
+                raise InputError(
+                    f"{path}: holds more than {_MOST_ITEMS} items, or groups too deep; leave it out"
+                )
             if isinstance(item, h5py.Dataset):
+                if item.is_virtual and wanted in (None, name, f"/{name}"):
+                    check_virtual(path, item)  # the library may look at its parts for the shape
                 found[name] = item.shape or ()
             elif _is_detector(item):
                 detectors.append(item)
 
-        file.visititems(visit)
         wanted = settings.dataset
+        file.visititems(visit)
         if not any(len(shape) >= 3 for shape in found.values()) or wanted is not None:
-            check_links(path, external_links(file), wanted)
+            check_links(path, external_links(path, file), wanted)
         self._name = choose_dataset(path, found, settings.dataset)
         dataset = file[self._name]
-        self._signed = check_samples(path, dataset.dtype, settings)
+        self._offset = check_samples(path, dataset.dtype, settings)
         self.paths = (path,)
         self.shape = stack_shape(path, dataset.shape, f"dataset {self._name}")
         self.dtype = unsigned_type(dataset.dtype)
         self._full = tuple(dataset.shape)
         size = path.stat().st_size
         check_filters(path, dataset)
+        if dataset.is_virtual:
+            held = sum(part.stat().st_size for part in virtual_files(path, dataset))
+            check_coded(path, self.shape, self.shape[1:], self.dtype.itemsize, size + held)
         self.notes = check_sources(path, dataset) + _reversed_axes(path, dataset)
         if dataset.chunks is not None:
             check_coded(path, self.shape, dataset.chunks, self.dtype.itemsize, size)
-            self.notes += _missing_chunks(path, dataset)
             _check_chunk_sizes(path, dataset)
+            _check_deflated(path, dataset)
+        missing = _missing_chunks(path, dataset)
+        self.notes += missing
+        self.unwritten = bool(missing)
         offsets = _plain_offsets(path, file, dataset, self.shape)
         if offsets is not None:
-            layout = Layout(offsets, *self.shape[1:], dataset.dtype, signed=self._signed)
+            layout = Layout(offsets, *self.shape[1:], dataset.dtype, self._offset)
             self.set_layout(path, layout, size)
         elif dataset.chunks is not None:
             self.rows_per_read = min(self.shape[1], int(dataset.chunks[-2]))
         parent = dataset.parent
         self.take_facts(_stated_facts(dataset, [parent, *(detectors if len(detectors) == 1 else [])]))
 
-    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
-        """See `FrameReader.read_into`."""
-        if self.layout is not None:
-            super().read_into(buffer, t0, t1, y0, y1)
-            return
-        import h5py
-
-        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
-        if buffer.size == 0:
-            return
-        path = self.paths[0]
+    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
+        """See `ContiguousReader.decode_into`."""
         window = full_window(self._full, t0, t1, y0, y1)
-        try:
-            with _LOCK, h5py.File(path, "r") as file:
-                dataset = file[self._name]
-                if tuple(dataset.shape) != self._full:
-                    raise changed(path, "the dataset changed its shape")
-                if len(self._full) == buffer.ndim and dataset.dtype == buffer.dtype:
-                    dataset.read_direct(buffer, window)
-                    return
-                values = dataset[window]
-        except FileNotFoundError as error:
-            raise changed(path, "the file vanished") from error
-        except InputError:
-            raise
-        except Exception as error:
-            raise InputError(f"{path}: {self._name} cannot be read ({error}); copy the file again") from error
-        if self._signed and int(values.min()) < 0:
-            raise InputError(
-                f"{path}: signed samples with negative values; counts of an ADC must be 0 or more"
-            )
-        buffer[...] = values.reshape(buffer.shape)
+        with _LOCK, opened(self.paths[0]) as file:
+            dataset = file[self._name]
+            if tuple(dataset.shape) != self._full:
+                raise changed(self.paths[0], "the dataset changed its shape")
+            if len(self._full) == buffer.ndim and dataset.dtype == buffer.dtype:
+                dataset.read_direct(buffer, window)
+            else:
+                buffer[...] = dataset[window].reshape(buffer.shape)
 
 
 def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
-    """Say how many chunks of a dataset were never written; the library reads them as the fill value."""
+    """Say how many chunks of a dataset were never written; the library reads them as the fill value.
+
+    Raises:
+        InputError: none was written, or the file has no place for them at all.
+    """
+    if dataset.chunks is None:
+        plain = not (dataset.is_virtual or dataset.external) and dataset.id.get_storage_size() == 0
+        return unwritten_notes(path, int(plain and dataset.size > 0), 1, "datasets")
     pairs = zip(dataset.shape, dataset.chunks, strict=True)
     wanted = math.prod(-(-length // chunk) for length, chunk in pairs)
-    missing = wanted - dataset.id.get_num_chunks()
-    words = f"{path.name}: {missing} of {wanted} chunks were never written; they are read as its fill value"
-    return (words,) if missing > 0 else ()
+    return unwritten_notes(path, wanted - dataset.id.get_num_chunks(), wanted)
 
 
 def _check_chunk_sizes(path: Path, dataset: Any) -> None:
@@ -166,6 +176,29 @@ def _check_chunk_sizes(path: Path, dataset: Any) -> None:
         raise InputError(
             f"{path}: damaged: a chunk of {min(sizes - {size})} bytes, where {size} are needed; copy it again"
         )
+
+
+def _check_deflated(path: Path, dataset: Any) -> None:
+    """Refuse chunks that were deflated twice, or that hold more than their shape says.
+
+    Raises:
+        InputError: there is one.
+    """
+    from h5py import h5z
+
+    record = dataset.id.get_create_plist()
+    codes = [record.get_filter(number)[0] for number in range(record.get_nfilters())]
+    if len(codes) > len(set(codes)):
+        raise InputError(f"{path}: {dataset.name} is coded twice by the same filter; write it again")
+    if [code for code in codes if code != h5z.FILTER_FLETCHER32][-1:] != [h5z.FILTER_DEFLATE] or not hasattr(
+        dataset.id, "chunk_iter"
+    ):
+        return
+    chunks: list[tuple[int, tuple[int, ...]]] = []
+    dataset.id.chunk_iter(lambda chunk: chunks.append((chunk.size, chunk.chunk_offset)))
+    largest = heapq.nlargest(LARGEST_PIECES, chunks)
+    pieces = (dataset.id.read_direct_chunk(place)[1] for _, place in largest)
+    check_unpacked_size(path, pieces, 4 * math.prod(dataset.chunks) * dataset.dtype.itemsize)
 
 
 def _plain_offsets(
@@ -243,10 +276,10 @@ def _stated_facts(dataset: Any, groups: list[Any]) -> StatedFacts:
         if _is_detector(group):
             names["description"] = "camera"  # so NeXus calls make and model
         for stored, name in names.items():
-            other = group.get(stored)
+            other: Any = group.get(stored) if is_own(group, stored) else None
             if getattr(other, "size", 0) == 1 and name not in beside:
                 beside[name] = np.ravel(other[()])[0]
-                units[name] = other.attrs.get("units")
+                units[name] = other.attrs.get("units", other.attrs.get("unit"))
     return facts_from_names({**beside, **values}, units)
 
 

@@ -6,13 +6,19 @@ it tells only the folder where it looked.
 
 from __future__ import annotations
 
+import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.base.errors import InputError, install_hint
+from pchem_pipeline.frames.reader import unwritten_notes
+
+#: parts of a virtual dataset, and virtual datasets within each other
+_MOST_PARTS, _DEEPEST = 100_000, 16
 
 
-def external_links(file: Any) -> dict[str, str]:
+def external_links(path: Path, file: Any) -> dict[str, str]:
     """Return the links to what may be stacks in other files: path in this file -> name of the other."""
     from h5py import h5l
 
@@ -24,7 +30,15 @@ def external_links(file: Any) -> dict[str, str]:
             found[name.decode("utf-8", "replace")] = links.get_val(name)[0].decode("utf-8", "replace")
 
     links.visit(visit, info=True)
-    return {name: other for name, other in found.items() if getattr(file.get(name), "ndim", 3) >= 3}
+
+    def may_be_a_stack(name: str) -> bool:
+        try:
+            source_file(path, path.parent / found[name])
+        except InputError:
+            return True
+        return getattr(file.get(name), "ndim", 3) >= 3
+
+    return {name: other for name, other in found.items() if may_be_a_stack(name)}
 
 
 def check_links(path: Path, links: dict[str, str], wanted: str | None) -> None:
@@ -54,29 +68,140 @@ def check_sources(path: Path, dataset: Any) -> tuple[str, ...]:
         A remark for the user where there are such files.
 
     Raises:
-        InputError: one of them is missing, or shorter than the dataset says.
+        InputError: one of them is missing, shorter than the dataset says, or not beside or below its file.
     """
-    for name, *_ in dataset.external or ():
-        if not Path(name).exists():  # so the library looks for it: from the current folder
-            raise InputError(
-                f"{path}: the samples of {dataset.name} lie in {name}, which is not here; start the command "
-                "in the folder of that file"
-            )
+    if dataset.external:
+        return _check_raw_parts(path, dataset)
     if not dataset.is_virtual:
-        return _elsewhere(path, {name for name, *_ in dataset.external or ()})
-    sources = dataset.virtual_sources()
-    bad: list[str] = []
-    for source in sources:
-        if "%" in source.file_name:  # numbered files without an end: as many as there are
-            continue
-        if not _is_whole(path, source):
-            bad.append(source.file_name)
+        return ()
+    sources = check_virtual(path, dataset)
+    bad = [source.file_name for source in sources if not _is_whole(path, source)]
     if bad:
         raise InputError(
             f"{path}: {len(bad)} of the {len(sources)} parts of {dataset.name} are missing or too short, the "
             f"first in {bad[0]}; put the files where they were when it was written"
         )
-    return _elsewhere(path, {source.file_name for source in sources} - {"."})
+    notes = _elsewhere(path, {source.file_name for source in sources} - {"."})
+    try:
+        covered = sum(source.vspace.get_select_npoints() for source in sources)
+    except (RuntimeError, ValueError):  # no end
+        return notes
+    return notes + unwritten_notes(path, dataset.size - covered, dataset.size, "samples")
+
+
+def _check_raw_parts(path: Path, dataset: Any) -> tuple[str, ...]:
+    """Check the files of plain samples that a dataset names."""
+    needed, found = dataset.size * dataset.dtype.itemsize, 0
+    for name, offset, size in dataset.external:
+        if not Path(name).exists():  # so the library looks for it: from the current folder
+            raise InputError(
+                f"{path}: the samples of {dataset.name} lie in {name}, which is not here; start the command "
+                "in the folder of that file"
+            )
+        found += max(0, min(size, source_file(path, Path(name)).stat().st_size - offset))
+    names = {name for name, *_ in dataset.external}
+    if found < needed:
+        raise InputError(
+            f"{path}: the samples of {dataset.name} lie in {', '.join(sorted(names)[:4])}, truncated: "
+            f"{needed} bytes are needed, {found} are there; copy the file again"
+        )
+    return _elsewhere(path, names)
+
+
+def source_file(path: Path, other: Path) -> Path:
+    """Return a file that another one names as its source.
+
+    Raises:
+        InputError: it is not beside or below that one, or no regular file.
+    """
+    home, real = path.resolve().parent, other.resolve()
+    if home not in real.parents:
+        raise InputError(
+            f"{path}: names {real} as its source, which is not beside or below it; copy it there"
+        )
+    if real.exists() and not real.is_file():
+        raise InputError(f"{path}: names {real} as its source, which is no regular file; copy it again")
+    return real
+
+
+def check_virtual(path: Path, dataset: Any, above: tuple[tuple[Path, str], ...] = ()) -> list[Any]:
+    """Check where the parts of a virtual dataset are, before the library looks for them; return them.
+
+    Args:
+        path: the file of the dataset.
+        dataset: of h5py.
+        above: files and names of the virtual datasets that take this one as a part.
+
+    Raises:
+        InputError: a part is the dataset itself, or not beside or below the file; or they are too many.
+    """
+    here = (*above, (path.resolve(), dataset.name.strip("/")))
+    if len(here) > _DEEPEST or dataset.id.get_create_plist().get_virtual_count() > _MOST_PARTS:
+        raise InputError(
+            f"{path}: the parts of {dataset.name} are too many or too deep; copy its frames together"
+        )
+    sources = dataset.virtual_sources()
+    for source in sources:
+        name = source.file_name
+        other = source_file(path, path if name == "." else path.parent / name)
+        if "%" in name:  # numbered files without an end: as many as there are
+            pattern = re.sub(r"%\d*b", "*", other.name)
+            for each in other.parent.glob(pattern):
+                source_file(path, each)
+            continue
+        if (other, source.dset_name.strip("/")) in here:
+            raise InputError(f"{path}: {dataset.name} is a part of itself; write its frames again")
+        with suppress(OSError), opened(other) as file:
+            part = _plain(file, source.dset_name)
+            if getattr(part, "is_virtual", False):
+                check_virtual(other, part, here)
+    return list(sources)
+
+
+def virtual_files(path: Path, dataset: Any) -> list[Path]:
+    """Return the files that the parts of a virtual dataset are in, as far as they are there."""
+    files: set[Path] = set()
+    for name in {source.file_name for source in dataset.virtual_sources()} - {"."}:
+        other = path.parent / name
+        files.update(other.parent.glob(re.sub(r"%\d*b", "*", other.name)) if "%" in name else [other])
+    return [file for file in files if file.is_file()]
+
+
+def _plain(file: Any, name: str) -> Any:
+    """Return what a file itself has under a name, or None: links into other files are not followed."""
+    import h5py
+
+    item = file
+    for step in filter(None, name.split("/")):
+        if not isinstance(item, h5py.Group) or not is_own(item, step):
+            return None
+        item = item[step]
+    return item
+
+
+def is_own(group: Any, name: str) -> bool:
+    """Tell whether a group has something in its own file under a name."""
+    import h5py
+
+    return isinstance(group.get(name, getlink=True), h5py.HardLink)
+
+
+def opened(path: Path) -> Any:
+    """Return an open HDF5 file, without a lock where the file system has none.
+
+    Raises:
+        OSError: it cannot be opened, or another program has locked it to write.
+    """
+    import h5py
+
+    try:
+        return h5py.File(path, "r")
+    except BlockingIOError:
+        raise
+    except OSError as error:
+        if "unable to lock file" not in str(error):
+            raise
+        return h5py.File(path, "r", locking=False)
 
 
 def _elsewhere(path: Path, names: set[str]) -> tuple[str, ...]:
@@ -86,12 +211,11 @@ def _elsewhere(path: Path, names: set[str]) -> tuple[str, ...]:
 
 def _is_whole(path: Path, source: Any) -> bool:
     """Tell whether a part of a virtual dataset is there and as large as it was."""
-    import h5py
-
-    other = path if source.file_name == "." else path.parent / source.file_name
+    if "%" in source.file_name:
+        return True
     try:
-        with h5py.File(other, "r") as file:
-            part = file.get(source.dset_name)
+        with opened(path if source.file_name == "." else path.parent / source.file_name) as file:
+            part = _plain(file, source.dset_name)
             return part is not None and _fits(part, source)
     except OSError:
         return False

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import zlib
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,12 @@ from pchem_pipeline.frames.settings import InputSettings
 _MOST_PIXELS = 1 << 20
 #: a file of coded frames, and a coded piece of it, that may hold much in little
 _MOST_CODED, _MOST_PIECE, _MOST_RATIO = 1 << 30, 1 << 28, 10_000
+#: the largest coded pieces, as many as are unpacked to see how much they hold
+LARGEST_PIECES = 64
 
 
-def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> bool:
-    """Check that samples can be digital numbers: unsigned, or declared unsigned by ``input.dtype``.
+def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> int | None:
+    """Check that samples can be digital numbers: unsigned, or signed as the settings say.
 
     Args:
         path: the file, for the message.
@@ -27,7 +30,7 @@ def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> 
         settings: the section ``input``; its ``dtype`` names the unsigned type that is meant.
 
     Returns:
-        Whether the samples are signed, to be checked for negative values on reading.
+        What is to be added to signed samples, DN; None for unsigned ones.
 
     Raises:
         InputError: float, complex, boolean, object, 64-bit or undeclared signed samples, or ``input.dtype``
@@ -39,13 +42,21 @@ def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> 
             raise InputError(
                 f"{path}: has {dtype.name} samples, input.dtype says {wanted}; correct input.dtype"
             )
-        return False
+        if settings.offset is not None:
+            raise InputError(f"{path}: has unsigned samples ({dtype.name}); remove input.offset (--offset)")
+        return None
     if dtype.kind == "i" and dtype.itemsize in (1, 2, 4):
-        unsigned = f"uint{8 * dtype.itemsize}"
-        if wanted == unsigned:
-            return True
+        unsigned, top = f"uint{8 * dtype.itemsize}", 1 << (8 * dtype.itemsize - 1)
+        if wanted not in (None, unsigned) or (settings.offset or 0) > top:
+            raise InputError(
+                f"{path}: has {dtype.name} samples; they are read as {unsigned}, with an offset of at most "
+                f"{top} DN; correct input.dtype or input.offset"
+            )
+        if settings.offset is not None or wanted is not None:
+            return settings.offset or 0
         raise InputError(
-            f"{path}: signed samples ({dtype.name}); if they are never negative, set input.dtype: {unsigned}"
+            f"{path}: signed samples ({dtype.name}); if they are never negative, set input.dtype: {unsigned} "
+            f"(--dtype {unsigned}); if 0 DN is stored as -{top}, set input.offset: {top} (--offset {top})"
         )
     if dtype.kind in "fc":
         raise InputError(
@@ -109,6 +120,55 @@ def check_coded(
         raise InputError(
             f"{path}: damaged header: pieces of {' x '.join(map(str, piece))} samples; copy the file again"
         )
+
+
+def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int, codecs: str = "gzip") -> None:
+    """Check that coded pieces hold no more than their shape says, before the library unpacks them whole.
+
+    Args:
+        path: the file, for the message.
+        pieces: coded bytes.
+        expected: bytes of a piece by shape and type.
+        codecs: names of those that may be in use; gzip and zlib are unpacked, the headers of others read.
+
+    Raises:
+        InputError: one holds more.
+    """
+    for data in pieces:
+        found = 0
+        if "blosc" in codecs:
+            found = int.from_bytes(data[4:8], "little")
+        elif "zstd" in codecs and data[:4] == b"\x28\xb5\x2f\xfd":
+            found = _zstd_size(data)
+        elif "gzip" in codecs or "zlib" in codecs:
+            found = _inflated(data, expected)
+        if found > expected:
+            raise InputError(
+                f"{path}: damaged: a piece of {len(data)} bytes unpacks to more than the {expected} of its "
+                "shape; copy it again"
+            )
+
+
+def _zstd_size(data: bytes) -> int:
+    """Return the bytes that the header of a zstd frame declares (RFC 8878, 3.1.1.1); 0 where it does not."""
+    flags = data[4]
+    single = flags >> 5 & 1
+    length = (single, 2, 4, 8)[flags >> 6]
+    start = 6 - single + (0, 1, 2, 4)[flags & 3]
+    return int.from_bytes(data[start : start + length], "little") + (256 if length == 2 else 0)
+
+
+def _inflated(data: bytes, most: int) -> int:
+    """Return the bytes that gzip or zlib data hold, or one more than ``most``."""
+    found = 0
+    while data and found <= most:
+        unpack = zlib.decompressobj(wbits=47)  # gzip or zlib
+        try:
+            found += len(unpack.decompress(data, most + 1 - found))
+        except zlib.error:
+            break  # it is told where the frames are read
+        data = unpack.unused_data
+    return found
 
 
 def full_window(full: tuple[int, ...], t0: int, t1: int, y0: int, y1: int) -> tuple[Any, ...]:

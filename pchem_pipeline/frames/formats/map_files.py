@@ -128,6 +128,8 @@ def read_image(path: Path) -> NDArray[np.float64]:
     kind = kinds.get(path.suffix.lower())
     if kind is None:
         raise InputError(f"{path}: an image is read from .npy, .tif or .fits")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: no regular file")
     try:
         values = np.squeeze(np.asarray(kind(path), np.float64))
     except FileNotFoundError as error:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
+from pchem_pipeline.frames.reader import sound
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -29,28 +30,18 @@ class NpyReader(ContiguousReader):
     @classmethod
     def open(cls, path: Path, settings: InputSettings) -> Self:
         """See `FrameReader.open`."""
-        try:
-            with path.open("rb") as stream:
-                version = npy_format.read_magic(stream)
-                read = (
-                    npy_format.read_array_header_1_0
-                    if version == (1, 0)
-                    else npy_format.read_array_header_2_0
-                )
-                shape, fortran, dtype = read(stream)
-                start, size = stream.tell(), path.stat().st_size
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-        except Exception as error:  # a damaged header can break the parser of Python's literals anywhere
-            raise InputError(
-                f"{path}: not a sound npy file, or truncated; write it again by numpy.save"
-            ) from error
+        with sound(path, "npy file"), path.open("rb") as stream:
+            version = npy_format.read_magic(stream)
+            old = version == (1, 0)
+            read = npy_format.read_array_header_1_0 if old else npy_format.read_array_header_2_0
+            shape, fortran, dtype = read(stream)
+            start, size = stream.tell(), path.stat().st_size
         if dtype.hasobject:
             raise InputError(
                 f"{path}: an object array, whose pickle is never opened; save a plain array of uint8, "
                 "uint16 or uint32"
             )
-        signed = check_samples(path, dtype, settings)
+        offset = check_samples(path, dtype, settings)
         n, rows, columns = stack_shape(path, shape)
         if fortran and n * rows > 1 and n * columns > 1 and rows * columns > 1:
             raise InputError(
@@ -58,7 +49,7 @@ class NpyReader(ContiguousReader):
             )
         offsets = even_offsets(path, n, rows * columns * dtype.itemsize, size, start=start)
         reader = cls()
-        reader.set_layout(path, Layout(offsets, rows, columns, dtype, signed=signed), size)
+        reader.set_layout(path, Layout(offsets, rows, columns, dtype, offset), size)
         behind = size - max(start, reader._layout.end)
         if behind:
             reader.notes = (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import heapq
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,16 +15,27 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.choice import choose_dataset
-from pchem_pipeline.frames.formats.contiguous import unsigned_type
-from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, full_window, stack_shape
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, unsigned_type
+from pchem_pipeline.frames.formats.kinds import (
+    LARGEST_PIECES,
+    check_coded,
+    check_samples,
+    check_unpacked_size,
+    full_window,
+    stack_shape,
+)
 from pchem_pipeline.frames.identity import file_size
-from pchem_pipeline.frames.reader import FrameReader, changed, check_window
+from pchem_pipeline.frames.reader import changed, sound, unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import link_out_of, whole_file
 
+#: folders within each other, and chunks of a shard
+_DEEPEST, _MOST_IN_A_SHARD = 64, 1 << 16
+_DESCRIBED = ("zarr.json", ".zarray", ".zattrs", ".zgroup", ".zmetadata")
 
-class ZarrReader(FrameReader):
+
+class ZarrReader(ContiguousReader):
     """A zarr array, the only stack of a zarr group, or the full resolution of an OME-Zarr image."""
 
     format_name = "zarr"
@@ -37,12 +50,8 @@ class ZarrReader(FrameReader):
     def open(cls, path: Path, settings: InputSettings) -> Self:
         """See `FrameReader.open`."""
         reader = cls()
-        try:
+        with sound(path, "zarr store"):
             reader._inspect(path, settings)
-        except InputError:
-            raise
-        except Exception as error:  # damaged metadata can break the library anywhere
-            raise InputError(f"{path}: not a sound zarr store ({error}); copy it again") from error
         return reader
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:
@@ -52,6 +61,11 @@ class ZarrReader(FrameReader):
 
         if link := link_out_of(path):
             raise InputError(f"{path}: {link} is a link out of the store; copy its files into it")
+        parts = [*path.rglob("*")]
+        if special := next((part for part in parts if not (part.is_file() or part.is_dir())), None):
+            raise InputError(f"{path}: {special.relative_to(path)} is no regular file; copy the store again")
+        if max((len(part.relative_to(path).parts) for part in parts), default=0) > _DEEPEST:
+            raise InputError(f"{path}: groups more than {_DEEPEST} deep; copy the array out of them")
         node = zarr.open(path, mode="r")
         if isinstance(node, zarr.Array):
             array: Any = node
@@ -67,7 +81,7 @@ class ZarrReader(FrameReader):
                 f"{path}: {self._name or 'the array'} is coded by {', '.join(foreign)}, which may run code; "
                 "write it again with blosc, gzip or zstd"
             )
-        self._signed = check_samples(path, np.dtype(array.dtype), settings)
+        self._offset = check_samples(path, np.dtype(array.dtype), settings)
         self.paths = (path,)
         self.shape = stack_shape(path, array.shape, f"array {self._name}".strip())
         self.dtype = unsigned_type(np.dtype(array.dtype))
@@ -77,25 +91,15 @@ class ZarrReader(FrameReader):
         piece = getattr(array, "shards", None) or array.chunks
         check_coded(path, self.shape, piece, self.dtype.itemsize, file_size(path))
         self.take_facts(facts_from_names(attributes))
-        self.notes = _channel_notes(path, _axes(node), self._full)
+        missing = _check_chunks(path, path / self._name, array, parts)
+        self.unwritten = bool(missing)
+        self.notes = _channel_notes(path, _axes(node), self._full) + missing
 
-    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
-        """See `FrameReader.read_into`."""
-        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
-        if buffer.size == 0:
-            return
-        path = self.paths[0]
-        if not path.exists():  # missing chunks would read as the fill value
-            raise changed(path, "the store vanished")
-        try:
-            values = np.asarray(self._array[full_window(self._full, t0, t1, y0, y1)])
-        except Exception as error:
-            raise InputError(f"{path}: {self._name} has a damaged chunk ({error}); copy it again") from error
-        if self._signed and int(values.min()) < 0:
-            raise InputError(
-                f"{path}: signed samples with negative values; counts of an ADC must be 0 or more"
-            )
-        buffer[...] = values.reshape(buffer.shape)
+    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
+        """See `ContiguousReader.decode_into`."""
+        if not self.paths[0].exists():  # missing chunks would read as the fill value
+            raise changed(self.paths[0], "the store vanished")
+        buffer[...] = np.asarray(self._array[full_window(self._full, t0, t1, y0, y1)]).reshape(buffer.shape)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the array, which holds the event loop's locks; it is opened again."""
@@ -110,6 +114,26 @@ class ZarrReader(FrameReader):
             self._array = node[self._name] if self._name else node
         except Exception as error:
             raise changed(self.paths[0], "the store vanished or broke") from error
+
+
+def _check_chunks(path: Path, folder: Path, array: Any, parts: Sequence[Path]) -> tuple[str, ...]:
+    """Refuse chunks that hold more than their shape; say how many are missing, and read as the fill value.
+
+    Not by ``nchunks_initialized`` of the library, whose time grows as the square of their number.
+    """
+    shards, size = getattr(array, "shards", None), math.prod(array.chunks)
+    files = [p for p in parts if folder in p.parents and p.is_file() and p.name not in _DESCRIBED]
+    if shards is None:
+        record = array.metadata.to_dict()
+        some = heapq.nlargest(LARGEST_PIECES, files, lambda part: part.stat().st_size)
+        codecs = str(record.get("codecs", record.get("compressor")))
+        expected = 4 * size * array.dtype.itemsize
+        check_unpacked_size(path, (part.read_bytes() for part in some), expected, codecs)
+    elif math.prod(shards) > _MOST_IN_A_SHARD * size:
+        raise InputError(f"{path}: shards of more than {_MOST_IN_A_SHARD} chunks; write larger chunks")
+    pairs = zip(array.shape, shards or array.chunks, strict=True)
+    wanted = math.prod(-(-length // piece) for length, piece in pairs)
+    return unwritten_notes(path, wanted - len(files), wanted)
 
 
 def _full_resolution(group: Any, settings: InputSettings) -> str | None:

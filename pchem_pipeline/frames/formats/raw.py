@@ -1,10 +1,9 @@
 """Raw binary frames, described by a sidecar file or by the settings.
 
 The sidecar lies beside ``frames.raw`` as ``frames.raw.json`` (or ``frames.json``, ``.yaml``, ``.yml``) with
-the keys
-``shape`` ([rows, columns] or [frames, rows, columns]), ``dtype``, ``byte_order``, ``header_bytes``,
-``frame_padding_bytes``, ``bit_shift``,
-``bit_depth``, ``integration_time`` (s). Other keys are left alone.
+the keys ``shape`` ([rows, columns] or [frames, rows, columns]), ``dtype``, ``offset``, ``byte_order``,
+``header_bytes``, ``frame_padding_bytes``, ``bit_shift``, ``bit_depth``, ``integration_time`` (s). Other keys
+are left alone, but for those of the camera.
 """
 
 from __future__ import annotations
@@ -21,28 +20,27 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
+from pchem_pipeline.frames.formats.kinds import check_samples
+from pchem_pipeline.frames.reader import sound
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 
 class _Sidecar(BaseModel):
-    """What a sidecar can say."""
+    """What a sidecar can say of the layout; other keys may be facts of the camera."""
 
-    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
     shape: tuple[int, ...] | None = None
-    dtype: Literal["uint8", "uint16", "uint32"] | None = None
+    dtype: Literal["uint8", "uint16", "uint32", "int16", "int32"] | None = None
+    offset: int | None = None
     byte_order: Literal["little", "big"] | None = None
     header_bytes: int | None = None
     frame_padding_bytes: int | None = None
     bit_shift: int | None = None
     bit_depth: int | None = None
     integration_time: float | None = None
-    camera: str | None = None
-    serial_number: str | None = None
-    sensor_temperature: float | None = None
-    start_time: str | None = None
 
 
 def find_sidecar(path: Path) -> Path | None:
@@ -101,8 +99,9 @@ class RawReader(ContiguousReader):
             )
         reader = cls()
         reader.bit_shift = facts["bit_shift"] or 0
-        reader.take_facts(facts_from_names({**side.model_dump(), **facts}))
-        reader._lay_out(path, facts)
+        reader.take_facts(facts_from_names({**side.model_dump(), "bit_depth": facts["bit_depth"]}))
+        with sound(path, "raw file"):
+            reader._lay_out(path, facts)
         return reader
 
     def _lay_out(self, path: Path, facts: dict[str, Any]) -> None:
@@ -112,12 +111,16 @@ class RawReader(ContiguousReader):
                 f"{path}: shape {list(shape)}, header_bytes {header}, frame_padding_bytes {padding} make no "
                 "sense; shape is [rows, columns] or [frames, rows, columns]; correct the sidecar"
             )
-        order = ">" if facts["byte_order"] == "big" else "<"
-        stored = np.dtype(facts["dtype"]).newbyteorder(order)
+        self.byte_order = facts["byte_order"] or "little"
+        stored = np.dtype(facts["dtype"])
+        if facts["offset"] is not None:
+            stored = np.dtype(f"i{stored.itemsize}")
+        offset = check_samples(path, stored, InputSettings(offset=facts["offset"]))
+        stored = stored.newbyteorder(self.byte_order)
         rows, columns = shape[-2:]
         frame = rows * columns * stored.itemsize
         step = frame + padding
-        size = _size(path)
+        size = path.stat().st_size
         whole, rest = divmod(size - header, step) if size >= header else (0, size)
         if rest == frame:  # the padding of the last frame may be missing
             whole, rest = whole + 1, 0
@@ -132,14 +135,7 @@ class RawReader(ContiguousReader):
         if n < whole:
             self.notes = (f"{path.name} holds {whole} frames, of which the first {n} are used (shape)",)
         offsets = even_offsets(path, n, frame, size, start=header, step=step)
-        self.set_layout(path, Layout(offsets, rows, columns, stored), size)
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+        self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
 
 
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import CameraFacts, text_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
+from pchem_pipeline.frames.reader import sound
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -38,12 +39,8 @@ class SerReader(ContiguousReader):
     @classmethod
     def open(cls, path: Path, settings: InputSettings) -> Self:
         """See `FrameReader.open`."""
-        try:
-            with path.open("rb") as stream:
-                head = stream.read(_HEADER.size)
-            size = path.stat().st_size
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+        with sound(path, "SER file"), path.open("rb") as stream:
+            head, size = stream.read(_HEADER.size), path.stat().st_size
         if len(head) < _HEADER.size or not head.startswith(_MAGIC):
             raise InputError(f"{path}: truncated, or not SER video; copy the file again")
         _, _, colour, flag, columns, rows, depth, n, _, instrument, _, _, ticks = _HEADER.unpack(head)
@@ -57,11 +54,11 @@ class SerReader(ContiguousReader):
                 f"{path}: damaged header ({n} frames, {rows} x {columns}, {depth} bits); copy it again"
             )
         order = settings.byte_order or ("big" if flag else "little")
-        stored = np.dtype("u1" if depth <= 8 else (">u2" if order == "big" else "<u2"))
+        stored = np.dtype("u1" if depth <= 8 else "u2").newbyteorder(order)
         offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=_HEADER.size)
         reader = cls()
         reader.set_layout(path, Layout(offsets, rows, columns, stored), size)
-        reader.bit_depth = depth
+        reader.bit_depth, reader.byte_order = depth, order
         reader._read_times()
         taken = _seconds(ticks) if reader.timestamps is None else float(reader.timestamps[0])
         reader.camera = CameraFacts(text_of(instrument), taken=taken)

@@ -26,7 +26,6 @@ from pchem_pipeline.frames.formats.contiguous import (
     OpenedFile,
     even_offsets,
     unsigned_type,
-    unstore,
 )
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples
 from pchem_pipeline.frames.formats.tiff_facts import (
@@ -35,7 +34,7 @@ from pchem_pipeline.frames.formats.tiff_facts import (
     stated_channels,
     stated_facts,
 )
-from pchem_pipeline.frames.reader import check_window
+from pchem_pipeline.frames.reader import sound, unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -82,19 +81,11 @@ class TiffReader(ContiguousReader):
         reader = cls()
         reader._guard = threading.Lock()
         reader._decoders = {}
-        try:
+        with sound(path, "TIFF file"):
             size = path.stat().st_size
             check_chain(path, size)
             with tifffile.TiffFile(path) as file:
                 reader._inspect(path, file, size, settings)
-        except InputError:
-            raise
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the file") from error
-        except Exception as error:  # a damaged file can break the parser anywhere
-            raise InputError(
-                f"{path}: not a sound TIFF file, or truncated ({error}); copy it again"
-            ) from error
         return reader
 
     _guard: threading.Lock
@@ -108,7 +99,7 @@ class TiffReader(ContiguousReader):
         notes = [f"{path.name}: {reduced} reduced pages (previews) are left out"] if reduced else []
         first = pages[0]
         _check_pages(path, pages)
-        signed = check_samples(path, np.dtype(first.dtype), settings)
+        offset = check_samples(path, np.dtype(first.dtype), settings)
         count = len(pages) if len(pages) > 1 else images_behind_one_page(file)
         notes += _channel_notes(path, *stated_channels(file), count) + _value_notes(path, pages)
         self.notes = tuple(notes)
@@ -116,12 +107,12 @@ class TiffReader(ContiguousReader):
         offsets = _contiguous_offsets(path, file, pages, size)
         rows, columns = first.shape[-2:]
         if offsets is not None:
-            self.set_layout(path, Layout(offsets, rows, columns, stored, signed=signed), size)
+            self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
         else:
-            self._set_segments(path, pages, size, signed)
+            self._set_segments(path, pages, size, offset)
         self.take_facts(stated_facts(file, first))
 
-    def _set_segments(self, path: Path, pages: Sequence[Any], size: int, signed: bool) -> None:
+    def _set_segments(self, path: Path, pages: Sequence[Any], size: int, offset: int | None) -> None:
         """Remember where the coded strips or tiles of each page are."""
         most = max(len(page.dataoffsets) for page in pages)
         offsets = np.zeros((len(pages), most), np.int64)
@@ -150,23 +141,15 @@ class TiffReader(ContiguousReader):
         self.shape = (len(pages), rows, columns)
         self.dtype = unsigned_type(np.dtype(first.dtype))
         self._size = size
-        self._signed = signed
+        self._offset = offset
         self.rows_per_read = min(rows, int(height.max()))
         self._segments = _Segments(offsets, counts, model, -(-columns // width), height)
 
-    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
-        """See `FrameReader.read_into`."""
-        if self._segments is None:
-            super().read_into(buffer, t0, t1, y0, y1)
-            return
-        y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
-        if buffer.size == 0:
-            return
+    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
+        """See `ContiguousReader.decode_into`."""
         with OpenedFile(self.paths[0], self._size) as file:
             for t in range(t0, t1):
                 self._decode(file, buffer[t - t0], t, y0, y1)
-        if self._signed:
-            unstore(buffer, self.dtype, biased=False, signed=True, path=self.paths[0])
 
     def _decode(self, file: OpenedFile, frame: NDArray[Any], t: int, y0: int, y1: int) -> None:
         """Decode the segments of page t that touch rows y0..y1 into ``frame``."""
@@ -259,13 +242,8 @@ def _value_notes(path: Path, pages: Sequence[Any]) -> list[str]:
             f"{path.name}: {', '.join(sorted(lossy))} coding can lose information; noise and histograms "
             "may no longer be those of the camera"
         )
-    unwritten = sum(page.databytecounts.count(0) for page in pages)
-    if unwritten:
-        total = sum(len(page.databytecounts) for page in pages)
-        notes.append(
-            f"{path.name}: {unwritten} of {total} strips or tiles were never written; they are read as "
-            f"{pages[0].nodata}"
-        )
+    counts = [count for page in pages for count in page.databytecounts]
+    notes += unwritten_notes(path, counts.count(0), len(counts), "strips or tiles")
     if getattr(pages[0].photometric, "name", "") == "MINISWHITE":
         notes.append(
             f"{path.name}: its tags call 0 white; samples are read as stored: if more light makes them "

@@ -13,11 +13,13 @@ from typing import Any, Literal, NamedTuple
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
     CameraFacts,
+    Duration,
     StatedFacts,
     bits_of,
     celsius,
     duration_of,
     facts_from_names,
+    first_duration,
     first_of,
     seconds_of,
     text_of,
@@ -36,6 +38,7 @@ class _Kind(NamedTuple):
 _CLASSIC, _BIG = _Kind(2, 12, 4, 4), _Kind(8, 20, 8, 8)
 #: tags of a directory, as in tifffile
 _MOST_TAGS = 4096
+_MOST_PAGES = 100_000
 _EXPOSURE_TAG, _EXIF_TAG = 33434, 34665
 _MICRO_MANAGER_TAG = 51123
 _STK_PLANES_TAG = 33629
@@ -58,6 +61,10 @@ def check_chain(path: Path, size: int) -> None:
         following = int.from_bytes(head[kind.first : kind.first + kind.pointer], order)
         seen: set[int] = set()
         while following:
+            if len(seen) > _MOST_PAGES:
+                raise InputError(
+                    f"{path}: more than {_MOST_PAGES} pages; write several files, or an npy array"
+                )
             if following in seen:
                 raise InputError(
                     f"{path}: damaged: after {len(seen)} pages the chain of pages runs in a circle; copy it "
@@ -139,21 +146,22 @@ def stated_facts(file: Any, page: Any) -> StatedFacts:
         CameraFacts(_make_and_model(page), taken=seconds_of(_tag(page, _DATE_TAG))),
     )
     times = (
-        own.integration_time,
+        own.duration,
         _ome_time(_ome(file)),
         _ratio(_tag(page, _EXPOSURE_TAG)),
         _ratio(exif.get("ExposureTime")) if isinstance(exif := _tag(page, _EXIF_TAG), dict) else None,
-        duration_of(record.get("Exposure-ms"), "ms"),
+        duration_of("Exposure-ms", record.get("Exposure-ms"), "ms"),
     )
     depths = (_ome_depth(_ome(file)), own.bit_depth, _odd_depth(page.bitspersample))
     names = [each.name for each in fields(CameraFacts)]
     camera = CameraFacts(*(first_of(getattr(each, name) for each in cameras) for name in names))
-    return StatedFacts(camera, first_of(times), first_of(depths))
+    return StatedFacts(camera, first_duration(times), first_of(depths))
 
 
-def _ome_time(text: str) -> float | None:
+def _ome_time(text: str) -> Duration | None:
     plane = re.search(r'<[^<>]*\sExposureTime="[^<>]*>', text)
-    return duration_of(_attribute(plane, "ExposureTime"), _attribute(plane, "ExposureTimeUnit"))
+    unit = _attribute(plane, "ExposureTimeUnit") or "s"  # as OME has it
+    return duration_of("ExposureTime of OME", _attribute(plane, "ExposureTime"), unit)
 
 
 def _ome_depth(text: str) -> int | None:
@@ -166,8 +174,9 @@ def _odd_depth(bits: Any) -> int | None:
     return None if bits in (8, 16, 32) else bits_of(bits)
 
 
-def _ratio(value: Any) -> float | None:
-    return duration_of(value[0] / value[1]) if isinstance(value, tuple) and value[1] else None
+def _ratio(value: Any) -> Duration | None:
+    known = isinstance(value, tuple) and value[1]
+    return duration_of("ExposureTime of EXIF", value[0] / value[1], "s") if known else None
 
 
 def _ome_camera(text: str) -> CameraFacts:

@@ -219,6 +219,9 @@ class _Batch:
     ) -> None:
         together = np.concatenate(samples, axis=1) if len(samples) > 1 else samples[0]
         counts = kernel_counts(together)
+        outside = sum(np.ravel(each).astype(np.int64) for each in (under, over) if each is not None)
+        if (lost := outside > counts.sum(axis=1)).any():  # what little is inside is no law of the pixel
+            counts = np.where(lost[:, None], counts.dtype.type(0), counts)
         self.given = Histograms(
             counts,
             np.concatenate([[0], np.cumsum([sample.shape[1] for sample in samples])]).astype(np.int64),
@@ -228,10 +231,7 @@ class _Batch:
         )
         self.n, self.n_samples = counts.shape[0], len(samples)
         self.settings, self.adc_limits = settings, adc_limits
-        self.outside, self.by_cells = np.zeros(self.n, np.bool_), np.zeros(self.n, np.bool_)
-        for each in (under, over):
-            if each is not None:
-                self.outside |= np.ravel(each) > 0
+        self.outside, self.by_cells = np.zeros(self.n, np.bool_) | (outside > 0), np.zeros(self.n, np.bool_)
 
     # -- the two fits
 

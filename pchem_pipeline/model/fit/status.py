@@ -32,6 +32,7 @@ class FitStatus(IntFlag):
     GAIN_AMBIGUOUS = 4096
     BIAS_UNSURE = 8192
     NOT_FITTED = 16384
+    EXCLUDED = 32768
 
 
 #: Bits for which the parameters of the pixel are NaN.
@@ -42,6 +43,7 @@ FAILED = (
     | FitStatus.GAIN_NOT_IDENTIFIED
     | FitStatus.EXPOSURE_AT_BOUND
     | FitStatus.NOT_FITTED
+    | FitStatus.EXCLUDED
 )
 
 #: Bits of pixels with a rival maximum that is nearly as likely.
@@ -99,7 +101,7 @@ def moves_gain(exposure: NDArray[np.float64], noise: NDArray[np.float64]) -> NDA
 
 #: A sentence for every bit.
 MEANINGS: dict[FitStatus, str] = {
-    FitStatus.NO_DATA: "no frame inside the histogram window",
+    FitStatus.NO_DATA: "too few frames inside the histogram window",
     FitStatus.TOO_FEW_BINS: "fewer than 3 occupied bins",
     FitStatus.NOT_FITTED: "not fitted: the tile failed or was not chosen",
     FitStatus.NOT_CONVERGED: "the fit did not converge",
@@ -115,6 +117,7 @@ MEANINGS: dict[FitStatus, str] = {
     FitStatus.BIAS_UNSURE: "bias clear by chance only: an electron off is as likely in pixels like this one",
     FitStatus.WEAKLY_IDENTIFIED: "too few frames at this sensor's read noise: the bias is clear by chance "
     "only, or the standard errors are rough",
+    FitStatus.EXCLUDED: "excluded by input.mask, or by the camera's marker",
 }
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.maps import hot_pixels
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.style.wording import percent, short
@@ -59,7 +60,7 @@ def _failed(data: ReportData) -> _Found:
     if status is None:
         return None
     failed = ((status & data.failed_mask) != 0) | data.unfitted
-    return float(failed.mean()), f"{data.noun}s without a value"
+    return float(failed[(status & int(FitStatus.EXCLUDED)) == 0].mean()), f"{data.noun}s without a value"
 
 
 def _flagged(data: ReportData) -> _Found:

@@ -11,7 +11,7 @@ import numpy as np
 
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.model.checks.map_parts import Parts
-from pchem_pipeline.model.fit.status import FLAGGED, flags_of
+from pchem_pipeline.model.fit.status import FLAGGED, FitStatus, flags_of
 from pchem_pipeline.model.maps.maps import MapSummary
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.maps import status_counts
@@ -83,8 +83,9 @@ def pixel_counts(data: ReportData) -> PixelCounts:
     if status is None:
         total = int(np.prod(data.shape))
         return PixelCounts(total, total, 0)
-    failed = ((status & data.failed_mask) != 0) | data.unfitted
-    return PixelCounts(int(status.size), int(failed.sum()), int(((status != 0) & ~failed).sum()))
+    wanted = (status & int(FitStatus.EXCLUDED)) == 0
+    failed = (((status & data.failed_mask) != 0) | data.unfitted) & wanted
+    return PixelCounts(int(wanted.sum()), int(failed.sum()), int(((status != 0) & ~failed & wanted).sum()))
 
 
 def summaries(data: ReportData) -> dict[str, MapSummary]:

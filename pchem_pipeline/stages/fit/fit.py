@@ -18,11 +18,11 @@ from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_roundin
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.excluding_codes import Interval
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.fit.status import FAILED
+from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.run.model_versions import ModelVersion, read_added_exposure
 from pchem_pipeline.run.progress import parts_told
 from pchem_pipeline.run.stage import StageContext, open_store
-from pchem_pipeline.stages.fit.arrays import create_fit_maps
+from pchem_pipeline.stages.fit.arrays import create_fit_maps, leave_out_excluded
 from pchem_pipeline.stages.fit.code_sums import CodeSums
 from pchem_pipeline.stages.fit.fitted_model import pixel_places
 from pchem_pipeline.stages.fit.model_fit import fit_arrays, fit_model
@@ -152,12 +152,13 @@ def _do_tile(
         for name, values in found.items():
             whole = arrays.setdefault(name, np.empty(tile.shape + values.shape[2:], values.dtype))
             whole[part] = values
+    leave_out_excluded(arrays, "fit_status", [run_store], tile.region)
     for name, array in arrays.items():
         run_store.write(f"fit/{name}", tile.region, array)
     words = arrays["fit_status"]
     summary: dict[str, Any] = {
         "pixels": int(words.size),
-        "failed": int(np.count_nonzero(words & np.uint16(int(FAILED)))),
+        "failed": int(np.count_nonzero(words & np.uint16(int(FAILED & ~FitStatus.EXCLUDED)))),
         "codes": codes.content(),
     }
     if settings.likelihood == "density" and not effects:

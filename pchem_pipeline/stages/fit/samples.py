@@ -23,7 +23,7 @@ from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.run.progress import parts_told
 from pchem_pipeline.run.stage import StageContext, open_store
-from pchem_pipeline.stages.fit.arrays import create_fit_maps
+from pchem_pipeline.stages.fit.arrays import create_fit_maps, first_is_sample, leave_out_excluded
 from pchem_pipeline.stages.fit.fitted_model import pixel_places
 from pchem_pipeline.stages.fit.model_fit import fit_arrays, fit_model
 from pchem_pipeline.stages.samples import sample_targets
@@ -142,28 +142,24 @@ def _compile(how: SampleFit) -> None:
 
 def _do_tile(tile: Tile, *, store: Path, stores: Sequence[Path], how: SampleFit) -> dict[str, Any]:
     """Fit one tile; the summary counts its pixels."""
-    histograms = []
-    for path in stores:
-        sample = RunStore.open(path)
-        histograms.append({name: sample.read(f"histogram/{name}", tile.region) for name in _HISTOGRAM})
+    runs = [RunStore.open(path) for path in stores]
+    histograms = [
+        {name: sample.read(f"histogram/{name}", tile.region) for name in _HISTOGRAM} for sample in runs
+    ]
     target = open_store(store)
     arrays: dict[str, NDArray[Any]] = {}
     for part in parts_told(tile.parts()):
         some = [{name: values[part] for name, values in each.items()} for each in histograms]
         found = fit_samples_tile(some, how, pixel_places(target, tile.within(part)))
         for name, values in found.items():
-            lead = values.shape[:1] if _by_sample(name) else ()
+            lead = values.shape[:1] if first_is_sample(name) else ()
             rest = values.shape[len(lead) + 2 :]
             whole = arrays.setdefault(name, np.empty((*lead, *tile.shape, *rest), values.dtype))
             whole[(slice(None), *part) if lead else part] = values
+    leave_out_excluded(arrays, "fit/fit_status", runs, tile.region)
     for name, values in arrays.items():
-        target.write(name, (slice(None), *tile.region) if _by_sample(name) else tile.region, values)
+        target.write(name, (slice(None), *tile.region) if first_is_sample(name) else tile.region, values)
     words = arrays["fit/fit_status"]
-    bits = {"failed": int(FAILED), "poor": int(FitStatus.POOR_FIT)}
+    bits = {"failed": int(FAILED & ~FitStatus.EXCLUDED), "poor": int(FitStatus.POOR_FIT)}
     counts = {name: int(np.count_nonzero(words & np.uint16(bit))) for name, bit in bits.items()}
     return {"pixels": int(words.size), **counts}
-
-
-def _by_sample(name: str) -> bool:
-    """Tell whether the first dimension of an array is the sample."""
-    return name.startswith("samples/") and name != "samples/covariance"

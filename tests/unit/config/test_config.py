@@ -124,8 +124,8 @@ def bomb(start):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("input: " + "[" * 5000, "too deep to read"),
-        ("input: " + "{a: " * 5000, "too deep to read"),
+        ("input: " + "[" * 5000, "not valid YAML"),
+        ("input: " + "{a: " * 5000, "not valid YAML"),
         (bomb("input: {files: *j}"), "write the settings out"),
         ("run: &a {store: *a}", "write the settings out"),
         ("input: !!python/object/apply:os.mkdir [trace]", "not valid YAML"),
@@ -134,6 +134,11 @@ def bomb(start):
         ("nothing: 1\nrun: {store: '" + "µ日本" * 100_000 + "'}", "nothing: unknown key"),
         ("run: {" + ", ".join(f"k{i}: 1" for i in range(500)) + "}", "and 480 more"),
         ("run: {tile: [" + "x, " * 50_000 + "]}", "run.tile"),
+        ("? [1, 2]\n: x", "a key is a list or a mapping"),
+        ("run: {tile: 0x" + "f" * 5000 + "}", "a number of 5002 digits"),
+        ('run: {store: "a\\0b"}', "a text that can be no name"),
+        ("\n".join(f"k{i}: 1" for i in range(300_000)), "a section of 300000 keys"),
+        ("input: {files: [a], integration_time: 1.0e-300}", "integration_time must be at least 1e-12 s"),
         ('run: {"\\e[31m": 1}', "run.\\x1b[31m: unknown key"),
     ],
 )

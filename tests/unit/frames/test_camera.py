@@ -218,10 +218,53 @@ def test_hostile_texts_become_one_short_line() -> None:
         (True, "s", None),
         ([1.0, 2.0], "s", None),
         (None, "s", None),
+        ("100 ms", None, 0.1),
+        (100, "exposure time in ms", 0.1),
+        (100, "EXPTIME (msec.)", 0.1),
+        (100, "[\u03bcs] shutter open", 1e-4),
+        (100, "Exposure time, milliseconds", 0.1),
+        (100, "exposure (shutter) time in seconds", 100.0),
+        (100, "exposure time of the second frame", 100.0),
+        (100, "exposure time in the dark mode", 100.0),
+        (100, "exposure time in ticks", None),
+        (100, "[lines] exposure time", None),
+        (100, "[s] exposure time in ms", None),
+        (100, "exposure in units of 10 us", None),
     ],
 )
 def test_durations(value: Any, unit: Any, seconds: float | None) -> None:
-    assert duration_of(value, unit) == (None if seconds is None else pytest.approx(seconds))
+    comment = unit if isinstance(unit, str) and " " in unit else ""
+    found = duration_of("exposure", value, None if comment else unit, comment=comment)
+    assert (found and found.seconds) == (None if seconds is None else pytest.approx(seconds))
+
+
+def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path: Path) -> None:
+    image = fits.PrimaryHDU(STACK)
+    cards = {"plain": {}, "unit": {"TIMEUNIT": "ms"}, "doubt": {"TIMEUNIT": "ms"}}
+    for name, more in cards.items():
+        image.header["EXPTIME"] = (100, "exposure in s" if name == "doubt" else "exposure time")
+        image.header.update(more)
+        image.writeto(tmp_path / f"{name}.fits")
+    attributes = {"exposure_time": 100, "exposure_time_unit": "ms"}
+    zarr.create_array(tmp_path / "a.zarr", data=STACK, attributes=attributes)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["frames"], file["exposure_ms"] = STACK, 100
+    STACK.astype("<u2").tofile(tmp_path / "a.raw")
+    side = {"shape": STACK.shape, "dtype": "uint16", "integration_time": 100, "integration_time_unit": "ms"}
+    (tmp_path / "a.raw.json").write_text(json.dumps(side))
+    seconds = {
+        "plain.fits": 100.0,
+        "unit.fits": 0.1,
+        "doubt.fits": None,
+        "a.zarr": 0.1,
+        "a.h5": 0.1,
+        "a.raw": 0.1,
+    }
+    for name, right in seconds.items():
+        with open_frames(InputSettings(files=(name,)), tmp_path) as stack:
+            assert stack.integration_time == (None if right is None else pytest.approx(right)), name
+            assert name in stack.time_words
+            assert "--integration-time" not in stack.time_words or right is None
 
 
 @pytest.mark.parametrize(
@@ -234,7 +277,7 @@ def test_bits(value: Any, bits: int | None) -> None:
 
 def test_every_format_with_attributes_takes_the_same_names(tmp_path: Path) -> None:
     """HDF5 as a program that stores each number as an array of one; zarr with the unit beside."""
-    frames = np.zeros((2, 3, 4), np.uint16)
+    frames = np.ones((2, 3, 4), np.uint16)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         attributes = file.create_dataset("frames", data=frames).attrs
         attributes["exposure_time"], attributes["exposure_time_units"] = np.array([20.0]), "ms"

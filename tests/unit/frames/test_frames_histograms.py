@@ -190,3 +190,16 @@ def test_measured_spectra() -> None:
         assert 9e6 < total < 2e7
         dn = found.origin[0, i] + np.arange(found.counts.shape[2])
         assert int((dn * found.counts[0, i].astype(np.int64)).sum()) == (table[:, 0] * table[:, 1]).sum()
+
+
+def test_tables_that_are_none(tmp_path: Path) -> None:
+    wide = "DN," + ",".join(f"c{i}" for i in range(1000))
+    cases = {
+        "cell": ("DN,count\n1," + "9" * 131_073, "no table of numbers"),
+        "number": ("DN,count\n1,1_0\n2,5", r"row 2 \(1,1_0\) is not 2 numbers"),
+        "wide": (f"{wide}\n0{',1' * 1000}\n16000000{',1' * 1000}", "span more than 134217728 DN together"),
+    }
+    for name, (text, words) in cases.items():
+        (tmp_path / f"{name}.csv").write_text(text)
+        with pytest.raises(InputError, match=words):
+            read(tmp_path, f"{name}.csv")

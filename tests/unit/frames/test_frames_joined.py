@@ -13,12 +13,14 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+import zarr
 from astropy.io import fits
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from pchem_pipeline.base.errors import ConfigError, ExitCode, InputError
 from pchem_pipeline.frames.identity import hash_file
+from pchem_pipeline.frames.inspect import _gaps
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import natural_key, resolve_files
 from pchem_pipeline.frames.settings import InputSettings
@@ -438,3 +440,103 @@ def test_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         tmp_path,
         r"a\.npy: cannot be read \(Permission denied\)",
     )
+
+
+def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path: Path) -> None:
+    stack = np.random.default_rng(4).integers(100, 4096, (9, 6, 8)).astype(np.uint32)
+    stack[:, 2, 3] = stack[4, 5, 5] = 2**32 - 1
+    np.save(tmp_path / "a.npy", stack)
+    mask = np.zeros((6, 8))
+    mask[4, 1:3] = 1.0, np.nan
+    np.save(tmp_path / "mask.npy", mask)
+    for roi, mask_too in ((None, False), (None, True), ((1, 6, 1, 7), True)):
+        name = "mask.npy" if mask_too else None
+        y0, y1, x0, x1 = roi or (0, 6, 0, 8)
+        excluded = ((stack[0] == 2**32 - 1) | (mask_too * (mask != 0)))[y0:y1, x0:x1]
+        with open_frames(InputSettings(files=("a.npy",), mask=name, roi=roi), tmp_path) as frames:
+            np.testing.assert_array_equal(frames.excluded, excluded)
+            wanted = stack[:, y0:y1, x0:x1]
+            middle = np.quantile(wanted[0][~excluded], 0.5, method="lower")
+            np.testing.assert_array_equal(frames.read(), np.where(excluded, middle, wanted))
+            np.testing.assert_array_equal(
+                frames.read(2, 5, 1, 4), np.where(excluded, middle, wanted)[2:5, 1:4]
+            )
+    for values, words in (
+        (mask[1:], r"mask of shape \(5, 8\)"),
+        (np.ones((6, 8)), "every pixel is excluded"),
+    ):
+        np.save(tmp_path / "mask.npy", values)
+        with pytest.raises(InputError, match=words):
+            open_frames(InputSettings(files=("a.npy",), mask="mask.npy"), tmp_path)
+
+
+@pytest.mark.parametrize("suffix", ["npy", "fits", "zarr", "h5", "tif", "raw"])
+def test_signed_samples_with_an_offset(tmp_path: Path, suffix: str) -> None:
+    stack = np.random.default_rng(4).integers(0, 65536, (9, 6, 8)).astype(np.uint16)
+    stored, path = (stack.astype(np.int32) - 32768).astype(np.int16), tmp_path / f"a.{suffix}"
+    match suffix:
+        case "npy":
+            np.save(path, stored)
+        case "fits":
+            fits.PrimaryHDU(stored).writeto(path)
+        case "zarr":
+            zarr.create_array(path, data=stored)
+        case "h5":
+            with h5py.File(path, "w") as file:
+                file.create_dataset("a", data=stored, chunks=(2, 3, 8), compression="gzip")
+        case "tif":
+            tifffile.imwrite(path, stored, photometric="minisblack", compression="zlib")
+        case "raw":
+            stored.astype("<i2").tofile(path)
+            path.with_suffix(".json").write_text('{"shape": [6, 8], "dtype": "int16"}')
+    with pytest.raises(InputError, match=r"signed samples .*--offset 32768"):
+        open_frames(InputSettings(files=(path.name,)), tmp_path)
+    with open_frames(InputSettings(files=(path.name,), offset=32768), tmp_path) as frames:
+        np.testing.assert_array_equal(frames.read(), stack)
+    frames = open_frames(InputSettings(files=(path.name,), offset=1000), tmp_path)
+    with pytest.raises(InputError, match=r"negative values \(down to -\d+ DN, with the offset of 1000\)"):
+        frames.read()
+    with pytest.raises(InputError, match="offset"):
+        open_frames(InputSettings(files=(path.name,), offset=32769), tmp_path)
+
+
+def test_fits_adds_what_its_header_says(tmp_path: Path) -> None:
+    stack = np.random.default_rng(4).integers(0, 4096, (9, 6, 8)).astype(np.uint16)
+    image = fits.PrimaryHDU((stack.astype(np.int32) - 1000).astype(np.int16))
+    image.header["BZERO"] = 1000
+    image.writeto(tmp_path / "a.fits")
+    with open_frames(InputSettings(files=("a.fits",)), tmp_path) as frames:
+        np.testing.assert_array_equal(frames.read(), stack)
+
+
+def test_files_with_names_that_are_special_and_files_that_are_none(tmp_path: Path) -> None:
+    for name in ("~root.npy", "~x.npy"):
+        np.save(tmp_path / name, STACK)
+        assert open_frames(InputSettings(files=(name,)), tmp_path).paths == (tmp_path / name,)
+    os.mkfifo(tmp_path / "a.npy")
+    refused(InputSettings(files=("a.npy",)), tmp_path, r"a\.npy: no regular file")
+    refused(InputSettings(files=("~x.npy",), mask="a.npy"), tmp_path, r"a\.npy: no regular file")
+    zarr.create_array(tmp_path / "a.zarr", data=STACK, chunks=(6, 17, 19))
+    (tmp_path / "a.zarr/c/1/0/0").unlink()
+    os.mkfifo(tmp_path / "a.zarr/c/1/0/0")
+    refused(InputSettings(files=("a.zarr",)), tmp_path, r"c/1/0/0 is no regular file")
+    latin = os.fsdecode(b"caf\xe9.npy")
+    np.save(tmp_path / latin, STACK)
+    refused(InputSettings(files=(latin,)), tmp_path, r"caf.*\.npy: its name is not in UTF-8; rename it")
+
+
+@pytest.mark.parametrize(
+    ("names", "missing"),
+    [
+        ([f"a_{i:06d}.npy" for i in range(50, 75)], 0),
+        ([f"a_{i:06d}.npy" for i in range(50, 75) if i not in (52, 70)], 2),
+        ([f"a_{i:06d}.npy" for i in range(10, 40) if i != 20], 1),
+        ([f"n7_{i}.npy" for i in (2, 4, 6, 10, 12)], 1),
+        ([f"20260131_12{i // 60:02d}{i % 60:02d}.npy" for i in range(0, 200, 5)], 0),
+        ([f"cam 2026-01-31T12:00:{i:02d}.npy" for i in (1, 2, 3, 7, 8, 9)], 0),
+        ([f"f{1_706_700_000_123 + i}.npy" for i in (0, 97, 199, 295, 400, 602)], 0),
+    ],
+)
+def test_numbers_that_are_missing_and_clocks(names: list[str], missing: int) -> None:
+    notes = _gaps([Path(name) for name in names])
+    assert [note.split(" ")[0] for note in notes] == [str(missing)] * (missing > 0)

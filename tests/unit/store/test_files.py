@@ -95,7 +95,7 @@ def test_no_other_module_puts_files_in_their_place():
         "store/disk.py": None,
         "store/files.py": 1,  # an object
         "store/remote_path.py": None,
-        "store/lease.py": 1,  # an object
+        "store/lock.py": 1,  # an object
         "run/progress.py": 1,
         "base/kernel_cache.py": None,  # compiled kernels, which may be lost
         # into memory

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 from pathlib import Path
 from typing import Any
@@ -213,6 +214,74 @@ def test_hdf5_samples_in_a_raw_file(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         read(tmp_path / "a.h5")
 
 
+def test_hdf5_samples_that_end_too_early_or_are_another_s(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    other = tmp_path / "folder" / "a.h5"
+    other.parent.mkdir()
+    for path, name in (("a.h5", "samples.bin"), (other, str(tmp_path / "samples.bin")), ("fifo.h5", "fifo")):
+        with h5py.File(path, "w") as file:
+            file.create_dataset("frames", STACK.shape, STACK.dtype, external=[(name, 0, STACK.nbytes)])
+    (tmp_path / "samples.bin").write_bytes(STACK.tobytes()[:-1])
+    with pytest.raises(InputError, match=rf"samples.bin, truncated: {STACK.nbytes} bytes"):
+        read(tmp_path / "a.h5")
+    with pytest.raises(InputError, match=r"names /.*/samples.bin as its source, .* not beside or below"):
+        read(other)
+    os.mkfifo(tmp_path / "fifo")
+    with pytest.raises(InputError, match=r"names /.*/fifo as its source, which is no regular file"):
+        read(tmp_path / "fifo.h5")
+
+
+@pytest.mark.parametrize("case", ["itself", "by another", "outside", "fifo", "numbered"])
+def test_hdf5_virtual_dataset_of_what_it_must_not_have(tmp_path: Path, case: str) -> None:
+    """The library crashes on a part of itself, waits for a pipe, and reads any file of this machine."""
+    home = tmp_path / "home"
+    home.mkdir()
+    os.mkfifo(home / "fifo")
+    names = {"by another": "b.h5", "outside": "../c.h5", "fifo": "fifo", "numbered": "fif%b"}
+
+    def virtual(path: Path, source: str) -> None:
+        numbered = "%" in source
+        shape = (1 if numbered else len(STACK), *STACK.shape[1:])
+        layout = h5py.VirtualLayout(shape, STACK.dtype, maxshape=(None, *shape[1:]))
+        layout[: h5py.h5s.UNLIMITED if numbered else shape[0]] = h5py.VirtualSource(source, "data", shape)
+        with h5py.File(path, "w") as file:
+            file.create_virtual_dataset("data", layout)
+
+    virtual(home / "a.h5", names.get(case, "a.h5" if case == "itself" else "."))
+    virtual(home / "b.h5", "a.h5")
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file["data"] = STACK
+    words = {
+        "itself": "is a part of itself",
+        "by another": "is a part of itself",
+        "outside": "beside or below",
+    }
+    with pytest.raises(InputError, match=words.get(case, "no regular file")):
+        read(home / "a.h5")
+
+
+def test_hdf5_where_files_cannot_be_locked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("frames", data=STACK, compression="gzip")
+    usual, wrong = (
+        h5py.File,
+        OSError("unable to lock file, errno = 38, error message = 'Function not implemented'"),
+    )
+
+    def without_locks(path: Path, mode: str, locking: bool | None = None) -> h5py.File:
+        if locking is not False:
+            raise wrong
+        return usual(path, mode, locking=locking)
+
+    monkeypatch.setattr(h5py, "File", without_locks)
+    np.testing.assert_array_equal(read(tmp_path / "a.h5"), STACK)
+    wrong = BlockingIOError(11, "unable to lock file")
+    with pytest.raises(InputError, match="is being written, or was never closed; wait"):
+        read(tmp_path / "a.h5")
+
+
 def test_hdf5_filter_that_is_not_installed(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
@@ -301,7 +370,7 @@ def test_hdf5_damaged_chunk(tmp_path: Path) -> None:
     data[place : place + 60] = bytes(60)
     path.write_bytes(data)
     np.testing.assert_array_equal(reader.read(0, 3), STACK[:3])
-    with pytest.raises(InputError, match=r"a\.h5: frames cannot be read"):
+    with pytest.raises(InputError, match=r"a\.h5: cannot be decoded"):
         reader.read()
     with h5py.File(path, "w") as file:
         file["frames"] = STACK[:4]
@@ -385,7 +454,7 @@ def test_zarr_damage(tmp_path: Path) -> None:
     reader = open_frames(InputSettings(files=("a.zarr",)), tmp_path)
     chunk = sorted(file for file in path.rglob("*") if file.is_file() and file.name != "zarr.json")[0]
     chunk.write_bytes(chunk.read_bytes()[:20])
-    with pytest.raises(InputError, match=r"a\.zarr: .*damaged chunk"):
+    with pytest.raises(InputError, match=r"a\.zarr: cannot be decoded"):
         reader.read()
     (path / "zarr.json").write_text("{")
     with pytest.raises(InputError, match="not a sound zarr store"):

@@ -250,7 +250,7 @@ def test_strips_that_were_never_written(tmp_path: Path) -> None:
     expected = STACK.copy()
     expected[2] = 0
     np.testing.assert_array_equal(reader.read(), expected)
-    assert "1 of 6 strips or tiles were never written; they are read as 0" in reader.notes[0]
+    assert "1 of 6 strips or tiles was never written and read as the fill value" in reader.notes[0]
 
 
 def test_page_without_its_strips(tmp_path: Path) -> None:

@@ -150,6 +150,11 @@ def test_outside_the_window() -> None:
         result = fit_histograms(pixel.counts, pixel.origin, **{name: np.array([3])})
         assert word(result) == FitStatus.OUTSIDE_WINDOW
         assert np.isfinite(result.bias[0])
+    samples = int(pixel.counts.sum())
+    for outside, expected in ((samples, FitStatus.OUTSIDE_WINDOW), (samples + 1, FitStatus.NO_DATA)):
+        result = fit_histograms(pixel.counts, pixel.origin, np.array([outside - 5]), np.array([5]))
+        assert word(result) & expected
+        assert np.isnan(result.bias[0]) == (outside > samples)
     nothing = fit_histograms(pixel.counts, pixel.origin, np.array([0]), np.array([0]))
     assert word(nothing) == FitStatus.OK
 

@@ -1,0 +1,154 @@
+"""Small files that stand for much: refused in two seconds, before they are unpacked."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import struct
+import time
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numcodecs
+import numpy as np
+import pytest
+import zarr
+from astropy.io import fits
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.histogram_files import read_histograms
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.settings import InputSettings
+
+STACK = np.random.default_rng(2).integers(0, 4096, (40, 16, 16)).astype(np.uint16)
+BOMB = 1 << 28
+
+
+@contextmanager
+def refused_at_once(words: str) -> Iterator[None]:
+    clock = time.process_time()
+    with pytest.raises(InputError, match=words):
+        yield
+    assert time.process_time() - clock < 2.0
+
+
+def read(path: Path) -> None:
+    with open_frames(InputSettings(files=(path.name,)), path.parent) as frames:
+        frames.read()
+
+
+@pytest.fixture(scope="module")
+def deflated() -> bytes:
+    return zlib.compress(bytes(BOMB), 9)
+
+
+@pytest.mark.parametrize("codec", ["zlib", "gzip", "zstd", "blosc"])
+def test_zarr(tmp_path: Path, codec: str) -> None:
+    path, old = tmp_path / "a.zarr", codec == "zlib"
+    coded = {"id": "zlib", "level": 1} if old else {"name": codec, "configuration": {}}
+    zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=coded, zarr_format=2 if old else 3)
+    read(path)
+    bomb = {"zlib": zlib, "gzip": gzip, "zstd": numcodecs.Zstd(), "blosc": numcodecs.Blosc()}[codec]
+    coder = bomb.encode if hasattr(bomb, "encode") else bomb.compress
+    (path / ("1.0.0" if old else "c/1/0/0")).write_bytes(coder(bytes(BOMB)))
+    with refused_at_once(r"a\.zarr: damaged: a piece of \d+ bytes unpacks to more than"):
+        read(path)
+
+
+@pytest.mark.parametrize("codec", ["gzip", "zstd", "blosc"])
+def test_shards_are_many_pieces(tmp_path: Path, codec: str) -> None:
+    coded = {"name": codec, "configuration": {}}
+    zarr.create_array(
+        tmp_path / "a.zarr", data=STACK, chunks=(2, 16, 16), shards=(40, 16, 16), compressors=coded
+    )
+    read(tmp_path / "a.zarr")
+
+
+def test_another_array_of_the_store_is_no_piece(tmp_path: Path) -> None:
+    group = zarr.create_group(tmp_path / "a.zarr")
+    group.create_array("frames", data=STACK, chunks=(1, 4, 4))
+    group.create_array("dark", data=STACK[0].repeat(50, axis=0))
+    read(tmp_path / "a.zarr")
+
+
+def test_zarr_of_many_chunks_in_a_shard(tmp_path: Path) -> None:
+    path = tmp_path / "a.zarr"
+    zarr.create_array(path, shape=(80, 256, 256), chunks=(1, 8, 8), shards=(80, 256, 256), dtype="u2")
+    (path / "c/0/0").mkdir(parents=True)
+    (path / "c/0/0/0").write_bytes(b"")
+    with refused_at_once(r"shards of more than 65536 chunks"):
+        read(path)
+
+
+@pytest.mark.parametrize("kind", ["deep", "twice", "claims"])
+def test_hdf5(tmp_path: Path, deflated: bytes, kind: str) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        if kind == "claims":
+            layout = h5py.VirtualLayout((10**9, 16, 16), STACK.dtype)
+            layout[:40] = h5py.VirtualSource("b.h5", "x", STACK.shape)
+            file.create_virtual_dataset("frames", layout)
+        elif kind == "deep":
+            dataset = file.create_dataset("frames", data=STACK, chunks=(20, 16, 16), compression="gzip")
+            dataset.id.write_direct_chunk((20, 0, 0), deflated)
+        else:
+            record = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+            record.set_chunk((20, 16, 16))
+            for _ in range(2):
+                record.set_filter(h5py.h5z.FILTER_DEFLATE, 0, (9,))
+            space, type_ = h5py.h5s.create_simple(STACK.shape), h5py.h5t.NATIVE_UINT16
+            made = h5py.h5d.create(file.id, b"frames", type_, space, record)
+            made.write(h5py.h5s.ALL, h5py.h5s.ALL, STACK)
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["x"] = STACK
+    words = {
+        "deep": "unpacks to more than",
+        "twice": "coded twice",
+        "claims": "cannot hold 1000000000 frames",
+    }
+    with refused_at_once(words[kind]):
+        read(path)
+
+
+def test_fits(tmp_path: Path) -> None:
+    path = tmp_path / "a.fits"
+    image = fits.CompImageHDU(STACK, compression_type="GZIP_1", tile_shape=(1, 16, 16))
+    fits.HDUList([fits.PrimaryHDU(), image]).writeto(path)
+    read(path)
+    with fits.open(path, disable_image_compression=True) as units:
+        tiles = [np.asarray(tile).tobytes() for tile in units[1].data["COMPRESSED_DATA"]]
+        header = units[1].header
+        tiles[3] = gzip.compress(bytes(BOMB))
+        values = np.empty(len(tiles), object)
+        values[:] = [np.frombuffer(tile, np.uint8) for tile in tiles]
+        table = fits.BinTableHDU.from_columns([fits.Column("COMPRESSED_DATA", "1PB()", array=values)])
+        for card in header.cards:
+            if card.keyword.startswith("Z") or card.keyword in ("BZERO", "BSCALE"):
+                table.header.append(card)
+        fits.HDUList([fits.PrimaryHDU(), table]).writeto(path, overwrite=True)
+    with refused_at_once("unpacks to more than the 512 of its shape"):
+        read(path)
+
+
+def test_tiff_of_many_pages(tmp_path: Path) -> None:
+    size, n = 2 + 12 + 4, 300_000
+    page = struct.pack("<HHHII", 1, 256, 4, 1, 1)
+    with (tmp_path / "a.tif").open("wb") as stream:
+        stream.write(b"II*\0" + struct.pack("<I", 8))
+        stream.write(b"".join(page + struct.pack("<I", 8 + size * (i + 1)) for i in range(n)))
+    with refused_at_once(r"more than 100000 pages"):
+        read(tmp_path / "a.tif")
+
+
+def test_npz(tmp_path: Path) -> None:
+    member = io.BytesIO()
+    np.save(member, np.zeros(8, np.int64))
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("dn.npy", member.getvalue())
+        archive.writestr("counts.npy", bytes(BOMB + 1))
+    with refused_at_once(r"bytes unpacked, which cannot be histograms"):
+        read_histograms(InputSettings(files=("a.npz",)), tmp_path)

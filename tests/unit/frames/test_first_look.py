@@ -1,0 +1,134 @@
+"""Byte order, left-justified samples and a last axis that is time are seen in some samples at ingest."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import zarr
+from helpers.plain_camera import LAYOUTS, PlainCamera
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.settings import InputSettings
+
+#: hardly any pattern: 5 % in the light, a DN in the bias
+SPREAD = (0.05, 0.005, 0.05, 1.0)
+
+
+def notes_on(path: Path, frames: NDArray[np.float64]) -> list[str]:
+    codes = np.rint(frames).clip(0, 65535).astype(np.uint16)
+    if path.suffix == ".npy":
+        np.save(path, codes)
+    else:
+        with h5py.File(path, "w") as file:
+            file.create_dataset("data", data=codes, chunks=(1, *codes.shape[1:]), compression="gzip")
+    report = open_frames(InputSettings(files=(path.name,)), path.parent).report
+    return [note for note in report.notes if "last axis" in note]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_time_is_told_from_columns(tmp_path: Path, layout: str) -> None:
+    frames = PlainCamera(0.3, 2.0, 10.0, (40, 48), 500, SPREAD, layout).frames(3).astype(np.float64)
+    rng = np.random.default_rng(5)
+    wandering = np.linspace(0.0, 4.0, 500)[:, None, None] + rng.normal(0.0, 0.5, (500, 1, 1))
+    of_rows = rng.normal(0.0, 2.0, (500, 40, 1))
+    path = tmp_path / "stack.npy"
+    for added in (0.0, wandering, of_rows):
+        assert notes_on(path, frames + added) == []
+    [note] = notes_on(path, np.moveaxis(frames, 0, -1))
+    assert note == (
+        "stack.npy: read as 40 frames of 48 x 500 pixels, but by its samples the last axis looks like time; "
+        "if it is, save numpy.moveaxis(array, -1, 0)"
+    )
+
+
+def test_it_is_said_of_hdf5_and_not_where_there_is_nothing_to_see(tmp_path: Path) -> None:
+    frames = PlainCamera(0.3, 2.0, 10.0, (40, 48), 500, SPREAD).frames(3).astype(np.float64)
+    path = tmp_path / "stack.h5"
+    assert notes_on(path, frames) == []
+    assert len(notes_on(path, np.moveaxis(frames, 0, -1))) == 1
+    assert notes_on(path, np.random.default_rng(1).normal(100.0, 3.0, (40, 48, 500))) == []
+    assert notes_on(path, frames[:4]) == []
+    assert notes_on(path, np.full((40, 48, 500), 7.0)) == []
+    frames[200:] = 0.0  # nothing came any more
+    assert notes_on(path, frames) == []
+    frames = np.rint(frames).astype(np.uint16)
+    with h5py.File(path, "w") as file:
+        file.create_dataset("data", shape=frames.shape, dtype="u2", chunks=(1, 20, 24))[:200] = frames[:200]
+    notes = open_frames(InputSettings(files=(path.name,)), path.parent).report.notes
+    assert notes == ["stack.h5: 1200 of 2000 chunks were never written and read as the fill value"]
+
+
+def camera(bias: float, noise: float, step: float, *, frames: int = 60) -> NDArray[np.uint16]:
+    rng = np.random.default_rng(8)
+    electrons = rng.poisson(1.2, (frames, 20, 24)) + noise * rng.standard_normal((frames, 20, 24))
+    return np.rint(bias + step * electrons).clip(0, 65535).astype(np.uint16)
+
+
+CAMERAS = {
+    "usual": camera(400, 0.28, 9.5),
+    "low": camera(30, 0.3, 5.0),
+    "skipper": camera(20_000, 0.17, 700.0),
+    "noisy": camera(30_000, 3.0, 1000.0),
+    "12 bits in 16": camera(100, 0.3, 10.0) << 4,
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_swapped_bytes_are_refused_with_their_cure_and_others_are_not(tmp_path: Path, name: str) -> None:
+    frames = CAMERAS[name]
+    settings = {"files": ("a.raw",), "shape": frames.shape[1:], "dtype": "uint16"}
+    frames.astype("<u2").tofile(tmp_path / "a.raw")
+    notes = open_frames(InputSettings(**settings), tmp_path).report.notes
+    assert notes == [f"a.raw: {words}" for words in LEFT if name == "12 bits in 16"]
+    for order in ("little", "big"):
+        frames.astype("<u2" if order == "big" else ">u2").tofile(tmp_path / "a.raw")
+        (tmp_path / "a.raw.json").write_text(json.dumps({"byte_order": order}))
+        right = "big" if order == "little" else "little"
+        with pytest.raises(InputError, match=f"look byte-swapped: set input.byte_order: {right} "):
+            open_frames(InputSettings(**settings), tmp_path)
+        np.testing.assert_array_equal(
+            open_frames(InputSettings(**settings, byte_order=right), tmp_path).read(), frames
+        )
+    np.save(tmp_path / "a.npy", frames.byteswap())
+    with pytest.raises(InputError, match=r"write the file again with its bytes swapped"):
+        open_frames(InputSettings(files=("a.npy",)), tmp_path)
+
+
+LEFT = [
+    "the lowest 4 bits of the samples are 0: left-justified samples; set input.bit_shift: 4 (--bit-shift 4), "
+    "or DN count 16 times"
+]
+
+
+def test_samples_in_the_high_byte_alone_are_one_of_two_things(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", camera(30, 0.3, 5.0) << 8)
+    with pytest.raises(
+        InputError, match=r"byte-swapped: .*, or, if they are left-justified, input.bit_shift: 8"
+    ):
+        open_frames(InputSettings(files=("a.npy",)), tmp_path)
+    assert open_frames(InputSettings(files=("a.npy",), bit_shift=8), tmp_path).report.notes == []
+
+
+def test_what_was_never_written_is_counted_or_refused(tmp_path: Path) -> None:
+    for name, shards in (("a.zarr", None), ("b.zarr", (20, 20, 24))):
+        array = zarr.create_array(
+            tmp_path / name, shape=(60, 20, 24), chunks=(10, 20, 24), shards=shards, dtype="u2"
+        )
+        with pytest.raises(InputError, match=r"none of its \d chunks was ever written"):
+            open_frames(InputSettings(files=(name,)), tmp_path)
+        array[:30] = camera(100, 0.3, 5.0)[:30]
+    [note] = open_frames(InputSettings(files=("a.zarr",)), tmp_path).report.notes
+    assert note == "a.zarr: 3 of 6 chunks were never written and read as the fill value"
+    [note] = open_frames(InputSettings(files=("b.zarr",)), tmp_path).report.notes
+    assert note == "b.zarr: 1 of 3 chunks was never written and read as the fill value"
+    for chunks in (None, (1, 20, 24)):
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            file.create_dataset("data", shape=(60, 20, 24), dtype="u2", chunks=chunks)
+        with pytest.raises(InputError, match=r"none of its \d+ \w+ was ever written"):
+            open_frames(InputSettings(files=("a.h5",)), tmp_path)
