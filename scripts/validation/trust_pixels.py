@@ -1,9 +1,9 @@
 """Pixels drawn at random, fitted by the package, judged by a likelihood of its own in plain numpy.
 
-The judge shares no code with the package. The mass of a code x is ``sum_k Poisson(k; H) [Phi((x + 1/2 - m_k) / s)
-- Phi((x - 1/2 - m_k) / s)]`` with ``m_k = mu + a k``, a DN per electron, s the read noise before rounding; a code at
-a limit of the ADC holds all that is beyond it. It is climbed by damped scoring steps from the truth, from the fit
-and from other gains and biases.
+The judge shares no code with the package. The mass of a code x is ``sum_k Poisson(k; H)
+[Phi((x + 1/2 - m_k) / s) - Phi((x - 1/2 - m_k) / s)]`` with ``m_k = mu + a k``, a DN per electron, s the read
+noise before rounding; a code at a limit of the ADC holds all that is beyond it. It is climbed by damped
+scoring steps from the truth, from the fit and from other gains and biases.
 """
 
 from __future__ import annotations
@@ -214,7 +214,7 @@ def _starts(truth: Array, mean: float, variance: float) -> Array:
 
 @dataclass
 class Judgement:
-    """Heights of truth and judge over the fit (nats), the judge's parameters, what is off, and the verdict."""
+    """Heights of truth and judge over the fit (nats), the judge's parameters, what is off, the verdict."""
 
     truth: float
     best: float
@@ -226,10 +226,10 @@ class Judgement:
 def judge(pixel: Pixel, values: Array, stderr: Array, good: NDArray[np.bool_]) -> Judgement:
     """Tell whether the quantities of a fit that are called good (4,) are wrong.
 
-    ``off``: a parameter is beyond 5 standard errors (and a floor of 0.5 %, of the bias 0.01 e-) from the truth,
-    and a maximum elsewhere is more than 3 nats higher, or the truth more than 15 lower or its maximum higher.
-    ``rival``: the fit is near the truth, yet a maximum more than 3 nats higher is 3 standard errors, an electron
-    or 20 % of the gain away.
+    ``off``: a parameter is beyond 5 standard errors (and a floor of 0.5 %, of the bias 0.01 e-) from the
+    truth, and a maximum elsewhere is more than 3 nats higher, or the truth more than 15 lower or its maximum
+    higher. ``rival``: the fit is near the truth, yet a maximum more than 3 nats higher is 3 standard errors,
+    an electron or 20 % of the gain away.
     """
     exact = Judge(pixel)
     merge = max(1, int(pixel.truth[3] / 3)) if exact.counts.size > _CELLS else 1

@@ -1,14 +1,14 @@
 """How often is a number that is called good wrong? Random pixels and whole runs, independently judged.
 
-1. Pixels over the whole box (H 0.001 to 60 e-, read noise 0.05 to 1 e-, 1.2 to 1,500 DN per electron, 100 to
-   20,000 frames, a quarter clipped at one end), drawn by plain numpy and fitted; those that are neither failed nor
-   flagged are judged by a many-start likelihood, see ``trust_pixels.py``.
+1. Pixels over the whole box (H 0.001 to 60 e-, read noise 0.05 to 1 e-, 1.2 to 1,500 DN per electron, 100
+   to 20,000 frames, a quarter clipped at one end), drawn by plain numpy and fitted; those that are neither
+   failed nor flagged are judged by a many-start likelihood, see ``trust_pixels.py``.
 2. Runs of ``pchem run`` on files of random sensors with a random mishap or none, see ``trust_runs.py``.
 
     python scripts/validation/trust_study.py                          # both
     python scripts/validation/trust_study.py --runs 0 --pixels 300    # some pixels alone
     python scripts/validation/trust_study.py --only 17                # one pixel again, in full
-    python scripts/validation/trust_study.py --only-run 17 --keep DIR # one run again, its files kept
+    python scripts/validation/trust_study.py --only-run 17            # one run again, its files kept
     python scripts/validation/trust_study.py --write-docs docs/trust.md
 """
 
@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterable
 from itertools import pairwise
@@ -31,6 +32,7 @@ from pchem_pipeline.compute.environment import prepare_environment
 prepare_environment()
 
 import trust_pixels  # noqa: E402
+import trust_runs  # noqa: E402
 
 MARKS = ("<!-- trust study: begin -->", "<!-- trust study: end -->")
 EDGES: dict[str, tuple[float, ...]] = {
@@ -173,6 +175,45 @@ def wrong_pixels(rows: list[dict[str, Any]]) -> str:
     return table(head, lines)
 
 
+def run_table(rows: list[dict[str, Any]]) -> str:
+    """Return the table of the runs, by mishap."""
+    head = ["what happened", "runs", "refused", "answer No or none", "wrong, called good", "without a word"]
+    head += ["cure fails", "raw exception", "values beyond 5 errors"]
+    lines = [run_line("all", rows)]
+    for name, (title, _) in trust_runs.MISHAPS.items():
+        lines.append(run_line(title, [row for row in rows if row["mishap"] == name]))
+    return table(head, lines)
+
+
+def run_line(title: str, rows: list[dict[str, Any]]) -> list[str]:
+    """Return the cells of one line of the table of runs; what a report calls No is not called good."""
+    good = [row for row in rows if not row["no"]]
+    counts = [len(rows), *(sum(row[name] for row in rows) for name in ("refused", "no"))]
+    counts += [sum(bool(row["wrong"]) for row in good)]
+    counts += [sum(row[name] for row in rows) for name in ("silent", "uncured", "traceback")]
+    values = f"{sum(row.get('beyond', 0) for row in good)} of {sum(row.get('pixels', 0) for row in good):,}"
+    return [title, *map(str, counts), values]
+
+
+def odd_runs(rows: list[dict[str, Any]]) -> str:
+    """Return the runs that are wrong, silent or end badly, each with the number that repeats it."""
+    head = ["--only-run", "what happened", "exit code", "answer", "wrong", "besides"]
+    lines = []
+    for row in rows:
+        besides = [name for name in ("silent", "uncured", "traceback") if row[name]]
+        if besides or (row["wrong"] and not row["no"]):
+            cells = [row["number"], row["mishap"], row["code"], row["answer"], "; ".join(row["wrong"])]
+            lines.append([*map(str, cells), ", ".join(besides)])
+    return table(head, lines)
+
+
+def show_run(number: int) -> None:
+    """Do one run again, print its output, and say where its files are."""
+    folder = Path(tempfile.mkdtemp(prefix="trust-"))
+    row = trust_runs.study_run(number, folder)
+    print(row.pop("text"), json.dumps(row, default=str), f"files in {folder}", sep="\n")
+
+
 def table(head: Iterable[str], lines: Iterable[Iterable[str]]) -> str:
     """Return a table in Markdown."""
     rows = [list(head), *map(list, lines)]
@@ -222,6 +263,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int, help="number of one pixel, shown in full")
+    parser.add_argument("--only-run", type=int, help="number of one run, shown in full")
     parser.add_argument("--json", type=Path, default=Path("trust_study.json"), help="every pixel and run")
     parser.add_argument("--write-docs", type=Path, help="page whose block of tables is replaced")
     return parser.parse_args()
@@ -232,6 +274,9 @@ def main() -> None:
     options = arguments()
     if options.only is not None:
         show_pixel(options.only)
+    if options.only_run is not None:
+        show_run(options.only_run)
+    if options.only is not None or options.only_run is not None:
         return
     text, record = "", {"seed": options.seed}
     if options.pixels:
@@ -239,6 +284,13 @@ def main() -> None:
         record["pixels"] = rows = study_pixels(options.pixels, options.seed)
         text += f"\n{len(rows):,} pixels, seed {options.seed}:\n\n{pixel_tables(rows)}"
         print(text, wrong_pixels(rows), f"{time.process_time() - begin:.0f} CPU s", sep="\n", flush=True)
+    if options.runs:
+        begin = time.process_time()
+        with tempfile.TemporaryDirectory(prefix="trust-") as folder:
+            record["runs"] = rows = trust_runs.study_runs(options.runs, options.seed, Path(folder))
+        block = f"\n{len(rows)} runs, seed {options.seed}:\n\n{run_table(rows)}"
+        text += block
+        print(block, odd_runs(rows), f"{time.process_time() - begin:.0f} CPU s", sep="\n")
     options.json.write_text(json.dumps(record, indent=1, default=float))
     if options.write_docs:
         write_docs(options.write_docs, text)
