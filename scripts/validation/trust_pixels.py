@@ -244,8 +244,9 @@ def judge(pixel: Pixel, values: Array, stderr: Array, good: NDArray[np.bool_]) -
     floor = np.array(
         [0.005 * pixel.truth[0], 0.005 * pixel.truth[1], 0.01 / pixel.truth[1], 0.005 * pixel.truth[3]]
     )
-    beyond = good & (np.abs(values - pixel.truth) > 5 * np.nan_to_num(stderr) + floor)
-    far = (good & (np.abs(at - values) > 3 * np.nan_to_num(stderr) + floor)).any()
+    errors = np.nan_to_num(stderr, nan=np.inf)  # a sigma at its bound has none
+    beyond = good & (np.abs(values - pixel.truth) > 5 * errors + floor)
+    far = (good & (np.abs(at - values) > 3 * errors + floor)).any()
     far |= good[2] and abs(at[2] - values[2]) * values[1] > 0.5
     far |= good[1] and abs(at[1] / values[1] - 1) > 0.2
     higher = bool(heights[best] - here > BETTER and far)

@@ -39,7 +39,9 @@ ARRAYS = (
     "maps/bias",
     "maps/read_noise_e",
 )
-UNITS = (  # keyword, comment, further cards of a header whose exposure time is in ms
+UNITS: tuple[
+    tuple[str, str, dict[str, str]], ...
+] = (  # keyword, comment, further cards of a header whose exposure time is in ms
     ("EXPTIME", "exposure time in ms", {}),
     ("EXPTIME", "[ms] exposure", {}),
     ("EXPTIME", "exposure (ms)", {}),
@@ -169,10 +171,11 @@ def left_justified(case: Case) -> None:
     case.words = r"(?i)justified|bit.shift|multiples? of" if shift else ""
 
 
-def milliseconds(case: Case) -> None:
-    case.form, case.seconds = "fits", case.rng.integers(20, 900) / 1000
+def time_unit(case: Case) -> None:
+    case.form, milliseconds = "fits", int(case.rng.integers(20, 900))
     name, comment, more = UNITS[case.rng.integers(len(UNITS))]
-    case.header[name] = (case.seconds * 1000, comment)
+    case.header[name] = (milliseconds, comment)
+    case.seconds = milliseconds / 1000
     case.header.update(more)
     case.options += ["--kind", "dark"]
 
@@ -250,7 +253,7 @@ MISHAPS: dict[str, tuple[str, Callable[[Case], None]]] = {
     "repeated": ("repeated frames", repeated_frames),
     "byte_order": ("bytes in the wrong order", byte_order),
     "justified": ("left-justified samples", left_justified),
-    "milliseconds": ("exposure time in ms", milliseconds),
+    "milliseconds": ("exposure time in ms", time_unit),
     "unwritten": ("zarr chunk never written", unwritten_chunk),
     "chunk_deleted": ("chunk of the store deleted", lambda case: store_damage(case, flip=False)),
     "bit_flipped": ("bit of the store flipped", lambda case: store_damage(case, flip=True)),

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import beta
 
 from pchem_pipeline.compute.environment import prepare_environment
@@ -33,6 +34,8 @@ prepare_environment()
 
 import trust_pixels  # noqa: E402
 import trust_runs  # noqa: E402
+
+from pchem_pipeline.model.fit import status  # noqa: E402
 
 MARKS = ("<!-- trust study: begin -->", "<!-- trust study: end -->")
 EDGES: dict[str, tuple[float, ...]] = {
@@ -61,32 +64,29 @@ def interval(hits: int, n: int) -> str:
 
 def study_pixels(n: int, seed: int) -> list[dict[str, Any]]:
     """Draw, fit and judge pixels; return a row for each."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     first = seed * 1_000_000
     for numbers in np.array_split(np.arange(first, first + n), max(1, n // 500)):
         pixels = [trust_pixels.draw(int(number)) for number in numbers]
         fits = trust_pixels.fit(pixels)
         good = trust_pixels.good_words(fits.words)
-        failed = (fits.words & int(trust_pixels.status.FAILED)) != 0
-        for i, pixel in enumerate(pixels):
-            row = {
-                "number": pixel.number,
-                **pixel.regime,
-                "word": int(fits.words[i]),
-                "failed": bool(failed[i]),
-            }
-            row |= {"good": bool(good[i].all()), "part": bool(good[i].any()), "kind": "", "beyond": []}
-            if good[i].any():
-                verdict = trust_pixels.judge(pixel, fits.values[i], fits.stderr[i], good[i])
-                row |= {
-                    "kind": verdict.kind,
-                    "beyond": verdict.beyond,
-                    "best": verdict.best,
-                    "truth": verdict.truth,
-                }
-                row |= {"ratio": list(fits.values[i] / pixel.truth), "rival": list(verdict.at / pixel.truth)}
-            rows.append(row)
+        rows += [_row(pixel, fits, good[i], i) for i, pixel in enumerate(pixels)]
     return rows
+
+
+def _row(
+    pixel: trust_pixels.Pixel, fits: trust_pixels.Fits, good: NDArray[np.bool_], i: int
+) -> dict[str, Any]:
+    """Return what is known of the i-th pixel of a batch; ``good`` says which of its quantities are."""
+    values, stderr, word = fits.values[i], fits.stderr[i], int(fits.words[i])
+    right = bool((np.abs(values - pixel.truth) < 5 * stderr).all())
+    row: dict[str, Any] = {"number": pixel.number, **pixel.regime, "word": word, "right": right}
+    row |= {"failed": bool(word & int(status.FAILED)), "good": bool(good.all()), "part": bool(good.any())}
+    if not good.any():
+        return row | {"kind": "", "beyond": []}
+    verdict = trust_pixels.judge(pixel, values, stderr, good)
+    row |= {"kind": verdict.kind, "beyond": verdict.beyond, "best": verdict.best, "truth": verdict.truth}
+    return row | {"ratio": list(values / pixel.truth), "rival": list(verdict.at / pixel.truth)}
 
 
 def summary(name: str, rows: list[dict[str, Any]]) -> list[str]:
@@ -97,7 +97,10 @@ def summary(name: str, rows: list[dict[str, Any]]) -> list[str]:
         f"{100 * sum(map(test, rows)) / max(len(rows), 1):.0f} %" for test in (_good, _flagged, _failed)
     ]
     beyond = sum(bool(row["beyond"]) for row in judged)
-    return [name, str(len(rows)), *shares, str(wrong), interval(wrong, len(judged)), str(beyond)]
+    flagged = list(filter(_flagged, rows))
+    right = f"{100 * sum(row['right'] for row in flagged) / max(len(flagged), 1):.0f} %"
+    counts = [f"{wrong} of {len(judged)}", interval(wrong, len(judged)), str(beyond)]
+    return [name, str(len(rows)), *shares, right, *counts]
 
 
 def _good(row: dict[str, Any]) -> bool:
@@ -118,7 +121,8 @@ def _within(key: str, low: float, high: float) -> Callable[[dict[str, Any]], boo
 
 def pixel_tables(rows: list[dict[str, Any]]) -> str:
     """Return the tables of the pixels by regime, and the wrong ones with their numbers."""
-    head = ["", "pixels", "good", "flagged", "failed", "wrong", "wrong of good, % (95 %)", "beyond 5 errors"]
+    head = ["", "pixels", "all four good", "flagged", "failed", "of the flagged right"]
+    head += ["wrong of those with a good value", "%, 95 % interval", "beyond 5 errors"]
     lines = [summary("all", rows)]
     for key, edges in EDGES.items():
         for low, high in pairwise(edges):
@@ -225,7 +229,7 @@ def show_pixel(number: int) -> None:
     """Print what is known of one pixel."""
     pixel = trust_pixels.draw(number)
     fits = trust_pixels.fit([pixel])
-    print(json.dumps(pixel.regime), trust_pixels.status.describe(int(fits.words[0])), sep="\n")
+    print(json.dumps(pixel.regime), status.describe(int(fits.words[0])), sep="\n")
     print("samples", pixel.samples.min(), "to", pixel.samples.max(), "mean", pixel.samples.mean())
     for name, row in zip(
         ("truth", "fit", "stderr"), (pixel.truth, fits.values[0], fits.stderr[0]), strict=True
@@ -278,7 +282,8 @@ def main() -> None:
         show_run(options.only_run)
     if options.only is not None or options.only_run is not None:
         return
-    text, record = "", {"seed": options.seed}
+    text = ""
+    record: dict[str, Any] = {"seed": options.seed}
     if options.pixels:
         begin = time.process_time()
         record["pixels"] = rows = study_pixels(options.pixels, options.seed)
