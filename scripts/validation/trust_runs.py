@@ -83,17 +83,17 @@ class Case:
         return float(np.median(self.frames.std(axis=0)))
 
 
-def sensor(number: int, folder: Path, **fixed: float) -> Case:
+def sensor(number: int, folder: Path, step_dn: float = 0.0) -> Case:
     """Draw a sensor: maps of H, gain, bias and read noise, hot and dead pixels."""
     rng = np.random.default_rng(number)
     shape = tuple(rng.choice(np.arange(8, 17), 2, replace=False))
     n = int(np.exp(rng.uniform(np.log(150), np.log(1500))))
-    step = fixed.get("step", np.exp(rng.uniform(np.log(3), np.log(30)))) * rng.normal(1, 0.01, shape)
+    step = (step_dn or np.exp(rng.uniform(np.log(3), np.log(30)))) * rng.normal(1, 0.01, shape)
     exposure = np.exp(rng.uniform(np.log(0.2), np.log(4))) * rng.lognormal(0, 0.25, shape)
     odd = rng.choice(exposure.size, 3, replace=False)
     exposure.flat[odd[: rng.integers(4)]] *= rng.choice([0.01, 12])
     noise = rng.uniform(0.12, 0.3) * rng.lognormal(0, 0.05, shape)
-    bias = fixed.get("bias", 10.0) * step.mean() + rng.normal(0, 0.3 * step.mean(), shape)
+    bias = 10 * step.mean() + rng.normal(0, 0.3 * step.mean(), shape)
     case = Case(
         number,
         folder,
@@ -225,7 +225,7 @@ def replaced_files(case: Case) -> None:
 
 
 def hundreds_of_dn(case: Case) -> None:
-    other = sensor(case.number, case.folder, step=float(case.rng.uniform(150, 900)))
+    other = sensor(case.number, case.folder, step_dn=float(case.rng.uniform(150, 900)))
     case.step, case.truth, case.electrons = other.step, other.truth, other.electrons
     digitise(case)
 
