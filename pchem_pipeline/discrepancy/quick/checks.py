@@ -102,6 +102,8 @@ _WORDS: dict[str, tuple[str, str, str]] = {
                  "larger signals are cut off there: exposures of bright pixels come out too low"),
     "bottom_code": ("1", "samples pile up at the lowest code", "the black level is too low: raise it, or set "
                     "input.bit_depth"),
+    "zero_code": ("1", "samples pile up at 0 DN", "the black level is too low: raise it. The fit counts them as 0 DN "
+                  "or less, so values hold, with larger errors"),
 }  # fmt: skip
 
 
@@ -182,6 +184,7 @@ _SIGNS: dict[str, tuple[str, ...]] = {
     "codes": ("code.rough", "code.smooth"),
     "top_code": ("code.top",),
     "bottom_code": ("code.bottom",),
+    "zero_code": ("code.bottom",),
     "wave": ("space.sample.readout.line", "space.sample.readout.spectrum"),
     "odd_frames": ("frame.readout.largest", "frame.readout.quadrants"),
     "empty_frames": (),
@@ -224,6 +227,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "codes": (0.1, 0.5),
     "top_code": (1e-4, 1e-2),
     "bottom_code": (1e-4, 1e-2),
+    "zero_code": (1e-4, 1.0),
     "odd_frames": (0.0, 0.05),
     "empty_frames": (0.01, 0.1),
 }

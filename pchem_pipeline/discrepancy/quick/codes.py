@@ -145,5 +145,5 @@ def _pile_up(codes: CodeSums, sample: CodeSample, end: int) -> Check:
     # a fit that expects too many beyond is poor; what is cut off is on the code
     z = min(extreme(int(seen[at]), on, float(beyond.sum())), poisson(int(seen[at]), on))
     share = float(sample.counts[bins == codes.first + at].sum() / sample.counts.sum())
-    name = "top_code" if end else "bottom_code"
+    name = "top_code" if end else "bottom_code" if codes.first + at else "zero_code"
     return check_of(name, normal_p(z), share, where=f"{codes.first + at} DN")

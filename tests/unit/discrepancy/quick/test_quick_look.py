@@ -349,10 +349,10 @@ def test_clipping_is_found() -> None:
 def test_samples_cut_off_at_0_are_the_black_level_and_no_widths() -> None:
     frames = stack(np.random.default_rng(12), SHAPE, lambda dn: dn - dn.mean(axis=(0, 1, 2)) + 11.0)
     found = by_name(looked(frames))
-    assert found["bottom_code"].found
-    assert found["bottom_code"].size == pytest.approx(np.mean(frames == 0), rel=0.02)
-    assert found["bottom_code"].where == "0 DN"
-    assert "black level is too low" in found["bottom_code"].advice
+    assert found["zero_code"].found
+    assert found["zero_code"].size == pytest.approx(np.mean(frames == 0), rel=0.02)
+    assert found["zero_code"].where == "0 DN"
+    assert "black level is too low" in found["zero_code"].advice
     assert "codes" not in found
     assert not found["top_code"].found
 
