@@ -380,14 +380,13 @@ def demo(
     frames: Annotated[int, typer.Option(min=16, help="number of frames")] = 4000,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, help="root of the random numbers [default: 1; random, unlisted: a new one]"),
+        typer.Option(min=0, help="root of the random numbers [default: 1]"),
     ] = None,
     hidden: Annotated[
         str | None,
         typer.Option(
-            help="hide this effect and search for it: a tag, in a part of the sensor or of the run with "
-            "row_noise@columns=40:50; unlisted: one outside the library; random: any of these, not told "
-            "before the end"
+            help="hide this effect and search for it: a tag; in a part of the sensor or of the run with "
+            "row_noise@columns=40:50"
         ),
     ] = None,
     quiet: Quiet = False,

@@ -8,17 +8,14 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import BaseModel
 
 from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.effects.framework.compose import effect_words
-from pchem_pipeline.effects.framework.registry import effect_class
 from pchem_pipeline.report.pages.discrepancy_tables import parameter_texts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pchem_pipeline.commands.demo.unlisted import Unlisted
     from pchem_pipeline.discrepancy.verdict import Verdict
     from pchem_pipeline.effects.framework.effect import Effect
 
@@ -28,7 +25,7 @@ COMPARED = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 Maps = Mapping[str, "NDArray[Any]"]
 
 
-def compare(found: Verdict, hidden: Effect | Unlisted, truth: Maps, before: Maps, after: Maps) -> str:
+def compare(found: Verdict, hidden: Effect, truth: Maps, before: Maps, after: Maps) -> str:
     """Return what was hidden, whether it was found, its parameters, and biases before and after.
 
     Args:
@@ -38,15 +35,12 @@ def compare(found: Verdict, hidden: Effect | Unlisted, truth: Maps, before: Maps
         before: maps of the plain model, with ``<name>_stderr`` and ``quality``.
         after: the same of the extended model.
     """
-    if isinstance(hidden, BaseModel):
-        title = type(hidden).title
-        words = f"{effect_words(hidden)}{f' ({title})' if title else ''}"
-        lines = [f"hidden was: {words} - {judgement(found, hidden)}", *_place(found, hidden)]
-        if type(hidden).untestable:
-            lines += textwrap.wrap(f"such frames cannot show it: {type(hidden).untestable}", 100)
-        lines += _parameters(found, hidden)
-    else:
-        lines = [f"hidden was: {hidden.words} (outside the library) - {unnamed(found)}"]
+    title = type(hidden).title
+    words = f"{effect_words(hidden)}{f' ({title})' if title else ''}"
+    lines = [f"hidden was: {words} - {judgement(found, hidden)}", *_place(found, hidden)]
+    if type(hidden).untestable:
+        lines += textwrap.wrap(f"such frames cannot show it: {type(hidden).untestable}", 100)
+    lines += _parameters(found, hidden)
     return "\n".join([*lines, *_biases(truth, before, after)])
 
 
@@ -57,19 +51,6 @@ def _place(found: Verdict, hidden: Effect) -> list[str]:
         if step.effect == hidden.tag and not step.place and (hidden.region or hidden.when):
             lines.append("found without a place")
     return lines
-
-
-def unnamed(found: Verdict) -> str:
-    """Return in words whether a verdict on frames with an effect outside the library is right."""
-    names = [tag for tag in found.effects if not effect_class(tag).measured_only]
-    if names:
-        return f"wrongly named: {', '.join(names)}"
-    return {
-        "described": "measured without a name, which is right",
-        "unexplained": "noticed and not named, which is right",
-        "ambiguous": "left open between effects of the library, none of which it is",
-        "consistent": "not noticed",
-    }.get(found.verdict, "not named")
 
 
 def judgement(found: Verdict, hidden: Effect) -> str:

@@ -17,7 +17,6 @@ import numpy as np
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.commands.demo.comparison import COMPARED, compare
 from pchem_pipeline.commands.demo.demo import is_in_use
-from pchem_pipeline.commands.demo.unlisted import UNLISTED, Unlisted
 from pchem_pipeline.commands.model import adopt_verdict
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
@@ -42,10 +41,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.target import Target
     from pchem_pipeline.simulate.truth import TruthMaps
 
-#: The word for an effect that is not told before the end: of the library or not, with a place or without.
-RANDOM = "random"
-#: The word for one outside the library.
-OUTSIDE = "unlisted"
 #: Truth and effect; no part of the run.
 SEALED_KEY = "sealed_key.npz"
 
@@ -68,11 +63,10 @@ def run_hidden_demo(
 
     Args:
         output: folder for the frames, the YAML, the store and the sealed key.
-        hidden: tag of the effect, ``random`` or ``unlisted``; with ``@`` and a place or a time: it acts only
-            there.
+        hidden: tag of the effect; with ``@`` and a place or a time: it acts only there.
         size: rows and columns.
         n_frames: number of frames.
-        seed: root of the random numbers; None: 1, and a new one each time for ``random``.
+        seed: root of the random numbers; None: 1.
         quiet: say warnings only.
 
     Raises:
@@ -83,10 +77,9 @@ def run_hidden_demo(
     asked = {"hidden": hidden, "size": size, "frames": n_frames, "seed": seed}
     _check_folder(output, asked)
     if not (output / SEALED_KEY).exists():
-        root = seed if seed is not None else _new_seed() if hidden in (RANDOM, OUTSIDE) else 1
         # first, so that a demonstration stopped here can start again; the key comes last
         write_json(output / _ASKED, asked)
-        _hide(output, hidden, size, n_frames, root)
+        _hide(output, hidden, size, n_frames, 1 if seed is None else seed)
     command = Command(quiet=quiet)
     if not (output / _PLAIN_MAPS).exists():
         _run_plain(output, command)
@@ -96,22 +89,10 @@ def run_hidden_demo(
     return _text(output, extended)
 
 
-def _new_seed() -> int:
-    import secrets
-
-    return secrets.randbelow(2**31)
-
-
 def _check_tag(asked: str) -> None:
-    hidden, region, when = _parted(asked)
-    if hidden == OUTSIDE or hidden in UNLISTED:
-        if region is not None or when is not None:
-            raise ConfigError(f"--hidden {asked}: an effect outside the library takes no place; leave it out")
-        return
-    if hidden == RANDOM:
-        return
+    hidden, *_ = _parted(asked)
     if hidden not in effect_classes():
-        known = ", ".join((*effect_classes(), RANDOM, OUTSIDE))
+        known = ", ".join(effect_classes())
         raise ConfigError(
             f"--hidden {hidden!r}: there is no such effect; choose one of: {known}; "
             f"behind it @ and a place, if any: {GRAMMAR}"
@@ -146,104 +127,33 @@ def _check_folder(output: Path, asked: dict[str, Any]) -> None:
     raise ConfigError(f"{output} {what}; choose another folder with --output")
 
 
-def what_to_hide(asked: str, settings: SimulateSettings, truth: TruthMaps) -> Effect | Unlisted:
-    """Return an effect to hide: of the library, with or without a place, or outside it.
+def hidden_effect(asked: str, settings: SimulateSettings, truth: TruthMaps) -> Effect:
+    """Return an effect of the library at a strength that is clearly visible but moderate.
 
     Args:
-        asked: a tag, ``unlisted`` for any effect outside the library, or ``random`` for any that such frames
-            can show, anywhere; with ``@`` and a place or a time in one line.
+        asked: its tag; with ``@`` and a place or a time in one line.
         settings: camera, without effects.
         truth: maps of the sensor; limits of the scale are set by them.
     """
     hidden, region, when = _parted(asked)
-    rng = np.random.default_rng([settings.seed, 0x9ACE])
-    if hidden == RANDOM and region is None and when is None:
-        kind = rng.choice(["everywhere", "place", "time", OUTSIDE], p=[0.4, 0.25, 0.15, 0.2])
-        if kind == OUTSIDE:
-            hidden = OUTSIDE
-        elif kind != "everywhere":
-            region, when = _random_place(rng, settings, in_time=kind == "time")
-    if hidden == OUTSIDE:
-        hidden = str(rng.choice(list(UNLISTED)))
-    return UNLISTED[hidden] if hidden in UNLISTED else hidden_effect(hidden, settings, truth, region, when)
-
-
-def hidden_effect(
-    hidden: str,
-    settings: SimulateSettings,
-    truth: TruthMaps,
-    region: Region | None = None,
-    when: When | None = None,
-) -> Effect:
-    """Return an effect of the library at a strength that is clearly visible but moderate.
-
-    Args:
-        hidden: its tag, or ``random`` for any that such frames can show, of any kind.
-        settings: camera, without effects.
-        truth: maps of the sensor; limits of the scale are set by them.
-        region: where it acts; None: everywhere.
-        when: the frames in which it does; None: always.
-    """
     share = 1.0
     if region is not None:
         share *= float(region.mask(settings.shape).mean())  # refuses what is not on the sensor
     if when is not None:
         share *= when.share(np.arange(settings.n_frames))
-    effect = _everywhere(hidden, settings, truth)
+    kinds = effect_class(hidden).typical()
+    effect = kinds[0] if kinds else _clipping(settings, truth)
     if effect.strength and 0.0 < share < 1.0:
         # as visible as everywhere: the errors of its statistics grow like that with fewer samples
         effect = effect.scaled(share**-0.5)
     return effect.at_place(region, when)
 
 
-def _random_place(
-    rng: np.random.Generator, settings: SimulateSettings, *, in_time: bool
-) -> tuple[Region | None, When | None]:
-    """Return a band of columns or rows, a quadrant, every 8th column or a box; or a range of the frames."""
-    if in_time:
-        first, last = _random_range(rng, settings.n_frames)
-        return None, When(range=((first, last),))
-    rows, columns = (_random_range(rng, size) for size in settings.shape)
-    places: list[dict[str, Any]] = [
-        {"columns": [columns]},
-        {"rows": [rows]},
-        {"quadrant": str(rng.choice(["top left", "top right", "bottom left", "bottom right"]))},
-        {"taps": {"every": 8, "which": int(rng.integers(8))}},
-        {"rows": [rows], "columns": [columns]},
-    ]
-    return Region.model_validate(places[int(rng.integers(len(places)))]), None
-
-
-def _random_range(rng: np.random.Generator, size: int) -> tuple[int, int]:
-    """Return an eighth to a third of a number of lines or frames."""
-    length = int(rng.integers(max(size // 8, 1), max(size // 3, 1) + 1))
-    first = int(rng.integers(size - length + 1))
-    return first, first + length
-
-
-def _everywhere(hidden: str, settings: SimulateSettings, truth: TruthMaps) -> Effect:
-    """Return the effect without a place."""
-    rng = np.random.default_rng([settings.seed, 0x5EA1ED])
-    if hidden != RANDOM:
-        kinds = list(effect_class(hidden).typical())
-        return kinds[0] if kinds else _clipping(settings, truth, high=False)
-    usable = [tag for tag, each in effect_classes().items() if not (each.untestable or each.measured_only)]
-    usable = [tag for tag in usable if tag == "clipping" or effect_class(tag).typical()]
-    tag = usable[int(rng.integers(len(usable)))]
-    kinds = list(effect_class(tag).typical())
-    return (
-        kinds[int(rng.integers(len(kinds)))]
-        if kinds
-        else _clipping(settings, truth, high=bool(rng.integers(2)))
-    )
-
-
-def _clipping(settings: SimulateSettings, truth: TruthMaps, *, high: bool) -> Effect:
-    """Return a limit of the scale that cuts a small share of this sensor's samples."""
+def _clipping(settings: SimulateSettings, truth: TruthMaps) -> Effect:
+    """Return a lower limit of the scale that cuts a small share of this sensor's samples."""
     count = min(settings.n_frames, max(1, 2_000_000 // truth.bias.size))
     dn = simulate_block(truth, settings, (0, count), electron_frames=0)[0]
-    limit = int(np.quantile(dn, 1.0 - _CLIPPED_SHARE if high else _CLIPPED_SHARE))
-    return effect_class("clipping").model_validate({"high" if high else "low": limit})
+    return effect_class("clipping").model_validate({"low": int(np.quantile(dn, _CLIPPED_SHARE))})
 
 
 def _hide(output: Path, hidden: str, size: int, n_frames: int, seed: int) -> None:
@@ -252,15 +162,13 @@ def _hide(output: Path, hidden: str, size: int, n_frames: int, seed: int) -> Non
         {"shape": [size, size], "n_frames": n_frames, "seed": seed, "parameters": _SENSOR}
     )
     truth = draw_truth(settings)
-    effect = what_to_hide(hidden, settings, truth)
-    unlisted = effect if isinstance(effect, Unlisted) else None
-    if not isinstance(effect, Unlisted):
-        settings = settings.model_copy(update={"effects": (effect,)})
+    effect = hidden_effect(hidden, settings, truth)
+    settings = settings.model_copy(update={"effects": (effect,)})
     (output / _FRAMES.parent).mkdir(parents=True, exist_ok=True)
     write_frames(
         "tiff",
         output / _FRAMES,
-        _blocks(settings, truth, unlisted),
+        _blocks(settings, truth),
         (n_frames, size, size),
         dn_dtype(settings.bit_depth),
         integration_time=settings.integration_time,
@@ -278,18 +186,14 @@ def _hide(output: Path, hidden: str, size: int, n_frames: int, seed: int) -> Non
     )
     write_atomic(output / _YAML, dump_config(config).encode())
     key = {name: getattr(truth, name) for name in COMPARED}
-    told = json.dumps({"unlisted": effect.tag}) if isinstance(effect, Unlisted) else effect.model_dump_json()
-    write_atomic(output / SEALED_KEY, _packed({**key, "effect": np.array(told)}))
+    write_atomic(output / SEALED_KEY, _packed({**key, "effect": np.array(effect.model_dump_json())}))
 
 
-def _blocks(
-    settings: SimulateSettings, truth: TruthMaps, unlisted: Unlisted | None
-) -> Iterator[NDArray[Any]]:
+def _blocks(settings: SimulateSettings, truth: TruthMaps) -> Iterator[NDArray[Any]]:
     step = frames_per_block(settings, settings.shape[0], _BUDGET)
     for start in range(0, settings.n_frames, step):
         stop = min(start + step, settings.n_frames)
-        block = simulate_block(truth, settings, (start, stop), electron_frames=0)[0]
-        yield block if unlisted is None else unlisted.applied(block, start, settings.seed)
+        yield simulate_block(truth, settings, (start, stop), electron_frames=0)[0]
 
 
 def _packed(arrays: dict[str, NDArray[Any]]) -> bytes:
@@ -321,11 +225,7 @@ def _text(output: Path, target: Target) -> str:
     assert found is not None
     key = _unpacked(output / SEALED_KEY)
     effect: dict[str, Any] = json.loads(str(key.pop("effect")))
-    hidden = (
-        UNLISTED[effect["unlisted"]]
-        if "unlisted" in effect
-        else effect_class(effect["tag"]).model_validate(effect)
-    )
+    hidden = effect_class(effect["tag"]).model_validate(effect)
     comparison = compare(found, hidden, key, _unpacked(output / _PLAIN_MAPS), _maps(target))
     paths = {
         "verdict": target.store / "discrepancy.html",

@@ -14,16 +14,12 @@ from typer.testing import CliRunner
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.cli.app import app
 from pchem_pipeline.commands.demo import hidden
-from pchem_pipeline.commands.demo.comparison import COMPARED, compare, judgement, unnamed
+from pchem_pipeline.commands.demo.comparison import COMPARED, compare, judgement
 from pchem_pipeline.commands.demo.hidden import (
-    OUTSIDE,
-    RANDOM,
     SEALED_KEY,
     hidden_effect,
     run_hidden_demo,
-    what_to_hide,
 )
-from pchem_pipeline.commands.demo.unlisted import UNLISTED, Unlisted
 from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 from pchem_pipeline.simulate.maps import draw_truth
@@ -33,7 +29,7 @@ SETTINGS = SimulateSettings.model_validate({"shape": [12, 12], "n_frames": 60, "
 
 
 def test_unknown_tags_are_refused_with_those_known(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"'rownoise'.*choose one of: adc_dnl, .*row_noise, .*random"):
+    with pytest.raises(ConfigError, match=r"'rownoise'.*choose one of: adc_dnl, .*row_noise"):
         run_hidden_demo(tmp_path / "x", hidden="rownoise", size=8, n_frames=60, seed=1)
     assert not (tmp_path / "x").exists()
 
@@ -55,57 +51,18 @@ def test_every_effect_can_be_hidden(tag: str) -> None:
 
 
 def test_an_effect_can_be_hidden_in_a_place() -> None:
-    effect = what_to_hide("row_noise@columns=2:5,frames=10:20", SETTINGS, draw_truth(SETTINGS))
-    assert not isinstance(effect, Unlisted)
+    effect = hidden_effect("row_noise@columns=2:5,frames=10:20", SETTINGS, draw_truth(SETTINGS))
     assert effect.tag == "row_noise"
     everywhere = hidden_effect("row_noise", SETTINGS, draw_truth(SETTINGS)).model_dump()["row_noise_dn"]
     assert effect.model_dump()["row_noise_dn"] == pytest.approx(everywhere * (4 * 6) ** 0.5)
     assert effect.region == Region(columns=((2, 5),))
     assert effect.when == When(range=((10, 20),))
-    other = what_to_hide("random@columns=2:5", SETTINGS, draw_truth(SETTINGS))
-    assert not isinstance(other, Unlisted)
-    assert other.region == effect.region
     with pytest.raises(ConfigError, match="columns=A:B"):
         hidden._check_tag("row_noise@colums=2:5")
     with pytest.raises(ConfigError, match="no such effect"):
         hidden._check_tag("rownoise@columns=2:5")
     with pytest.raises(ConfigError, match="the sensor has"):
-        what_to_hide("row_noise@columns=2:9000", SETTINGS, draw_truth(SETTINGS))
-
-
-def test_random_hides_any_that_can_be_seen_anywhere_and_some_outside_the_library() -> None:
-    truth = draw_truth(SETTINGS)
-    seeds = [SETTINGS.model_copy(update={"seed": seed}) for seed in range(80)]
-    found = [what_to_hide(RANDOM, settings, truth) for settings in seeds]
-    listed = [each for each in found if not isinstance(each, Unlisted)]
-    assert len({effect.tag for effect in listed}) > 12
-    assert not [e.tag for e in listed if type(e).untestable or type(e).measured_only]
-    placed = [bool(effect.region) + 2 * bool(effect.when) for effect in listed]
-    assert {0, 1, 2} == set(placed)
-    assert {each.tag for each in found if isinstance(each, Unlisted)} == set(UNLISTED)
-    assert found[:5] == [what_to_hide(RANDOM, settings, truth) for settings in seeds[:5]]
-
-
-@pytest.mark.parametrize("tag", sorted(UNLISTED))
-def test_an_effect_outside_the_library_changes_frames_and_is_none_of_the_library(tag: str) -> None:
-    assert tag not in effect_classes()
-    assert what_to_hide(tag, SETTINGS, draw_truth(SETTINGS)) is UNLISTED[tag]
-    frames = np.random.default_rng(1).integers(90, 140, (600, 12, 12)).astype(np.uint16)
-    changed = UNLISTED[tag].applied(frames, 0, 7)
-    assert changed.dtype == frames.dtype
-    assert 1e-4 < (changed != frames).mean() < 0.6
-    np.testing.assert_array_equal(changed, UNLISTED[tag].applied(frames, 0, 7))
-    assert (changed != UNLISTED[tag].applied(frames, 0, 8)).any()
-    with pytest.raises(ConfigError, match="takes no place"):
-        hidden._check_tag(f"{tag}@columns=2:5")
-
-
-def test_a_name_for_an_effect_outside_the_library_is_wrong() -> None:
-    assert unnamed(verdict_of("named", effects=["row_noise"])) == "wrongly named: row_noise"
-    assert unnamed(verdict_of("consistent", effects=[])) == "not noticed"
-    truth = dict.fromkeys(COMPARED, np.full((8, 8), 2.0))
-    text = compare(verdict_of("consistent"), UNLISTED["late_rows"], truth, maps({}), maps({}))
-    assert "hidden was: some rows are read one column late (outside the library) - not noticed" in text
+        hidden_effect("row_noise@columns=2:9000", SETTINGS, draw_truth(SETTINGS))
 
 
 def test_a_hidden_limit_cuts_few_samples_but_some() -> None:
@@ -130,12 +87,9 @@ def test_only_the_sealed_key_knows(tmp_path: Path) -> None:
             assert "truth" not in path.name
     text = (tmp_path / "hidden.yaml").read_text()
     assert "simulate:" not in text
-    hidden._hide(tmp_path / "outside", OUTSIDE, 12, 60, 5)
-    key = json.loads(str(hidden._unpacked(tmp_path / "outside" / SEALED_KEY)["effect"]))
-    assert key["unlisted"] in UNLISTED
-    # nor does a random effect show in what lies beside the frames
+    # nor does another effect show in what lies beside the frames
     other = tmp_path / "other"
-    hidden._hide(other, RANDOM, 12, 60, 5)
+    hidden._hide(other, "bias_drift", 12, 60, 5)
     assert (other / "hidden.yaml").read_text() == text
 
 
@@ -229,9 +183,9 @@ def test_the_command_line_passes_on(
         return "told"
 
     monkeypatch.setattr(hidden, "run_hidden_demo", run)
-    outcome = CliRunner().invoke(app, ["demo", "--hidden", "random", "-o", "out", "-q", *options])
+    outcome = CliRunner().invoke(app, ["demo", "--hidden", "row_noise", "-o", "out", "-q", *options])
     assert outcome.stdout == "told\n"
-    given = {"hidden": "random", "size": 64, "n_frames": 4000, "seed": seed, "quiet": True}
+    given = {"hidden": "row_noise", "size": 64, "n_frames": 4000, "seed": seed, "quiet": True}
     assert seen == [(Path("out"), given)]
 
 
@@ -242,7 +196,7 @@ def test_a_demonstration_that_was_stopped_goes_on(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(hidden, "adopt_verdict", lambda target: (calls.append(["adopt"]), (target, None))[1])
     monkeypatch.setattr(hidden, "_maps", lambda target: {"quality": np.zeros(1)})
     monkeypatch.setattr(hidden, "_text", lambda output, target: "told")
-    given: dict[str, Any] = {"hidden": RANDOM, "size": 8, "n_frames": 60, "seed": None}
+    given: dict[str, Any] = {"hidden": "row_noise", "size": 8, "n_frames": 60, "seed": None}
     assert run_hidden_demo(tmp_path / "x", **given) == "told"
     key = (tmp_path / "x" / SEALED_KEY).read_bytes()
     plain = ["ingest", "histogram", "fit", "maps", "ensemble"]
