@@ -102,8 +102,8 @@ _WORDS: dict[str, tuple[str, str, str]] = {
                  "larger signals are cut off there: exposures of bright pixels come out too low"),
     "bottom_code": ("1", "samples pile up at the lowest code", "the black level is too low: raise it, or set "
                     "input.bit_depth"),
-    "zero_code": ("1", "samples pile up at 0 DN", "the black level is too low: raise it. The fit counts them as "
-                  "0 DN or less, so values hold, with larger errors"),
+    "zero_code": ("1", "samples pile up at 0 DN", "the black level is too low: raise it. The fit counts "
+                  "them as 0 DN or less, so values hold, with larger errors"),
 }  # fmt: skip
 
 
