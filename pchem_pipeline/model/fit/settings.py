@@ -22,7 +22,8 @@ class FitSettings(Section):
         description="density: the PCD at whole DN, as in the paper. exact: each component integrated over "
         "the cell of its code, codes at the limits of the ADC censored (three times slower). auto: exact in "
         "the pixels where rounding would bias the density's estimates by more than 0.05 standard errors, "
-        "whose codes another gain explains as well, or with samples at a limit of the ADC; density in the others",
+        "whose codes another gain explains as well, or with samples at a limit of the ADC; density in the "
+        "others",
     )
     max_iterations: int = Field(
         default=200,
