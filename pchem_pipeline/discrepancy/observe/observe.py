@@ -42,7 +42,7 @@ from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals, Evi
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED, FitStatus
+from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.histogram.count import histogram_frames
 
 FloatArray = NDArray[np.float64]
@@ -255,7 +255,7 @@ def _with_fit(evidence: Evidence, result: FitResult) -> Evidence:
     return replace(
         evidence,
         covariance=result.covariance.reshape(*good.shape, 4, 4),
-        ambiguous=float(np.mean((result.fit_status[good.ravel()] & int(AMBIGUOUS)) != 0)),
+        ambiguous=float(np.mean((result.fit_status[good.ravel()] & int(FitStatus.BIAS_AMBIGUOUS)) != 0)),
     )
 
 

@@ -71,8 +71,8 @@ _TWO_PI = 2.0 * math.pi
 N_ATTEMPTS = 2  # the first start, then all steps of the comb; at several samples some starts, then all
 #: Frequencies of the scan over the step of the comb: the first is 1 over the range of the sample, each is
 #: larger than the one before by a share of itself, half the width of a narrow peak, or by a third of the
-#: width of a side lobe, 0.16/sd, if that is less; the last is that of H = 66 e-.
-_SCAN_SHARE, _SCAN_STEP, _SCAN_END = 0.06, 0.05, 8.2
+#: width of a side lobe, 0.16/sd, if that is less; the last is that of H = 200 e-.
+_SCAN_SHARE, _SCAN_STEP, _SCAN_END = 0.06, 0.05, 14.4
 _CLEAR = 3.0  # standard errors of the modulus of the ECF, 1 / sqrt(N)
 _UNRESOLVED = 1.1  # ratio of frequencies whose lobes are in the noise
 _CENTRAL_LOBE = 0.75  # 1/sd: the central lobe of any sample has ended there
@@ -437,7 +437,7 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
 
     ``phi(1/a) = exp(-2 pi^2 s^2) exp(2 pi i mu / a)`` for a comb of step a and read noise s (e-), whatever H
     is: modulus and phase give s and mu, mean and variance H. A step of more than the range of the sample
-    leaves no second peak, one of less than ``sd / 8`` has H > 60 e-; between them the frequencies are closer
+    leaves no second peak, one of less than ``sd / 14`` has H > 200 e-; between them the frequencies are closer
     than the likelihood's maxima. Past the central lobe those that stay in the noise, ``3 / sqrt(N)``, are no
     comb's and are left out.
     """
