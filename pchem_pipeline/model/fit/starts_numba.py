@@ -437,9 +437,9 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
 
     ``phi(1/a) = exp(-2 pi^2 s^2) exp(2 pi i mu / a)`` for a comb of step a and read noise s (e-), whatever H
     is: modulus and phase give s and mu, mean and variance H. A step of more than the range of the sample
-    leaves no second peak, one of less than ``sd / 14`` has H > 200 e-; between them the frequencies are closer
-    than the likelihood's maxima. Past the central lobe those that stay in the noise, ``3 / sqrt(N)``, are no
-    comb's and are left out.
+    leaves no second peak, one of less than ``sd / 14`` has H > 200 e-; between them the frequencies are
+    closer than the likelihood's maxima. Past the central lobe few are tried of those that stay in the noise,
+    ``3 / sqrt(N)``.
     """
     histogram, work, used = histogram_of(pixel, np.int64(0)), scratch.rows, 0
     _no_starts(scratch.small[HEIGHTS])

@@ -32,7 +32,7 @@ def test_perfect_frames_of_a_sensor_of_any_layout_are_not_called_wrong(layout):
 
 
 def test_row_noise_is_found_on_a_noisy_sensor():
-    """A third of the read noise of 5.6 DN, 19 errors of the variance of row means; of 7 stacks 6 were named."""
+    """A third of the read noise of 5.6 DN, 19 errors of the variance of row means."""
     found = []
     for seed in (21, 22, 23):
         rng = np.random.default_rng(seed)
