@@ -228,7 +228,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "top_code": (1e-4, 1e-2),
     "bottom_code": (1e-4, 1e-2),
     "zero_code": (1e-4, 1.0),
-    "odd_frames": (0.0, 0.05),
+    "odd_frames": (0.0, 0.01),
     "empty_frames": (0.01, 0.1),
 }
 

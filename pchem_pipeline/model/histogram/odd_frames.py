@@ -14,7 +14,7 @@ KINDS = ("empty", "copied", "far")
 #: they are no more than this share of the run: what more frames do is a property of the sensor.
 _FAR, _MOST = 6.5, 0.05
 FAR_CHANCE = 8.1e-11  # of one frame to be as far, by a normal law
-_AROUND, _FEWEST_FRAMES, _FEWEST_PIXELS = 101, 32, 100
+_AROUND, _FEWEST_FRAMES, _FEWEST_PIXELS = 101, 32, 64
 
 
 def odd_frames(
