@@ -112,7 +112,7 @@ def electron_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
 def component_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
     """Return the widths of the components of the ensemble (Appendix B)."""
     variance = data.ensemble.get("component_variance")
-    if variance is None or variance.size == 0:
+    if variance is None or not np.isfinite(variance).any():
         return []
     cases = data.component_cases or [f"case {i}" for i in range(variance.shape[0])]
     table = component_table(variance, cases, data.ensemble.get("nuced_component_variance"))
