@@ -338,11 +338,11 @@ def window(axis: Axis, values: Iterator[Values], base: float | None = None) -> t
         ends = low - margin, high + margin
         if base is not None:
             ends = (low if low == base else ends[0]), (high if high == base < low else ends[1])
-    found = (
-        ends[0] if axis.low is None else axis.low,
-        ends[1] if axis.high is None else axis.high,
-    )
-    return found if found[0] < found[1] else (found[0], found[0] + abs(found[0]) + 1.0)
+    given = (axis.low, axis.high)
+    found = [
+        end if own is None or not np.isfinite(own) else own for end, own in zip(ends, given, strict=True)
+    ]
+    return found[0], found[1] if found[0] < found[1] else found[0] + abs(found[0]) + 1.0
 
 
 def x_window(stack: Stack) -> tuple[float, float]:
