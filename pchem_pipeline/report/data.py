@@ -19,13 +19,13 @@ from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
-from pchem_pipeline.model.checks.map_parts import Parts, map_parts
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus, flags_of
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.model.maps.ordered import Ordered, median_of
 from pchem_pipeline.report.settings import Criteria
 
 if TYPE_CHECKING:
+    from pchem_pipeline.model.checks.map_parts import Parts
     from pchem_pipeline.report.figures.figure import Figure
     from pchem_pipeline.report.inspector.inspector_data import InspectorData
 
@@ -320,6 +320,8 @@ class ReportData:
     @cached_property
     def parts(self) -> dict[str, list[Parts]]:
         """Parts of the sensor that differ in a map, by its name; flagged pixels are left out."""
+        from pchem_pipeline.model.checks.map_parts import map_parts
+
         names = () if self.few_channels else ("conversion_gain", "read_noise_e", "quanta_exposure", "bias")
         known = (name for name in names if self.has_values(name))
         return {name: map_parts(np.where(self.flagged_in(name), np.nan, self.maps[name])) for name in known}

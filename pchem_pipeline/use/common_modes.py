@@ -116,7 +116,8 @@ class Offsets:
     def of_samples(self, modes: CommonModes, rows: slice = slice(None)) -> NDArray[np.float32]:
         """Return the offset of each sample of some rows, DN, shape (frame, y, x)."""
         design, n = _Design.of(modes), len(self.rows)
-        frames = [design.offsets(self.rows[t], self.columns[t], self.waves[t], rows) for t in range(n)]
+        waves = self.waves if len(self.waves) else np.zeros((n, 0, 2))
+        frames = [design.offsets(self.rows[t], self.columns[t], waves[t], rows) for t in range(n)]
         return np.array(frames, np.float32).reshape(n, *modes.parts[0, rows].shape)
 
 

@@ -190,22 +190,6 @@ def test_light_levels_and_no_line(joint):
     assert np.isfinite(store.read("maps/conversion_gain")).mean() > 0.8
 
 
-def test_the_yaml_of_version_0_1_is_read_and_says_what_is_new(joint, capsys):
-    path = joint / "old.yaml"
-    path.write_text(
-        "samples: [{run: dark_1s.zarr}, {run: dark_2s.zarr, integration_time: 3}, "
-        "{run: bias.zarr, kind: bias}]\njoint: {store: old.zarr, tile: 16, title: Old}\n"
-        "fit: {likelihood: exact}\n"
-    )
-    config = find_run(path).config
-    assert [each.bias for each in config.input.samples] == [False, False, True]
-    assert (config.run.store, config.run.tile, config.run.title) == ("old.zarr", 16, "Old")
-    assert (config.input.against, config.fit.likelihood) == ("integration_time", "exact")
-    said = capsys.readouterr().err
-    assert said.startswith(f"pchem: {path}: samples and joint are now input.samples, input.against and run")
-    assert said.count("\n") == 1
-
-
 def test_what_looks_at_a_run_looks_at_this_one(joint, kernels, tmp_path):
     shell = Shell(joint, {**os.environ, "NUMBA_CACHE_DIR": kernels})
     assert "maps.fits" in shell.ok("export", "dark.zarr", "-o", str(tmp_path), "--format", "fits,csv").stdout

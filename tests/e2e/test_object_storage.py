@@ -84,7 +84,7 @@ def test_frames_are_read_from_s3_and_fetched_once(cloud, server, camera, finishe
     found = arrays_of(cloud.folder / "run.zarr", ("histogram", "summary"))
     assert found.keys() == expected.keys()
     for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
+        np.testing.assert_allclose(found[name], values, rtol=1e-12, err_msg=name)
     fetched = sorted((tmp_path / "cache").rglob("*.tif"))
     before = [path.stat().st_mtime_ns for path in fetched]
     assert len(fetched) == 4
@@ -144,7 +144,7 @@ def assert_same(store, finished, groups):
     expected, found = arrays_of(finished, groups), arrays_of(store, groups)
     assert found.keys() == expected.keys()
     for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
+        np.testing.assert_allclose(found[name], values, rtol=1e-12, err_msg=name)
 
 
 def test_a_run_whose_store_is_on_s3(cloud, server, frames, finished, tmp_path):

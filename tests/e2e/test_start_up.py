@@ -11,6 +11,7 @@ import pytest
 from pchem_pipeline.cli.app import app
 from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.stages.table import STAGES
+from pchem_pipeline.store.run_store import RunStore
 
 COMMAND = """
 import sys
@@ -70,9 +71,10 @@ def test_fit_imports_its_kernels_and_not_those_who_draw_or_read_cameras(librarie
 
 
 def test_a_report_without_files_of_figures_imports_nobody_who_draws(libraries, tmp_path):
-    config = tmp_path / "run.zarr/.pchem/config.yaml"
-    text = re.sub(r"figure_formats:\s*(\[svg\]|- svg)", "figure_formats: []", config.read_text())
-    config.write_text(text)
+    store = RunStore.open(tmp_path / "run.zarr")
+    text = store.config_text()
+    assert text is not None
+    store.write_config(re.sub(r"figure_formats:\s*(\[svg\]|- svg)", "figure_formats: []", text))
     found = libraries("report", "{store}", "--force", "--quiet", "--backend", "serial")
     assert "jinja2" in found
     assert not found & {"matplotlib", "PIL", "contourpy", "fontTools"}

@@ -22,6 +22,7 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.report.inspector import inspector_data, read_maps
 from pchem_pipeline.stages.report.pixels import choose_inspected
 from pchem_pipeline.stages.report.stored import FittedModel, read_histograms
+from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 
 
@@ -87,4 +88,5 @@ def make_run(
     data = replace(report_data(shape, failed=failed), **changes)  # type: ignore[arg-type]
     store = write_run(folder, data, n_frames=n_frames)
     store.write_file("report.html", page_without_pictures(inspected(store, data)).encode())
+    store.records.write(StageRecord("report", 1, "made", {}, finished=True))
     return store

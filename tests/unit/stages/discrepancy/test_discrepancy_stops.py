@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 from types import SimpleNamespace
 from typing import Any
@@ -31,6 +32,7 @@ def test_a_stop_in_the_middle_of_a_comparison_makes_no_verdict(
 
     context = SimpleNamespace(sensor=SimpleNamespace(kind="frames"), reporter=Reporter(quiet=True))
     context.run_units = run_units
+    context.stop = SimpleNamespace(at_once=contextlib.nullcontext)
     monkeypatch.setattr(discrepancy, "_start", lambda _: ((), None))
     monkeypatch.setattr(discrepancy, "_run_frames", search)
     with pytest.raises(type(error)) as found:
