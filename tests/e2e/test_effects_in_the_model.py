@@ -124,10 +124,15 @@ def test_ensemble_is_predicted_with_the_extended_law(both) -> None:
     for name in ("mean", "variance", "nuced_mean", "nuced_variance"):
         row = rows[name]
         assert abs(row["predicted"] - row["observed"]) < 5 * row["stderr"]
-    terms = ("variance_of_bias", "variance_of_signal", "mean_read_variance", "mean_shot_variance")
-    total = sum(rows[name]["predicted"] for name in (*terms, "bias_signal_covariance", "effects"))
-    # the variance of the bias leaves out that pixels may be an electron off, the total has it
-    assert rows["variance"]["predicted"] * 0.95 < total <= rows["variance"]["predicted"] * (1 + 1e-12)
+    # the total has the variance of all biases, its term leaves out that they may be an electron off
+    bias, gain, gap = (store.read(f"fit/{name}") for name in ("bias", "conversion_gain", "likelihood_gap"))
+    weight = np.tanh(gap / 2)
+    square = (bias - np.average(bias, weights=weight)) ** 2 - (1 - weight**2) / (2 * gain) ** 2
+    expected = pytest.approx(np.average(square, weights=weight), rel=1e-12)
+    assert rows["variance_of_bias"]["predicted"] == expected
+    terms = ("variance_of_signal", "mean_read_variance", "mean_shot_variance", "bias_signal_covariance")
+    total = bias.var() + sum(rows[name]["predicted"] for name in (*terms, "effects"))
+    assert total == pytest.approx(rows["variance"]["predicted"], rel=1e-12)
 
 
 def test_electron_numbers_err_as_often_as_predicted(both) -> None:
