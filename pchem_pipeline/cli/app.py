@@ -378,10 +378,7 @@ def demo(
     output: Output = Path("pchem-demo"),
     size: Annotated[int, typer.Option(min=8, help="rows and columns of the simulated sensor")] = 64,
     frames: Annotated[int, typer.Option(min=16, help="number of frames")] = 4000,
-    seed: Annotated[
-        int | None,
-        typer.Option(min=0, help="root of the random numbers [default: 1]"),
-    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="root of the random numbers")] = 1,
     hidden: Annotated[
         str | None,
         typer.Option(
@@ -395,14 +392,9 @@ def demo(
 
     Prints the estimated parameters beside the true ones, and the path of the report.
     """
-    if hidden is not None:
-        from pchem_pipeline.commands.demo.hidden import run_hidden_demo
+    from pchem_pipeline.commands.demo import run_demo
 
-        text = run_hidden_demo(output, hidden=hidden, size=size, n_frames=frames, seed=seed, quiet=quiet)
-    else:
-        from pchem_pipeline.commands.demo.demo import run_demo
-
-        text = run_demo(output, size=size, n_frames=frames, seed=1 if seed is None else seed, quiet=quiet)
+    text = run_demo(output, size=size, n_frames=frames, seed=seed, hidden=hidden, quiet=quiet)
     typer.echo(text)
 
 

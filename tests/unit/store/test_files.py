@@ -101,7 +101,6 @@ def test_no_other_module_puts_files_in_their_place():
         # into memory
         "stages/fit/start.py": 1,
         "stages/simulate.py": 1,
-        "commands/demo/hidden.py": 1,
         "commands/twin.py": 1,
     }
     found: dict[str, int] = {}

@@ -1,0 +1,166 @@
+"""``pchem demo``: a simulated sensor through the whole pipeline, beside its truth.
+
+With ``--hidden`` an effect acts in the frames, of which model and search know nothing, and the search has to
+find it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pchem_pipeline.base.errors import ConfigError, quoted
+from pchem_pipeline.base.variables import VARIABLES
+from pchem_pipeline.commands.model import adopt_verdict
+from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.discrepancy.verdict import read_verdict
+from pchem_pipeline.effects.framework.compose import effect_words
+from pchem_pipeline.effects.framework.region import GRAMMAR, parse_place
+from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
+from pchem_pipeline.run.target import find_run
+from pchem_pipeline.runner.session import Command, run_stages
+from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
+from pchem_pipeline.stages.table import pipeline_of
+from pchem_pipeline.store.files import write_atomic
+from pchem_pipeline.store.run_store import RunStore
+
+if TYPE_CHECKING:
+    from pchem_pipeline.effects.framework.effect import Effect
+    from pchem_pipeline.run.target import Target
+
+_COMPARED = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
+
+
+def run_demo(
+    output: Path, *, size: int, n_frames: int, seed: int, hidden: str | None = None, quiet: bool = False
+) -> str:
+    """Simulate a sensor of ``size`` x ``size`` pixels to TIFF, run every stage, and return a text.
+
+    Args:
+        output: folder for the frames, the YAML and the store.
+        size: rows and columns.
+        n_frames: number of frames.
+        seed: root of the random numbers.
+        hidden: tag of an effect in the frames, to be found by the search; with ``@`` and a place or a time:
+            it acts only there.
+        quiet: say warnings only.
+
+    Raises:
+        ConfigError: the folder holds something else, or the effect is unknown or has no typical strength.
+        PchEmError: a stage failed.
+    """
+    if output.exists() and not output.is_dir():
+        raise ConfigError(f"{output} is a file; choose a folder with --output")
+    path = output / "demo.yaml"
+    if output.exists() and any(output.iterdir()) and not path.exists():
+        raise ConfigError(f"{output} is not empty; choose another folder with --output")
+    effect = None if hidden is None else hidden_effect(hidden, size, n_frames)
+    simulate = {"shape": [size, size], "n_frames": n_frames, "seed": seed, "format": "tiff"}
+    if effect is not None:
+        simulate["effects"] = [effect.model_dump(mode="json")]
+    config = RunConfig.model_validate(
+        {
+            "run": {"store": "demo.zarr", "title": "Simulated demo sensor", "tile": 32},
+            "simulate": simulate,
+        }
+    )
+    write_atomic(path, dump_config(config).encode())
+    target, command = find_run(path), Command(quiet=quiet)
+    run_stages(target, pipeline_of(target.config), command)
+    table = comparison_table(RunStore.open(target.store))
+    if effect is not None:
+        table = _search(target, effect, command, table)
+    place = quoted(target.store)
+    return (
+        f"{table}\n\nreport: {target.store / 'report.html'}\n\n"
+        f"use it: pchem apply {place} FRAMES --output OUT    (other frames in electrons, with errors)\n"
+        f"        pchem twin {place} --output camera.yaml    (this camera, to simulate other scenes)"
+    )
+
+
+def hidden_effect(asked: str, size: int, n_frames: int) -> Effect:
+    """Return an effect of the library at its typical strength.
+
+    Args:
+        asked: its tag; with ``@`` and a place or a time in one line: ``row_noise@columns=40:50``. The
+            strength there is larger by one over the root of the share of the samples, so that it is as
+            significant as everywhere.
+        size: rows and columns.
+        n_frames: number of frames.
+
+    Raises:
+        ConfigError: there is no such effect, place or typical strength.
+    """
+    tag, at, place = asked.partition("@")
+    if tag not in effect_classes():
+        known = ", ".join(effect_classes())
+        raise ConfigError(
+            f"--hidden {tag!r}: there is no such effect; choose one of: {known}; "
+            f"behind it @ and a place, if any: {GRAMMAR}"
+        )
+    kinds = effect_class(tag).typical()
+    if not kinds:
+        raise ConfigError(f"--hidden {tag}: this effect names no typical strength to hide; choose another")
+    try:
+        region, when = parse_place(place) if at else (None, None)
+    except ValueError as error:  # of pydantic, too
+        raise ConfigError(f"--hidden {asked}: {' '.join(str(error).split())}") from None
+    share = 1.0 if region is None else float(region.mask((size, size)).mean())
+    share *= 1.0 if when is None else when.share(np.arange(n_frames))
+    effect = kinds[0].scaled(share**-0.5) if kinds[0].strength and 0.0 < share < 1.0 else kinds[0]
+    return effect.at_place(region, when)
+
+
+def _search(target: Target, effect: Effect, command: Command, plain: str) -> str:
+    """Search for what is missing, run again with the model found, and return all that beside the truth."""
+    run_stages(target, ["discrepancy"], command)
+    extended, _ = adopt_verdict(target)
+    run_stages(extended, pipeline_of(extended.config), command)
+    found = read_verdict(target.store)
+    assert found is not None
+    numbers = {n: v for n, v in effect.model_dump().items() if isinstance(v, int | float)}
+    reason = type(effect).untestable
+    return (
+        f"{verdict_text(found)}\n\nhidden was: {effect_words(effect)}"
+        f"{''.join(f', {name} = {value:.4g}' for name, value in numbers.items())}"
+        f"{f' (such frames cannot show it: {reason})' if reason else ''}\n\n"
+        f"with the plain model:\n{plain}\n\n"
+        f"with the model of the verdict:\n{comparison_table(RunStore.open(target.store))}\n\n"
+        f"verdict: {target.store / 'discrepancy.html'}"
+    )
+
+
+def comparison_table(store: RunStore) -> str:
+    """Return a table of estimated against true parameters of the good pixels of a simulated run.
+
+    ``error / stderr`` is the standard deviation over pixels of (estimate - truth) / standard error: 1
+    where the standard errors are right.
+    """
+    quality = store.read("maps/quality")
+    good = quality == 0
+    columns = ("true median", "estimated", "rms error", "stderr", "error/stderr")
+    head = f"{'parameter':<24}" + "".join(f"{column:>14}" for column in columns)
+    lines = [head, "-" * len(head)]
+    for name in _COMPARED:
+        truth = store.read(f"truth/{name}")[good]
+        estimate = store.read(f"maps/{name}")[good]
+        stderr = store.read(f"maps/{name}_stderr")[good]
+        error = estimate - truth
+        numbers = (
+            np.median(truth),
+            np.median(estimate),
+            np.sqrt(np.mean(error**2)),
+            np.median(stderr),
+            np.std(error / stderr),
+        )
+        label = f"{name}, {VARIABLES[f'maps/{name}'].unit}"
+        lines.append(f"{label:<24}" + "".join(f"{number:>14.4g}" for number in numbers))
+    caution, failed = np.count_nonzero(quality == 1), np.count_nonzero(quality == 2)
+    lines.append(
+        f"{good.sum()} of {good.size} pixels are good (the table is of these), {caution} are to be used with "
+        f"caution, {failed} have no value"
+    )
+    return "\n".join(lines)

@@ -1,1 +1,0 @@
-"""``pchem demo``: simulated sensors through the whole pipeline, beside their truth."""
