@@ -25,10 +25,12 @@ from pchem_pipeline.report.charts.chart import (
     Sticks,
     Values,
     Words,
+    fewer_steps,
+    some_points,
+    thinned,
     x_window,
     y_window,
 )
-from pchem_pipeline.report.charts.thinning import fewer_steps, some_points, thinned
 from pchem_pipeline.report.style.palette import DARK, LIGHT, Palette
 from pchem_pipeline.report.style.wording import without_formulas
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import struct
 import textwrap
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
@@ -30,13 +33,14 @@ from pchem_pipeline.report.charts.chart import (
     Steps,
     Sticks,
     Words,
+    fewer_steps,
     height_of,
+    some_points,
+    thinned,
     tick_rows,
     x_window,
     y_window,
 )
-from pchem_pipeline.report.charts.png import png_url
-from pchem_pipeline.report.charts.thinning import fewer_steps, some_points, thinned
 from pchem_pipeline.report.charts.ticks import scaled, ticks
 from pchem_pipeline.report.style.palette import LIGHT, MAP_COLOURS, shades
 from pchem_pipeline.report.style.wording import without_formulas
@@ -49,6 +53,8 @@ _LEFT, _RIGHT, _BELOW, _BETWEEN, _LINE = 68.0, 10.0, 38.0, 8.0, 15.0
 _POINT = 1.35  # px
 #: Dots of a map on a px of the picture; width of the bar of its colours and room around it, px.
 _DOTS, _BAR, _ROOM = 2.5, 11.0, 8.0
+#: Packing of PNG files: maps are within 3 % as small as at levels 6 and 9, in three quarters of the time.
+_COMPRESSION = 4
 _DASHES: dict[Dash, str] = {
     "--": "5 3",
     ":": "1.5 2.5",
@@ -298,7 +304,7 @@ def _image(mark: Image, frame: Frame) -> str:
     if top > bottom:
         values, top, bottom = values[::-1], bottom, top
     place = f'x="{left:.2f}" y="{top:.2f}" width="{right - left:.2f}" height="{bottom - top:.2f}"'
-    href = png_url(mark.index(values), np.vstack([_colours(mark), _rgb((_named(mark.none),))]))
+    href = _png_url(mark.index(values), np.vstack([_colours(mark), _rgb((_named(mark.none),))]))
     return f'<image {place} preserveAspectRatio="none" style="image-rendering:pixelated" href="{href}"/>'
 
 
@@ -319,7 +325,7 @@ def _bar(mark: Image, frame: Frame) -> list[str]:
     if not mark.bar:
         return []
     left, top, high = frame.left + frame.width + _ROOM, frame.top, frame.height
-    href = png_url(np.arange(NO_COLOUR, dtype=np.uint8)[::-1, None], _colours(mark))
+    href = _png_url(np.arange(NO_COLOUR, dtype=np.uint8)[::-1, None], _colours(mark))
     place = f'x="{left:.1f}" y="{top:.1f}" width="{_BAR}" height="{high:.1f}"'
     parts = [
         f'<image {place} preserveAspectRatio="none" href="{href}"/>',
@@ -461,3 +467,32 @@ def _path(frame: Frame, x: FloatArray, y: FloatArray) -> str:
     new = known & np.concatenate([[True], ~known[:-1]])
     places = zip(across[known].tolist(), down[known].tolist(), new[known].tolist(), strict=True)
     return "".join(f"{'M' if first else 'L'}{a:.1f} {b:.1f}" for a, b, first in places)
+
+
+def png_of(index: NDArray[np.uint8], colours: NDArray[np.uint8]) -> bytes:
+    """Return a picture as a PNG file.
+
+    Args:
+        index: number of the colour of each dot, (row, column).
+        colours: red, green and blue, shape (n, 3), n up to 256.
+    """
+    rows, columns = index.shape
+    # before each row the number of the filter: none
+    lines = np.zeros((rows, columns + 1), np.uint8)
+    lines[:, 1:] = index
+    parts = (
+        (b"IHDR", struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)),
+        (b"PLTE", colours.tobytes()),
+        (b"IDAT", zlib.compress(lines.tobytes(), _COMPRESSION)),
+        (b"IEND", b""),
+    )
+    written = (
+        struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        for kind, content in parts
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(written)
+
+
+def _png_url(index: NDArray[np.uint8], colours: NDArray[np.uint8]) -> str:
+    """Return a picture as a data URL; see :func:`png_of`."""
+    return f"data:image/png;base64,{base64.b64encode(png_of(index, colours)).decode('ascii')}"

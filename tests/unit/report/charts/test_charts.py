@@ -34,14 +34,15 @@ from pchem_pipeline.report.charts.chart import (
     Steps,
     Sticks,
     Words,
+    fewer_steps,
+    some_points,
+    thinned,
     x_window,
     y_window,
 )
 from pchem_pipeline.report.charts.on_page import page_chart, rounded
 from pchem_pipeline.report.charts.on_paper import draw_chart
-from pchem_pipeline.report.charts.picture import chart_picture
-from pchem_pipeline.report.charts.png import png_of
-from pchem_pipeline.report.charts.thinning import fewer_steps, some_points, thinned
+from pchem_pipeline.report.charts.picture import chart_picture, png_of
 from pchem_pipeline.report.charts.ticks import ticks
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.figure import Figure
