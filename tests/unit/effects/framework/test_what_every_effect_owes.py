@@ -129,6 +129,10 @@ def test_each_says_what_is_known_of_it(tag):
     for effect in kind.typical():
         assert isinstance(effect, kind)
         assert getattr(effect, kind.strength) != 0
+        twice = getattr(effect.scaled(2.0), kind.strength)
+        # all of the samples is the most that a correction can replace
+        largest = 1.0 if tag == "pixel_correction" else np.inf
+        assert twice == pytest.approx(min(2 * getattr(effect, kind.strength), largest))
         assert kind.model_validate(effect.model_dump(mode="json")) == effect
 
 
