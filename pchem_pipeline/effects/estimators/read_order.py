@@ -34,7 +34,7 @@ def pink_amplitudes(n: int) -> FloatArray:
         (RECORD n // 2 + 1,), real.
     """
     cycles = np.arange(RECORD * n // 2 + 1)
-    amplitudes = np.where(cycles >= RECORD, np.maximum(cycles, 1) ** -0.5, 0.0)
+    amplitudes = np.where(cycles >= min(RECORD, cycles[-1]), np.maximum(cycles, 1) ** -0.5, 0.0)
     weight = np.where((cycles == 0) | (2 * cycles == RECORD * n), 1.0, 2.0)
     return np.asarray(amplitudes / np.sqrt((weight * amplitudes**2).sum() / (RECORD * n)))
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.effects.analog.analog_memory import AnalogMemory
 from pchem_pipeline.effects.analog.flicker_noise import FlickerNoise
 from pchem_pipeline.effects.analog.gain_drift import GainDrift
@@ -23,42 +20,14 @@ from pchem_pipeline.effects.analog.signal_dependent_noise import SignalDependent
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.framework.plane import Plane
-from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.simulate import chain
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.streams import KeyedStreams
 from pchem_pipeline.simulate.truth import TruthMaps
 
-CLASSES: tuple[type[Effect], ...] = (
-    AnalogMemory, FlickerNoise, GainDrift, HeavyTailedNoise, InterpixelCapacitance, NoiseSkew,
-    Nonlinearity, RtsNoise, SignalDependentNoise,
-)  # fmt: skip
 BOW = (-0.5, 0.5, -0.5)
-STRONG: list[Effect] = [
-    AnalogMemory(memory=0.4),
-    FlickerNoise(share=0.9, correlation_frames=7.0),
-    FlickerNoise(share=0.9, correlation_frames=0.4),
-    FlickerNoise(share=0.9, correlation_frames=90.0, spectrum="one_over_f"),
-    GainDrift(drift=0.4),
-    GainDrift(drift=0.4, shape="path", path=BOW),
-    GainDrift(drift=0.4, shape="settling"),
-    HeavyTailedNoise(share=0.3, factor=4.0),
-    InterpixelCapacitance(coupling=0.1, anisotropy=0.3),
-    NoiseSkew(share=-0.9),
-    Nonlinearity(step_change=0.1),
-    Nonlinearity(step_change=0.1, noise="bent"),
-    RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.7),
-    RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.7, samples=4, spread="exponential"),
-    RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.6, sampling="single", correlation_frames=11.0),
-    RtsNoise(fraction=0.5, amplitude_e=2.0, sampling="single", spread="lognormal", times_spread=0.9),
-    SignalDependentNoise(noise_e=0.5),
-    SignalDependentNoise(noise_e=0.5, growth="linear"),
-]
-SHAPE, N_FRAMES = (7, 5), 40
 
 
 def names(effect: Effect) -> str:
@@ -76,14 +45,6 @@ def make_truth(shape: tuple[int, int], seed: int | None = 5) -> TruthMaps:
         analog_read_noise_e=0.3 + spread * rng.uniform(-0.05, 0.05, shape),
         defect=np.zeros(shape, np.uint8),
     )
-
-
-TRUTH = make_truth(SHAPE)
-
-
-def simulated(*effects: Effect, frames=(0, N_FRAMES), rows=None) -> np.ndarray[Any, Any]:
-    settings = SimulateSettings(shape=SHAPE, n_frames=N_FRAMES, seed=3, bit_depth=12, effects=effects)
-    return simulate_block(TRUTH, settings, frames, rows)[0]
 
 
 def analog(effect: Effect, shape=(500, 20, 30), *, charge=None, first=0, n_run=None, noise=0.3, seed=1):
@@ -111,59 +72,7 @@ def within(seen, expected, stderr, widths: float = 5.0) -> None:
     assert abs(seen - expected) <= widths * stderr, (seen, expected, stderr)
 
 
-# -- what every effect owes ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("effect", CLASSES, ids=lambda c: c.__name__)
-def test_the_class_says_what_it_is(effect):
-    tag = effect.model_fields["tag"].default
-    assert effect_classes()[tag] is effect
-    assert effect.plane is Plane.ANALOG
-    assert effect.title
-    assert effect.source
-    assert effect.signature
-    assert set(effect.signature) <= set(STATISTICS)
-    assert effect.strength in effect.model_fields
-    assert effect.power > 0
-    assert tag not in effect.separate
-    assert all(text for text in effect.separate.values())
-    assert set(effect.separate) <= set(effect_classes())
-    assert effect.typical()
-    assert all(isinstance(e, effect) and getattr(e, effect.strength) for e in effect.typical())
-
-
-@pytest.mark.parametrize("effect", STRONG, ids=names)
-def test_no_strength_changes_no_bit_and_strength_does(effect):
-    plain = simulated()
-    np.testing.assert_array_equal(simulated(effect.scaled(0.0)), plain)
-    assert (simulated(effect) != plain).mean() > 0.05
-
-
-@pytest.mark.parametrize("effect", STRONG, ids=names)
-def test_frames_do_not_depend_on_how_the_work_is_divided(effect, monkeypatch):
-    whole = simulated(effect)
-    monkeypatch.setattr(chain, "_SAMPLES_AT_ONCE", 1)
-    for frames, rows in itertools.product([(0, 1), (1, 18), (18, 40)], [(0, 3), (3, 4), (4, 7)]):
-        part = simulated(effect, frames=frames, rows=rows)
-        np.testing.assert_array_equal(part, whole[slice(*frames), slice(*rows)])
-
-
-@pytest.mark.parametrize("effect", [e for e in STRONG if e.halo() or e.history()], ids=names)
-def test_without_halo_or_history_the_division_would_show(effect, monkeypatch):
-    whole = simulated(effect)
-    monkeypatch.setattr(type(effect), "halo", lambda self: 0)
-    monkeypatch.setattr(type(effect), "history", lambda self: 0)
-    part = simulated(effect, frames=(18, 40), rows=(3, 5))
-    assert (part != whole[18:40, 3:5]).any()
-
-
-@pytest.mark.parametrize("effect", STRONG, ids=names)
-def test_only_what_is_needed_is_read_and_nothing_is_overwritten(effect):
-    after, before, k, r = analog(effect, (12, 4, 5))
-    assert after.dtype == np.float64
-    assert after.shape == before.shape
-    assert not np.shares_memory(after, before)
-    np.testing.assert_array_equal(before, k + r)
+# -- what is refused ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

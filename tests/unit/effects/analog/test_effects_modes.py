@@ -11,7 +11,6 @@ from helpers.sensor_of_modes import context_of, drawn_truth, offsets
 from pydantic import ValidationError
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
 from pchem_pipeline.effects.adc.adc_inl import AdcInl
 from pchem_pipeline.effects.adc.clipping import Clipping
@@ -23,109 +22,17 @@ from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
 from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.effects.framework.plane import Plane
-from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
-from pchem_pipeline.simulate import chain
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
 
-CLASSES: tuple[type[Effect], ...] = (
-    AdcDnl,
-    AdcInl,
-    BiasDrift,
-    BiasJumps,
-    Clipping,
-    ColumnNoise,
-    FrameNoise,
-    PeriodicPickup,
-    ReadoutAlternation,
-    RepeatedFrames,
-    RowNoise,
-)
 JUMPS = (((0, 1.0), (5, -2.0), (9, 0.0)), ((3, 1.0),), (), ((2, 0.5), (11, 4.0)))
-NOTHING = [
-    BiasDrift(drift_dn=0),
-    BiasDrift(drift_dn=0, shape="path", path=(1.0, 5.0, -3.0)),
-    BiasDrift(drift_dn=0, shape="walk"),
-    BiasJumps(amplitude_dn=0, rate=0.1),
-    BiasJumps(amplitude_dn=0, path=JUMPS),
-    FrameNoise(frame_noise_dn=0),
-    RowNoise(row_noise_dn=0),
-    ColumnNoise(column_noise_dn=0),
-    PeriodicPickup(amplitude_dn=0, cycles_per_row=0.1, cycles_per_column=0.2, random_phase=True),
-    ReadoutAlternation(alternation_dn=0),
-    AdcDnl(dnl_lsb=0),
-    AdcDnl(dnl_lsb=0, per_column=True),
-    AdcDnl(dnl_lsb=0, pattern="bit", bit=2),
-    AdcDnl(dnl_lsb=0, pattern="edges", first_code=90, edges=(1.0, -1.0)),
-    AdcInl(inl_lsb=0),
-    RepeatedFrames(),
-]
-STRONG = [
-    BiasDrift(drift_dn=9),
-    BiasDrift(drift_dn=9, shape="path", path=(1.0, 5.0, -3.0)),
-    BiasDrift(drift_dn=9, shape="walk"),
-    BiasDrift(drift_dn=9, shape="settling"),
-    BiasJumps(amplitude_dn=9, rate=0.2, levels=4),
-    BiasJumps(amplitude_dn=9, path=JUMPS),
-    BiasJumps(amplitude_dn=9, rate=0.2, parts="left_right"),
-    FrameNoise(frame_noise_dn=9),
-    RowNoise(row_noise_dn=9),
-    ColumnNoise(column_noise_dn=9),
-    PeriodicPickup(amplitude_dn=9, cycles_per_row=0.1, cycles_per_frame=-0.3, cycles_per_column=0.2),
-    PeriodicPickup(amplitude_dn=9, cycles_per_row=0.1, random_phase=True),
-    ReadoutAlternation(alternation_dn=-9),
-    AdcDnl(dnl_lsb=0.9),
-    AdcDnl(dnl_lsb=0.9, per_column=True),
-    AdcDnl(dnl_lsb=-0.9, pattern="bit", bit=2),
-    AdcInl(inl_lsb=3, period_dn=50),
-    Clipping(low=98, high=140),
-    RepeatedFrames(probability=0.4),
-    RepeatedFrames(frames=(1, 2, 3, 7, 13), rows=(1, 4)),
-]
 N_FRAMES, SHAPE = 14, (6, 5)
 
 
 def frames_of(*effects: Effect) -> Any:
     sensor = SimulateSettings(shape=SHAPE, n_frames=N_FRAMES, seed=8, effects=effects)
     return simulate_block(drawn_truth(SHAPE), sensor, (0, N_FRAMES))[0]
-
-
-def short(effect: Effect) -> str:
-    return f"{effect.tag} {effect.model_dump(exclude_defaults=True, exclude={'tag'})}"[:60]
-
-
-@pytest.mark.parametrize("effect", CLASSES, ids=lambda c: c.__name__)
-def test_each_effect_says_what_it_is(effect):
-    assert effect.title
-    assert effect.source
-    assert effect.signature
-    assert set(effect.signature) <= set(STATISTICS)
-    assert effect.separate
-    assert effect.separate.keys() <= effect_classes().keys() - {effect.model_fields["tag"].default}
-    assert not effect.strength or effect.strength in effect.model_fields
-    for one in effect.typical():
-        assert getattr(one.scaled(2.0), effect.strength) == pytest.approx(2 * getattr(one, effect.strength))
-
-
-@pytest.mark.parametrize("effect", NOTHING, ids=short)
-def test_no_strength_changes_nothing_not_even_the_last_bit(effect):
-    np.testing.assert_array_equal(frames_of(effect), frames_of())
-
-
-@pytest.mark.parametrize("effect", STRONG, ids=short)
-def test_the_same_frames_at_every_division(effect, monkeypatch):
-    sensor = SimulateSettings(shape=SHAPE, n_frames=N_FRAMES, seed=8, effects=(effect,))
-    truth = drawn_truth(SHAPE)
-    whole = frames_of(effect)
-    assert (whole != frames_of()).any()
-    for frames, rows in [([0, 1, 4, 9, 14], [0, 2, 3, 6]), (range(15), range(7))]:
-        for t, y in itertools.product(itertools.pairwise(frames), itertools.pairwise(rows)):
-            part = simulate_block(truth, sensor, t, y)[0]
-            np.testing.assert_array_equal(part, whole[slice(*t), slice(*y)])
-    monkeypatch.setattr(chain, "_SAMPLES_AT_ONCE", 1)
-    np.testing.assert_array_equal(frames_of(effect), whole)
 
 
 def test_a_repeat_that_forgets_history_would_be_noticed():
@@ -410,13 +317,6 @@ def test_scaling_stops_where_the_parameters_end():
     assert RepeatedFrames(probability=0.3).scaled(4).probability == 0.5
     with pytest.raises(ConfigError, match="no strength"):
         Clipping(low=3).scaled(2)
-
-
-def test_planes():
-    at = {effect.model_fields["tag"].default: effect.plane for effect in CLASSES}
-    assert at["repeated_frames"] is Plane.READOUT
-    assert {at[tag] for tag in ("adc_dnl", "adc_inl", "clipping")} == {Plane.ADC}
-    assert list(at.values()).count(Plane.ANALOG) == 7
 
 
 def test_clipping_guesses_nothing_without_evidence():

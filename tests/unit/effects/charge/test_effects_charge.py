@@ -11,7 +11,6 @@ from helpers.charge_material import a_sensor, electrons, exposures, simulated
 from pydantic import ValidationError
 from scipy import stats
 
-from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
 from pchem_pipeline.effects.charge.charge_diffusion import ChargeDiffusion
 from pchem_pipeline.effects.charge.charge_lag import ChargeLag
@@ -19,7 +18,6 @@ from pchem_pipeline.effects.charge.cosmic_rays import CosmicRays
 from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
 from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
 from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
-from pchem_pipeline.effects.charge.trapping import Trapping
 from pchem_pipeline.effects.estimators.charge_sums import exposure_nodes
 from pchem_pipeline.effects.estimators.electrons import binomial_upper, further_uniform, regrouped
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
@@ -27,68 +25,7 @@ from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
 from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
 from pchem_pipeline.effects.exposure.persistence import Persistence
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.law.sample_law import SampleLaw
-
-CLASSES = (
-    ExposureDrift,
-    Persistence,
-    DarkCurrentRts,
-    ExposureFlicker,
-    OverdispersedCounts,
-    BranchingCounts,
-    OpticalCrosstalk,
-    CosmicRays,
-    Trapping,
-    ChargeLag,
-    ChargeDiffusion,
-    SpuriousCharge,
-)
-KINDS = [
-    *(effect for cls in CLASSES for effect in cls.typical()),
-    ExposureDrift(drift=0.5, path=(0.0, 3.0, 1.0)),
-    Persistence(peak_e=1.0, decay_frames=9.0, slow_decay_frames=50.0, image=((1.0, 0.0), (0.5, 0.2))),
-    DarkCurrentRts(fraction=0.4, steps="exponential", dwell_low_frames=3.0, dwell_high_frames=2.0),
-    CosmicRays(tracks_per_frame=0.7),
-    CosmicRays(tracks_per_frame=0.7, cloud_share=0.5, cloud_range=0.4),
-    OverdispersedCounts(relative_variance=0.3),
-    OverdispersedCounts(relative_variance=0.3, exposures="lognormal"),
-    BranchingCounts(branching=0.3),
-]
-
-
-@pytest.mark.parametrize("effect", KINDS, ids=repr)
-def test_no_strength_is_no_effect_to_the_bit(effect):
-    truth = a_sensor((7, 9))
-    with_it, plain = (simulated(truth, *e, n_frames=30) for e in ((effect.scaled(0.0),), ()))
-    assert np.array_equal(with_it[0], plain[0])
-    assert np.array_equal(with_it[1], plain[1])
-
-
-@pytest.mark.parametrize("effect", KINDS, ids=repr)
-def test_every_tiling_gives_the_same_frames(effect):
-    truth = a_sensor((8, 7))
-    effects = (effect, OpticalCrosstalk(probability=0.2), ChargeLag(fraction=0.2))
-    whole = simulated(truth, *effects, n_frames=40)
-    for frames, rows in (((0, 17), (0, 8)), ((17, 40), (0, 3)), ((5, 6), (2, 8)), ((39, 40), (7, 8))):
-        part = simulated(truth, *effects, n_frames=40, frames=frames, rows=rows)
-        for a, b in zip(part, whole, strict=True):
-            assert np.array_equal(a, b[slice(*frames), slice(*rows)])
-
-
-@pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
-def test_each_says_what_is_known_of_it(cls):
-    tags = effect_classes().keys()
-    assert cls.title
-    assert cls.source
-    assert cls.strength in cls.model_fields
-    assert all(name in STATISTICS for name in cls.signature)
-    assert bool(cls.untestable) == (cls in (ChargeLag, ChargeDiffusion, SpuriousCharge))
-    assert bool(cls.signature) != bool(cls.untestable)
-    assert set(cls.separate) <= tags - {cls.model_fields["tag"].default}
-    assert bool(cls.separate) != bool(cls.untestable)
-    assert all(getattr(effect, cls.strength) != 0 for effect in cls.typical())
-
 
 # -- laws of the electron number ---------------------------------------------------------------------
 
@@ -416,19 +353,6 @@ def test_further_numbers_are_uniform_and_unrelated():
 def test_impossible_parameters_are_refused(cls, fields, words):
     with pytest.raises(ValidationError, match=words):
         cls(**fields)
-
-
-@pytest.mark.parametrize("effect", KINDS, ids=repr)
-def test_the_largest_strengths_work(effect):
-    truth = a_sensor((4, 4), exposure=(20.0, 50.0))
-    _, k = simulated(truth, effect.scaled(1e9), n_frames=5)
-    assert k.max() < 2**31
-
-
-def test_a_run_of_one_frame_and_a_sensor_of_one_pixel():
-    truth = a_sensor((1, 1))
-    for effect in KINDS:
-        assert simulated(truth, effect, n_frames=1)[0].shape == (1, 1, 1)
 
 
 def test_of_very_many_electrons_of_which_nearly_all_are_lost_the_few_are_left():

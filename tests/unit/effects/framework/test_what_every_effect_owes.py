@@ -1,0 +1,192 @@
+"""What every effect owes, whoever wrote it: words, neutrality, the same frames at every division, no harm."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.charge_material import a_sensor, simulated
+
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
+from pchem_pipeline.effects.adc.adc_inl import AdcInl
+from pchem_pipeline.effects.adc.clipping import Clipping
+from pchem_pipeline.effects.analog.analog_memory import AnalogMemory
+from pchem_pipeline.effects.analog.bias_drift import BiasDrift
+from pchem_pipeline.effects.analog.bias_jumps import BiasJumps
+from pchem_pipeline.effects.analog.column_noise import ColumnNoise
+from pchem_pipeline.effects.analog.flicker_noise import FlickerNoise
+from pchem_pipeline.effects.analog.frame_noise import FrameNoise
+from pchem_pipeline.effects.analog.gain_drift import GainDrift
+from pchem_pipeline.effects.analog.heavy_tailed_noise import HeavyTailedNoise
+from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
+from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
+from pchem_pipeline.effects.analog.nonlinearity import Nonlinearity
+from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
+from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
+from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.analog.rts_noise import RtsNoise
+from pchem_pipeline.effects.analog.signal_dependent_noise import SignalDependentNoise
+from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
+from pchem_pipeline.effects.charge.charge_lag import ChargeLag
+from pchem_pipeline.effects.charge.cosmic_rays import CosmicRays
+from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
+from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
+from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
+from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
+from pchem_pipeline.effects.exposure.persistence import Persistence
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.registry import effect_classes
+from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
+from pchem_pipeline.simulate import chain
+
+KINDS = effect_classes()
+BOW = (-0.5, 0.5, -0.5)
+JUMPS = (((0, 1.0), (5, -2.0), (9, 0.0)), ((3, 1.0),), (), ((2, 0.5), (11, 4.0)))
+UNTESTABLE = {"charge_lag", "charge_diffusion", "spurious_charge"}
+SHAPE, N_FRAMES = (8, 7), 40
+# forms and strengths of which an effect of 40 small frames is seen at once
+STRONG: list[Effect] = [
+    AnalogMemory(memory=0.4),
+    FlickerNoise(share=0.9, correlation_frames=7.0),
+    FlickerNoise(share=0.9, correlation_frames=0.4),
+    FlickerNoise(share=0.9, correlation_frames=90.0, spectrum="one_over_f"),
+    GainDrift(drift=0.4),
+    GainDrift(drift=0.4, shape="path", path=BOW),
+    GainDrift(drift=0.4, shape="settling"),
+    HeavyTailedNoise(share=0.3, factor=4.0),
+    InterpixelCapacitance(coupling=0.1, anisotropy=0.3),
+    NoiseSkew(share=-0.9),
+    Nonlinearity(step_change=0.1),
+    Nonlinearity(step_change=0.1, noise="bent"),
+    RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.7),
+    RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.7, samples=4, spread="exponential"),
+    RtsNoise(fraction=0.5, amplitude_e=2.0, probability=0.6, sampling="single", correlation_frames=11.0),
+    RtsNoise(fraction=0.5, amplitude_e=2.0, sampling="single", spread="lognormal", times_spread=0.9),
+    SignalDependentNoise(noise_e=0.5),
+    SignalDependentNoise(noise_e=0.5, growth="linear"),
+    BiasDrift(drift_dn=9),
+    BiasDrift(drift_dn=9, shape="path", path=(1.0, 5.0, -3.0)),
+    BiasDrift(drift_dn=9, shape="walk"),
+    BiasDrift(drift_dn=9, shape="settling"),
+    BiasJumps(amplitude_dn=9, rate=0.2, levels=4),
+    BiasJumps(amplitude_dn=9, path=JUMPS),
+    BiasJumps(amplitude_dn=9, rate=0.2, parts="left_right"),
+    FrameNoise(frame_noise_dn=9),
+    RowNoise(row_noise_dn=9),
+    ColumnNoise(column_noise_dn=9),
+    PeriodicPickup(amplitude_dn=9, cycles_per_row=0.1, cycles_per_frame=-0.3, cycles_per_column=0.2),
+    PeriodicPickup(amplitude_dn=9, cycles_per_row=0.1, random_phase=True),
+    ReadoutAlternation(alternation_dn=-9),
+    AdcDnl(dnl_lsb=0.9),
+    AdcDnl(dnl_lsb=0.9, per_column=True),
+    AdcDnl(dnl_lsb=-0.9, pattern="bit", bit=2),
+    AdcInl(inl_lsb=3, period_dn=50),
+    Clipping(low=98, high=140),
+    RepeatedFrames(probability=0.4),
+    RepeatedFrames(frames=(1, 2, 3, 7, 13, 18, 19), rows=(1, 4)),
+    AdcDnl(dnl_lsb=0.9, pattern="edges", first_code=104, edges=(1.0, -1.0)),
+]
+EVERY: list[Effect] = [
+    *STRONG,
+    *(effect for kind in KINDS.values() for effect in kind.typical()),
+    ExposureDrift(drift=0.5, path=(0.0, 3.0, 1.0)),
+    Persistence(peak_e=1.0, decay_frames=9.0, slow_decay_frames=50.0, image=((1.0, 0.0), (0.5, 0.2))),
+    DarkCurrentRts(fraction=0.4, steps="exponential", dwell_low_frames=3.0, dwell_high_frames=2.0),
+    CosmicRays(tracks_per_frame=0.7),
+    CosmicRays(tracks_per_frame=0.7, cloud_share=0.5, cloud_range=0.4),
+    OverdispersedCounts(relative_variance=0.3),
+    OverdispersedCounts(relative_variance=0.3, exposures="lognormal"),
+    BranchingCounts(branching=0.3),
+]
+# a list of frames stays what it is at any strength
+SCALED = [effect for effect in EVERY if effect.strength and getattr(effect, effect.strength)]
+
+
+def frames(*effects: Effect, shape: Any = SHAPE, n: int = N_FRAMES, **part: Any) -> Any:
+    """Return frames and electron numbers of a sensor with effects."""
+    return simulated(a_sensor(shape), *effects, n_frames=n, seed=8, **part)
+
+
+@pytest.mark.parametrize("tag", sorted(KINDS))
+def test_each_says_what_is_known_of_it(tag):
+    kind = KINDS[tag]
+    assert kind.title
+    assert kind.source
+    assert kind.power > 0
+    assert kind.strength in kind.model_fields or tag == "clipping"
+    assert bool(kind.untestable) == (tag in UNTESTABLE)
+    # what is empirical is measured by its own hand and told from no other
+    known = tag not in UNTESTABLE and not tag.startswith("empirical")
+    assert bool(kind.signature) == bool(kind.separate) == known
+    assert set(kind.signature) <= set(STATISTICS)
+    assert set(kind.separate) <= KINDS.keys() - {tag}
+    assert all(kind.separate.values())
+    assert bool(kind.typical()) == (tag != "clipping")
+    for effect in kind.typical():
+        assert isinstance(effect, kind)
+        assert getattr(effect, kind.strength) != 0
+        twice = getattr(effect.scaled(2.0), kind.strength)
+        # all of the samples is the most that a correction can replace
+        largest = 1.0 if tag == "pixel_correction" else np.inf
+        assert twice == pytest.approx(min(2 * getattr(effect, kind.strength), largest))
+        assert kind.model_validate(effect.model_dump(mode="json")) == effect
+
+
+@pytest.mark.parametrize("effect", SCALED, ids=repr)
+def test_no_strength_is_no_effect_to_the_bit(effect):
+    for with_it, plain in zip(frames(effect.scaled(0.0)), frames(), strict=True):
+        np.testing.assert_array_equal(with_it, plain)
+
+
+@pytest.mark.parametrize("effect", STRONG, ids=repr)
+def test_strength_is_seen(effect):
+    assert (frames(effect)[0] != frames()[0]).mean() > (0.05 if effect.plane.value == "analog" else 0)
+
+
+@pytest.mark.parametrize("effect", EVERY, ids=repr)
+def test_every_division_gives_the_same_frames(effect, monkeypatch):
+    effects = (effect, OpticalCrosstalk(probability=0.2), ChargeLag(fraction=0.2))
+    whole = frames(*effects)
+    monkeypatch.setattr(chain, "_SAMPLES_AT_ONCE", 1)
+    for t, y in itertools.product([(0, 1), (1, 18), (18, 40)], [(0, 3), (3, 4), (4, 8)]):
+        for a, b in zip(frames(*effects, frames=t, rows=y), whole, strict=True):
+            np.testing.assert_array_equal(a, b[slice(*t), slice(*y)])
+
+
+@pytest.mark.parametrize("effect", [e for e in STRONG if e.halo() or e.history()], ids=repr)
+def test_without_halo_or_history_the_division_would_show(effect, monkeypatch):
+    whole = frames(effect)[0]
+    monkeypatch.setattr(type(effect), "halo", lambda self: 0)
+    monkeypatch.setattr(type(effect), "history", lambda self: 0)
+    part = frames(effect, frames=(18, 40), rows=(3, 5))[0]
+    assert (part != whole[18:40, 3:5]).any()
+
+
+@pytest.mark.parametrize("effect", [e for e in EVERY if e.plane.value == "analog"], ids=repr)
+def test_nothing_is_overwritten(effect, monkeypatch):
+    apply, calls = type(effect).apply, []
+
+    def watched(self, values, context):
+        before = values.copy()
+        after = apply(self, values, context)
+        np.testing.assert_array_equal(values, before)
+        calls.append((after.dtype, after.shape == before.shape, np.shares_memory(after, values)))
+        return after
+
+    monkeypatch.setattr(type(effect), "apply", watched)
+    frames(effect)
+    assert set(calls) == {(np.dtype(np.float64), True, False)}
+
+
+@pytest.mark.parametrize("effect", SCALED, ids=repr)
+def test_the_largest_strengths_work(effect):
+    truth = a_sensor((4, 4), exposure=(20.0, 50.0))
+    assert simulated(truth, effect.scaled(1e9), n_frames=5)[1].max() < 2**31
+
+
+@pytest.mark.parametrize("effect", EVERY, ids=repr)
+def test_a_run_of_one_frame_and_a_sensor_of_one_pixel(effect):
+    assert frames(effect, shape=(1, 1), n=1)[0].shape == (1, 1, 1)
