@@ -40,6 +40,12 @@ class StackFacts(NamedTuple):
     integration_time: float | None = None
     bit_depth: int | None = None
 
+    @property
+    def stated(self) -> dict[str, Any]:
+        """Integration time and bit depth by their names, as far as they are known."""
+        facts = {"integration_time": self.integration_time, "bit_depth": self.bit_depth}
+        return {name: value for name, value in facts.items() if value is not None}
+
 
 def write_frames(
     format: str,
@@ -85,7 +91,8 @@ def write_frames(
     written: list[Path] = []
     for part, count in _parts(path, shape[0], frames_per_file):
         stack = StackFacts((count, *shape[1:]), kind.newbyteorder("="), integration_time, bit_depth)
-        written += writer(part, stream.take(count), stack)
+        writer(part, stream.take(count), stack)
+        written.append(part)
     stream.finish()
     return written
 

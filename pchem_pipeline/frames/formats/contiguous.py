@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,8 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
 from pchem_pipeline.frames.identity import FileHasher
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window
+from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.store.files import whole_file
 
 _MOST_BYTES = 1 << 30
 _MOST_FRAMES = 1 << 26
@@ -175,6 +178,7 @@ class ContiguousReader(FrameReader):
     """A reader that needs nothing but a `Layout`; of files without one it decodes by `decode_into`."""
 
     _offset: int | None = None
+    _full: tuple[int, ...]
 
     def set_layout(self, path: Path, layout: Layout, size: int) -> None:
         """Take the layout; ``size`` is the size of the file.
@@ -190,6 +194,19 @@ class ContiguousReader(FrameReader):
         self.dtype = unsigned_type(layout.stored)
         self._layout = layout
         self._size = size
+
+    def set_stack(
+        self,
+        path: Path,
+        full: Sequence[int],
+        stored: np.dtype[Any],
+        settings: InputSettings | None,
+        what: str,
+    ) -> None:
+        """Take shape and type as a file states them, or raise InputError; without settings any sign fits."""
+        self._offset = None if settings is None else check_samples(path, stored, settings)
+        self.paths, self.shape = (path,), stack_shape(path, full, what)
+        self.dtype, self._full = unsigned_type(stored), tuple(full)
 
     @property
     def layout(self) -> Layout | None:
@@ -287,6 +304,12 @@ def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, pat
                 f"input.offset: {top} (--offset {top}), if 0 DN is stored as -{top}"
             )
     if offset:
-        np.add(
-            buffer, buffer.dtype.type(offset), out=buffer
-        )  # modulo 2**bits, which is right for signed ones
+        np.add(buffer, buffer.dtype.type(offset), out=buffer)  # modulo 2**bits: right for signed ones
+
+
+def write_plain(path: Path, head: bytes, blocks: Iterable[NDArray[Any]], stored: np.dtype[Any]) -> None:
+    """Write a header and the frames behind it, as samples of the stored type."""
+    with whole_file(path) as part, part.open("wb") as stream:
+        stream.write(head)
+        for block in blocks:
+            stream.write(np.ascontiguousarray(block, stored).data)
