@@ -39,13 +39,11 @@ def open_frames(
     Args:
         settings: the section ``input``.
         base_dir: folder to which relative paths refer.
-        check_duplicates: also look for files with the same content (reads a little of each file), and at
-            some samples.
+        check_duplicates: also look for equal files (reads a little of each), and at some samples.
         least: frames that there must be.
 
     Returns:
-        One reader, that can be shared by threads and pickled to other processes; its ``report`` says what
-        was found and left out.
+        A reader for threads and processes alike; its ``report`` says what was found and left out.
 
     Raises:
         InputError: bad files (all in one message), too few frames, or a region outside of the frames.
@@ -61,11 +59,7 @@ def open_frames(
 
 
 def _excluded(frames: FrameSequence, settings: InputSettings, base_dir: Path) -> NDArray[np.bool_]:
-    """Return the pixels (y, x) that ``input.mask`` excludes, or that hold the marker at both ends of the run.
-
-    Raises:
-        InputError: the mask is no image of the shape of the frames.
-    """
+    """Return the pixels (y, x) that ``input.mask`` excludes, or that hold the marker at both ends."""
     n, rows, columns = frames.shape
     excluded = np.zeros((rows, columns), np.bool_)
     if frames.dtype.itemsize == 4:
@@ -89,12 +83,7 @@ def _excluded(frames: FrameSequence, settings: InputSettings, base_dir: Path) ->
 def _first_look(frames: FrameSequence, settings: InputSettings) -> list[str]:
     """Return remarks on left-justified samples, and on a stack whose last axis looks like time.
 
-    Args:
-        frames: the stack.
-        settings: the section ``input``; what it states is not looked for.
-
-    Raises:
-        InputError: the samples look byte-swapped, and no byte order is set.
+    What is set is not looked for. InputError: the samples look byte-swapped, and no order is set.
     """
     n, rows, columns = frames.shape
     least = _ROWS if frames.order_by_habit else 1
@@ -126,11 +115,7 @@ def _first_look(frames: FrameSequence, settings: InputSettings) -> list[str]:
 
 
 def _check_byte_order(values: NDArray[Any], where: str, order: str | None) -> None:
-    """Refuse samples that differ far less along time with their bytes swapped.
-
-    Raises:
-        InputError: they do.
-    """
+    """Refuse samples that differ far less along time with their bytes swapped."""
     unused = _unused_bits(values)
     # of left-justified samples; a high byte in the place of the low one has low bits
     if values.dtype.itemsize == 1 or 4 <= unused < 8:
@@ -170,11 +155,7 @@ def _is_time_last(values: NDArray[Any]) -> bool:
 
 
 def _common_variance(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the covariance along the last axis of the means of two halves of the second, and its error.
-
-    Args:
-        values: shape (m, n, k); averaged over m.
-    """
+    """Return the covariance of the means of two halves along axis 1 of (m, n, k) values, and its error."""
     one, other = values[:, ::2].mean(axis=1), values[:, 1::2].mean(axis=1)
     one, other = (each - each.mean(axis=1, keepdims=True) for each in (one, other))
     products = one * other

@@ -27,14 +27,8 @@ def natural_key(path: Path) -> tuple[tuple[tuple[int, int | str], ...], str]:
 def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
     """Return the files that ``input.files`` names, in natural order; a path named twice is there twice.
 
-    Args:
-        settings: the section ``input``.
-        base_dir: folder to which relative paths refer.
-
-    Raises:
-        ConfigError: no files are named.
-        InputError: a path is missing, a glob matches nothing, a folder holds no camera files or several
-            formats.
+    ConfigError: no files are named. InputError: a path is missing, a glob matches nothing, a folder holds no
+    camera files or several formats.
     """
     if not settings.files:
         raise ConfigError("input.files is empty; name camera files, a glob such as frames/*.tif, or a folder")
@@ -64,12 +58,7 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
 
 
 def input_paths(settings: InputSettings, base_dir: Path) -> list[Path]:
-    """Return all files that decide what is read: mask, camera files, each with its sidecar.
-
-    Raises:
-        ConfigError: no files are named.
-        InputError: as in `resolve_files`.
-    """
+    """Return all files that decide what is read: mask, camera files, each with its sidecar."""
     mask = mask_path(settings, base_dir)
     paths = [] if mask is None else [mask]
     for path in resolve_files(settings, base_dir):
@@ -81,11 +70,7 @@ def input_paths(settings: InputSettings, base_dir: Path) -> list[Path]:
 
 
 def mask_path(settings: InputSettings, base_dir: Path) -> Path | None:
-    """Return the file of ``input.mask``, fetched where it is remote.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return the file of ``input.mask``, fetched where it is remote; InputError: there is none."""
     if settings.mask is None:
         return None
     return resolve_files(settings.model_copy(update={"files": (settings.mask,)}), base_dir)[0]

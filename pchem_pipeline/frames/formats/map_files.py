@@ -38,19 +38,9 @@ class MapImage:
 
 
 def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) -> list[Path]:
-    """Write one FITS file with an image extension for each map.
+    """Write one FITS file with an image extension for each map, of the map's type.
 
-    Args:
-        path: the file.
-        maps: the maps; floating point and integers stay as they are.
-        header: keywords of the primary header (at most 8 characters each); None is left out.
-
-    Returns:
-        The file written.
-
-    Raises:
-        StoreError: the folder cannot be written.
-        MissingDependencyError: astropy is not installed.
+    ``header`` has keywords of the primary header, of 8 characters at most; None is left out.
     """
     require("astropy.io.fits", "fits", "FITS files")
     from astropy.io import fits
@@ -71,18 +61,7 @@ def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) 
 
 
 def write_tiff(folder: Path, maps: Sequence[MapImage]) -> list[Path]:
-    """Write one TIFF file for each map: float32 for parameters, integers as they are.
-
-    Args:
-        folder: where to write ``<name>.tif``.
-        maps: the maps.
-
-    Returns:
-        The files written.
-
-    Raises:
-        StoreError: the folder cannot be written.
-    """
+    """Write ``<name>.tif`` for each map, float32 for parameters, integers as they are; return the files."""
     import tifffile
 
     written = []
@@ -97,18 +76,7 @@ def write_tiff(folder: Path, maps: Sequence[MapImage]) -> list[Path]:
 
 
 def write_npz(path: Path, maps: Sequence[MapImage]) -> list[Path]:
-    """Write all maps into one npz file, each under its name.
-
-    Args:
-        path: the file.
-        maps: the maps.
-
-    Returns:
-        The file written.
-
-    Raises:
-        StoreError: the folder cannot be written.
-    """
+    """Write all maps into one npz file, each under its name; return it in a list."""
     arrays: dict[str, Any] = {image.name: image.values for image in maps}
     with whole_file(path) as part:
         np.savez_compressed(part, allow_pickle=False, **arrays)
@@ -139,11 +107,7 @@ class Cube:
 
 
 def write_tiff_cube(path: Path, cube: Cube) -> None:
-    """Write a page for each image: an ImageJ stack, or BigTIFF where that is too small.
-
-    Raises:
-        StoreError: the folder cannot be written.
-    """
+    """Write a page for each image: an ImageJ stack, or BigTIFF where that is too small."""
     import tifffile
 
     size = int(np.prod(cube.shape)) * cube.dtype.itemsize
@@ -164,12 +128,7 @@ def write_tiff_cube(path: Path, cube: Cube) -> None:
 
 
 def write_fits_cube(path: Path, cube: Cube) -> None:
-    """Write an image of the axes of the array, the unit in ``BUNIT``, the provenance as ``HISTORY``.
-
-    Raises:
-        StoreError: the folder cannot be written.
-        MissingDependencyError: astropy is not installed.
-    """
+    """Write an image of the axes of the array, the unit in ``BUNIT``, the provenance as ``HISTORY``."""
     cards = {
         "BUNIT": cube.unit,
         "OBJECT": cube.name,
@@ -181,17 +140,7 @@ def write_fits_cube(path: Path, cube: Cube) -> None:
 
 
 def read_image(path: Path) -> NDArray[np.float64]:
-    """Return an image, or a stack of images, from npy, TIFF or FITS.
-
-    Args:
-        path: the file.
-
-    Returns:
-        Shape (y, x) or (image, y, x).
-
-    Raises:
-        InputError: there is no such file, or it is no image.
-    """
+    """Return an image (y, x) or images (image, y, x) from npy, TIFF or FITS; InputError: it is none."""
     kinds = {".npy": _read_npy, ".tif": _read_tiff, ".tiff": _read_tiff}
     kinds |= dict.fromkeys((".fits", ".fit", ".fts"), _read_fits)
     kind = kinds.get(path.suffix.lower())
