@@ -14,6 +14,7 @@ import pytest
 import tifffile
 import zarr
 from astropy.io import fits
+from helpers.camera_files import opened
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
@@ -35,7 +36,7 @@ TAKEN = 1_769_860_800.0  # 2026-01-31T12:00:00 UTC
 
 
 def facts(path: Path, **settings: object) -> CameraFacts:
-    with open_frames(InputSettings(files=(path.name,), **settings), path.parent) as frames:
+    with opened(path, **settings) as frames:
         np.testing.assert_array_equal(frames.read(), STACK)
         return frames.camera
 
@@ -132,7 +133,7 @@ def test_several_files_share_what_they_state_alike(tmp_path: Path) -> None:
         image.header["SERIALNO"] = f"{i}"  # counts the files
         image.header["DATE-OBS"] = f"2026-01-31T12:00:0{i}"
         image.writeto(tmp_path / f"{i}.fits")
-    with open_frames(InputSettings(files=("*.fits",)), tmp_path) as frames:
+    with opened(tmp_path / "*.fits") as frames:
         assert frames.camera == CameraFacts("C", None, pytest.approx(-57.4 / 3), TAKEN)
         assert [note for note in frames.notes if "from -20.4 to -17 °C" in note]
     steady, remark = shared_facts([CameraFacts(temperature=1.0), CameraFacts(temperature=1.9)])
@@ -261,7 +262,7 @@ def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path: Path) ->
         "a.raw": 0.1,
     }
     for name, right in seconds.items():
-        with open_frames(InputSettings(files=(name,)), tmp_path) as stack:
+        with opened(tmp_path / name) as stack:
             assert stack.integration_time == (None if right is None else pytest.approx(right)), name
             assert name in stack.time_words
             assert "--integration-time" not in stack.time_words or right is None
@@ -286,5 +287,5 @@ def test_every_format_with_attributes_takes_the_same_names(tmp_path: Path) -> No
     array[:] = frames
     array.attrs.update(exposure_time=20, exposure_time_units="ms", bit_depth_readout=12)
     for name in ("a.h5", "a.zarr"):
-        with open_frames(InputSettings(files=(name,)), tmp_path) as stack:
+        with opened(tmp_path / name) as stack:
             assert (stack.integration_time, stack.bit_depth) == (pytest.approx(0.02), 12)
