@@ -55,11 +55,8 @@ def test_fits(tmp_path: Path) -> None:
 
 
 def test_tiff_tags_and_records(tmp_path: Path) -> None:
-    tags = [
-        (271, "s", 0, "Maker", True),
-        (272, "s", 0, "Model 7", True),
-        (306, "s", 0, "2026:01:31 12:00:00", True),
-    ]
+    texts = {271: "Maker", 272: "Model 7", 306: "2026:01:31 12:00:00"}
+    tags = [(number, "s", 0, text, True) for number, text in texts.items()]
     tifffile.imwrite(tmp_path / "tags.tif", STACK, photometric="minisblack", extratags=tags, metadata=None)
     assert facts(tmp_path / "tags.tif") == CameraFacts("Maker Model 7", None, None, TAKEN)
     record = json.dumps(
@@ -253,14 +250,8 @@ def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path: Path) ->
     STACK.astype("<u2").tofile(tmp_path / "a.raw")
     side = {"shape": STACK.shape, "dtype": "uint16", "integration_time": 100, "integration_time_unit": "ms"}
     (tmp_path / "a.raw.json").write_text(json.dumps(side))
-    seconds = {
-        "plain.fits": 100.0,
-        "unit.fits": 0.1,
-        "doubt.fits": None,
-        "a.zarr": 0.1,
-        "a.h5": 0.1,
-        "a.raw": 0.1,
-    }
+    seconds = dict.fromkeys(("unit.fits", "a.zarr", "a.h5", "a.raw"), 0.1)
+    seconds |= {"plain.fits": 100.0, "doubt.fits": None}
     for name, right in seconds.items():
         with opened(tmp_path / name) as stack:
             assert stack.integration_time == (None if right is None else pytest.approx(right)), name

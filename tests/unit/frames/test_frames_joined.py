@@ -31,28 +31,9 @@ STACK = np.random.default_rng(15).integers(0, 4096, (12, 17, 19)).astype(np.uint
 
 
 def test_natural_order() -> None:
-    names = [
-        "frame10.tif",
-        "frame2.tif",
-        "Frame1.tif",
-        "a9b10.tif",
-        "a9b9.tif",
-        "frame.tif",
-        "10.tif",
-        "9.tif",
-    ]
-    order = sorted((Path(name) for name in names), key=natural_key)
-    wanted = [
-        "9.tif",
-        "10.tif",
-        "a9b9.tif",
-        "a9b10.tif",
-        "Frame1.tif",
-        "frame2.tif",
-        "frame10.tif",
-        "frame.tif",
-    ]
-    assert [path.name for path in order] == wanted
+    wanted = ["9", "10", "a9b9", "a9b10", "Frame1", "frame2", "frame10", "frame"]
+    paths = [Path(f"{name}.tif") for name in wanted]
+    assert sorted([*paths[4::-1], *paths[:4:-1]], key=natural_key) == paths
 
 
 def test_resolve(tmp_path: Path) -> None:
@@ -139,26 +120,15 @@ def test_region_through_a_small_scratch_buffer(tmp_path: Path, monkeypatch: pyte
 
 def test_range_and_region_out_of_bounds(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", STACK)
-    not_opened(
-        r"input\.roi \[0, 18, 0, 5\] reaches beyond .* \(--roi 0:18,0:5; all of them: 0:\d+,0:\d+\)",
-        tmp_path / "a.npy",
-        roi=(0, 18, 0, 5),
-    )
+    beyond = r"input\.roi \[0, 18, 0, 5\] reaches beyond .* \(--roi 0:18,0:5; all of them: 0:\d+,0:\d+\)"
+    not_opened(beyond, tmp_path / "a.npy", roi=(0, 18, 0, 5))
     not_opened(r"does not hold at least 2 of the 12", tmp_path / "a.npy", frame_range=(0, 13))
     not_opened("at least 2 of the 12 frames", tmp_path / "a.npy", frame_range=(11, None))
-    bad: list[dict[str, Any]] = [
-        {"roi": (5, 5, 0, 3)},
-        {"frame_range": (4, 4)},
-        {"integration_time": 0.0},
-        {"integration_time": float("nan")},
-        {"shape": (0, 4)},
-        {"shape": (4,)},
-        {"bit_depth": 0},
-        {"unknown": 1},
-    ]
-    for keys in bad:
+    bad: list[tuple[str, Any]] = [("roi", (5, 5, 0, 3)), ("frame_range", (4, 4)), ("shape", (0, 4))]
+    bad += [("integration_time", 0.0), ("integration_time", float("nan"))]
+    for name, value in [*bad, ("shape", (4,)), ("bit_depth", 0), ("unknown", 1)]:
         with pytest.raises(ValidationError):
-            InputSettings(files=("a.npy",), **keys)
+            InputSettings(files=("a.npy",), **{name: value})
 
 
 def test_bit_shift(tmp_path: Path) -> None:
@@ -320,9 +290,8 @@ def test_file_that_shrinks(tmp_path: Path, format: str) -> None:
     path = write_any(format, tmp_path / "a")
     reader = opened(path)
     os.truncate(path, path.stat().st_size // 2)
-    with pytest.raises(
-        InputError, match=r"(became shorter|changed its size) while it was being read; restore"
-    ):
+    words = r"(became shorter|changed its size) while it was being read; restore"
+    with pytest.raises(InputError, match=words):
         reader.read()
 
 

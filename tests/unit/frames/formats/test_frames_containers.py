@@ -200,9 +200,7 @@ def test_hdf5_samples_in_a_raw_file(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     refused(r"a\.h5: the samples of /frames lie in samples\.bin, which is not", tmp_path / "a.h5")
 
 
-def test_hdf5_samples_that_end_too_early_or_are_another_s(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hdf5_samples_cut_or_of_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     other = tmp_path / "folder" / "a.h5"
     other.parent.mkdir()
@@ -235,21 +233,15 @@ def test_hdf5_virtual_dataset_of_what_it_must_not_have(tmp_path: Path, case: str
     virtual(home / "a.h5", names.get(case, "a.h5" if case == "itself" else "."))
     virtual(home / "b.h5", "a.h5")
     write_hdf5(tmp_path / "c.h5", data=STACK)
-    words = {
-        "itself": "is a part of itself",
-        "by another": "is a part of itself",
-        "outside": "beside or below",
-    }
+    words = dict.fromkeys(("itself", "by another"), "is a part of itself") | {"outside": "beside or below"}
     refused(words.get(case, "no regular file"), home / "a.h5")
 
 
 def test_hdf5_where_files_cannot_be_locked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("frames", data=STACK, compression="gzip")
-    usual, wrong = (
-        h5py.File,
-        OSError("unable to lock file, errno = 38, error message = 'Function not implemented'"),
-    )
+    usual = h5py.File
+    wrong = OSError("unable to lock file, errno = 38, error message = 'Function not implemented'")
 
     def without_locks(path: Path, mode: str, locking: bool | None = None) -> h5py.File:
         if locking is not False:

@@ -40,12 +40,8 @@ def test_raw_by_settings(
     path = tmp_path / "a.raw"
     code = (">" if order == "big" else "<") + np.dtype(dtype).str[1:]
     path.write_bytes(raw_bytes(stack, code, header, padding, last))
-    settings: dict[str, Any] = {
-        "dtype": dtype,
-        "byte_order": order,
-        "header_bytes": header,
-        "frame_padding_bytes": padding,
-    }
+    settings: dict[str, Any] = {"dtype": dtype, "byte_order": order}
+    settings |= {"header_bytes": header, "frame_padding_bytes": padding}
     for shape in ((11, 13), (5, 11, 13)):
         np.testing.assert_array_equal(read(path, shape=shape, **settings), stack)
     reader = opened(tmp_path / "a.raw", shape=(11, 13), **settings)
@@ -57,22 +53,10 @@ def test_raw_by_settings(
 def test_raw_by_sidecar(tmp_path: Path, name: str) -> None:
     path = tmp_path / "a.raw"
     path.write_bytes(raw_bytes(STACK >> 4 << 4, ">u2", 16, 4))
-    side = {
-        "shape": [11, 13],
-        "dtype": "uint16",
-        "byte_order": "big",
-        "header_bytes": 16,
-        "frame_padding_bytes": 4,
-        "bit_shift": 4,
-        "integration_time": 0.25,
-        "camera": "left alone",
-    }
-    text = (
-        json.dumps(side)
-        if name.endswith("json")
-        else "\n".join(f"{k}: {json.dumps(v)}" for k, v in side.items())
-    )
-    (tmp_path / name).write_text(text)
+    side: dict[str, Any] = {"shape": [11, 13], "dtype": "uint16", "byte_order": "big", "header_bytes": 16}
+    side |= {"frame_padding_bytes": 4, "bit_shift": 4, "integration_time": 0.25, "camera": "left alone"}
+    lines = "\n".join(f"{k}: {json.dumps(v)}" for k, v in side.items())
+    (tmp_path / name).write_text(json.dumps(side) if name.endswith("json") else lines)
     reader = opened(tmp_path / "*.raw")
     np.testing.assert_array_equal(reader.read(), STACK >> 4)
     assert (reader.bit_shift, reader.bit_depth, reader.integration_time) == (4, 12, 0.25)
@@ -110,18 +94,10 @@ def test_raw_with_a_bad_sidecar(tmp_path: Path, text: str, words: str) -> None:
 def test_raw_truncated_or_of_another_shape(tmp_path: Path) -> None:
     path = tmp_path / "a.raw"
     path.write_bytes(raw_bytes(STACK, "<u2", 0, 0)[:-1])
-    refused(
-        r"a\.raw: truncated, or not 11 x 13 uint16: 1429 bytes .*input.shape",
-        path,
-        shape=(11, 13),
-        dtype="uint16",
-    )
-    refused(
-        r"truncated: 5 frames need 1430 bytes, the file has 1429 \(4 whole frames\)",
-        path,
-        shape=(5, 11, 13),
-        dtype="uint16",
-    )
+    raw: dict[str, Any] = {"shape": (11, 13), "dtype": "uint16"}
+    refused(r"a\.raw: truncated, or not 11 x 13 uint16: 1429 bytes .*input.shape", path, **raw)
+    words = r"truncated: 5 frames need 1430 bytes, the file has 1429 \(4 whole frames\)"
+    refused(words, path, shape=(5, 11, 13), dtype="uint16")
     refused("truncated, or not", path, shape=(11, 13), dtype="uint16", header_bytes=10_000)
 
 
@@ -216,12 +192,9 @@ def ser_bytes(stack: NDArray[Any], depth: int, colour: int = 0, flag: int = 0, t
 
 def test_ser(tmp_path: Path) -> None:
     path = tmp_path / "a.ser"
-    for stack, depth, flag in [
-        ((STACK & 255).astype(np.uint8), 8, 0),
-        ((STACK & 4095).astype("<u2"), 12, 0),
-        (STACK.astype("<u2"), 16, 0),
-        (STACK.astype(">u2"), 16, 1),
-    ]:
+    kinds = [("u1", 8, 0), ("<u2", 12, 0), ("<u2", 16, 0), (">u2", 16, 1)]
+    for dtype, depth, flag in kinds:
+        stack = (STACK & (2**depth - 1)).astype(dtype)
         path.write_bytes(ser_bytes(stack, depth, flag=flag))
         reader = opened(tmp_path / "a.ser")
         np.testing.assert_array_equal(reader.read(), stack)
@@ -251,10 +224,7 @@ def test_ser_refusals(tmp_path: Path) -> None:
         (ser_bytes(STACK, 16, colour=100), r"colour video \(RGB"),
         (ser_bytes(STACK, 33), "damaged header"),
         (ser_bytes(STACK, 16)[:100], "truncated, or not SER"),
-        (
-            ser_bytes(STACK, 16)[:-1],
-            r"truncated: 5 frames need 1608 bytes, the file has 1607 \(4 whole frames\)",
-        ),
+        (ser_bytes(STACK, 16)[:-1], r"truncated: 5 frames need 1608 bytes, the file has 1607 \(4 whole fr"),
     ]:
         path.write_bytes(data)
         refused(words, path)

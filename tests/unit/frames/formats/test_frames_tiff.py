@@ -54,14 +54,8 @@ def test_layout_is_read_exactly(tmp_path: Path, layout: str) -> None:
     assert reader.shape == STACK.shape
     assert reader.dtype == np.uint16
     np.testing.assert_array_equal(reader.read(), STACK)
-    for t0, t1, y0, y1 in [
-        (0, 1, 0, 21),
-        (2, 5, 3, 4),
-        (1, 6, 15, 21),
-        (5, 6, 20, 21),
-        (0, 6, 4, 17),
-        (3, 3, 0, 2),
-    ]:
+    windows = [(0, 1, 0, 21), (2, 5, 3, 4), (1, 6, 15, 21), (5, 6, 20, 21), (0, 6, 4, 17), (3, 3, 0, 2)]
+    for t0, t1, y0, y1 in windows:
         np.testing.assert_array_equal(reader.read(t0, t1, y0, y1), STACK[t0:t1, y0:y1])
     again = pickle.loads(pickle.dumps(reader))
     np.testing.assert_array_equal(again.read(1, 4, 2, 19), STACK[1:4, 2:19])
@@ -152,12 +146,7 @@ def test_pages_are_frames_although_metadata_tell_several_series(tmp_path: Path) 
 
 def test_pages_coded_differently(tmp_path: Path) -> None:
     path = tmp_path / "mixed.tif"
-    codings: list[dict[str, Any]] = [
-        {"compression": "zlib", "rowsperstrip": 4},
-        {},
-        {"compression": "lzw"},
-        {"tile": (16, 16)},
-    ]
+    codings: list[Any] = [LAYOUTS["zlib"] | LAYOUTS["strips"], {}, LAYOUTS["lzw"], LAYOUTS["tiles"]]
     with tifffile.TiffWriter(path) as writer:
         for i, frame in enumerate(STACK):
             writer.write(frame, photometric="minisblack", metadata=None, **codings[i % len(codings)])
@@ -286,12 +275,11 @@ def test_colour_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kept", [0.15, 0.5, 0.9, 0.99])
 def test_truncated(tmp_path: Path, kind: str, kept: float) -> None:
     path = tmp_path / "cut.tif"
-    with tifffile.TiffWriter(
-        path, **{k: v for k, v in LAYOUTS[kind].items() if k in ("bigtiff", "byteorder")}
-    ) as writer:
-        options = {k: v for k, v in LAYOUTS[kind].items() if k not in ("bigtiff", "byteorder", "metadata")}
+    options = LAYOUTS[kind] | {"metadata": None}
+    whole = {key: options.pop(key) for key in ("bigtiff", "byteorder") if key in options}
+    with tifffile.TiffWriter(path, **whole) as writer:
         for frame in STACK:
-            writer.write(frame, photometric="minisblack", metadata=None, **options)
+            writer.write(frame, photometric="minisblack", **options)
     data = path.read_bytes()
     np.testing.assert_array_equal(read(path), STACK)
     path.write_bytes(data[: int(len(data) * kept)])
