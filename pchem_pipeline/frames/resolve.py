@@ -8,7 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from pchem_pipeline.base.errors import ConfigError, InputError
-from pchem_pipeline.frames.formats.raw import RawReader, find_sidecar
+from pchem_pipeline.frames.formats.omezarr import is_zarr
+from pchem_pipeline.frames.formats.raw import SIDECARS, RawReader, find_sidecar
 from pchem_pipeline.frames.registry import frame_suffixes
 from pchem_pipeline.frames.remote import fetch, is_remote
 from pchem_pipeline.frames.settings import InputSettings
@@ -41,7 +42,7 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
         with suppress(RuntimeError):  # a file called ~x.tif
             path = path.expanduser()
         path = base_dir / path
-        if path.is_dir() and not _is_zarr(path):
+        if path.is_dir() and not is_zarr(path):
             found += _folder(path, settings)
         elif path.exists():
             found.append(path)
@@ -76,25 +77,17 @@ def mask_path(settings: InputSettings, base_dir: Path) -> Path | None:
     return resolve_files(settings.model_copy(update={"files": (settings.mask,)}), base_dir)[0]
 
 
-def _is_zarr(path: Path) -> bool:
-    return any((path / name).exists() for name in ("zarr.json", ".zarray", ".zgroup"))
-
-
 def _glob(pattern: Path, base_dir: Path, entry: str) -> list[Path]:
     """Return the files that a pattern names; in the names of ``base_dir`` nothing is a pattern."""
     whole = pattern.is_absolute()
     folder = Path(pattern.anchor) if whole else base_dir
     matches = folder.glob(str(pattern.relative_to(pattern.anchor) if whole else pattern))
-    files = [path for path in matches if not path.name.startswith(".") and not _is_sidecar(path)]
-    plain = [path for path in files if path.is_file() or _is_zarr(path)]
+    # a description (frames.raw.json) is no camera file
+    files = [p for p in matches if not p.name.startswith(".") and p.suffix.lower() not in SIDECARS]
+    plain = [path for path in files if path.is_file() or is_zarr(path)]
     if not plain:
         raise InputError(f"{entry}: matches no file; correct the pattern (input.files)")
     return plain
-
-
-def _is_sidecar(path: Path) -> bool:
-    """Tell a description (``frames.raw.json``) from frames: it is named after a file that is there."""
-    return path.suffix.lower() in (".json", ".yaml", ".yml")
 
 
 def _folder(folder: Path, settings: InputSettings) -> list[Path]:
@@ -105,11 +98,7 @@ def _folder(folder: Path, settings: InputSettings) -> list[Path]:
     entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     files = [path for path in entries if path.is_file() and path.suffix.lower() in suffixes]
     if not files:
-        files = (
-            [path for path in entries if path.is_dir() and _is_zarr(path)]
-            if "zarr" in suffixes.values()
-            else []
-        )
+        files = [path for path in entries if is_zarr(path)] if "zarr" in suffixes.values() else []
     if not files:
         kinds = ", ".join(sorted(suffixes))
         raise InputError(

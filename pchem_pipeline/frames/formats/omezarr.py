@@ -33,6 +33,11 @@ _DEEPEST, _MOST_IN_A_SHARD = 64, 1 << 16
 _DESCRIBED = ("zarr.json", ".zarray", ".zattrs", ".zgroup", ".zmetadata")
 
 
+def is_zarr(path: Path) -> bool:
+    """Tell whether a path is a folder with the metadata of a zarr store."""
+    return path.is_dir() and any((path / name).exists() for name in ("zarr.json", ".zarray", ".zgroup"))
+
+
 class ZarrReader(ContiguousReader):
     """A zarr array, the only stack of a zarr group, or the full resolution of an OME-Zarr image."""
 
@@ -42,7 +47,7 @@ class ZarrReader(ContiguousReader):
     @classmethod
     def recognises(cls, path: Path, head: bytes) -> bool:
         """See `FrameReader.recognises`: a zarr store is a folder with metadata."""
-        return path.is_dir() and any((path / name).exists() for name in ("zarr.json", ".zarray", ".zgroup"))
+        return is_zarr(path)
 
     @classmethod
     def open(cls, path: Path, settings: InputSettings) -> Self:

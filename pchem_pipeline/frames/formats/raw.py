@@ -26,6 +26,9 @@ from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
+#: suffixes of descriptions beside raw files
+SIDECARS = (".json", ".yaml", ".yml")
+
 
 class _Sidecar(BaseModel):
     """What a sidecar can say of the layout; other keys may be facts of the camera."""
@@ -45,7 +48,7 @@ class _Sidecar(BaseModel):
 
 def find_sidecar(path: Path) -> Path | None:
     """Return the sidecar of a raw file, or None."""
-    for suffix in (".json", ".yaml", ".yml"):
+    for suffix in SIDECARS:
         for candidate in (path.with_name(path.name + suffix), path.with_suffix(suffix)):
             if candidate.is_file():
                 return candidate

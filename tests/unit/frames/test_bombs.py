@@ -99,12 +99,8 @@ def test_hdf5(tmp_path: Path, deflated: bytes, kind: str) -> None:
             made = h5py.h5d.create(file.id, b"frames", type_, space, record)
             made.write(h5py.h5s.ALL, h5py.h5s.ALL, STACK)
     write_hdf5(tmp_path / "b.h5", x=STACK)
-    words = {
-        "deep": "unpacks to more than",
-        "twice": "coded twice",
-        "claims": "cannot hold 1000000000 frames",
-    }
-    with refused_at_once(words[kind]):
+    words = {"deep": "unpacks to more than", "twice": "coded twice"}
+    with refused_at_once(words.get(kind, "cannot hold 1000000000 frames")):
         read(path)
 
 
