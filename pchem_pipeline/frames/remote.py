@@ -14,12 +14,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pchem_pipeline.base.errors import InputError, MissingDependencyError, install_hint
+from pchem_pipeline.frames.formats.raw import SIDECARS, RawReader
 from pchem_pipeline.store.files import whole_file, write_atomic
 
 _URL = re.compile(r"^[a-z][a-z0-9+-]+://")
 _GLOB = re.compile(r"[*?\[]")
-#: descriptions that lie beside raw files
-_SIDECARS = (".json", ".yaml", ".yml")
 
 
 def is_remote(entry: str) -> bool:
@@ -28,18 +27,11 @@ def is_remote(entry: str) -> bool:
 
 
 def fetch(url: str) -> list[Path]:
-    """Return the files behind a URL, a glob or a folder, fetched to this machine.
+    """Return the files behind a URL, a glob or a folder (``s3://bucket/frames/*.tif``), fetched here.
 
     Keys and the address of the server come from where the storage's library looks for them (for S3: the
     environment variables ``AWS_ACCESS_KEY_ID``, ``AWS_SECRET_ACCESS_KEY`` and ``AWS_ENDPOINT_URL``, or
-    ``~/.aws``).
-
-    Args:
-        url: such as ``s3://bucket/frames/*.tif``.
-
-    Raises:
-        InputError: nothing is there, or the storage refuses.
-        MissingDependencyError: the library of that kind of storage is not installed.
+    ``~/.aws``). InputError: nothing is there, or it is refused; MissingDependencyError: no library for it.
     """
     import fsspec
 
@@ -52,7 +44,7 @@ def fetch(url: str) -> list[Path]:
     try:
         storage.invalidate_cache()
         names = _names(storage, path)
-        found = [_fetched(storage, name) for name in names if not name.endswith(_SIDECARS)]
+        found = [_fetched(storage, name) for name in names if not name.endswith(SIDECARS)]
         for name in names:
             _fetch_sidecars(storage, name)
     except InputError:
@@ -101,9 +93,9 @@ def _fetched(storage: Any, name: str) -> Path:
 def _fetch_sidecars(storage: Any, name: str) -> None:
     """Fetch what describes a raw file, under its own name or that of the file."""
     place = PurePosixPath(name)
-    if place.suffix.lower() not in (".raw", ".bin", ".dat"):
+    if place.suffix.lower() not in RawReader.suffixes:
         return
-    for suffix in _SIDECARS:
+    for suffix in SIDECARS:
         for beside in (f"{name}{suffix}", str(place.with_suffix(suffix))):
             if storage.exists(beside):
                 _fetched(storage, beside)

@@ -8,7 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from pchem_pipeline.base.errors import ConfigError, InputError
-from pchem_pipeline.frames.formats.raw import RawReader, find_sidecar
+from pchem_pipeline.frames.formats.omezarr import is_zarr
+from pchem_pipeline.frames.formats.raw import SIDECARS, RawReader, find_sidecar
 from pchem_pipeline.frames.registry import frame_suffixes
 from pchem_pipeline.frames.remote import fetch, is_remote
 from pchem_pipeline.frames.settings import InputSettings
@@ -27,14 +28,8 @@ def natural_key(path: Path) -> tuple[tuple[tuple[int, int | str], ...], str]:
 def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
     """Return the files that ``input.files`` names, in natural order; a path named twice is there twice.
 
-    Args:
-        settings: the section ``input``.
-        base_dir: folder to which relative paths refer.
-
-    Raises:
-        ConfigError: no files are named.
-        InputError: a path is missing, a glob matches nothing, a folder holds no camera files or several
-            formats.
+    ConfigError: no files are named. InputError: a path is missing, a glob matches nothing, a folder holds no
+    camera files or several formats.
     """
     if not settings.files:
         raise ConfigError("input.files is empty; name camera files, a glob such as frames/*.tif, or a folder")
@@ -47,7 +42,7 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
         with suppress(RuntimeError):  # a file called ~x.tif
             path = path.expanduser()
         path = base_dir / path
-        if path.is_dir() and not _is_zarr(path):
+        if path.is_dir() and not is_zarr(path):
             found += _folder(path, settings)
         elif path.exists():
             found.append(path)
@@ -64,12 +59,7 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
 
 
 def input_paths(settings: InputSettings, base_dir: Path) -> list[Path]:
-    """Return all files that decide what is read: mask, camera files, each with its sidecar.
-
-    Raises:
-        ConfigError: no files are named.
-        InputError: as in `resolve_files`.
-    """
+    """Return all files that decide what is read: mask, camera files, each with its sidecar."""
     mask = mask_path(settings, base_dir)
     paths = [] if mask is None else [mask]
     for path in resolve_files(settings, base_dir):
@@ -81,18 +71,10 @@ def input_paths(settings: InputSettings, base_dir: Path) -> list[Path]:
 
 
 def mask_path(settings: InputSettings, base_dir: Path) -> Path | None:
-    """Return the file of ``input.mask``, fetched where it is remote.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return the file of ``input.mask``, fetched where it is remote; InputError: there is none."""
     if settings.mask is None:
         return None
     return resolve_files(settings.model_copy(update={"files": (settings.mask,)}), base_dir)[0]
-
-
-def _is_zarr(path: Path) -> bool:
-    return any((path / name).exists() for name in ("zarr.json", ".zarray", ".zgroup"))
 
 
 def _glob(pattern: Path, base_dir: Path, entry: str) -> list[Path]:
@@ -100,16 +82,12 @@ def _glob(pattern: Path, base_dir: Path, entry: str) -> list[Path]:
     whole = pattern.is_absolute()
     folder = Path(pattern.anchor) if whole else base_dir
     matches = folder.glob(str(pattern.relative_to(pattern.anchor) if whole else pattern))
-    files = [path for path in matches if not path.name.startswith(".") and not _is_sidecar(path)]
-    plain = [path for path in files if path.is_file() or _is_zarr(path)]
+    # a description (frames.raw.json) is no camera file
+    files = [p for p in matches if not p.name.startswith(".") and p.suffix.lower() not in SIDECARS]
+    plain = [path for path in files if path.is_file() or is_zarr(path)]
     if not plain:
         raise InputError(f"{entry}: matches no file; correct the pattern (input.files)")
     return plain
-
-
-def _is_sidecar(path: Path) -> bool:
-    """Tell a description (``frames.raw.json``) from frames: it is named after a file that is there."""
-    return path.suffix.lower() in (".json", ".yaml", ".yml")
 
 
 def _folder(folder: Path, settings: InputSettings) -> list[Path]:
@@ -120,11 +98,7 @@ def _folder(folder: Path, settings: InputSettings) -> list[Path]:
     entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     files = [path for path in entries if path.is_file() and path.suffix.lower() in suffixes]
     if not files:
-        files = (
-            [path for path in entries if path.is_dir() and _is_zarr(path)]
-            if "zarr" in suffixes.values()
-            else []
-        )
+        files = [path for path in entries if is_zarr(path)] if "zarr" in suffixes.values() else []
     if not files:
         kinds = ", ".join(sorted(suffixes))
         raise InputError(

@@ -40,6 +40,12 @@ class StackFacts(NamedTuple):
     integration_time: float | None = None
     bit_depth: int | None = None
 
+    @property
+    def stated(self) -> dict[str, Any]:
+        """Integration time and bit depth by their names, as far as they are known."""
+        facts = {"integration_time": self.integration_time, "bit_depth": self.bit_depth}
+        return {name: value for name, value in facts.items() if value is not None}
+
 
 def write_frames(
     format: str,
@@ -52,21 +58,17 @@ def write_frames(
     bit_depth: int | None = None,
     frames_per_file: int | None = None,
 ) -> list[Path]:
-    """Write a stream of frames; each file appears only when it is whole.
+    """Write a stream of frames; each file appears only when it is whole; return the files in order.
 
     Args:
         format: tiff, fits, hdf5, npy, raw, zarr or ser.
-        path: the file; without a suffix the format's own is added. With ``frames_per_file``, parts are named
-            ``<stem>_00001<suffix>`` and so on.
+        path: the file; its suffix is the format's if it has none; parts are ``<stem>_00001<suffix>``, ...
         blocks: arrays (any number of frames, rows, columns), in order, together ``shape``.
         shape: (frames, rows, columns).
         dtype: uint8, uint16 or uint32.
         integration_time: s, recorded where the format has a place for it.
         bit_depth: bits of the ADC, recorded likewise.
         frames_per_file: frames of a part (1: a sequence of single frames); None: all in one file.
-
-    Returns:
-        The files written, in order.
 
     Raises:
         ConfigError: an unknown format, or an optional library is missing.
@@ -85,7 +87,8 @@ def write_frames(
     written: list[Path] = []
     for part, count in _parts(path, shape[0], frames_per_file):
         stack = StackFacts((count, *shape[1:]), kind.newbyteorder("="), integration_time, bit_depth)
-        written += writer(part, stream.take(count), stack)
+        writer(part, stream.take(count), stack)
+        written.append(part)
     stream.finish()
     return written
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import Variable, variables_of
-from pchem_pipeline.frames.formats.cube_files import Cube, write_fits_cube, write_tiff_cube
+from pchem_pipeline.frames.formats.map_files import Cube, write_fits_cube, write_tiff_cube
 from pchem_pipeline.store.files import write_json
 from pchem_pipeline.store.run_store import RunStore
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,8 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
 from pchem_pipeline.frames.identity import FileHasher
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window
+from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.store.files import whole_file
 
 _MOST_BYTES = 1 << 30
 _MOST_FRAMES = 1 << 26
@@ -72,18 +75,9 @@ def unsigned_type(stored: np.dtype[Any]) -> np.dtype[Any]:
 def even_offsets(
     path: Path, n_frames: int, frame_bytes: int, size: int, *, start: int = 0, step: int | None = None
 ) -> NDArray[np.int64]:
-    """Return the byte offset of each of the frames that lie evenly in a file.
+    """Return the byte offset of each frame; frames lie ``step`` bytes apart (None: they follow each other).
 
-    Args:
-        path: the file, for the message.
-        n_frames: their number, as the header says.
-        frame_bytes: bytes of a frame.
-        size: bytes of the file.
-        start: offset of the first frame.
-        step: bytes from one frame to the next; None: they follow each other.
-
-    Raises:
-        InputError: they do not fit into the file. The numbers of a damaged header must not take memory.
+    InputError: they do not fit into a file of ``size`` bytes; a damaged header must not take memory.
     """
     step = frame_bytes if step is None else step
     if n_frames and frame_bytes < 1:
@@ -175,13 +169,10 @@ class ContiguousReader(FrameReader):
     """A reader that needs nothing but a `Layout`; of files without one it decodes by `decode_into`."""
 
     _offset: int | None = None
+    _full: tuple[int, ...]
 
     def set_layout(self, path: Path, layout: Layout, size: int) -> None:
-        """Take the layout; ``size`` is the size of the file.
-
-        Raises:
-            InputError: the file is shorter than the layout says.
-        """
+        """Take the layout in a file of ``size`` bytes; InputError: it is shorter than that."""
         if layout.end > size:
             whole = int(np.count_nonzero(layout.offsets + layout.frame_bytes <= size))
             raise _truncated(path, layout.offsets.size, layout.end, size, whole)
@@ -191,22 +182,29 @@ class ContiguousReader(FrameReader):
         self._layout = layout
         self._size = size
 
+    def set_stack(
+        self,
+        path: Path,
+        full: Sequence[int],
+        stored: np.dtype[Any],
+        settings: InputSettings | None,
+        what: str,
+    ) -> None:
+        """Take shape and type as a file states them, or raise InputError; without settings any sign fits."""
+        self._offset = None if settings is None else check_samples(path, stored, settings)
+        self.paths, self.shape = (path,), stack_shape(path, full, what)
+        self.dtype, self._full = unsigned_type(stored), tuple(full)
+
     @property
     def layout(self) -> Layout | None:
         """Where the frames lie, or None where they have to be decoded."""
         return getattr(self, "_layout", None)
 
     def scatter(self, parts: Sequence[NDArray[Any]], t0: int, t1: int, hasher: FileHasher) -> None:
-        """Read whole frames into the bands of rows that make them up, and hash all bytes up to their end.
+        """Read frames t0..t1 into the bands of rows that make them up, and hash all bytes up to their end.
 
-        Args:
-            parts: C-contiguous, (t1 - t0, rows, columns) each, that cover the frames from top to bottom.
-            t0: first frame.
-            t1: end of the frames.
-            hasher: of this file; it stands before the first of the frames.
-
-        Raises:
-            InputError: the file vanished, changed or cannot be read.
+        The parts, C-contiguous (t1 - t0, rows, columns), cover the frames from top to bottom; the hasher
+        stands before the first frame. InputError: the file vanished, changed or cannot be read.
         """
         layout = self._layout
         bytes_of = [part.reshape(t1 - t0, -1).view(np.uint8) for part in parts]
@@ -262,16 +260,9 @@ def _runs(offsets: NDArray[np.int64], frame_bytes: int) -> list[tuple[int, int]]
 
 
 def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, path: Path) -> None:
-    """Turn stored bytes into native unsigned samples, in place.
+    """Turn stored bytes, read into unsigned native samples of that size, into these, in place.
 
-    Args:
-        buffer: unsigned native type of the size of ``stored``, holding the bytes of the file.
-        stored: type in the file, with its byte order.
-        offset: what is added to signed samples, 0 to 2**(bits - 1); None: they are unsigned.
-        path: the file, for the message.
-
-    Raises:
-        InputError: a sample is negative, with the offset.
+    ``offset`` is added to signed samples, 0 to 2**(bits - 1) DN (None: unsigned). InputError: a negative sum.
     """
     if not stored.isnative:
         buffer.byteswap(inplace=True)
@@ -287,6 +278,12 @@ def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, pat
                 f"input.offset: {top} (--offset {top}), if 0 DN is stored as -{top}"
             )
     if offset:
-        np.add(
-            buffer, buffer.dtype.type(offset), out=buffer
-        )  # modulo 2**bits, which is right for signed ones
+        np.add(buffer, buffer.dtype.type(offset), out=buffer)  # modulo 2**bits: right for signed ones
+
+
+def write_plain(path: Path, head: bytes, blocks: Iterable[NDArray[Any]], stored: np.dtype[Any]) -> None:
+    """Write a header and the frames behind it, as samples of the stored type."""
+    with whole_file(path) as part, part.open("wb") as stream:
+        stream.write(head)
+        for block in blocks:
+            stream.write(np.ascontiguousarray(block, stored).data)

@@ -33,20 +33,8 @@ from pchem_pipeline.frames.camera import (
     seconds_of,
     text_of,
 )
-from pchem_pipeline.frames.formats.contiguous import (
-    ContiguousReader,
-    Layout,
-    even_offsets,
-    unsigned_type,
-)
-from pchem_pipeline.frames.formats.kinds import (
-    LARGEST_PIECES,
-    check_coded,
-    check_samples,
-    check_unpacked_size,
-    full_window,
-    stack_shape,
-)
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
+from pchem_pipeline.frames.formats.kinds import LARGEST_PIECES, check_coded, check_unpacked_size, full_window
 from pchem_pipeline.frames.reader import changed, sound
 from pchem_pipeline.frames.registry import check_unpacked, require
 from pchem_pipeline.frames.settings import InputSettings
@@ -95,8 +83,8 @@ class FitsReader(ContiguousReader):
             sizes = [header[f"NAXIS{axis}"] for axis in range(header["NAXIS"], 0, -1)]
             compressed = isinstance(hdu, fits.CompImageHDU)
             stored, zero = _samples(path, header, compressed)
-            offset = zero or check_samples(path, stored, settings)
-            n, rows, columns = stack_shape(path, sizes, "image")
+            self.set_stack(path, sizes, stored, None if zero else settings, "image")
+            n, rows, columns = self.shape
             self.notes = _value_notes(path, header, n)
             if compressed:
                 self.notes += _coding_notes(
@@ -111,13 +99,11 @@ class FitsReader(ContiguousReader):
                 raise InputError(
                     f"{path}: truncated: {end} bytes are needed, the file has {size}; copy it again"
                 )
-            self.paths, self.shape, self.dtype = (path,), (n, rows, columns), unsigned_type(stored)
-            self._compressed, self._size, self._offset = number, size, None if zero else offset
-            self._full = tuple(sizes)
+            self._compressed, self._size = number, size
             check_coded(path, self.shape, hdu.tile_shape, stored.itemsize, size)
             return
         offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=start)
-        self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
+        self.set_layout(path, Layout(offsets, rows, columns, stored, zero or self._offset), size)
 
     def _read_facts(self, *headers: Any) -> None:
         """Take each fact from the last header that has it."""
@@ -186,17 +172,10 @@ def _value_notes(path: Path, header: Any, frames: int) -> tuple[str, ...]:
 
 
 def _coding_notes(path: Path, number: int, piece: int, *, biased: bool) -> tuple[str, ...]:
-    """Say where compression lost information.
+    """Say where the compression of image ``number`` lost information; ``piece`` is the bytes of a tile.
 
-    Args:
-        path: the file.
-        number: of the image in it.
-        piece: bytes of a tile.
-        biased: unsigned by BZERO.
-
-    Raises:
-        InputError: unsigned samples in PLIO, of which the library does not take back the shift;
-            or a tile that holds more than its shape says.
+    InputError: unsigned samples (``biased``) in PLIO, of which the library does not take back the shift; or a
+    tile that holds more than its shape says.
     """
     from astropy.io import fits
 
@@ -268,7 +247,7 @@ def _samples(path: Path, header: Any, compressed: bool) -> tuple[np.dtype[Any], 
     return stored, int(zero)
 
 
-def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:
     """Write frames as one cube (one frame: one image); see `frames.writing.write_frames`."""
     shape, dtype, integration_time, bit_depth = stack
     cards: dict[str, Any] = {}
@@ -277,7 +256,6 @@ def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) 
     if bit_depth is not None:
         cards["BITDEPTH"] = (bit_depth, "bits of the ADC")
     write_image(path, blocks, shape if shape[0] > 1 else shape[1:], dtype, cards)
-    return [path]
 
 
 def write_image(
@@ -287,19 +265,7 @@ def write_image(
     dtype: np.dtype[Any],
     cards: dict[str, Any],
 ) -> None:
-    """Write an array that comes by blocks as the primary image.
-
-    Args:
-        path: the file.
-        blocks: of its images, in order.
-        shape: of the whole.
-        dtype: floating point or unsigned.
-        cards: further keywords.
-
-    Raises:
-        StoreError: the folder cannot be written.
-        MissingDependencyError: astropy is not installed.
-    """
+    """Write blocks of images (float or unsigned) that make up ``shape`` as the primary image, with cards."""
     require("astropy.io.fits", "fits", "FITS files")
     from astropy.io import fits
 

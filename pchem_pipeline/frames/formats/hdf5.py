@@ -21,13 +21,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError, quoted
 from pchem_pipeline.frames.camera import FACT_NAMES, StatedFacts, facts_from_names, text_of
-from pchem_pipeline.frames.formats.choice import choose_dataset
-from pchem_pipeline.frames.formats.contiguous import (
-    ContiguousReader,
-    Layout,
-    even_offsets,
-    unsigned_type,
-)
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.formats.hdf5_parts import (
     check_filters,
     check_links,
@@ -41,10 +35,9 @@ from pchem_pipeline.frames.formats.hdf5_parts import (
 from pchem_pipeline.frames.formats.kinds import (
     LARGEST_PIECES,
     check_coded,
-    check_samples,
     check_unpacked_size,
+    choose_dataset,
     full_window,
-    stack_shape,
 )
 from pchem_pipeline.frames.reader import changed, sound, unwritten_notes
 from pchem_pipeline.frames.registry import require
@@ -107,11 +100,7 @@ class Hdf5Reader(ContiguousReader):
             check_links(path, external_links(path, file), wanted)
         self._name = choose_dataset(path, found, settings.dataset)
         dataset = file[self._name]
-        self._offset = check_samples(path, dataset.dtype, settings)
-        self.paths = (path,)
-        self.shape = stack_shape(path, dataset.shape, f"dataset {self._name}")
-        self.dtype = unsigned_type(dataset.dtype)
-        self._full = tuple(dataset.shape)
+        self.set_stack(path, dataset.shape, dataset.dtype, settings, f"dataset {self._name}")
         size = path.stat().st_size
         check_filters(path, dataset)
         if dataset.is_virtual:
@@ -148,11 +137,7 @@ class Hdf5Reader(ContiguousReader):
 
 
 def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
-    """Say how many chunks of a dataset were never written; the library reads them as the fill value.
-
-    Raises:
-        InputError: none was written, or the file has no place for them at all.
-    """
+    """Say how many chunks were never written, and read as the fill value; InputError: all of them."""
     if dataset.chunks is None:
         plain = not (dataset.is_virtual or dataset.external) and dataset.id.get_storage_size() == 0
         return unwritten_notes(path, int(plain and dataset.size > 0), 1, "datasets")
@@ -162,11 +147,7 @@ def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
 
 
 def _check_chunk_sizes(path: Path, dataset: Any) -> None:
-    """Refuse plain chunks of another size than their shape: the library reads beyond them, and crashes.
-
-    Raises:
-        InputError: there is one.
-    """
+    """Refuse plain chunks of another size than their shape: the library reads beyond them, and crashes."""
     if dataset.id.get_create_plist().get_nfilters() or not hasattr(dataset.id, "chunk_iter"):
         return
     size = math.prod(dataset.chunks) * dataset.dtype.itemsize
@@ -179,11 +160,7 @@ def _check_chunk_sizes(path: Path, dataset: Any) -> None:
 
 
 def _check_deflated(path: Path, dataset: Any) -> None:
-    """Refuse chunks that were deflated twice, or that hold more than their shape says.
-
-    Raises:
-        InputError: there is one.
-    """
+    """Refuse chunks that were deflated twice, or that hold more than their shape says."""
     from h5py import h5z
 
     record = dataset.id.get_create_plist()
@@ -238,9 +215,9 @@ def _require() -> None:
         require("hdf5plugin", "hdf5", "compressed HDF5 files")  # its import registers the filters
 
 
-def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:
     """Write frames as the dataset ``frames``, stored plainly; see `frames.writing.write_frames`."""
-    shape, dtype, integration_time, bit_depth = stack
+    shape, dtype, *_ = stack
     _require()
     import h5py
 
@@ -250,11 +227,9 @@ def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) 
         for block in blocks:
             dataset[start : start + len(block)] = block
             start += len(block)
-        if integration_time is not None:
-            dataset.attrs["integration_time"], dataset.attrs["integration_time_units"] = integration_time, "s"
-        if bit_depth is not None:
-            dataset.attrs["bit_depth"] = bit_depth
-    return [path]
+        dataset.attrs.update(stack.stated)
+        if stack.integration_time is not None:
+            dataset.attrs["integration_time_units"] = "s"
 
 
 def _is_detector(group: Any) -> bool:
@@ -262,12 +237,7 @@ def _is_detector(group: Any) -> bool:
 
 
 def _stated_facts(dataset: Any, groups: list[Any]) -> StatedFacts:
-    """Return what the attributes of the dataset say, else the values beside it (count_time in NeXus).
-
-    Args:
-        dataset: the frames.
-        groups: the group of the dataset, and the detector where the frames are in NXdata by a link.
-    """
+    """Return what the attributes of the dataset say, else the values beside it or in its detector (NeXus)."""
     values = {name: np.ravel(value)[0] for name, value in dataset.attrs.items() if np.size(value) == 1}
     beside: dict[str, Any] = {}
     units: dict[str, Any] = {}

@@ -1,10 +1,10 @@
-"""Which sample types and stack shapes can be frames: one set of refusals for all formats."""
+"""Which samples, shapes and arrays of a container can be frames: one set of refusals for all formats."""
 
 from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +22,10 @@ LARGEST_PIECES = 64
 
 
 def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> int | None:
-    """Check that samples can be digital numbers: unsigned, or signed as the settings say.
+    """Return what is to be added to signed samples, DN; None for unsigned ones.
 
-    Args:
-        path: the file, for the message.
-        dtype: type of the stored samples.
-        settings: the section ``input``; its ``dtype`` names the unsigned type that is meant.
-
-    Returns:
-        What is to be added to signed samples, DN; None for unsigned ones.
-
-    Raises:
-        InputError: float, complex, boolean, object, 64-bit or undeclared signed samples, or ``input.dtype``
-            says otherwise.
+    ``input.dtype`` names the unsigned type that is meant. InputError: float, complex, boolean, object, 64-bit
+    or undeclared signed samples, or the settings say otherwise.
     """
     wanted = settings.dtype
     if dtype.kind == "u" and dtype.itemsize in (1, 2, 4):
@@ -71,10 +62,9 @@ def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> 
 
 
 def stack_shape(path: Path, shape: Sequence[int], what: str = "array") -> tuple[int, int, int]:
-    """Return (frames, rows, columns) of a 2-D or 3-D array; more axes are taken if they have length 1.
+    """Return (frames, rows, columns) of a 2-D or 3-D array; further axes must have length 1.
 
-    Raises:
-        InputError: too few or too many axes.
+    InputError: too few or too many axes.
     """
     sizes = list(shape)
     if min(sizes, default=0) < 0 or max(sizes[-2:], default=0) > _MOST_PIXELS:
@@ -100,15 +90,8 @@ def check_coded(
 ) -> None:
     """Check that coded frames can be what their header says, before memory is taken for them.
 
-    Args:
-        path: the file, for the message.
-        shape: (frames, rows, columns).
-        piece: shape of a chunk, tile or strip, which is decoded at once.
-        itemsize: bytes of a sample.
-        size: bytes of the file or folder.
-
-    Raises:
-        InputError: the frames are too many for so few bytes, or a piece is far larger than they all.
+    A piece (chunk, tile, strip) is decoded at once. InputError: too many frames for a file of ``size`` bytes,
+    or a piece is far larger than they all.
     """
     total, one = math.prod(shape) * itemsize, math.prod(piece) * itemsize
     if total > max(_MOST_CODED, _MOST_RATIO * size):
@@ -123,16 +106,9 @@ def check_coded(
 
 
 def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int, codecs: str = "gzip") -> None:
-    """Check that coded pieces hold no more than their shape says, before the library unpacks them whole.
+    """Refuse coded pieces that hold more bytes than expected, before the library unpacks them.
 
-    Args:
-        path: the file, for the message.
-        pieces: coded bytes.
-        expected: bytes of a piece by shape and type.
-        codecs: names of those that may be in use; gzip and zlib are unpacked, the headers of others read.
-
-    Raises:
-        InputError: one holds more.
+    ``codecs`` may be in use: gzip and zlib are unpacked, the headers of others read.
     """
     for data in pieces:
         found = 0
@@ -178,3 +154,29 @@ def full_window(full: tuple[int, ...], t0: int, t1: int, y0: int, y1: int) -> tu
         if length != 1:
             window[axis] = slice(t0, t1)
     return (*window, slice(y0, y1), slice(None))
+
+
+def choose_dataset(path: Path, shapes: Mapping[str, tuple[int, ...]], wanted: str | None) -> str:
+    """Return the wanted dataset, else the only one of three axes or more, else of two; else list them.
+
+    ``shapes`` has the shape of every dataset by its path inside. InputError: not there, or several.
+    """
+    stacks = [name for name, shape in shapes.items() if len(shape) >= 3]
+    images = [name for name, shape in shapes.items() if len(shape) == 2]
+    names = [*stacks, *images]
+    listed = ", ".join(f"{name} {shapes[name]}" for name in names[:12])
+    listed += f" and {len(names) - 12} more" if len(names) > 12 else ""
+    if wanted is not None:
+        name = wanted.strip("/")
+        if name in shapes:
+            return name
+        raise InputError(
+            f"{path}: no dataset {wanted!r}; there are: {listed or 'no images'}; correct input.dataset "
+            "(--dataset)"
+        )
+    if not stacks and not images:
+        raise InputError(f"{path}: holds no dataset of frames (frames, rows, columns); leave it out")
+    candidates = stacks or images
+    if len(candidates) > 1:
+        raise InputError(f"{path}: holds several datasets: {listed}; choose one by input.dataset (--dataset)")
+    return candidates[0]

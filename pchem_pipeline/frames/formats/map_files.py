@@ -1,9 +1,9 @@
-"""Files of parameter maps for other programs: FITS, TIFF and npz; and images that others made."""
+"""Maps and stacks of images for other programs: FITS, TIFF and npz; and images that others made."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.formats.fits import write_image
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.store.files import whole_file
+
+#: bytes above which a TIFF file needs offsets of 64 bits
+_LARGEST_TIFF = 1 << 32
 
 
 @dataclass(frozen=True)
@@ -34,19 +38,9 @@ class MapImage:
 
 
 def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) -> list[Path]:
-    """Write one FITS file with an image extension for each map.
+    """Write one FITS file with an image extension for each map, of the map's type.
 
-    Args:
-        path: the file.
-        maps: the maps; floating point and integers stay as they are.
-        header: keywords of the primary header (at most 8 characters each); None is left out.
-
-    Returns:
-        The file written.
-
-    Raises:
-        StoreError: the folder cannot be written.
-        MissingDependencyError: astropy is not installed.
+    ``header`` has keywords of the primary header, of 8 characters at most; None is left out.
     """
     require("astropy.io.fits", "fits", "FITS files")
     from astropy.io import fits
@@ -67,18 +61,7 @@ def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) 
 
 
 def write_tiff(folder: Path, maps: Sequence[MapImage]) -> list[Path]:
-    """Write one TIFF file for each map: float32 for parameters, integers as they are.
-
-    Args:
-        folder: where to write ``<name>.tif``.
-        maps: the maps.
-
-    Returns:
-        The files written.
-
-    Raises:
-        StoreError: the folder cannot be written.
-    """
+    """Write ``<name>.tif`` for each map, float32 for parameters, integers as they are; return the files."""
     import tifffile
 
     written = []
@@ -93,36 +76,71 @@ def write_tiff(folder: Path, maps: Sequence[MapImage]) -> list[Path]:
 
 
 def write_npz(path: Path, maps: Sequence[MapImage]) -> list[Path]:
-    """Write all maps into one npz file, each under its name.
-
-    Args:
-        path: the file.
-        maps: the maps.
-
-    Returns:
-        The file written.
-
-    Raises:
-        StoreError: the folder cannot be written.
-    """
+    """Write all maps into one npz file, each under its name; return it in a list."""
     arrays: dict[str, Any] = {image.name: image.values for image in maps}
     with whole_file(path) as part:
         np.savez_compressed(part, allow_pickle=False, **arrays)
     return [path]
 
 
-def read_image(path: Path) -> NDArray[np.float64]:
-    """Return an image, or a stack of images, from npy, TIFF or FITS.
+@dataclass(frozen=True)
+class Cube:
+    """An array and what it is.
 
-    Args:
-        path: the file.
-
-    Returns:
-        Shape (y, x) or (image, y, x).
-
-    Raises:
-        InputError: there is no such file, or it is no image.
+    Attributes:
+        name: as in the store.
+        blocks: arrays (any number of images, rows, columns), in order.
+        shape: (images, rows, columns) of all together; FITS takes a map of (rows, columns), too.
+        dtype: type of the samples.
+        unit: physical unit.
+        long_name: one sentence.
+        facts: provenance, as JSON data.
     """
+
+    name: str
+    blocks: Iterable[NDArray[Any]]
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    unit: str
+    long_name: str
+    facts: Mapping[str, Any]
+
+
+def write_tiff_cube(path: Path, cube: Cube) -> None:
+    """Write a page for each image: an ImageJ stack, or BigTIFF where that is too small."""
+    import tifffile
+
+    size = int(np.prod(cube.shape)) * cube.dtype.itemsize
+    about = {
+        "name": cube.name,
+        "unit": cube.unit,
+        "long_name": cube.long_name,
+        "provenance": dict(cube.facts),
+    }
+    images = (image for block in cube.blocks for image in np.ascontiguousarray(block, cube.dtype))
+    options: dict[str, Any] = {"shape": cube.shape, "dtype": cube.dtype, "photometric": "minisblack"}
+    with whole_file(path) as part:
+        if size + (1 << 25) < _LARGEST_TIFF and cube.dtype.str[1:] in ("u1", "u2", "f4"):
+            frames = {"axes": "TYX", "Info": json.dumps(about), "unit": "pixel"}
+            tifffile.imwrite(part, images, imagej=True, metadata=frames, **options)
+        else:
+            tifffile.imwrite(part, images, bigtiff=True, metadata=about, **options)
+
+
+def write_fits_cube(path: Path, cube: Cube) -> None:
+    """Write an image of the axes of the array, the unit in ``BUNIT``, the provenance as ``HISTORY``."""
+    cards = {
+        "BUNIT": cube.unit,
+        "OBJECT": cube.name,
+        "COMMENT": cube.long_name,
+        "CREATOR": "pchem-pipeline",
+        "HISTORY": json.dumps(dict(cube.facts)),
+    }
+    write_image(path, cube.blocks, cube.shape, cube.dtype, cards)
+
+
+def read_image(path: Path) -> NDArray[np.float64]:
+    """Return an image (y, x) or images (image, y, x) from npy, TIFF or FITS; InputError: it is none."""
     kinds = {".npy": _read_npy, ".tif": _read_tiff, ".tiff": _read_tiff}
     kinds |= dict.fromkeys((".fits", ".fit", ".fts"), _read_fits)
     kind = kinds.get(path.suffix.lower())

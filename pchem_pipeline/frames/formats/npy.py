@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, write_plain
 from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
 from pchem_pipeline.frames.reader import sound
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
-from pchem_pipeline.store.files import whole_file
 
 
 class NpyReader(ContiguousReader):
@@ -58,12 +57,10 @@ class NpyReader(ContiguousReader):
         return reader
 
 
-def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:
     """Write frames as one npy array; the format has no place for times and bit depth."""
     shape, dtype, *_ = stack
     header = {"descr": npy_format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
-    with whole_file(path) as part, part.open("wb") as stream:
-        npy_format.write_array_header_1_0(stream, header)
-        for block in blocks:
-            stream.write(np.ascontiguousarray(block, dtype).data)
-    return [path]
+    head = io.BytesIO()
+    npy_format.write_array_header_1_0(head, header)
+    write_plain(path, head.getvalue(), blocks, dtype)

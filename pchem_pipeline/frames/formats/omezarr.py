@@ -14,15 +14,13 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
-from pchem_pipeline.frames.formats.choice import choose_dataset
-from pchem_pipeline.frames.formats.contiguous import ContiguousReader, unsigned_type
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader
 from pchem_pipeline.frames.formats.kinds import (
     LARGEST_PIECES,
     check_coded,
-    check_samples,
     check_unpacked_size,
+    choose_dataset,
     full_window,
-    stack_shape,
 )
 from pchem_pipeline.frames.identity import file_size
 from pchem_pipeline.frames.reader import changed, sound, unwritten_notes
@@ -35,6 +33,11 @@ _DEEPEST, _MOST_IN_A_SHARD = 64, 1 << 16
 _DESCRIBED = ("zarr.json", ".zarray", ".zattrs", ".zgroup", ".zmetadata")
 
 
+def is_zarr(path: Path) -> bool:
+    """Tell whether a path is a folder with the metadata of a zarr store."""
+    return path.is_dir() and any((path / name).exists() for name in ("zarr.json", ".zarray", ".zgroup"))
+
+
 class ZarrReader(ContiguousReader):
     """A zarr array, the only stack of a zarr group, or the full resolution of an OME-Zarr image."""
 
@@ -44,7 +47,7 @@ class ZarrReader(ContiguousReader):
     @classmethod
     def recognises(cls, path: Path, head: bytes) -> bool:
         """See `FrameReader.recognises`: a zarr store is a folder with metadata."""
-        return path.is_dir() and any((path / name).exists() for name in ("zarr.json", ".zarray", ".zgroup"))
+        return is_zarr(path)
 
     @classmethod
     def open(cls, path: Path, settings: InputSettings) -> Self:
@@ -81,11 +84,7 @@ class ZarrReader(ContiguousReader):
                 f"{path}: {self._name or 'the array'} is coded by {', '.join(foreign)}, which may run code; "
                 "write it again with blosc, gzip or zstd"
             )
-        self._offset = check_samples(path, np.dtype(array.dtype), settings)
-        self.paths = (path,)
-        self.shape = stack_shape(path, array.shape, f"array {self._name}".strip())
-        self.dtype = unsigned_type(np.dtype(array.dtype))
-        self._full = tuple(array.shape)
+        self.set_stack(path, array.shape, np.dtype(array.dtype), settings, f"array {self._name}".strip())
         self.rows_per_read = min(self.shape[1], int(array.chunks[-2]))
         self._array = array
         piece = getattr(array, "shards", None) or array.chunks
@@ -170,18 +169,13 @@ def _shapes(group: Any) -> dict[str, tuple[int, ...]]:
     return {name: tuple(node.shape) for name, node in members if hasattr(node, "shape")}
 
 
-def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:
     """Write frames as one zarr array (format 3) in chunks along time; see `frames.writing.write_frames`."""
-    shape, dtype, integration_time, bit_depth = stack
+    shape, dtype, *_ = stack
     import zarr
     from zarr.codecs import BloscCodec
 
     n, rows, columns = shape
-    attributes: dict[str, Any] = {"units": "DN", "long_name": "raw frames"}
-    if integration_time is not None:
-        attributes["integration_time"] = integration_time
-    if bit_depth is not None:
-        attributes["bit_depth"] = bit_depth
     depth = min(256, n)
     with whole_file(path) as part:
         array = zarr.create_array(
@@ -191,13 +185,12 @@ def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) 
             chunks=(depth, min(128, rows), min(128, columns)),
             compressors=BloscCodec(cname="lz4", shuffle="bitshuffle", typesize=dtype.itemsize),
             dimension_names=("frame", "y", "x"),
-            attributes=attributes,
+            attributes={"units": "DN", "long_name": "raw frames", **stack.stated},
         )
         start = 0
         for block in _regrouped(blocks, depth):
             array[start : start + len(block)] = block
             start += len(block)
-    return [path]
 
 
 def _regrouped(blocks: Iterator[NDArray[Any]], depth: int) -> Iterator[NDArray[Any]]:

@@ -19,12 +19,15 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
-from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, write_plain
 from pchem_pipeline.frames.formats.kinds import check_samples
 from pchem_pipeline.frames.reader import sound
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
+
+#: suffixes of descriptions beside raw files
+SIDECARS = (".json", ".yaml", ".yml")
 
 
 class _Sidecar(BaseModel):
@@ -45,7 +48,7 @@ class _Sidecar(BaseModel):
 
 def find_sidecar(path: Path) -> Path | None:
     """Return the sidecar of a raw file, or None."""
-    for suffix in (".json", ".yaml", ".yml"):
+    for suffix in SIDECARS:
         for candidate in (path.with_name(path.name + suffix), path.with_suffix(suffix)):
             if candidate.is_file():
                 return candidate
@@ -138,23 +141,14 @@ class RawReader(ContiguousReader):
         self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
 
 
-def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:
     """Write frames as bytes, with a sidecar ``<path>.json``; see `frames.writing.write_frames`."""
-    shape, dtype, integration_time, bit_depth = stack
-    little = dtype.newbyteorder("<")
-    with whole_file(path) as part, part.open("wb") as stream:
-        for block in blocks:
-            stream.write(np.ascontiguousarray(block, little).data)
-    record: dict[str, Any] = {
-        "shape": list(shape),
-        "dtype": dtype.name,
+    write_plain(path, b"", blocks, stack.dtype.newbyteorder("<"))
+    record = {
+        "shape": list(stack.shape),
+        "dtype": stack.dtype.name,
         "byte_order": "little",
         "header_bytes": 0,
     }
-    if integration_time is not None:
-        record["integration_time"] = integration_time
-    if bit_depth is not None:
-        record["bit_depth"] = bit_depth
     with whole_file(path.with_name(path.name + ".json")) as part:
-        part.write_text(json.dumps(record) + "\n", encoding="utf-8")
-    return [path]
+        part.write_text(json.dumps(record | stack.stated) + "\n", encoding="utf-8")

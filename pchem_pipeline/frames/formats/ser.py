@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import CameraFacts, text_of
-from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, write_plain
 from pchem_pipeline.frames.reader import sound
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
-from pchem_pipeline.store.files import whole_file
 
 _HEADER = struct.Struct("<14s7i40s40s40s2q")
 _MAGIC = b"LUCAM-RECORDER"
@@ -80,7 +79,7 @@ def _seconds(ticks: int) -> float | None:
     return (ticks - _EPOCH) * 1e-7 if ticks > _EPOCH else None
 
 
-def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:
     """Write frames as SER video (uint8 or uint16) without times; see `frames.writing.write_frames`."""
     shape, dtype, _, bit_depth = stack
     if dtype.itemsize > 2:
@@ -92,8 +91,4 @@ def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) 
             f"{path}: SER stores {depth} bits in other samples than {dtype.name}; choose another format"
         )
     header = _HEADER.pack(_MAGIC, 0, 0, 0, columns, rows, depth, n, b"", b"", b"", 0, 0)
-    with whole_file(path) as part, part.open("wb") as stream:
-        stream.write(header)
-        for block in blocks:
-            stream.write(np.ascontiguousarray(block, dtype.newbyteorder("<")).data)
-    return [path]
+    write_plain(path, header, blocks, dtype.newbyteorder("<"))

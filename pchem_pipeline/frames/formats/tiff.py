@@ -1,9 +1,8 @@
 """TIFF, BigTIFF, ImageJ and OME-TIFF stacks, and sequences of single-frame files.
 
 Pages are frames whenever all pages share shape and type, whatever the metadata say about series. Uncompressed
-pages are read straight from their offsets; others are decoded strip by strip by tifffile, only the strips
-that
-the wanted rows need.
+pages are read straight from their offsets; others are decoded strip by strip by tifffile, only
+the strips that the wanted rows need.
 """
 
 from __future__ import annotations
@@ -326,12 +325,11 @@ def _adjoining(page: Any, total: int) -> bool:
     return bool(sum(counts) == total and list(offsets[1:]) == ends[:-1])
 
 
-def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> list[Path]:
+def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:
     """Write frames as pages of one file, BigTIFF above 2 GiB; see `frames.writing.write_frames`."""
-    shape, dtype, integration_time, bit_depth = stack
+    shape, dtype, *_ = stack
     import tifffile
 
-    facts = {"integration_time": integration_time, "bit_depth": bit_depth}
     with whole_file(path) as part:
         tifffile.imwrite(
             part,
@@ -340,6 +338,5 @@ def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) 
             dtype=dtype,
             bigtiff=int(np.prod(shape)) * dtype.itemsize > 1 << 31,
             photometric="minisblack",
-            metadata={key: value for key, value in facts.items() if value is not None},
+            metadata=stack.stated,
         )
-    return [path]

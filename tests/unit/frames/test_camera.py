@@ -14,6 +14,7 @@ import pytest
 import tifffile
 import zarr
 from astropy.io import fits
+from helpers.camera_files import opened
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
@@ -35,7 +36,7 @@ TAKEN = 1_769_860_800.0  # 2026-01-31T12:00:00 UTC
 
 
 def facts(path: Path, **settings: object) -> CameraFacts:
-    with open_frames(InputSettings(files=(path.name,), **settings), path.parent) as frames:
+    with opened(path, **settings) as frames:
         np.testing.assert_array_equal(frames.read(), STACK)
         return frames.camera
 
@@ -54,11 +55,8 @@ def test_fits(tmp_path: Path) -> None:
 
 
 def test_tiff_tags_and_records(tmp_path: Path) -> None:
-    tags = [
-        (271, "s", 0, "Maker", True),
-        (272, "s", 0, "Model 7", True),
-        (306, "s", 0, "2026:01:31 12:00:00", True),
-    ]
+    texts = {271: "Maker", 272: "Model 7", 306: "2026:01:31 12:00:00"}
+    tags = [(number, "s", 0, text, True) for number, text in texts.items()]
     tifffile.imwrite(tmp_path / "tags.tif", STACK, photometric="minisblack", extratags=tags, metadata=None)
     assert facts(tmp_path / "tags.tif") == CameraFacts("Maker Model 7", None, None, TAKEN)
     record = json.dumps(
@@ -132,7 +130,7 @@ def test_several_files_share_what_they_state_alike(tmp_path: Path) -> None:
         image.header["SERIALNO"] = f"{i}"  # counts the files
         image.header["DATE-OBS"] = f"2026-01-31T12:00:0{i}"
         image.writeto(tmp_path / f"{i}.fits")
-    with open_frames(InputSettings(files=("*.fits",)), tmp_path) as frames:
+    with opened(tmp_path / "*.fits") as frames:
         assert frames.camera == CameraFacts("C", None, pytest.approx(-57.4 / 3), TAKEN)
         assert [note for note in frames.notes if "from -20.4 to -17 °C" in note]
     steady, remark = shared_facts([CameraFacts(temperature=1.0), CameraFacts(temperature=1.9)])
@@ -252,16 +250,10 @@ def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path: Path) ->
     STACK.astype("<u2").tofile(tmp_path / "a.raw")
     side = {"shape": STACK.shape, "dtype": "uint16", "integration_time": 100, "integration_time_unit": "ms"}
     (tmp_path / "a.raw.json").write_text(json.dumps(side))
-    seconds = {
-        "plain.fits": 100.0,
-        "unit.fits": 0.1,
-        "doubt.fits": None,
-        "a.zarr": 0.1,
-        "a.h5": 0.1,
-        "a.raw": 0.1,
-    }
+    seconds = dict.fromkeys(("unit.fits", "a.zarr", "a.h5", "a.raw"), 0.1)
+    seconds |= {"plain.fits": 100.0, "doubt.fits": None}
     for name, right in seconds.items():
-        with open_frames(InputSettings(files=(name,)), tmp_path) as stack:
+        with opened(tmp_path / name) as stack:
             assert stack.integration_time == (None if right is None else pytest.approx(right)), name
             assert name in stack.time_words
             assert "--integration-time" not in stack.time_words or right is None
@@ -286,5 +278,5 @@ def test_every_format_with_attributes_takes_the_same_names(tmp_path: Path) -> No
     array[:] = frames
     array.attrs.update(exposure_time=20, exposure_time_units="ms", bit_depth_readout=12)
     for name in ("a.h5", "a.zarr"):
-        with open_frames(InputSettings(files=(name,)), tmp_path) as stack:
+        with opened(tmp_path / name) as stack:
             assert (stack.integration_time, stack.bit_depth) == (pytest.approx(0.02), 12)

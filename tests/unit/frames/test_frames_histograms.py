@@ -175,14 +175,8 @@ def test_what_is_a_histogram_input(tmp_path: Path) -> None:
 
 def test_measured_spectra() -> None:
     found = read(SIPM, "*.csv")
-    assert found.names == (
-        "M11_LED_1muA",
-        "M11_LED_10muA",
-        "M11_LED_25muA",
-        "M11_LED_50muA",
-        "M11_LED_100nA",
-        "M11_LED_dark",
-    )
+    currents = ("1muA", "10muA", "25muA", "50muA", "100nA", "dark")
+    assert found.names == tuple(f"M11_LED_{current}" for current in currents)
     for i, name in enumerate(found.names):
         table = np.loadtxt(SIPM / f"{name}.csv", delimiter=",", skiprows=1, dtype=np.int64)
         total = int(found.counts[0, i].sum())

@@ -15,10 +15,11 @@ import pytest
 import tifffile
 import zarr
 from astropy.io import fits
+from helpers.camera_files import not_opened, opened, write_hdf5
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from pchem_pipeline.base.errors import ConfigError, ExitCode, InputError
+from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.identity import hash_file
 from pchem_pipeline.frames.inspect import _gaps
 from pchem_pipeline.frames.open import open_frames
@@ -29,37 +30,10 @@ from pchem_pipeline.frames.writing import WRITERS, write_frames
 STACK = np.random.default_rng(15).integers(0, 4096, (12, 17, 19)).astype(np.uint16)
 
 
-def refused(settings: InputSettings, base: Path, words: str) -> None:
-    """Assert one clear line with exit code 4."""
-    with pytest.raises(InputError, match=words) as caught:
-        open_frames(settings, base)
-    assert "\n" not in str(caught.value)
-    assert caught.value.exit_code == ExitCode.INPUT == 4
-
-
 def test_natural_order() -> None:
-    names = [
-        "frame10.tif",
-        "frame2.tif",
-        "Frame1.tif",
-        "a9b10.tif",
-        "a9b9.tif",
-        "frame.tif",
-        "10.tif",
-        "9.tif",
-    ]
-    order = sorted((Path(name) for name in names), key=natural_key)
-    wanted = [
-        "9.tif",
-        "10.tif",
-        "a9b9.tif",
-        "a9b10.tif",
-        "Frame1.tif",
-        "frame2.tif",
-        "frame10.tif",
-        "frame.tif",
-    ]
-    assert [path.name for path in order] == wanted
+    wanted = ["9", "10", "a9b9", "a9b10", "Frame1", "frame2", "frame10", "frame"]
+    paths = [Path(f"{name}.tif") for name in wanted]
+    assert sorted([*paths[4::-1], *paths[:4:-1]], key=natural_key) == paths
 
 
 def test_resolve(tmp_path: Path) -> None:
@@ -85,42 +59,41 @@ def test_resolve(tmp_path: Path) -> None:
 def test_missing_and_empty(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"input\.files is empty"):
         open_frames(InputSettings(), tmp_path)
-    refused(InputSettings(files=("none.tif",)), tmp_path, r"none\.tif: no such file or folder")
-    refused(InputSettings(files=("*.tif",)), tmp_path, r"\*\.tif: matches no file")
+    not_opened(r"none\.tif: no such file or folder", tmp_path / "none.tif")
+    not_opened(r"\*\.tif: matches no file", tmp_path / "*.tif")
     (tmp_path / "empty").mkdir()
-    refused(InputSettings(files=("empty",)), tmp_path, "holds no camera files")
+    not_opened("holds no camera files", tmp_path / "empty")
     (tmp_path / "empty" / "a.tif").touch()
-    refused(InputSettings(files=("empty",)), tmp_path, r"a\.tif: the file is empty")
+    not_opened(r"a\.tif: the file is empty", tmp_path / "empty")
     (tmp_path / "b.xyz").write_bytes(b"what is this")
-    refused(InputSettings(files=("b.xyz",)), tmp_path, r"b\.xyz: not a known camera format")
+    not_opened(r"b\.xyz: not a known camera format", tmp_path / "b.xyz")
     (tmp_path / "c.tif").write_bytes(b"II*\0nonsense")
-    refused(InputSettings(files=("c.tif",)), tmp_path, r"c\.tif: not a sound TIFF")
+    not_opened(r"c\.tif: not a sound TIFF", tmp_path / "c.tif")
     (tmp_path / "d.fits").write_text("hello")
-    refused(InputSettings(files=("d.fits",)), tmp_path, r"d\.fits: not a sound FITS")
+    not_opened(r"d\.fits: not a sound FITS", tmp_path / "d.fits")
     with pytest.raises(ConfigError, match=r"input\.format 'jpeg' is not known; choose one of: auto, npy"):
-        open_frames(InputSettings(files=("b.xyz",), format="jpeg"), tmp_path)
+        opened(tmp_path / "b.xyz", format="jpeg")
 
 
 def test_folder_of_several_formats(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", STACK)
     tifffile.imwrite(tmp_path / "a.tif", STACK + 1, photometric="minisblack")
-    refused(InputSettings(files=(".",)), tmp_path, r"several formats \(npy, tiff\); set input.format")
+    not_opened(r"several formats \(npy, tiff\); set input.format", tmp_path / ".")
     with open_frames(InputSettings(files=(".",), format="tiff"), tmp_path) as reader:
         np.testing.assert_array_equal(reader.read(), STACK + 1)
 
 
 def test_content_wins_over_suffix(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "really_tiff.fits", STACK, photometric="minisblack")
-    np.testing.assert_array_equal(open_frames(InputSettings(files=("*",)), tmp_path).read(), STACK)
+    np.testing.assert_array_equal(opened(tmp_path / "*").read(), STACK)
 
 
 def test_mixed_formats_are_concatenated(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "p1.tif", STACK[:5], photometric="minisblack", compression="zlib")
     fits.PrimaryHDU(STACK[5]).writeto(tmp_path / "p2.fits")
-    with h5py.File(tmp_path / "p3.h5", "w") as file:
-        file["x"] = STACK[6:9]
+    write_hdf5(tmp_path / "p3.h5", x=STACK[6:9])
     np.save(tmp_path / "p10.npy", STACK[9:])
-    reader = open_frames(InputSettings(files=("p*",)), tmp_path)
+    reader = opened(tmp_path / "p*")
     np.testing.assert_array_equal(reader.read(), STACK)
     for t0, t1 in [(0, 1), (4, 6), (5, 6), (3, 10), (11, 12)]:
         np.testing.assert_array_equal(reader.read(t0, t1, 3, 14), STACK[t0:t1, 3:14])
@@ -141,60 +114,43 @@ def test_range_and_region(tmp_path: Path, format: str) -> None:
 def test_region_through_a_small_scratch_buffer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(tmp_path / "a.npy", STACK)
     monkeypatch.setattr("pchem_pipeline.frames.sequence._SCRATCH_BYTES", 3 * 17 * 19 * 2)
-    reader = open_frames(InputSettings(files=("a.npy",), roi=(0, 17, 5, 6)), tmp_path)
+    reader = opened(tmp_path / "a.npy", roi=(0, 17, 5, 6))
     np.testing.assert_array_equal(reader.read(), STACK[:, :, 5:6])
 
 
 def test_range_and_region_out_of_bounds(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", STACK)
-    refused(
-        InputSettings(files=("a.npy",), roi=(0, 18, 0, 5)),
-        tmp_path,
-        r"input\.roi \[0, 18, 0, 5\] reaches beyond .* \(--roi 0:18,0:5; all of them: 0:\d+,0:\d+\)",
-    )
-    refused(
-        InputSettings(files=("a.npy",), frame_range=(0, 13)), tmp_path, r"does not hold at least 2 of the 12"
-    )
-    refused(InputSettings(files=("a.npy",), frame_range=(11, None)), tmp_path, "at least 2 of the 12 frames")
-    bad: list[dict[str, Any]] = [
-        {"roi": (5, 5, 0, 3)},
-        {"frame_range": (4, 4)},
-        {"integration_time": 0.0},
-        {"integration_time": float("nan")},
-        {"shape": (0, 4)},
-        {"shape": (4,)},
-        {"bit_depth": 0},
-        {"unknown": 1},
-    ]
-    for keys in bad:
+    beyond = r"input\.roi \[0, 18, 0, 5\] reaches beyond .* \(--roi 0:18,0:5; all of them: 0:\d+,0:\d+\)"
+    not_opened(beyond, tmp_path / "a.npy", roi=(0, 18, 0, 5))
+    not_opened(r"does not hold at least 2 of the 12", tmp_path / "a.npy", frame_range=(0, 13))
+    not_opened("at least 2 of the 12 frames", tmp_path / "a.npy", frame_range=(11, None))
+    bad: list[tuple[str, Any]] = [("roi", (5, 5, 0, 3)), ("frame_range", (4, 4)), ("shape", (0, 4))]
+    bad += [("integration_time", 0.0), ("integration_time", float("nan"))]
+    for name, value in [*bad, ("shape", (4,)), ("bit_depth", 0), ("unknown", 1)]:
         with pytest.raises(ValidationError):
-            InputSettings(files=("a.npy",), **keys)
+            InputSettings(files=("a.npy",), **{name: value})
 
 
 def test_bit_shift(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", STACK << 4)
-    reader = open_frames(InputSettings(files=("a.npy",), bit_shift=4), tmp_path)
+    reader = opened(tmp_path / "a.npy", bit_shift=4)
     np.testing.assert_array_equal(reader.read(), STACK)
     assert reader.bit_depth == 12
     dirty = STACK << 4
     dirty[7, 8, 9] |= 2
     np.save(tmp_path / "a.npy", dirty)
-    reader = open_frames(InputSettings(files=("a.npy",), bit_shift=4), tmp_path)
+    reader = opened(tmp_path / "a.npy", bit_shift=4)
     np.testing.assert_array_equal(reader.read(0, 7), STACK[:7])
     with pytest.raises(InputError, match=r"a\.npy: the lowest 4 bits are not all zero.*input\.bit_shift"):
         reader.read()
-    refused(InputSettings(files=("a.npy",), bit_shift=16), tmp_path, "leaves nothing of uint16")
-    refused(
-        InputSettings(files=("a.npy",), bit_shift=4, bit_depth=14), tmp_path, "bit depth of 14 does not fit"
-    )
+    not_opened("leaves nothing of uint16", tmp_path / "a.npy", bit_shift=16)
+    not_opened("bit depth of 14 does not fit", tmp_path / "a.npy", bit_shift=4, bit_depth=14)
 
 
 def test_bit_depth_is_checked(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", STACK)
-    np.testing.assert_array_equal(
-        open_frames(InputSettings(files=("a.npy",), bit_depth=12), tmp_path).read(), STACK
-    )
-    reader = open_frames(InputSettings(files=("a.npy",), bit_depth=11), tmp_path)
+    np.testing.assert_array_equal(opened(tmp_path / "a.npy", bit_depth=12).read(), STACK)
+    reader = opened(tmp_path / "a.npy", bit_depth=11)
     with pytest.raises(InputError, match=r"a\.npy: values need more than the bit depth of 11; correct"):
         reader.read()
 
@@ -202,7 +158,7 @@ def test_bit_depth_is_checked(tmp_path: Path) -> None:
 @pytest.mark.parametrize("shift", [0, 2])
 def test_left_justified_values_above_the_bit_depth_say_their_shift(tmp_path: Path, shift: int) -> None:
     np.save(tmp_path / "a.npy", STACK << 4)  # 12 bits in 16
-    reader = open_frames(InputSettings(files=("a.npy",), bit_depth=12, bit_shift=shift), tmp_path)
+    reader = opened(tmp_path / "a.npy", bit_depth=12, bit_shift=shift)
     words = r"lowest 4 bits are all zero.*; set input\.bit_shift: 4 \(--bit-shift\)$"
     with pytest.raises(InputError, match=words):
         reader.read()
@@ -213,32 +169,21 @@ def test_files_that_contradict_each_other(tmp_path: Path) -> None:
         hdu = fits.PrimaryHDU(STACK[i])
         hdu.header["EXPTIME"] = time
         hdu.writeto(tmp_path / f"f{i}.fits")
-    refused(
-        InputSettings(files=("*.fits",)),
-        tmp_path,
-        r"different integration_time: 1\.5 in f0\.fits, 2\.0 in f2\.fits",
-    )
-    assert (
-        open_frames(InputSettings(files=("*.fits",), integration_time=3.0), tmp_path).integration_time == 3.0
-    )
+    not_opened(r"different integration_time: 1\.5 in f0\.fits, 2\.0 in f2\.fits", tmp_path / "*.fits")
+    assert opened(tmp_path / "*.fits", integration_time=3.0).integration_time == 3.0
     fits.PrimaryHDU(STACK[2]).writeto(tmp_path / "f2.fits", overwrite=True)
-    assert open_frames(InputSettings(files=("*.fits",)), tmp_path).integration_time is None
+    assert opened(tmp_path / "*.fits").integration_time is None
 
 
 def test_zero_and_one_frame(tmp_path: Path) -> None:
     np.save(tmp_path / "one.npy", STACK[0])
-    refused(
-        InputSettings(files=("one.npy",)),
-        tmp_path,
-        r"one\.npy: 1 frame of \d+ x \d+ pixels in all; at least 2 needed",
-    )
+    not_opened(r"one\.npy: 1 frame of \d+ x \d+ pixels in all; at least 2 needed", tmp_path / "one.npy")
     np.save(tmp_path / "zero.npy", STACK[:0])
-    refused(InputSettings(files=("zero.npy",)), tmp_path, r"zero\.npy: holds no frames")
+    not_opened(r"zero\.npy: holds no frames", tmp_path / "zero.npy")
     fits.PrimaryHDU().writeto(tmp_path / "zero.fits")
-    refused(InputSettings(files=("zero.fits",)), tmp_path, "holds no image")
-    with h5py.File(tmp_path / "zero.h5", "w") as file:
-        file["a"] = STACK[:0]
-    refused(InputSettings(files=("zero.h5",)), tmp_path, "holds no frames")
+    not_opened("holds no image", tmp_path / "zero.fits")
+    write_hdf5(tmp_path / "zero.h5", a=STACK[:0])
+    not_opened("holds no frames", tmp_path / "zero.h5")
 
 
 def make_bad_folder(folder: Path) -> None:
@@ -285,22 +230,20 @@ def test_one_message_lists_all_bad_files(tmp_path: Path) -> None:
 def test_skip_with_nothing_left(tmp_path: Path) -> None:
     for name in ("a.tif", "b.tif"):
         (tmp_path / name).write_bytes(b"II*\0rubbish")
-    refused(
-        InputSettings(files=("*.tif",), on_bad_file="skip"), tmp_path, "2 of 2 input files cannot be used"
-    )
+    not_opened("2 of 2 input files cannot be used", tmp_path / "*.tif", on_bad_file="skip")
 
 
 def test_duplicate_by_link_and_by_content(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", STACK)
     (tmp_path / "b.npy").symlink_to(tmp_path / "a.npy")
-    refused(InputSettings(files=("*.npy",)), tmp_path, r"b\.npy: is named twice")
+    not_opened(r"b\.npy: is named twice", tmp_path / "*.npy")
     (tmp_path / "b.npy").unlink()
     shutil.copy(tmp_path / "a.npy", tmp_path / "b.npy")
-    refused(InputSettings(files=("*.npy",)), tmp_path, r"b\.npy: has the same content as a\.npy")
+    not_opened(r"b\.npy: has the same content as a\.npy", tmp_path / "*.npy")
     other = np.load(tmp_path / "b.npy")
     other[6, 8, 9] ^= 1
     np.save(tmp_path / "b.npy", other)
-    assert open_frames(InputSettings(files=("*.npy",)), tmp_path).shape[0] == 24
+    assert opened(tmp_path / "*.npy").shape[0] == 24
 
 
 def test_large_files_that_differ_between_the_samples(tmp_path: Path) -> None:
@@ -309,7 +252,7 @@ def test_large_files_that_differ_between_the_samples(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", big)
     big[2, 100, 100] = 1
     np.save(tmp_path / "b.npy", big)
-    assert open_frames(InputSettings(files=("*.npy",)), tmp_path).shape[0] == 16
+    assert opened(tmp_path / "*.npy").shape[0] == 16
 
 
 def test_gaps_in_the_numbers(tmp_path: Path) -> None:
@@ -336,7 +279,7 @@ def write_any(format: str, path: Path) -> Path:
 @pytest.mark.parametrize("format", [*WRITERS, "zlib", "rice"])
 def test_file_that_vanishes(tmp_path: Path, format: str) -> None:
     path = write_any(format, tmp_path / "a")
-    reader = open_frames(InputSettings(files=(str(path),)), tmp_path)
+    reader = opened(path)
     path.rename(tmp_path / "gone")
     with pytest.raises(InputError, match=r"vanished while it was being read; restore"):
         reader.read()
@@ -345,11 +288,10 @@ def test_file_that_vanishes(tmp_path: Path, format: str) -> None:
 @pytest.mark.parametrize("format", ["raw", "npy", "tiff", "fits", "ser", "zlib", "rice"])
 def test_file_that_shrinks(tmp_path: Path, format: str) -> None:
     path = write_any(format, tmp_path / "a")
-    reader = open_frames(InputSettings(files=(str(path),)), tmp_path)
+    reader = opened(path)
     os.truncate(path, path.stat().st_size // 2)
-    with pytest.raises(
-        InputError, match=r"(became shorter|changed its size) while it was being read; restore"
-    ):
+    words = r"(became shorter|changed its size) while it was being read; restore"
+    with pytest.raises(InputError, match=words):
         reader.read()
 
 
@@ -359,7 +301,7 @@ def test_many_threads_on_one_reader(tmp_path: Path, format: str) -> None:
         write_frames(format, tmp_path / "a", iter([STACK]), STACK.shape, "uint16", frames_per_file=5)
     else:
         write_any(format, tmp_path / "a.tif")
-    reader = open_frames(InputSettings(files=("a[._]*",)), tmp_path)
+    reader = opened(tmp_path / "a[._]*")
     rng = np.random.default_rng(4)
     windows = []
     for _ in range(120):
@@ -377,7 +319,7 @@ def test_many_threads_on_one_reader(tmp_path: Path, format: str) -> None:
 
 def test_read_into_checks_its_arguments(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", STACK)
-    reader = open_frames(InputSettings(files=("a.npy",)), tmp_path)
+    reader = opened(tmp_path / "a.npy")
     good: NDArray[np.uint16] = np.empty((2, 17, 19), np.uint16)
     reader.read_into(good, 3, 5)
     np.testing.assert_array_equal(good, STACK[3:5])
@@ -434,12 +376,8 @@ def test_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         return real(path, *args, **rest)
 
     monkeypatch.setattr(Path, "open", deny)
-    refused(InputSettings(files=("a.npy",)), tmp_path, r"a\.npy: cannot be read \(Permission denied\)")
-    refused(
-        InputSettings(files=("a.npy",), format="npy"),
-        tmp_path,
-        r"a\.npy: cannot be read \(Permission denied\)",
-    )
+    not_opened(r"a\.npy: cannot be read \(Permission denied\)", tmp_path / "a.npy")
+    not_opened(r"a\.npy: cannot be read \(Permission denied\)", tmp_path / "a.npy", format="npy")
 
 
 def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path: Path) -> None:
@@ -453,7 +391,7 @@ def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path: Path)
         name = "mask.npy" if mask_too else None
         y0, y1, x0, x1 = roi or (0, 6, 0, 8)
         excluded = ((stack[0] == 2**32 - 1) | (mask_too * (mask != 0)))[y0:y1, x0:x1]
-        with open_frames(InputSettings(files=("a.npy",), mask=name, roi=roi), tmp_path) as frames:
+        with opened(tmp_path / "a.npy", mask=name, roi=roi) as frames:
             np.testing.assert_array_equal(frames.excluded, excluded)
             wanted = stack[:, y0:y1, x0:x1]
             middle = np.quantile(wanted[0][~excluded], 0.5, method="lower")
@@ -466,8 +404,7 @@ def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path: Path)
         (np.ones((6, 8)), "every pixel is excluded"),
     ):
         np.save(tmp_path / "mask.npy", values)
-        with pytest.raises(InputError, match=words):
-            open_frames(InputSettings(files=("a.npy",), mask="mask.npy"), tmp_path)
+        not_opened(words, tmp_path / "a.npy", mask="mask.npy")
 
 
 @pytest.mark.parametrize("suffix", ["npy", "fits", "zarr", "h5", "tif", "raw"])
@@ -489,15 +426,13 @@ def test_signed_samples_with_an_offset(tmp_path: Path, suffix: str) -> None:
         case "raw":
             stored.astype("<i2").tofile(path)
             path.with_suffix(".json").write_text('{"shape": [6, 8], "dtype": "int16"}')
-    with pytest.raises(InputError, match=r"signed samples .*--offset 32768"):
-        open_frames(InputSettings(files=(path.name,)), tmp_path)
-    with open_frames(InputSettings(files=(path.name,), offset=32768), tmp_path) as frames:
+    not_opened(r"signed samples .*--offset 32768", path)
+    with opened(path, offset=32768) as frames:
         np.testing.assert_array_equal(frames.read(), stack)
-    frames = open_frames(InputSettings(files=(path.name,), offset=1000), tmp_path)
+    frames = opened(path, offset=1000)
     with pytest.raises(InputError, match=r"negative values \(down to -\d+ DN, with the offset of 1000\)"):
         frames.read()
-    with pytest.raises(InputError, match="offset"):
-        open_frames(InputSettings(files=(path.name,), offset=32769), tmp_path)
+    not_opened("offset", path, offset=32769)
 
 
 def test_fits_adds_what_its_header_says(tmp_path: Path) -> None:
@@ -505,24 +440,24 @@ def test_fits_adds_what_its_header_says(tmp_path: Path) -> None:
     image = fits.PrimaryHDU((stack.astype(np.int32) - 1000).astype(np.int16))
     image.header["BZERO"] = 1000
     image.writeto(tmp_path / "a.fits")
-    with open_frames(InputSettings(files=("a.fits",)), tmp_path) as frames:
+    with opened(tmp_path / "a.fits") as frames:
         np.testing.assert_array_equal(frames.read(), stack)
 
 
 def test_files_with_names_that_are_special_and_files_that_are_none(tmp_path: Path) -> None:
     for name in ("~root.npy", "~x.npy"):
         np.save(tmp_path / name, STACK)
-        assert open_frames(InputSettings(files=(name,)), tmp_path).paths == (tmp_path / name,)
+        assert opened(tmp_path / name).paths == (tmp_path / name,)
     os.mkfifo(tmp_path / "a.npy")
-    refused(InputSettings(files=("a.npy",)), tmp_path, r"a\.npy: no regular file")
-    refused(InputSettings(files=("~x.npy",), mask="a.npy"), tmp_path, r"a\.npy: no regular file")
+    not_opened(r"a\.npy: no regular file", tmp_path / "a.npy")
+    not_opened(r"a\.npy: no regular file", tmp_path / "~x.npy", mask="a.npy")
     zarr.create_array(tmp_path / "a.zarr", data=STACK, chunks=(6, 17, 19))
     (tmp_path / "a.zarr/c/1/0/0").unlink()
     os.mkfifo(tmp_path / "a.zarr/c/1/0/0")
-    refused(InputSettings(files=("a.zarr",)), tmp_path, r"c/1/0/0 is no regular file")
+    not_opened(r"c/1/0/0 is no regular file", tmp_path / "a.zarr")
     latin = os.fsdecode(b"caf\xe9.npy")
     np.save(tmp_path / latin, STACK)
-    refused(InputSettings(files=(latin,)), tmp_path, r"caf.*\.npy: its name is not in UTF-8; rename it")
+    not_opened(r"caf.*\.npy: its name is not in UTF-8; rename it", tmp_path / latin)
 
 
 @pytest.mark.parametrize(

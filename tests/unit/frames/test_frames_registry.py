@@ -95,14 +95,9 @@ def plug_in(monkeypatch: pytest.MonkeyPatch, *points: tuple[str, str]) -> None:
 def test_reader_from_a_plug_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plug_in(monkeypatch, ("textframes", f"{__name__}:TextReader"))
     (tmp_path / "a.txf").write_text("TEXTFRAMES\n1 2|3 4\n5 6|7 8\n")
-    for settings in (
-        InputSettings(files=("a.txf",)),
-        InputSettings(files=(".",)),
-        InputSettings(files=("a.txf",), format="textframes"),
-    ):
-        np.testing.assert_array_equal(
-            open_frames(settings, tmp_path).read(), np.arange(1, 9).reshape(2, 2, 2)
-        )
+    for name, format in (("a.txf", "auto"), (".", "auto"), ("a.txf", "textframes")):
+        found = open_frames(InputSettings(files=(name,), format=format), tmp_path).read()
+        np.testing.assert_array_equal(found, np.arange(1, 9).reshape(2, 2, 2))
     assert "textframes" in registry.reader_names()
 
 
@@ -150,11 +145,11 @@ def test_missing_library_is_named_with_what_installs_it(
 
     monkeypatch.setattr(builtins, "__import__", importer)
     real_import = importlib.import_module
-    monkeypatch.setattr(
-        importlib,
-        "import_module",
-        lambda name, *rest: importer(name) if name.split(".")[0] == library else real_import(name, *rest),
-    )
+
+    def import_module(name: str, *rest: Any) -> Any:
+        return importer(name) if name.split(".")[0] == library else real_import(name, *rest)
+
+    monkeypatch.setattr(importlib, "import_module", import_module)
     for action in (
         lambda: open_frames(InputSettings(files=(str(path),)), tmp_path),
         lambda: write_frames(format, tmp_path / "b", iter([stack]), stack.shape, "uint16"),

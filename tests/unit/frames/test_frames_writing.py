@@ -43,15 +43,8 @@ def test_round_trip(tmp_path: Path, format: str, dtype: str, size: int, per_file
         with pytest.raises(InputError, match="at most 16 bits"):
             write_frames(format, tmp_path / "a", blocks(stack, size), SHAPE, dtype)
         return
-    paths = write_frames(
-        format,
-        tmp_path / "new" / "a",
-        blocks(stack, size),
-        SHAPE,
-        dtype,
-        frames_per_file=per_file,
-        integration_time=0.5,
-    )
+    options = {"frames_per_file": per_file, "integration_time": 0.5}
+    paths = write_frames(format, tmp_path / "new" / "a", blocks(stack, size), SHAPE, dtype, **options)
     assert len(paths) == (1 if per_file is None else -(-13 // per_file))
     assert not list(tmp_path.rglob(".partial*"))
     reader = open_frames(InputSettings(files=tuple(str(path) for path in paths)), tmp_path)
@@ -62,12 +55,9 @@ def test_round_trip(tmp_path: Path, format: str, dtype: str, size: int, per_file
 
 def test_own_libraries_read_what_we_write(tmp_path: Path) -> None:
     stack = make_stack("uint16")
-    written = {
-        name: write_frames(
-            name, tmp_path / "a", blocks(stack, 4), SHAPE, "uint16", integration_time=4.87, bit_depth=16
-        )[0]
-        for name in WRITERS
-    }
+    written, facts = {}, {"integration_time": 4.87, "bit_depth": 16}
+    for name in WRITERS:
+        [written[name]] = write_frames(name, tmp_path / "a", blocks(stack, 4), SHAPE, "uint16", **facts)
     np.testing.assert_array_equal(tifffile.imread(written["tiff"]), stack)
     with fits.open(written["fits"]) as units:
         units.verify("exception")
@@ -139,7 +129,6 @@ def test_blocks_must_make_up_the_shape(tmp_path: Path) -> None:
 
 def test_a_folder_in_the_way(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(
-        StoreError, match=r"cannot use .*a file where a folder is meant: choose another place"
-    ):
+    words = r"cannot use .*a file where a folder is meant: choose another place"
+    with pytest.raises(StoreError, match=words):
         write_frames("npy", tmp_path / "file" / "a", iter([make_stack("uint8")]), SHAPE, "uint8")

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+from helpers.camera_files import read, refused
 from helpers.damage import frames
 
 from pchem_pipeline.base.errors import InputError, PchEmError, StoreError
-from pchem_pipeline.frames.open import open_frames
-from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.run_store import RunStore, _refuse_links
 
 
@@ -26,11 +25,6 @@ class Trap:
 
     def __reduce__(self) -> tuple[object, ...]:
         return os.mkdir, (str(self.trace),)
-
-
-def read(path: Path, **settings: str) -> None:
-    with open_frames(InputSettings(files=(str(path),), **settings), path.parent) as stack:
-        stack.read()
 
 
 def changed(path: Path, **content: object) -> None:
@@ -56,8 +50,7 @@ def test_a_codec_that_may_run_code(tmp_path: Path, content: dict[str, object]) -
     changed(path / ".zarray", **{"compressor": None, **content})
     for chunk in path.glob("[0-9]*"):
         chunk.write_bytes(pickle.dumps(Trap(tmp_path / "trace")))
-    with pytest.raises(InputError, match=r"a\.zarr"):
-        read(path)
+    refused(r"a\.zarr", path)
     assert not (tmp_path / "trace").exists()
 
 
@@ -68,8 +61,7 @@ def test_a_link_out_of_the_store(tmp_path: Path, link: str) -> None:
     moved = tmp_path / "elsewhere"
     (path / link).rename(moved)
     (path / link).symlink_to(moved)
-    with pytest.raises(InputError, match=f"{link} is a link out of the store; copy its files into it"):
-        read(path)
+    refused(f"{link} is a link out of the store; copy its files into it", path)
 
 
 def test_a_link_within_the_store(tmp_path: Path) -> None:
@@ -85,11 +77,9 @@ def test_a_path_out_of_the_store(tmp_path: Path, place: str) -> None:
     zarr.create_array(tmp_path / "b.zarr", data=frames())
     group = zarr.create_group(tmp_path / "a.zarr")
     group.attrs["ome"] = {"multiscales": [{"datasets": [{"path": place}]}]}
-    with pytest.raises(InputError, match=r"a\.zarr"):
-        read(tmp_path / "a.zarr")
+    refused(r"a\.zarr", tmp_path / "a.zarr")
     group.attrs["ome"] = {}
-    with pytest.raises(InputError, match=r"a\.zarr"):
-        read(tmp_path / "a.zarr", dataset=place)
+    refused(r"a\.zarr", tmp_path / "a.zarr", dataset=place)
 
 
 def test_a_run_with_a_codec_that_is_not_ours(tmp_path: Path) -> None:

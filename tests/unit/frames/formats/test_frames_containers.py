@@ -12,6 +12,7 @@ import hdf5plugin
 import numpy as np
 import pytest
 import zarr
+from helpers.camera_files import opened, read, refused, write_hdf5
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
@@ -31,11 +32,6 @@ FILTERS: dict[str, dict[str, Any]] = {
     "blosc2": {"chunks": (3, 10, 22), **hdf5plugin.Blosc2(cname="zstd")},
     "zstd": {"chunks": (3, 10, 22), **hdf5plugin.Zstd()},
 }
-
-
-def read(path: Path, **settings: Any) -> NDArray[Any]:
-    with open_frames(InputSettings(files=(str(path),), **settings), path.parent) as reader:
-        return reader.read()
 
 
 def check_windows(path: Path, stack: NDArray[Any], **settings: Any) -> None:
@@ -60,8 +56,7 @@ def test_hdf5_filters(tmp_path: Path, filters: str) -> None:
 def test_hdf5_types(tmp_path: Path, dtype: str) -> None:
     path = tmp_path / "a.hdf5"
     stack = np.random.default_rng(2).integers(0, 256 ** np.dtype(dtype).itemsize, STACK.shape).astype(dtype)
-    with h5py.File(path, "w") as file:
-        file["frames"] = stack
+    write_hdf5(path, frames=stack)
     check_windows(path, stack)
 
 
@@ -145,8 +140,7 @@ def write_parts(folder: Path, from_row: int = 0) -> Path:
     _, rows, columns = STACK.shape
     layout = h5py.VirtualLayout((len(STACK), rows - from_row, columns), STACK.dtype)
     for i, (start, end) in enumerate([(0, 3), (3, 6), (6, 7)]):
-        with h5py.File(folder / f"part{i}.h5", "w") as file:
-            file["data"] = STACK[start:end]
+        write_hdf5(folder / f"part{i}.h5", data=STACK[start:end])
         source = h5py.VirtualSource(f"part{i}.h5", "data", (end - start, rows, columns))
         layout[start:end] = source[:, from_row:] if from_row else source
     with h5py.File(folder / "all.h5", "w") as file:
@@ -160,14 +154,11 @@ def test_hdf5_virtual_dataset(tmp_path: Path, from_row: int) -> None:
     path = write_parts(tmp_path, from_row)
     np.testing.assert_array_equal(read(path), STACK[:, from_row:])
     assert "other files (3)" in Hdf5Reader.open(path, InputSettings()).notes[0]
-    with h5py.File(tmp_path / "part1.h5", "w") as file:
-        file["data"] = STACK[3:5]
+    write_hdf5(tmp_path / "part1.h5", data=STACK[3:5])
     words = r"all\.h5: 1 of the 3 parts of /data are missing or too short, the first in part1\.h5"
-    with pytest.raises(InputError, match=words):
-        read(path)
+    refused(words, path)
     (tmp_path / "part1.h5").unlink()
-    with pytest.raises(InputError, match=words):
-        read(path)
+    refused(words, path)
 
 
 def test_hdf5_virtual_dataset_without_an_end(tmp_path: Path) -> None:
@@ -181,8 +172,7 @@ def test_hdf5_virtual_dataset_without_an_end(tmp_path: Path) -> None:
         file.create_virtual_dataset("data", layout)
     check_windows(tmp_path / "all.h5", STACK)
     (tmp_path / "part.h5").unlink()
-    with pytest.raises(InputError, match=r"missing or too short|holds no frames"):
-        read(tmp_path / "all.h5")
+    refused(r"missing or too short|holds no frames", tmp_path / "all.h5")
 
 
 @pytest.mark.parametrize("there", [True, False])
@@ -193,12 +183,9 @@ def test_hdf5_links_into_other_files(tmp_path: Path, there: bool) -> None:
         file["mask"] = np.zeros(STACK.shape[1:], np.uint32)
         file["entry/data_000001"] = h5py.ExternalLink("data_000001.h5", "/data")
     if there:
-        with h5py.File(tmp_path / "data_000001.h5", "w") as file:
-            file["data"] = STACK
-    with pytest.raises(InputError, match=r"in other files: entry/data_000001 in data_000001\.h5; name those"):
-        read(path)
-    with pytest.raises(InputError, match="in other files"):
-        read(path, dataset="/entry/data_000001")
+        write_hdf5(tmp_path / "data_000001.h5", data=STACK)
+    refused(r"in other files: entry/data_000001 in data_000001\.h5; name those", path)
+    refused("in other files", path, dataset="/entry/data_000001")
     with h5py.File(path, "a") as file:
         file["frames"] = STACK
     np.testing.assert_array_equal(read(path), STACK)
@@ -210,13 +197,10 @@ def test_hdf5_samples_in_a_raw_file(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         file.create_dataset("frames", data=STACK, external=[("samples.bin", 0, STACK.nbytes)])
     np.testing.assert_array_equal(read(tmp_path / "a.h5"), STACK)
     monkeypatch.chdir(tmp_path.parent)
-    with pytest.raises(InputError, match=r"a\.h5: the samples of /frames lie in samples\.bin, which is not"):
-        read(tmp_path / "a.h5")
+    refused(r"a\.h5: the samples of /frames lie in samples\.bin, which is not", tmp_path / "a.h5")
 
 
-def test_hdf5_samples_that_end_too_early_or_are_another_s(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hdf5_samples_cut_or_of_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     other = tmp_path / "folder" / "a.h5"
     other.parent.mkdir()
@@ -224,13 +208,10 @@ def test_hdf5_samples_that_end_too_early_or_are_another_s(
         with h5py.File(path, "w") as file:
             file.create_dataset("frames", STACK.shape, STACK.dtype, external=[(name, 0, STACK.nbytes)])
     (tmp_path / "samples.bin").write_bytes(STACK.tobytes()[:-1])
-    with pytest.raises(InputError, match=rf"samples.bin, truncated: {STACK.nbytes} bytes"):
-        read(tmp_path / "a.h5")
-    with pytest.raises(InputError, match=r"names /.*/samples.bin as its source, .* not beside or below"):
-        read(other)
+    refused(rf"samples.bin, truncated: {STACK.nbytes} bytes", tmp_path / "a.h5")
+    refused(r"names /.*/samples.bin as its source, .* not beside or below", other)
     os.mkfifo(tmp_path / "fifo")
-    with pytest.raises(InputError, match=r"names /.*/fifo as its source, which is no regular file"):
-        read(tmp_path / "fifo.h5")
+    refused(r"names /.*/fifo as its source, which is no regular file", tmp_path / "fifo.h5")
 
 
 @pytest.mark.parametrize("case", ["itself", "by another", "outside", "fifo", "numbered"])
@@ -251,24 +232,16 @@ def test_hdf5_virtual_dataset_of_what_it_must_not_have(tmp_path: Path, case: str
 
     virtual(home / "a.h5", names.get(case, "a.h5" if case == "itself" else "."))
     virtual(home / "b.h5", "a.h5")
-    with h5py.File(tmp_path / "c.h5", "w") as file:
-        file["data"] = STACK
-    words = {
-        "itself": "is a part of itself",
-        "by another": "is a part of itself",
-        "outside": "beside or below",
-    }
-    with pytest.raises(InputError, match=words.get(case, "no regular file")):
-        read(home / "a.h5")
+    write_hdf5(tmp_path / "c.h5", data=STACK)
+    words = dict.fromkeys(("itself", "by another"), "is a part of itself") | {"outside": "beside or below"}
+    refused(words.get(case, "no regular file"), home / "a.h5")
 
 
 def test_hdf5_where_files_cannot_be_locked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("frames", data=STACK, compression="gzip")
-    usual, wrong = (
-        h5py.File,
-        OSError("unable to lock file, errno = 38, error message = 'Function not implemented'"),
-    )
+    usual = h5py.File
+    wrong = OSError("unable to lock file, errno = 38, error message = 'Function not implemented'")
 
     def without_locks(path: Path, mode: str, locking: bool | None = None) -> h5py.File:
         if locking is not False:
@@ -278,8 +251,7 @@ def test_hdf5_where_files_cannot_be_locked(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(h5py, "File", without_locks)
     np.testing.assert_array_equal(read(tmp_path / "a.h5"), STACK)
     wrong = BlockingIOError(11, "unable to lock file")
-    with pytest.raises(InputError, match="is being written, or was never closed; wait"):
-        read(tmp_path / "a.h5")
+    refused("is being written, or was never closed; wait", tmp_path / "a.h5")
 
 
 def test_hdf5_filter_that_is_not_installed(tmp_path: Path) -> None:
@@ -291,8 +263,7 @@ def test_hdf5_filter_that_is_not_installed(tmp_path: Path) -> None:
     assert data[place : place + 2] == b"\1\0"
     data[place : place + 2] = (40_000).to_bytes(2, "little")
     path.write_bytes(data)
-    with pytest.raises(InputError, match=r"/frames is coded by HDF5 filter 40000 \(deflate\), which is not"):
-        read(path)
+    refused(r"/frames is coded by HDF5 filter 40000 \(deflate\), which is not", path)
 
 
 def test_hdf5_left_open_by_its_writer(tmp_path: Path) -> None:
@@ -303,8 +274,7 @@ def test_hdf5_left_open_by_its_writer(tmp_path: Path) -> None:
         file.flush()
         copy = tmp_path / "copy.h5"
         copy.write_bytes(path.read_bytes())
-    with pytest.raises(InputError, match=r"copy\.h5: is being written, or was never closed; .*h5clear -s"):
-        read(copy)
+    refused(r"copy\.h5: is being written, or was never closed; .*h5clear -s", copy)
 
 
 def test_matlab_file(tmp_path: Path) -> None:
@@ -321,43 +291,31 @@ def test_matlab_file(tmp_path: Path) -> None:
 
 def test_hdf5_single_frames(tmp_path: Path) -> None:
     for i, frame in enumerate(STACK):
-        with h5py.File(tmp_path / f"f{i + 7}.h5", "w") as file:
-            file["image"] = frame
+        write_hdf5(tmp_path / f"f{i + 7}.h5", image=frame)
     np.testing.assert_array_equal(read(tmp_path), STACK)
 
 
 def test_hdf5_candidates_are_listed(tmp_path: Path) -> None:
     path = tmp_path / "two.h5"
-    with h5py.File(path, "w") as file:
-        file["dark/frames"] = STACK
-        file["light/frames"] = STACK + 1
-    with pytest.raises(
-        InputError, match=r"several datasets: dark/frames \(7, 19, 22\), light/frames .*input.dataset"
-    ):
-        read(path)
+    write_hdf5(path, **{"dark/frames": STACK}, **{"light/frames": STACK + 1})
+    refused(r"several datasets: dark/frames \(7, 19, 22\), light/frames .*input.dataset", path)
     check_windows(path, STACK, dataset="/dark/frames")
-    with pytest.raises(InputError, match=r"no dataset 'flat'; there are: dark/frames"):
-        read(path, dataset="flat")
+    refused(r"no dataset 'flat'; there are: dark/frames", path, dataset="flat")
     with h5py.File(path, "w") as file:
         for i in range(15):
             file[f"frame{i}"] = STACK[0]
-    with pytest.raises(InputError, match=r"and 3 more; choose one"):
-        read(path)
-    with h5py.File(path, "w") as file:
-        file["temperature"] = np.arange(4)
-    with pytest.raises(InputError, match="holds no dataset of frames"):
-        read(path)
+    refused(r"and 3 more; choose one", path)
+    write_hdf5(path, temperature=np.arange(4))
+    refused("holds no dataset of frames", path)
 
 
 @pytest.mark.parametrize("kept", [0.05, 0.5, 0.95])
 def test_hdf5_truncated(tmp_path: Path, kept: float) -> None:
     path = tmp_path / "cut.h5"
-    with h5py.File(path, "w") as file:
-        file["frames"] = STACK
+    write_hdf5(path, frames=STACK)
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * kept)])
-    with pytest.raises(InputError, match=r"cut\.h5: not a sound HDF5 file, or truncated"):
-        read(path)
+    refused(r"cut\.h5: not a sound HDF5 file, or truncated", path)
 
 
 def test_hdf5_damaged_chunk(tmp_path: Path) -> None:
@@ -365,15 +323,14 @@ def test_hdf5_damaged_chunk(tmp_path: Path) -> None:
     with h5py.File(path, "w") as file:
         dataset = file.create_dataset("frames", data=STACK, chunks=(1, 19, 22), compression="gzip")
         place = dataset.id.get_chunk_info(3).byte_offset
-    reader = open_frames(InputSettings(files=("a.h5",)), tmp_path)
+    reader = opened(tmp_path / "a.h5")
     data = bytearray(path.read_bytes())
     data[place : place + 60] = bytes(60)
     path.write_bytes(data)
     np.testing.assert_array_equal(reader.read(0, 3), STACK[:3])
     with pytest.raises(InputError, match=r"a\.h5: cannot be decoded"):
         reader.read()
-    with h5py.File(path, "w") as file:
-        file["frames"] = STACK[:4]
+    write_hdf5(path, frames=STACK[:4])
     with pytest.raises(InputError, match="changed its shape while it was being read"):
         reader.read(0, 2)
 
@@ -381,19 +338,13 @@ def test_hdf5_damaged_chunk(tmp_path: Path) -> None:
 def test_hdf5_bad_types(tmp_path: Path) -> None:
     path = tmp_path / "t.h5"
     for data, words in [(STACK.astype(float), "floating-point"), (STACK.astype(np.int32), "signed samples")]:
-        with h5py.File(path, "w") as file:
-            file["frames"] = data
-        with pytest.raises(InputError, match=words):
-            read(path)
+        write_hdf5(path, frames=data)
+        refused(words, path)
     np.testing.assert_array_equal(read(path, dtype="uint32"), STACK)
-    with h5py.File(path, "w") as file:
-        file["frames"] = -STACK.astype(np.int32)
-    with pytest.raises(InputError, match="negative values"):
-        read(path, dtype="uint32")
-    with h5py.File(path, "w") as file:
-        file["frames"] = np.zeros((2, 5, 6, 3), np.uint8)
-    with pytest.raises(InputError, match="axes before rows and columns"):
-        read(path)
+    write_hdf5(path, frames=-STACK.astype(np.int32))
+    refused("negative values", path, dtype="uint32")
+    write_hdf5(path, frames=np.zeros((2, 5, 6, 3), np.uint8))
+    refused("axes before rows and columns", path)
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -431,8 +382,7 @@ def test_ome_zarr(tmp_path: Path, version: int) -> None:
     check_windows(path, STACK)
     group.attrs.update({"multiscales": scales, "ome": {"multiscales": [{"datasets": [{"path": "two"}]}]}})
     group.create_array("two", data=np.zeros((4, 2, 1, 8, 9), np.uint16))
-    with pytest.raises(InputError, match="2 axes before rows and columns"):
-        read(path)
+    refused("2 axes before rows and columns", path)
 
 
 @pytest.mark.parametrize("axes", [["c", "y", "x"], [{"name": "c"}, {"name": "y"}, {"name": "x"}]])
@@ -451,11 +401,10 @@ def test_channels_of_ome_zarr_are_reported(tmp_path: Path, axes: list[Any]) -> N
 def test_zarr_damage(tmp_path: Path) -> None:
     path = tmp_path / "a.zarr"
     zarr.create_array(path, data=STACK, chunks=(3, 19, 22))
-    reader = open_frames(InputSettings(files=("a.zarr",)), tmp_path)
+    reader = opened(tmp_path / "a.zarr")
     chunk = sorted(file for file in path.rglob("*") if file.is_file() and file.name != "zarr.json")[0]
     chunk.write_bytes(chunk.read_bytes()[:20])
     with pytest.raises(InputError, match=r"a\.zarr: cannot be decoded"):
         reader.read()
     (path / "zarr.json").write_text("{")
-    with pytest.raises(InputError, match="not a sound zarr store"):
-        read(path)
+    refused("not a sound zarr store", path)

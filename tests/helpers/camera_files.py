@@ -1,0 +1,45 @@
+"""Camera files of a test: opened, read, and refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import pytest
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import ExitCode, InputError
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.sequence import FrameSequence
+from pchem_pipeline.frames.settings import InputSettings
+
+
+def opened(path: Path, **settings: Any) -> FrameSequence:
+    return open_frames(InputSettings(files=(path.name,), **settings), path.parent)
+
+
+def read(path: Path, **settings: Any) -> NDArray[Any]:
+    with opened(path, **settings) as frames:
+        return frames.read()
+
+
+def refused(words: str, path: Path, use: Callable[..., Any] = read, **settings: Any) -> None:
+    """Assert that a file is refused where it is opened and read, in one line, with exit code 4."""
+    with pytest.raises(InputError, match=words) as caught:
+        use(path, **settings)
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_code == ExitCode.INPUT == 4
+
+
+def not_opened(words: str, path: Path, **settings: Any) -> None:
+    """Assert that a file is refused already where it is opened; see `refused`."""
+    refused(words, path, opened, **settings)
+
+
+def write_hdf5(path: Path, **arrays: Any) -> Path:
+    with h5py.File(path, "w") as file:
+        for name, values in arrays.items():
+            file[name] = values
+    return path
