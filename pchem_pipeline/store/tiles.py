@@ -14,6 +14,8 @@ TileSize = int | tuple[int, int] | Literal["auto"]
 
 #: The side of the smallest tile that is chosen, and the pixels that it has at least on a sensor of few rows.
 _SIDE, _FEW_PIXELS = 64, 2048
+#: Bins of the histograms of a piece of a tile: a fit takes some ten bytes for each.
+_MOST_BINS = 1 << 23
 #: Tiles beyond which they grow: each is some 50 files.
 _MANY = 80
 #: Columns beyond which tiles grow in rows: bands of rows over the full width are read and counted at once.
@@ -56,12 +58,13 @@ class Tile:
         y, x = part
         return slice(self.y0 + y.start, self.y0 + y.stop), slice(self.x0 + x.start, self.x0 + x.stop)
 
-    def parts(self) -> Iterator[tuple[slice, slice]]:
-        """Yield pieces of at most 64 x 64 pixels, as indices into an array of the tile."""
+    def parts(self, bins: int = 1) -> Iterator[tuple[slice, slice]]:
+        """Yield pieces of at most 64 x 64 pixels and 2^23 bins, as indices into an array of the tile."""
         ny, nx = self.shape
-        for y in range(0, ny, _SIDE):
+        rows = min(_SIDE, max(1, _MOST_BINS // (_SIDE * bins)))
+        for y in range(0, ny, rows):
             for x in range(0, nx, _SIDE):
-                yield slice(y, min(y + _SIDE, ny)), slice(x, min(x + _SIDE, nx))
+                yield slice(y, min(y + rows, ny)), slice(x, min(x + _SIDE, nx))
 
 
 def tile_shape(size: TileSize, sensor: tuple[int, int]) -> tuple[int, int]:

@@ -191,19 +191,14 @@ def _count(place: FloatArray, bars: Bars) -> None:
 
 def varints(values: NDArray[Any]) -> bytes:
     """Return whole numbers >= 0 with seven bits to a byte, the lowest first; the last byte is below 128."""
-    rest = np.asarray(values, dtype=np.uint64).ravel()
-    length = np.ones(rest.size, dtype=np.int64)
-    for power in range(1, 10):
-        length += rest >= np.uint64(1 << 7 * power)
-    start = np.cumsum(length) - length
-    out = np.zeros(int(length.sum()), dtype=np.uint8)
-    for i in range(int(length.max(initial=0))):
-        more = length > i
-        last = length == i + 1
-        digits = (rest & np.uint64(127)).astype(np.uint8)
-        out[(start + i)[more]] = np.where(last, digits, digits | 128)[more]
-        rest = rest >> np.uint64(7)
-    return out.tobytes()
+    rest = np.asarray(values, dtype=np.uint64).reshape(-1, 1)
+    bits = max(int(rest.max(initial=0)).bit_length(), 1)
+    digits = rest >> np.arange(0, bits, 7, dtype=np.uint64)
+    used = digits > 0
+    used[:, 0] = True
+    digits &= np.uint64(127)
+    digits[:, :-1] |= used[:, 1:].astype(np.uint64) << np.uint64(7)
+    return digits[used].astype(np.uint8).tobytes()
 
 
 def pack_counts(
@@ -226,5 +221,6 @@ def pack_counts(
         occupied = np.flatnonzero(each)
         if occupied.size:
             first[i], size[i] = origin[i] + occupied[0], occupied[-1] - occupied[0] + 1
-            kept.append(each[occupied[0] : occupied[-1] + 1])
-    return first, size, varints(np.concatenate(kept) if kept else np.empty(0))
+            # one by one: of all bins at once, those of wide histograms would take GiB
+            kept.append(varints(each[occupied[0] : occupied[-1] + 1]))
+    return first, size, b"".join(kept)

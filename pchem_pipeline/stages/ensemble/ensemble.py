@@ -375,7 +375,7 @@ def _sum_tile(
     counted = _read_counted(store, tile, origin) if codes is None else _uncounted(origin, job.n_frames)
     errors = _errors(store, tile)
     rows = []
-    for part in parts_told(tile.parts()):
+    for part in parts_told(tile.parts(store.array("histogram/counts").shape[2])):
         everything = counted.of(part).cut(low[part], high[part])
         some = everything if chosen is None else chosen.of(part).cut(low[part], high[part])
         place, of_pixels = tile.within(part), [values[part] for values in maps]

@@ -135,8 +135,9 @@ def _do_tile(
     effects, set_aside = model.effects, model.settings.set_aside_e
     added = read_added_exposure(run_store, model, tile.region)
     arrays: dict[str, NDArray[Any]] = {}
-    codes = CodeSums(histogram["origin"], histogram["counts"].shape[2])
-    for part in parts_told(tile.parts()):
+    bins = histogram["counts"].shape[2]
+    codes = CodeSums(histogram["origin"], bins)
+    for part in parts_told(tile.parts(bins)):
         some = {name: values[part] for name, values in histogram.items()}
         found = fit_tile(
             some,

@@ -148,7 +148,7 @@ def _do_tile(tile: Tile, *, store: Path, stores: Sequence[Path], how: SampleFit)
     ]
     target = open_store(store)
     arrays: dict[str, NDArray[Any]] = {}
-    for part in parts_told(tile.parts()):
+    for part in parts_told(tile.parts(sum(each["counts"].shape[2] for each in histograms))):
         some = [{name: values[part] for name, values in each.items()} for each in histograms]
         found = fit_samples_tile(some, how, pixel_places(target, tile.within(part)))
         for name, values in found.items():

@@ -197,7 +197,8 @@ class _Pixels:
 def _of_pixels(store: RunStore, run: StoredRun, config: RunConfig) -> _Pixels:
     """Choose pixels, and read their histograms."""
     shown = _shown(run, config)
-    full = choose_inspected(run.maps, run.fit, [(y, x) for _, y, x in shown], _suspects(run))
+    places, bins = [(y, x) for _, y, x in shown], store.array("histogram/counts").shape[2]
+    full = choose_inspected(run.maps, run.fit, places, _suspects(run), bins=bins)
     index = np.concatenate([pixel_index(shown, run.sensor.shape), full.index])
     histograms = read_histograms(store, index, run.sensor.shape, run.model)
     drawn, held, some = slice(0, len(shown)), slice(len(shown), None), slice(0, len(shown) + _SOME_MASSES)

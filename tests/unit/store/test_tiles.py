@@ -39,13 +39,14 @@ def test_no_sensor_has_many_tiles(ny, nx):
     assert rows % 64 == columns % 64 == 0
 
 
-@given(y0=st.integers(0, 3), x0=st.integers(0, 3), ny=st.integers(1, 150), nx=st.integers(1, 200))
-def test_parts_of_a_tile_cover_it_once(y0, x0, ny, nx):
+@given(*map(st.integers, (0, 0, 1, 1, 1), (3, 3, 150, 200, 99_999)))
+def test_parts_of_a_tile_cover_it_once_and_have_few_bins(y0, x0, ny, nx, bins):
     tile = Tile(0, 0, y0, y0 + ny, x0, x0 + nx)
     seen = np.zeros((y0 + ny, x0 + nx), int)
-    for part in tile.parts():
+    for part in tile.parts(bins):
         assert seen[tile.within(part)].shape == np.empty(tile.shape)[part].shape
         seen[tile.within(part)] += 1
+        assert np.empty(tile.shape)[part].size * bins <= 1 << 23
     assert (seen[tile.region] == 1).all()
 
 

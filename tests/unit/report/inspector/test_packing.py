@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -139,6 +140,15 @@ def test_histograms_lose_their_empty_ends_only() -> None:
     assert origin.tolist() == [12, 0, -3]
     assert bins.tolist() == [3, 0, 1]
     assert read_varints(data) == [5, 0, 300, 7]
+
+
+def test_all_bins_are_never_held_at_once_as_wide_numbers() -> None:
+    counts = [np.ones(16384, np.uint16)] * 64
+    tracemalloc.start()
+    pack_counts(np.zeros(64, int), counts)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 64 * 16384 * 8
 
 
 def test_a_map_of_noise_costs_what_its_information_does() -> None:

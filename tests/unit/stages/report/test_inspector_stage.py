@@ -167,6 +167,12 @@ def test_a_small_sensor_is_there_whole(data: ReportData) -> None:
     assert sorted(chosen.index.tolist()) == list(range(12 * 16))
 
 
+def test_of_wide_histograms_fewer_pixels_are_there() -> None:
+    data = report_data((60, 60))
+    assert choose_inspected(data.maps, data.fit, [], bins=2048).index.size == 3600
+    assert choose_inspected(data.maps, data.fit, [], bins=16384).index.size == 512
+
+
 def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample() -> None:
     data = report_data((100, 120), failed=0.01)
     p = np.array(data.fit["goodness_p"])
