@@ -1,7 +1,7 @@
 """``pchem demo``: a simulated sensor through the whole pipeline, beside its truth.
 
-With ``--hidden`` an effect acts in the frames, of which model and search know nothing, and the search has to
-find it.
+With ``--hidden`` the simulated frames contain an effect that the fitted model lacks, and the search for a
+discrepancy has to find it.
 """
 
 from __future__ import annotations
@@ -101,21 +101,23 @@ def hidden_effect(asked: str, size: int, n_frames: int) -> Effect:
             f"--hidden {tag!r}: there is no such effect; choose one of: {known}; "
             f"behind it @ and a place, if any: {GRAMMAR}"
         )
-    kinds = effect_class(tag).typical()
-    if not kinds:
-        raise ConfigError(f"--hidden {tag}: this effect names no typical strength to hide; choose another")
+    typical = effect_class(tag).typical()
+    if not typical:
+        raise ConfigError(f"--hidden {tag}: this effect has no typical strength; choose another")
     try:
         region, when = parse_place(place) if at else (None, None)
     except ValueError as error:  # of pydantic, too
         raise ConfigError(f"--hidden {asked}: {' '.join(str(error).split())}") from None
     share = 1.0 if region is None else float(region.mask((size, size)).mean())
     share *= 1.0 if when is None else when.share(np.arange(n_frames))
-    effect = kinds[0].scaled(share**-0.5) if kinds[0].strength and 0.0 < share < 1.0 else kinds[0]
+    effect = typical[0]
+    if effect.strength and 0.0 < share < 1.0:
+        effect = effect.scaled(share**-0.5)
     return effect.at_place(region, when)
 
 
 def _search(target: Target, effect: Effect, command: Command, plain: str) -> str:
-    """Search for what is missing, run again with the model found, and return all that beside the truth."""
+    """Search for the effect, run again with the model found, and return verdict, effect and both tables."""
     run_stages(target, ["discrepancy"], command)
     extended, _ = adopt_verdict(target)
     run_stages(extended, pipeline_of(extended.config), command)

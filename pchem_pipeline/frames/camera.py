@@ -112,7 +112,12 @@ def text_of(value: Any) -> str | None:
 
 
 def celsius(value: Any, unit: Any = "C") -> float | None:
-    """Return degrees Celsius of a number in C or K; None where no sensor is so hot or cold."""
+    """Return a temperature in degrees Celsius; None where it is no number, or no temperature of a sensor.
+
+    Args:
+        value: the number.
+        unit: kelvin if it is ``K`` or begins with ``kelvin``.
+    """
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -135,9 +140,14 @@ def seconds_of(value: Any) -> float | None:
 
 
 def duration_of(name: str, value: Any, *units: Any, comment: str = "") -> Duration | None:
-    """Return a duration, without any unit in s; None where the value is no positive number.
+    """Return a duration; None where the value is no positive number. Without a unit it is s.
 
-    A text may have its unit behind the number; a unit may be None or empty; the comment may state one, too.
+    Args:
+        name: of the value.
+        value: the number; a text may have its unit behind it.
+        units: of the value, None or empty where there is none.
+        comment: words beside it, which may state a unit.
+
     The seconds are None where the units contradict each other, or one is not known.
     """
     if isinstance(value, bool):
@@ -192,7 +202,12 @@ def bits_of(value: Any) -> int | None:
 
 
 def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] | None = None) -> StatedFacts:
-    """Return the facts from values (and their units) under the names that most programs use."""
+    """Return the facts from values under the names that most programs use (HDF5, zarr, sidecars, JSON).
+
+    Args:
+        values: attributes.
+        units: of them, by name.
+    """
     given = units or {}
 
     def units_of(name: str) -> list[Any]:
@@ -222,7 +237,11 @@ def first_of(found: Iterable[Any]) -> Any:
 
 
 def shared_facts(each: Iterable[CameraFacts]) -> tuple[CameraFacts, str]:
-    """Return what the files of a stack say alike, their mean temperature, and a remark if it moved."""
+    """Return what all files of a stack say alike, their mean temperature, and a remark if it moved.
+
+    Args:
+        each: of the files, in their order.
+    """
     facts = list(each)
     known = [one.temperature for one in facts if one.temperature is not None]
     times = [one.taken for one in facts if one.taken is not None]

@@ -68,7 +68,11 @@ class _Channel:
 
 
 def is_histogram_input(settings: InputSettings, base_dir: Path) -> bool:
-    """Tell whether the input is ready-made histograms; InputError: mixed with frames, or not there."""
+    """Tell whether the input is ready-made histograms: by ``input.format``, or CSV and npz with auto.
+
+    Raises:
+        InputError: a path is missing, or frames and histograms are mixed.
+    """
     if settings.format != "auto":
         return settings.format == "histogram"
     names = [Path(entry) for entry in settings.files]
@@ -81,7 +85,15 @@ def is_histogram_input(settings: InputSettings, base_dir: Path) -> bool:
 
 
 def read_histograms(settings: InputSettings, base_dir: Path) -> HistogramInput:
-    """Read all histograms of ``input.files`` onto axes of equal length; InputError lists all bad files."""
+    """Read all histograms of ``input.files`` onto axes of equal length.
+
+    Args:
+        settings: the section ``input``.
+        base_dir: folder to which relative paths refer.
+
+    Raises:
+        InputError: files that cannot be read, or that are no histograms, all in one message.
+    """
     paths = resolve_files(settings, base_dir)
     channels: list[_Channel] = []
     problems: list[str] = []

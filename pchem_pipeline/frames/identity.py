@@ -47,7 +47,11 @@ class FileHasher:
         self._count(len(data))
 
     def read_to(self, count: int | None = None) -> None:
-        """Hash until ``count`` bytes are hashed in all, or all; InputError: the file cannot be read."""
+        """Read and hash until ``count`` bytes are hashed in all, or everything.
+
+        Raises:
+            InputError: the file cannot be read.
+        """
         try:
             if self._parts is None:
                 self._parts = _parts(self.path)
@@ -92,7 +96,12 @@ class FileHasher:
 def hash_file(path: Path, advance: Callable[[int], None] | None = None) -> str:
     """Return the xxh3_128 of a file's content, streamed; of a folder: names and contents of all its files.
 
-    ``advance`` is told of the bytes of each block. InputError: the file cannot be read.
+    Args:
+        path: the file or folder.
+        advance: told of the number of bytes of each block, for a progress bar.
+
+    Raises:
+        InputError: the file cannot be read.
     """
     return FileHasher(path, advance).hexdigest()
 
@@ -122,7 +131,12 @@ def digest_of(record: object) -> str:
 def content_identity(paths: Iterable[Path], advance: Callable[[int], None] | None = None) -> dict[str, Any]:
     """Return ``{"files": [{"name", "size", "xxh3_128"}, ...], "digest"}``; reads every byte.
 
-    ``advance`` is told of the bytes of each block. InputError: a file cannot be read.
+    Args:
+        paths: the files, in reading order.
+        advance: told of the number of bytes of each block, for a progress bar.
+
+    Raises:
+        InputError: a file cannot be read.
     """
     return identity_of_hashes({path: hash_file(path, advance) for path in paths})
 
@@ -134,7 +148,11 @@ def identity_of_hashes(hashes: Mapping[Path, str]) -> dict[str, Any]:
 
 
 def quick_identity(paths: Iterable[Path]) -> dict[str, Any]:
-    """Return ``{"files": [{"name", "size", "mtime_ns"}, ...]}``; reads none; InputError: one is missing."""
+    """Return ``{"files": [{"name", "size", "mtime_ns"}, ...]}`` without reading the files.
+
+    Raises:
+        InputError: a file is missing.
+    """
     files = []
     for path in paths:
         size = _size(path)

@@ -81,10 +81,17 @@ class FrameReader(ABC):
 
     @abstractmethod
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
-        """Fill ``buffer`` with frames t0..t1 and rows y0..y1 (ends excluded; None: to the last).
+        """Fill ``buffer`` with frames t0..t1 and rows y0..y1 (ends excluded), all columns.
 
-        The buffer is C-contiguous, (t1 - t0, y1 - y0, all columns), of ``self.dtype``. InputError: the
-        file vanished, changed or cannot be decoded.
+        Args:
+            buffer: C-contiguous, (t1 - t0, y1 - y0, columns), of ``self.dtype``.
+            t0: first frame.
+            t1: end of the frames.
+            y0: first row.
+            y1: end of the rows; None means to the last.
+
+        Raises:
+            InputError: the file vanished, changed or cannot be decoded.
         """
 
     def read(self, t0: int = 0, t1: int | None = None, y0: int = 0, y1: int | None = None) -> NDArray[Any]:
@@ -125,7 +132,8 @@ def check_window(
 ) -> tuple[int, int]:
     """Check the arguments of `FrameReader.read_into`; return (y0, y1) with y1 filled in.
 
-    ValueError: a programming mistake: window outside of the stack, or a buffer that does not fit.
+    Raises:
+        ValueError: a programming mistake: window outside of the stack, or a buffer that does not fit.
     """
     n, ny, nx = reader.shape
     y1 = ny if y1 is None else y1
@@ -159,7 +167,11 @@ def shared_notes(readers: Sequence[FrameReader]) -> list[str]:
 
 
 def unwritten_notes(path: Path, missing: int, wanted: int, what: str = "chunks") -> tuple[str, ...]:
-    """Return a remark on parts that were never written, if there are; InputError: none was."""
+    """Return a remark on parts of a file that were never written; empty where all were.
+
+    Raises:
+        InputError: none was written.
+    """
     if missing >= wanted > 0:
         raise InputError(
             f"{path}: none of its {wanted} {what} was ever written; copy it again or leave it out"
@@ -171,9 +183,10 @@ def unwritten_notes(path: Path, missing: int, wanted: int, what: str = "chunks")
 
 @contextmanager
 def sound(path: Path, what: str) -> Iterator[None]:
-    """Turn what a library says of a damaged file into one InputError: damage can break it anywhere.
+    """Turn what a library says of a damaged file into one line: damage can break it anywhere.
 
-    Errors of settings and missing libraries pass.
+    Raises:
+        InputError: always in place of another error, but for those of settings and missing libraries.
     """
     try:
         yield

@@ -61,7 +61,11 @@ def reader_names() -> list[str]:
 
 
 def reader_class(name: str) -> type[FrameReader]:
-    """Return the reader of a format, imported only now; ConfigError: no such format, or no reader."""
+    """Return the reader of a format, importing it only now.
+
+    Raises:
+        ConfigError: no such format, or a plug-in that is not a reader.
+    """
     if name in _OURS:
         module, cls = _OURS[name]
         found: type[FrameReader] = getattr(
@@ -105,7 +109,8 @@ def frame_suffixes(name: str = "auto") -> dict[str, str]:
 def detect_format(path: Path) -> str:
     """Return the format of a file: from its first bytes, then from its suffix.
 
-    InputError: the file is missing, empty, or of no known format.
+    Raises:
+        InputError: the file is missing, empty, or of no known format.
     """
     try:
         head = b"" if path.is_dir() else _head(path)
@@ -131,7 +136,11 @@ def detect_format(path: Path) -> str:
 
 
 def check_unpacked(path: Path, head: bytes) -> None:
-    """Refuse a packed file: libraries may unpack it, but its bytes are not where they say."""
+    """Refuse a file that holds another one: libraries may unpack it, but its bytes are not where they say.
+
+    Raises:
+        InputError: its first bytes are those of a program that packs files.
+    """
     for magic, program in _PACKED.items():
         if head.startswith(magic):
             raise InputError(f"{path}: packed by {program}; unpack it first")
@@ -143,7 +152,11 @@ def _head(path: Path) -> bytes:
 
 
 def require(module: str, extra: str, what: str) -> None:
-    """Import an optional library, or raise MissingDependencyError that names the extra to install."""
+    """Check that an optional library can be imported.
+
+    Raises:
+        MissingDependencyError: it cannot; the message names the extra to install.
+    """
     try:
         importlib.import_module(module)
     except ImportError as error:

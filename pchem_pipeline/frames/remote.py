@@ -27,11 +27,18 @@ def is_remote(entry: str) -> bool:
 
 
 def fetch(url: str) -> list[Path]:
-    """Return the files behind a URL, a glob or a folder (``s3://bucket/frames/*.tif``), fetched here.
+    """Return the files behind a URL, a glob or a folder, fetched to this machine.
 
     Keys and the address of the server come from where the storage's library looks for them (for S3: the
     environment variables ``AWS_ACCESS_KEY_ID``, ``AWS_SECRET_ACCESS_KEY`` and ``AWS_ENDPOINT_URL``, or
-    ``~/.aws``). InputError: nothing is there, or it is refused; MissingDependencyError: no library for it.
+    ``~/.aws``).
+
+    Args:
+        url: such as ``s3://bucket/frames/*.tif``.
+
+    Raises:
+        InputError: nothing is there, or the storage refuses.
+        MissingDependencyError: the library of that kind of storage is not installed.
     """
     import fsspec
 

@@ -28,8 +28,14 @@ def natural_key(path: Path) -> tuple[tuple[tuple[int, int | str], ...], str]:
 def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
     """Return the files that ``input.files`` names, in natural order; a path named twice is there twice.
 
-    ConfigError: no files are named. InputError: a path is missing, a glob matches nothing, a folder holds no
-    camera files or several formats.
+    Args:
+        settings: the section ``input``.
+        base_dir: folder to which relative paths refer.
+
+    Raises:
+        ConfigError: no files are named.
+        InputError: a path is missing, a glob matches nothing, a folder holds no camera files or several
+            formats.
     """
     if not settings.files:
         raise ConfigError("input.files is empty; name camera files, a glob such as frames/*.tif, or a folder")
@@ -59,7 +65,12 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
 
 
 def input_paths(settings: InputSettings, base_dir: Path) -> list[Path]:
-    """Return all files that decide what is read: mask, camera files, each with its sidecar."""
+    """Return all files that decide what is read: mask, camera files, each with its sidecar.
+
+    Raises:
+        ConfigError: no files are named.
+        InputError: as in `resolve_files`.
+    """
     mask = mask_path(settings, base_dir)
     paths = [] if mask is None else [mask]
     for path in resolve_files(settings, base_dir):
@@ -71,7 +82,11 @@ def input_paths(settings: InputSettings, base_dir: Path) -> list[Path]:
 
 
 def mask_path(settings: InputSettings, base_dir: Path) -> Path | None:
-    """Return the file of ``input.mask``, fetched where it is remote; InputError: there is none."""
+    """Return the file of ``input.mask``, fetched where it is remote.
+
+    Raises:
+        InputError: there is none.
+    """
     if settings.mask is None:
         return None
     return resolve_files(settings.model_copy(update={"files": (settings.mask,)}), base_dir)[0]

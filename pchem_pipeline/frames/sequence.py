@@ -41,8 +41,9 @@ class FrameSequence(FrameReader):
     ) -> None:
         """Join the readers; see `pchem_pipeline.frames.open.open_frames`, which makes them.
 
-        InputError: too few frames, a region of interest or frame range outside of the stack, or files that
-        contradict each other on bit depth, bit shift, integration time or camera.
+        Raises:
+            InputError: too few frames, a region of interest or frame range outside of the stack, or
+                files that contradict each other on bit depth, bit shift, integration time or camera.
         """
         self.report = report
         self._readers = tuple(readers)
@@ -107,14 +108,19 @@ class FrameSequence(FrameReader):
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`; rows count from the top of the region of interest.
 
-        InputError: also where dropped bits are not zero, or a value does not fit the bit depth.
+        Raises:
+            InputError: also where dropped bits are not zero, or a value does not fit the bit depth.
         """
         y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
         for reader, part in self._parts(buffer, t0, t1, (y0, y1)):
             self.check_bits(reader, part, y0)
 
     def exclude(self, pixels: NDArray[np.bool_]) -> None:
-        """Give pixels (y, x) the median of the others in the first frame; InputError: no other is left."""
+        """Exclude pixels (y, x): their samples become the median of the others in the first frame.
+
+        Raises:
+            InputError: no pixel is left.
+        """
         if pixels.all():
             raise InputError(f"{_where(self.paths)}: every pixel is excluded; correct input.mask (--mask)")
         if pixels.any():
@@ -179,7 +185,10 @@ class FrameSequence(FrameReader):
     def check_bits(self, reader: FrameReader, part: NDArray[Any], y0: int) -> None:
         """Replace excluded samples; shift left-justified ones, refusing to lose bits; check the bit depth.
 
-        The part holds frames (frame, y, x) of the reader's file from row y0 on.
+        Args:
+            reader: of the file.
+            part: frames of it, (frame, y, x).
+            y0: their first row.
         """
         if self.excluded is not None:
             ys, xs = self._places

@@ -158,15 +158,16 @@ class HashedFrameStream(FrameStream):
         threads: int = 1,
         advance: Callable[[int], None] | None = None,
     ) -> None:
-        """Take the memory; nothing is read yet; see `FrameStream`.
+        """Take the memory; nothing is read yet.
 
         Args:
             stack: the frames.
             bands: bands that cover all rows, from top to bottom.
-            step: frames in a block.
-            files: all that decide what is read, in reading order, with those of the frames from ``first``.
+            step: see `FrameStream`.
+            files: all files that decide what is read, in reading order; among them those of the frames from
+                ``first`` on.
             first: frame to begin with, the first one of a file.
-            threads: threads that decode.
+            threads: threads that decode, where there is something to decode.
             advance: told of the number of bytes that were hashed.
         """
         super().__init__(stack, bands, step, frames=(first, stack.shape[0]), threads=threads)
@@ -175,11 +176,19 @@ class HashedFrameStream(FrameStream):
         self._sizes: dict[Path, int] = {}
 
     def identity(self) -> dict[str, Any]:
-        """Hash what is left of the files, and return their identity; InputError: one cannot be read."""
+        """Hash what is left of the files, and return their identity; see `content_identity`.
+
+        Raises:
+            InputError: a file vanished or cannot be read.
+        """
         return identity_of_hashes({path: hasher.hexdigest() for path, hasher in self._hashers.items()})
 
     def _fill(self, parts: Sequence[NDArray[Any]], t0: int, t1: int) -> None:
-        """Read the next frames, and hash the bytes of their files up to there; InputError: one changed."""
+        """Read the next frames, and hash the bytes of their files up to there.
+
+        Raises:
+            InputError: a file vanished, changed or cannot be read.
+        """
         decode: list[tuple[int, int]] = []
         for reader, first, end, offset in self._stack.pieces(t0, t1):
             hasher = self._hashers[reader.paths[0]]

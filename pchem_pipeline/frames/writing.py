@@ -58,17 +58,21 @@ def write_frames(
     bit_depth: int | None = None,
     frames_per_file: int | None = None,
 ) -> list[Path]:
-    """Write a stream of frames; each file appears only when it is whole; return the files in order.
+    """Write a stream of frames; each file appears only when it is whole.
 
     Args:
         format: tiff, fits, hdf5, npy, raw, zarr or ser.
-        path: the file; its suffix is the format's if it has none; parts are ``<stem>_00001<suffix>``, ...
+        path: the file; without a suffix the format's own is added. With ``frames_per_file``, parts are named
+            ``<stem>_00001<suffix>`` and so on.
         blocks: arrays (any number of frames, rows, columns), in order, together ``shape``.
         shape: (frames, rows, columns).
         dtype: uint8, uint16 or uint32.
         integration_time: s, recorded where the format has a place for it.
         bit_depth: bits of the ADC, recorded likewise.
         frames_per_file: frames of a part (1: a sequence of single frames); None: all in one file.
+
+    Returns:
+        The files written, in order.
 
     Raises:
         ConfigError: an unknown format, or an optional library is missing.

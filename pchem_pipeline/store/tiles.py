@@ -14,8 +14,8 @@ TileSize = int | tuple[int, int] | Literal["auto"]
 
 #: The side of the smallest tile that is chosen, and the pixels that it has at least on a sensor of few rows.
 _SIDE, _FEW_PIXELS = 64, 2048
-#: Bins of the histograms of a piece of a tile: a fit takes some ten bytes for each.
-_MOST_BINS = 1 << 23
+#: Bins of histograms that are worked on at once: a fit takes some ten bytes for each.
+MAX_BINS = 1 << 23
 #: Tiles beyond which they grow: each is some 50 files.
 _MANY = 80
 #: Columns beyond which tiles grow in rows: bands of rows over the full width are read and counted at once.
@@ -59,9 +59,13 @@ class Tile:
         return slice(self.y0 + y.start, self.y0 + y.stop), slice(self.x0 + x.start, self.x0 + x.stop)
 
     def parts(self, bins: int = 1) -> Iterator[tuple[slice, slice]]:
-        """Yield pieces of at most 64 x 64 pixels and 2^23 bins, as indices into an array of the tile."""
+        """Yield pieces of at most 64 x 64 pixels and `MAX_BINS` bins, as indices into an array of the tile.
+
+        Args:
+            bins: of the histogram of a pixel.
+        """
         ny, nx = self.shape
-        rows = min(_SIDE, max(1, _MOST_BINS // (_SIDE * bins)))
+        rows = min(_SIDE, max(1, MAX_BINS // (_SIDE * bins)))
         for y in range(0, ny, rows):
             for x in range(0, nx, _SIDE):
                 yield slice(y, min(y + rows, ny)), slice(x, min(x + _SIDE, nx))

@@ -75,9 +75,18 @@ def unsigned_type(stored: np.dtype[Any]) -> np.dtype[Any]:
 def even_offsets(
     path: Path, n_frames: int, frame_bytes: int, size: int, *, start: int = 0, step: int | None = None
 ) -> NDArray[np.int64]:
-    """Return the byte offset of each frame; frames lie ``step`` bytes apart (None: they follow each other).
+    """Return the byte offset of each of the frames that lie evenly in a file.
 
-    InputError: they do not fit into a file of ``size`` bytes; a damaged header must not take memory.
+    Args:
+        path: the file, for the message.
+        n_frames: their number, as the header says.
+        frame_bytes: bytes of a frame.
+        size: bytes of the file.
+        start: offset of the first frame.
+        step: bytes from one frame to the next; None: they follow each other.
+
+    Raises:
+        InputError: they do not fit into the file. The numbers of a damaged header must not take memory.
     """
     step = frame_bytes if step is None else step
     if n_frames and frame_bytes < 1:
@@ -172,7 +181,11 @@ class ContiguousReader(FrameReader):
     _full: tuple[int, ...]
 
     def set_layout(self, path: Path, layout: Layout, size: int) -> None:
-        """Take the layout in a file of ``size`` bytes; InputError: it is shorter than that."""
+        """Take the layout; ``size`` is the size of the file.
+
+        Raises:
+            InputError: the file is shorter than the layout says.
+        """
         if layout.end > size:
             whole = int(np.count_nonzero(layout.offsets + layout.frame_bytes <= size))
             raise _truncated(path, layout.offsets.size, layout.end, size, whole)
@@ -190,7 +203,18 @@ class ContiguousReader(FrameReader):
         settings: InputSettings | None,
         what: str,
     ) -> None:
-        """Take shape and type as a file states them, or raise InputError; without settings any sign fits."""
+        """Set the shape of the stack and the type of its samples.
+
+        Args:
+            path: the file.
+            full: shape as the file states it.
+            stored: type of the samples in the file.
+            settings: the section ``input``; None: the file says itself what its signed samples mean.
+            what: the array, for the message.
+
+        Raises:
+            InputError: these are no frames, see :mod:`.kinds`.
+        """
         self._offset = None if settings is None else check_samples(path, stored, settings)
         self.paths, self.shape = (path,), stack_shape(path, full, what)
         self.dtype, self._full = unsigned_type(stored), tuple(full)
@@ -201,10 +225,16 @@ class ContiguousReader(FrameReader):
         return getattr(self, "_layout", None)
 
     def scatter(self, parts: Sequence[NDArray[Any]], t0: int, t1: int, hasher: FileHasher) -> None:
-        """Read frames t0..t1 into the bands of rows that make them up, and hash all bytes up to their end.
+        """Read whole frames into the bands of rows that make them up, and hash all bytes up to their end.
 
-        The parts, C-contiguous (t1 - t0, rows, columns), cover the frames from top to bottom; the hasher
-        stands before the first frame. InputError: the file vanished, changed or cannot be read.
+        Args:
+            parts: C-contiguous, (t1 - t0, rows, columns) each, that cover the frames from top to bottom.
+            t0: first frame.
+            t1: end of the frames.
+            hasher: of this file; it stands before the first of the frames.
+
+        Raises:
+            InputError: the file vanished, changed or cannot be read.
         """
         layout = self._layout
         bytes_of = [part.reshape(t1 - t0, -1).view(np.uint8) for part in parts]
@@ -260,9 +290,16 @@ def _runs(offsets: NDArray[np.int64], frame_bytes: int) -> list[tuple[int, int]]
 
 
 def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, path: Path) -> None:
-    """Turn stored bytes, read into unsigned native samples of that size, into these, in place.
+    """Turn stored bytes into native unsigned samples, in place.
 
-    ``offset`` is added to signed samples, 0 to 2**(bits - 1) DN (None: unsigned). InputError: a negative sum.
+    Args:
+        buffer: unsigned native type of the size of ``stored``, holding the bytes of the file.
+        stored: type in the file, with its byte order.
+        offset: what is added to signed samples, 0 to 2**(bits - 1); None: they are unsigned.
+        path: the file, for the message.
+
+    Raises:
+        InputError: a sample is negative, with the offset.
     """
     if not stored.isnative:
         buffer.byteswap(inplace=True)

@@ -172,10 +172,17 @@ def _value_notes(path: Path, header: Any, frames: int) -> tuple[str, ...]:
 
 
 def _coding_notes(path: Path, number: int, piece: int, *, biased: bool) -> tuple[str, ...]:
-    """Say where the compression of image ``number`` lost information; ``piece`` is the bytes of a tile.
+    """Say where compression lost information.
 
-    InputError: unsigned samples (``biased``) in PLIO, of which the library does not take back the shift; or a
-    tile that holds more than its shape says.
+    Args:
+        path: the file.
+        number: of the image in it.
+        piece: bytes of a tile.
+        biased: unsigned by BZERO.
+
+    Raises:
+        InputError: unsigned samples in PLIO, of which the library does not take back the shift;
+            or a tile that holds more than its shape says.
     """
     from astropy.io import fits
 
@@ -265,7 +272,19 @@ def write_image(
     dtype: np.dtype[Any],
     cards: dict[str, Any],
 ) -> None:
-    """Write blocks of images (float or unsigned) that make up ``shape`` as the primary image, with cards."""
+    """Write an array that comes by blocks as the primary image.
+
+    Args:
+        path: the file.
+        blocks: of its images, in order.
+        shape: of the whole.
+        dtype: floating point or unsigned.
+        cards: further keywords.
+
+    Raises:
+        StoreError: the folder cannot be written.
+        MissingDependencyError: astropy is not installed.
+    """
     require("astropy.io.fits", "fits", "FITS files")
     from astropy.io import fits
 

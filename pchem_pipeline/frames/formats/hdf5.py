@@ -137,7 +137,11 @@ class Hdf5Reader(ContiguousReader):
 
 
 def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
-    """Say how many chunks were never written, and read as the fill value; InputError: all of them."""
+    """Say how many chunks of a dataset were never written; the library reads them as the fill value.
+
+    Raises:
+        InputError: none was written, or the file has no place for them at all.
+    """
     if dataset.chunks is None:
         plain = not (dataset.is_virtual or dataset.external) and dataset.id.get_storage_size() == 0
         return unwritten_notes(path, int(plain and dataset.size > 0), 1, "datasets")
@@ -147,7 +151,11 @@ def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
 
 
 def _check_chunk_sizes(path: Path, dataset: Any) -> None:
-    """Refuse plain chunks of another size than their shape: the library reads beyond them, and crashes."""
+    """Refuse plain chunks of another size than their shape: the library reads beyond them, and crashes.
+
+    Raises:
+        InputError: there is one.
+    """
     if dataset.id.get_create_plist().get_nfilters() or not hasattr(dataset.id, "chunk_iter"):
         return
     size = math.prod(dataset.chunks) * dataset.dtype.itemsize
@@ -160,7 +168,11 @@ def _check_chunk_sizes(path: Path, dataset: Any) -> None:
 
 
 def _check_deflated(path: Path, dataset: Any) -> None:
-    """Refuse chunks that were deflated twice, or that hold more than their shape says."""
+    """Refuse chunks that were deflated twice, or that hold more than their shape says.
+
+    Raises:
+        InputError: there is one.
+    """
     from h5py import h5z
 
     record = dataset.id.get_create_plist()
@@ -237,7 +249,12 @@ def _is_detector(group: Any) -> bool:
 
 
 def _stated_facts(dataset: Any, groups: list[Any]) -> StatedFacts:
-    """Return what the attributes of the dataset say, else the values beside it or in its detector (NeXus)."""
+    """Return what the attributes of the dataset say, else the values beside it (count_time in NeXus).
+
+    Args:
+        dataset: the frames.
+        groups: the group of the dataset, and the detector where the frames are in NXdata by a link.
+    """
     values = {name: np.ravel(value)[0] for name, value in dataset.attrs.items() if np.size(value) == 1}
     beside: dict[str, Any] = {}
     units: dict[str, Any] = {}

@@ -42,7 +42,11 @@ def external_links(path: Path, file: Any) -> dict[str, str]:
 
 
 def check_links(path: Path, links: dict[str, str], wanted: str | None) -> None:
-    """Refuse what lies in other files (a Dectris master file): the wanted dataset, or (None) any link."""
+    """Refuse what lies in another file (a Dectris master file, say).
+
+    Raises:
+        InputError: the wanted dataset is a link, or (none is wanted) there are links.
+    """
     asked = {name: links[name] for name in links if wanted is None or name == wanted.strip("/")}
     if asked:
         shown = ", ".join(f"{name} in {file}" for name, file in list(asked.items())[:4])
@@ -54,9 +58,17 @@ def check_links(path: Path, links: dict[str, str], wanted: str | None) -> None:
 
 
 def check_sources(path: Path, dataset: Any) -> tuple[str, ...]:
-    """Return a remark on the files that hold the samples of a dataset of h5py, if there are any.
+    """Check that the files which hold the samples of a dataset are there and long enough.
 
-    InputError: one is missing, shorter than the dataset says, or not beside or below the file.
+    Args:
+        path: the file of the dataset.
+        dataset: of h5py.
+
+    Returns:
+        A remark for the user where there are such files.
+
+    Raises:
+        InputError: one of them is missing, shorter than the dataset says, or not beside or below its file.
     """
     if dataset.external:
         return _check_raw_parts(path, dataset)
@@ -97,7 +109,11 @@ def _check_raw_parts(path: Path, dataset: Any) -> tuple[str, ...]:
 
 
 def source_file(path: Path, other: Path) -> Path:
-    """Return a file that another one names; InputError: not beside or below it, or no regular file."""
+    """Return a file that another one names as its source.
+
+    Raises:
+        InputError: it is not beside or below that one, or no regular file.
+    """
     home, real = path.resolve().parent, other.resolve()
     if home not in real.parents:
         raise InputError(
@@ -111,8 +127,13 @@ def source_file(path: Path, other: Path) -> Path:
 def check_virtual(path: Path, dataset: Any, above: tuple[tuple[Path, str], ...] = ()) -> list[Any]:
     """Check where the parts of a virtual dataset are, before the library looks for them; return them.
 
-    ``above`` has the virtual datasets that take this one as a part. InputError: a part is the dataset itself,
-    or not beside or below the file; or they are too many.
+    Args:
+        path: the file of the dataset.
+        dataset: of h5py.
+        above: files and names of the virtual datasets that take this one as a part.
+
+    Raises:
+        InputError: a part is the dataset itself, or not beside or below the file; or they are too many.
     """
     here = (*above, (path.resolve(), dataset.name.strip("/")))
     if len(here) > _DEEPEST or dataset.id.get_create_plist().get_virtual_count() > _MOST_PARTS:
@@ -166,7 +187,11 @@ def is_own(group: Any, name: str) -> bool:
 
 
 def opened(path: Path) -> Any:
-    """Return an open HDF5 file, without a lock where the file system has none; OSError: it cannot be."""
+    """Return an open HDF5 file, without a lock where the file system has none.
+
+    Raises:
+        OSError: it cannot be opened, or another program has locked it to write.
+    """
     import h5py
 
     try:
@@ -210,7 +235,11 @@ def _fits(part: Any, source: Any) -> bool:
 
 
 def check_filters(path: Path, dataset: Any) -> None:
-    """Refuse a dataset that is coded by a filter which is not installed, unless it was not applied."""
+    """Check that the filters by which a dataset is coded are installed, unless they were not applied.
+
+    Raises:
+        InputError: one is not.
+    """
     from h5py import h5z
 
     record = dataset.id.get_create_plist()

@@ -22,10 +22,19 @@ LARGEST_PIECES = 64
 
 
 def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> int | None:
-    """Return what is to be added to signed samples, DN; None for unsigned ones.
+    """Check that samples can be digital numbers: unsigned, or signed as the settings say.
 
-    ``input.dtype`` names the unsigned type that is meant. InputError: float, complex, boolean, object, 64-bit
-    or undeclared signed samples, or the settings say otherwise.
+    Args:
+        path: the file, for the message.
+        dtype: type of the stored samples.
+        settings: the section ``input``; its ``dtype`` names the unsigned type that is meant.
+
+    Returns:
+        What is to be added to signed samples, DN; None for unsigned ones.
+
+    Raises:
+        InputError: float, complex, boolean, object, 64-bit or undeclared signed samples, or ``input.dtype``
+            says otherwise.
     """
     wanted = settings.dtype
     if dtype.kind == "u" and dtype.itemsize in (1, 2, 4):
@@ -62,9 +71,10 @@ def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> 
 
 
 def stack_shape(path: Path, shape: Sequence[int], what: str = "array") -> tuple[int, int, int]:
-    """Return (frames, rows, columns) of a 2-D or 3-D array; further axes must have length 1.
+    """Return (frames, rows, columns) of a 2-D or 3-D array; more axes are taken if they have length 1.
 
-    InputError: too few or too many axes.
+    Raises:
+        InputError: too few or too many axes.
     """
     sizes = list(shape)
     if min(sizes, default=0) < 0 or max(sizes[-2:], default=0) > _MOST_PIXELS:
@@ -90,8 +100,15 @@ def check_coded(
 ) -> None:
     """Check that coded frames can be what their header says, before memory is taken for them.
 
-    A piece (chunk, tile, strip) is decoded at once. InputError: too many frames for a file of ``size`` bytes,
-    or a piece is far larger than they all.
+    Args:
+        path: the file, for the message.
+        shape: (frames, rows, columns).
+        piece: shape of a chunk, tile or strip, which is decoded at once.
+        itemsize: bytes of a sample.
+        size: bytes of the file or folder.
+
+    Raises:
+        InputError: the frames are too many for so few bytes, or a piece is far larger than they all.
     """
     total, one = math.prod(shape) * itemsize, math.prod(piece) * itemsize
     if total > max(_MOST_CODED, _MOST_RATIO * size):
@@ -106,9 +123,16 @@ def check_coded(
 
 
 def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int, codecs: str = "gzip") -> None:
-    """Refuse coded pieces that hold more bytes than expected, before the library unpacks them.
+    """Check that coded pieces hold no more than their shape says, before the library unpacks them whole.
 
-    ``codecs`` may be in use: gzip and zlib are unpacked, the headers of others read.
+    Args:
+        path: the file, for the message.
+        pieces: coded bytes.
+        expected: bytes of a piece by shape and type.
+        codecs: names of those that may be in use; gzip and zlib are unpacked, the headers of others read.
+
+    Raises:
+        InputError: one holds more.
     """
     for data in pieces:
         found = 0
@@ -157,9 +181,15 @@ def full_window(full: tuple[int, ...], t0: int, t1: int, y0: int, y1: int) -> tu
 
 
 def choose_dataset(path: Path, shapes: Mapping[str, tuple[int, ...]], wanted: str | None) -> str:
-    """Return the wanted dataset, else the only one of three axes or more, else of two; else list them.
+    """Return the dataset to read: the wanted one, else the only one of three axes or more, else of two.
 
-    ``shapes`` has the shape of every dataset by its path inside. InputError: not there, or several.
+    Args:
+        path: the file, for the message.
+        shapes: shape of every dataset in the file, by its path inside.
+        wanted: ``input.dataset``.
+
+    Raises:
+        InputError: not there, or not the only one; the message lists the candidates.
     """
     stacks = [name for name, shape in shapes.items() if len(shape) >= 3]
     images = [name for name, shape in shapes.items() if len(shape) == 2]

@@ -38,9 +38,19 @@ class MapImage:
 
 
 def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) -> list[Path]:
-    """Write one FITS file with an image extension for each map, of the map's type.
+    """Write one FITS file with an image extension for each map.
 
-    ``header`` has keywords of the primary header, of 8 characters at most; None is left out.
+    Args:
+        path: the file.
+        maps: the maps; floating point and integers stay as they are.
+        header: keywords of the primary header (at most 8 characters each); None is left out.
+
+    Returns:
+        The file written.
+
+    Raises:
+        StoreError: the folder cannot be written.
+        MissingDependencyError: astropy is not installed.
     """
     require("astropy.io.fits", "fits", "FITS files")
     from astropy.io import fits
@@ -61,7 +71,18 @@ def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) 
 
 
 def write_tiff(folder: Path, maps: Sequence[MapImage]) -> list[Path]:
-    """Write ``<name>.tif`` for each map, float32 for parameters, integers as they are; return the files."""
+    """Write one TIFF file for each map: float32 for parameters, integers as they are.
+
+    Args:
+        folder: where to write ``<name>.tif``.
+        maps: the maps.
+
+    Returns:
+        The files written.
+
+    Raises:
+        StoreError: the folder cannot be written.
+    """
     import tifffile
 
     written = []
@@ -76,7 +97,18 @@ def write_tiff(folder: Path, maps: Sequence[MapImage]) -> list[Path]:
 
 
 def write_npz(path: Path, maps: Sequence[MapImage]) -> list[Path]:
-    """Write all maps into one npz file, each under its name; return it in a list."""
+    """Write all maps into one npz file, each under its name.
+
+    Args:
+        path: the file.
+        maps: the maps.
+
+    Returns:
+        The file written.
+
+    Raises:
+        StoreError: the folder cannot be written.
+    """
     arrays: dict[str, Any] = {image.name: image.values for image in maps}
     with whole_file(path) as part:
         np.savez_compressed(part, allow_pickle=False, **arrays)
@@ -107,7 +139,11 @@ class Cube:
 
 
 def write_tiff_cube(path: Path, cube: Cube) -> None:
-    """Write a page for each image: an ImageJ stack, or BigTIFF where that is too small."""
+    """Write a page for each image: an ImageJ stack, or BigTIFF where that is too small.
+
+    Raises:
+        StoreError: the folder cannot be written.
+    """
     import tifffile
 
     size = int(np.prod(cube.shape)) * cube.dtype.itemsize
@@ -128,7 +164,12 @@ def write_tiff_cube(path: Path, cube: Cube) -> None:
 
 
 def write_fits_cube(path: Path, cube: Cube) -> None:
-    """Write an image of the axes of the array, the unit in ``BUNIT``, the provenance as ``HISTORY``."""
+    """Write an image of the axes of the array, the unit in ``BUNIT``, the provenance as ``HISTORY``.
+
+    Raises:
+        StoreError: the folder cannot be written.
+        MissingDependencyError: astropy is not installed.
+    """
     cards = {
         "BUNIT": cube.unit,
         "OBJECT": cube.name,
@@ -140,7 +181,17 @@ def write_fits_cube(path: Path, cube: Cube) -> None:
 
 
 def read_image(path: Path) -> NDArray[np.float64]:
-    """Return an image (y, x) or images (image, y, x) from npy, TIFF or FITS; InputError: it is none."""
+    """Return an image, or a stack of images, from npy, TIFF or FITS.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Shape (y, x) or (image, y, x).
+
+    Raises:
+        InputError: there is no such file, or it is no image.
+    """
     kinds = {".npy": _read_npy, ".tif": _read_tiff, ".tiff": _read_tiff}
     kinds |= dict.fromkeys((".fits", ".fit", ".fts"), _read_fits)
     kind = kinds.get(path.suffix.lower())

@@ -48,7 +48,8 @@ _MAKE_TAG, _MODEL_TAG, _DATE_TAG = 271, 272, 306
 def check_chain(path: Path, size: int) -> None:
     """Walk from directory to directory: the library stops silently at one that is damaged, or never.
 
-    InputError: no TIFF file, a directory that is not within the file, or a chain that runs in a circle.
+    Raises:
+        InputError: no TIFF file, a directory that is not within the file, or a chain that runs in a circle.
     """
     with path.open("rb") as stream:
         head = stream.read(16)

@@ -21,14 +21,15 @@ from pchem_pipeline.report.data import MAP_NAMES, PixelFit
 from pchem_pipeline.report.inspector.packing import some_of
 from pchem_pipeline.report.style.wording import symbol
 from pchem_pipeline.stages.report.stored import FittedModel, PixelHistograms
+from pchem_pipeline.store.tiles import MAX_BINS
 
 #: Pixels for each reason: a flag, a poor fit, an extreme value, a large standard error.
 _FLAGGED, _POOR, _EXTREME, _UNSURE = 40, 60, 12, 8
 _SEED = 20_231
 #: Ranks, of 1, about those that are sought among which a pixel is looked for first.
 _REACH = 0.02
-#: Sensors with fewer pixels have all of them in the file; of a larger one so many; and the bins of all these.
-_ALL_PIXELS, _SOME_PIXELS, _MOST_BINS = 4096, 2400, 1 << 23
+#: Sensors with fewer pixels have all of them in the file; of a larger one so many.
+_ALL_PIXELS, _SOME_PIXELS = 4096, 2400
 
 #: Labels of the four shown pixels, and the ranks of read noise and quanta exposure at which they lie.
 _CORNERS = (
@@ -206,13 +207,13 @@ def choose_inspected(
         fit: ``fit_status``, and ``goodness_p`` where it is known, (y, x).
         shown: pixels (y, x) that the report draws.
         suspects: pixels (y, x) to which the discrepancy verdict points.
-        bins: of a histogram; of wide ones fewer pixels are taken.
+        bins: of a histogram; all that are taken have at most `MAX_BINS` together.
         everything: a sensor of at most so many pixels is taken whole.
         most: number of pixels of a larger one.
     """
     status = np.asarray(fit["fit_status"])
     ny, nx = status.shape
-    everything, most = (min(n, _MOST_BINS // bins) for n in (everything, most))
+    everything, most = (min(n, MAX_BINS // bins) for n in (everything, most))
     rng = np.random.default_rng(_SEED)
     reasons = [
         ("shown in the report", _places(shown, nx)),

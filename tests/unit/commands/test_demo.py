@@ -18,7 +18,7 @@ from pchem_pipeline.effects.framework.registry import effect_class, effect_class
         ("rownoise@columns=2:5", r"'rownoise': there is no such effect; choose one of: adc_dnl, .*row_noise"),
         ("row_noise@colums=2:5", "columns=A:B"),
         ("row_noise@columns=2:9000", "the sensor has"),
-        ("clipping", "names no typical strength"),
+        ("clipping", "has no typical strength"),
     ],
 )
 def test_what_cannot_be_hidden_is_refused(tmp_path: Path, asked: str, said: str) -> None:

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.store.tiles import Tile, parse_tiles, roi_tiles, tile_grid, tile_shape
+from pchem_pipeline.store.tiles import MAX_BINS, Tile, parse_tiles, roi_tiles, tile_grid, tile_shape
 
 
 @given(ny=st.integers(1, 200), nx=st.integers(1, 200), size=st.sampled_from([8, 16, 64]))
@@ -46,7 +46,7 @@ def test_parts_of_a_tile_cover_it_once_and_have_few_bins(y0, x0, ny, nx, bins):
     for part in tile.parts(bins):
         assert seen[tile.within(part)].shape == np.empty(tile.shape)[part].shape
         seen[tile.within(part)] += 1
-        assert np.empty(tile.shape)[part].size * bins <= 1 << 23
+        assert np.empty(tile.shape)[part].size * bins <= MAX_BINS
     assert (seen[tile.region] == 1).all()
 
 

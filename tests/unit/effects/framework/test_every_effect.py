@@ -1,4 +1,4 @@
-"""What every effect owes, whoever wrote it: words, neutrality, the same frames at every division, no harm."""
+"""Properties of every effect: described, neutral at no strength, the same frames in any division."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ BOW = (-0.5, 0.5, -0.5)
 JUMPS = (((0, 1.0), (5, -2.0), (9, 0.0)), ((3, 1.0),), (), ((2, 0.5), (11, 4.0)))
 UNTESTABLE = {"charge_lag", "charge_diffusion", "spurious_charge"}
 SHAPE, N_FRAMES = (8, 7), 40
-# forms and strengths of which an effect of 40 small frames is seen at once
+# strong enough to be seen in 40 small frames
 STRONG: list[Effect] = [
     AnalogMemory(memory=0.4),
     FlickerNoise(share=0.9, correlation_frames=7.0),
@@ -111,14 +111,14 @@ def frames(*effects: Effect, shape: Any = SHAPE, n: int = N_FRAMES, **part: Any)
 
 
 @pytest.mark.parametrize("tag", sorted(KINDS))
-def test_each_says_what_is_known_of_it(tag):
+def test_every_effect_is_described(tag):
     kind = KINDS[tag]
     assert kind.title
     assert kind.source
     assert kind.power > 0
     assert kind.strength in kind.model_fields or tag == "clipping"
     assert bool(kind.untestable) == (tag in UNTESTABLE)
-    # what is empirical is measured by its own hand and told from no other
+    # empirical effects have estimators of their own, and no rivals
     known = tag not in UNTESTABLE and not tag.startswith("empirical")
     assert bool(kind.signature) == bool(kind.separate) == known
     assert set(kind.signature) <= set(STATISTICS)
