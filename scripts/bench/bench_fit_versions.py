@@ -83,12 +83,9 @@ def cases(rng: np.random.Generator, share: float) -> dict[str, Case]:
 
 
 def fitter(case: Case) -> Callable[[], Any]:
-    """Return the fit of a case by the package that is imported here; cc2d092 had other names."""
+    """Return the fit of a case by the package that is imported here."""
     counts, origin = case["counts"], case["origin"]
-    try:
-        fit = importlib.import_module("pchem_pipeline.model.fit.api").fit_histograms
-    except ModuleNotFoundError:
-        return old_fitter(case)
+    fit = importlib.import_module("pchem_pipeline.model.fit.api").fit_histograms
     settings = importlib.import_module("pchem_pipeline.model.fit.settings").FitSettings(
         likelihood=case.get("likelihood", "density")
     )
@@ -98,31 +95,6 @@ def fitter(case: Case) -> Callable[[], Any]:
             variance_per_electron=case["variance_per_electron"]
         )
     return lambda: fit(counts, origin, law=law, settings=settings)
-
-
-def old_fitter(case: Case) -> Callable[[], Any]:
-    """Return the fit of a case by commit cc2d092."""
-    model = "pchem_pipeline.model."
-    counts, origin = case["counts"], case["origin"]
-    if isinstance(counts, list):
-        joint = importlib.import_module(model + "joint")
-        return lambda: joint.fit_joint(counts, origin)
-    pchem, grown = importlib.import_module(model + "pchem"), importlib.import_module(model + "grown")
-    if "likelihood" in case:
-        exact = importlib.import_module(model + "exact")
-        settings = importlib.import_module(model + "settings").FitSettings(likelihood="exact")
-        return lambda: exact.refine(counts, origin, pchem.fit_histograms(counts, origin), settings)
-    if "variance_per_electron" in case:
-        law = importlib.import_module(model + "marginal").MarginalModel(
-            variance_per_electron=case["variance_per_electron"]
-        )
-
-        def both() -> Any:
-            plain = pchem.fit_histograms(counts, origin)
-            return grown.fit_grown(counts, origin, plain, law, plain=plain)
-
-        return both
-    return lambda: pchem.fit_histograms(counts, origin)
 
 
 def work(path: Path) -> None:

@@ -363,7 +363,7 @@ class _Batch:
             answers.parameters[pixels] = np.nan
             answers.covariance[pixels] = np.nan
             # a few at a time: a signal is heard between kernels only
-            for some in np.array_split(pixels, pixels.size // 256 + 1):
+            for some in np.array_split(pixels, pixels.size // 1024 + 1):
                 tile_numba.fit_tile(
                     given,
                     some,

@@ -207,7 +207,7 @@ def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, found: Found) -> Fo
     if pixel.facts.shape[0] == 1:
         used = scan_steps(pixel, tools.evaluate, np.bool_(True), scratch)
     else:
-        _, used = fill_starts(np.int64(1), pixel, tools.basis, tools.evaluate, scratch)
+        _, used = fill_starts(np.int64(1), np.bool_(False), pixel, tools.basis, tools.evaluate, scratch)
         used += add_line_starts(pixel, tools.evaluate, np.bool_(True), np.bool_(True), scratch)
     found = _climb_kept(pixel, tools, best, plus(found, used))
     return found

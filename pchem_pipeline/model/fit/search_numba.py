@@ -654,7 +654,7 @@ def search_density(
             return word, used + 1, int(out[DEGREES])
     found = Found(-math.inf, -math.inf, used, np.bool_(False))
     for attempt in range(N_ATTEMPTS):
-        clear, count = fill_starts(attempt, pixel, tools.basis, tools.evaluate, tools.scratch)
+        clear, count = fill_starts(attempt, limits.quick, pixel, tools.basis, tools.evaluate, tools.scratch)
         before = found.loglik
         if clear and attempt == 0:
             _keep_highest(tools.scratch.small[HEIGHTS])

@@ -1,4 +1,4 @@
-"""Starting points: from the empirical characteristic function (ECF), from cumulants, from several exposures.
+"""Starting points: from the empirical characteristic function (ECF), and from several exposures.
 
 ``phi(f) = mean exp(2 pi i f y)`` of a PCD has ``log|phi| = -2 pi^2 f^2 sigma^2 - H (1 - cos 2 pi f a)`` and
 the phase ``2 pi f m + H sin 2 pi f a`` (f in cycles/DN, ``a = 1/g``). Frequencies and steps are counted in
@@ -52,14 +52,10 @@ from pchem_pipeline.model.law.pixel_numba import (
     Scratch,
     copy,
     histogram_of,
-    load,
-    make_pixel,
-    make_scratch,
 )
 
 FREQUENCY_STEP = 0.1  # 1/sd: less than the width of a satellite
 N_FREQUENCIES = 48  # up to 4.8/sd, the satellite of H = 22
-N_FREQUENCIES_WIDE = 144  # up to 14.4/sd, the satellite of H = 200
 LOBE_STEP = 0.05
 LOBE_FIRST = 0.25  # lowest satellite frequency tried, 1/sd: the step a is at most 4 sd
 N_LOBES = 90
@@ -83,7 +79,6 @@ _DIM = 0.7  # log H: aliases are lower by exp(-2 H) at least, 2 % of the lobe at
 
 _LINE_NOISES = (0.15, 0.22, 0.3, 0.38, 0.46, 0.55, 0.65, 0.8, 0.95, 1.15)  # e-
 _LINE_SCALES = (1.0, 0.85, 1.18, 0.7, 1.4)  # of the slope of the line
-_N_CLOSED = 3  # starts of each sample
 _SMALLEST_EXPOSURE = 0.02
 
 
@@ -310,101 +305,6 @@ def start_regression(
 
 
 @kernel(borrows=True)
-def start_peak(
-    histogram: Histogram,
-    work: NDArray[np.float64],
-    theta: NDArray[np.float64],
-) -> bool:
-    """Start from the highest side lobe of the ECF; False where none stands out of the noise."""
-    n, variance = histogram.n, histogram.variance
-    sd = math.sqrt(variance)
-    ecf_power(histogram, FREQUENCY_STEP / sd, np.int64(N_FREQUENCIES_WIDE), work)
-    modulus = work[0]
-    for m in range(N_FREQUENCIES_WIDE):
-        modulus[m] = math.sqrt(max(modulus[m], 0.0))
-    best, place = 3.0 / math.sqrt(n), -1
-    highest = min(N_FREQUENCIES_WIDE - 1, int(_HIGHEST_FREQUENCY * sd / FREQUENCY_STEP) - 1)
-    for m in range(1, highest):
-        if modulus[m] > best and modulus[m] >= modulus[m - 1] and modulus[m] >= modulus[m + 1]:
-            best, place = modulus[m], m
-    if place < 0:
-        return False
-    left, right = modulus[place - 1], modulus[place + 1]
-    bend = left - 2.0 * best + right
-    vertex = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
-    a = sd / (FREQUENCY_STEP * (place + 1 + vertex))
-    electron_noise = -math.log(min(best, 0.999)) / (2.0 * math.pi * math.pi)
-    exposure = max(0.05, variance / (a * a) - electron_noise)
-    found: bool = assemble(histogram, a, exposure, theta)[0]
-    return found
-
-
-@kernel(borrows=True)
-def start_cumulants(
-    histogram: Histogram,
-    theta: NDArray[np.float64],
-) -> bool:
-    """Start from the third and fourth cumulants, ``a = k4/k3`` and ``H = k3/a^3``; good below H = 1."""
-    weights, _, n_bins, first, n, mean, variance = histogram
-    third = fourth = 0.0
-    for i in range(n_bins):
-        d = first + i - mean
-        third += weights[i] * d * d * d
-        fourth += weights[i] * d * d * d * d
-    third /= n
-    fourth = fourth / n - 3.0 * variance * variance
-    if third <= 0.0 or fourth <= 0.0:
-        return False
-    a = fourth / third
-    exposure = third / (a * a * a)
-    s2 = variance - exposure * a * a
-    if s2 <= QUANTISATION_VARIANCE:
-        s2 = max(QUANTISATION_VARIANCE, 0.05 * a * a)
-        exposure = max(1e-3, (variance - s2) / (a * a))
-    theta[0] = math.log(max(exposure, 1e-3))
-    theta[1] = a
-    theta[2] = mean - exposure * a
-    theta[3] = math.log(s2)
-    return math.isfinite(theta[1])
-
-
-@kernel(borrows=True)
-def _likeliest(
-    pixel: Pixel, evaluate: Any, scratch: Scratch, height: float, theta: NDArray[np.float64]
-) -> float:
-    """Put the trial `HERE` in the place of ``theta`` if it is higher than ``height``; return the larger."""
-    trial = scratch.small[HERE]
-    if not trial[STEP + 1] > MIN_STEP:
-        return height
-    loglik: float = evaluate(pixel, trial, LOGLIK_ALONE, scratch, scratch.evaluations[AT])
-    if loglik > height:
-        copy(trial, theta)
-        return loglik
-    return height
-
-
-@kernel(inline=True)
-def _first_start(
-    pixel: Pixel, basis: NDArray[np.float64], evaluate: Any, scratch: Scratch, theta: NDArray[np.float64]
-) -> bool:
-    """Fill ``theta`` with the regression's start, or, if that sees no side lobe, the likeliest of three."""
-    trial = scratch.small[HERE]
-    histogram = histogram_of(pixel, np.int64(0))
-    usable, clear = start_regression(histogram, basis, scratch.rows, theta)
-    if usable and clear:
-        return True
-    best = -math.inf
-    if usable:
-        copy(theta, trial)
-        best = _likeliest(pixel, evaluate, scratch, best, theta)
-    if start_peak(histogram, scratch.rows, trial):
-        best = _likeliest(pixel, evaluate, scratch, best, theta)
-    if start_cumulants(histogram, trial):
-        best = _likeliest(pixel, evaluate, scratch, best, theta)
-    return best > -math.inf
-
-
-@kernel(borrows=True)
 def _keep_lobe(
     pixel: Pixel, evaluate: Any, cells: bool, a: float, lobe: tuple[float, float], scratch: Scratch
 ) -> int:
@@ -522,12 +422,10 @@ def longer_steps(
     a = best[1 + STEP]
     if not histogram.variance < _SPARSE * a * a or _holds_one(histogram, best):
         return used
-    for multiple in (2.0, 3.0):
+    for multiple in (2.0, 3.0, 4.0, 5.0):
         if multiple * a < histogram.n_bins:
             lobe = ecf_at(histogram, 1.0 / (multiple * a))
             used += _keep_lobe(pixel, evaluate, cells, multiple * a, lobe, scratch)
-    if start_cumulants(histogram, scratch.small[HERE]) and scratch.small[HERE, STEP + 1] > 1.2 * a:
-        used += keep_start(pixel, evaluate, cells, scratch)
     for i in range(N_KEPT):
         if heights[i] < least:
             heights[i] = -math.inf
@@ -628,10 +526,10 @@ def _line_start(
 
 
 @kernel(inline=True)
-def _closed_start(
-    which: int, j: int, pixel: Pixel, basis: NDArray[np.float64], scratch: Scratch, theta: NDArray[np.float64]
+def _regression_start(
+    j: int, pixel: Pixel, basis: NDArray[np.float64], scratch: Scratch, theta: NDArray[np.float64]
 ) -> tuple[bool, bool]:
-    """Fill ``theta`` with one of the closed-form starts of sample j.
+    """Fill ``theta`` with the start from the regression of sample j.
 
     Returns:
         Whether there is one, and whether its side lobe stands clear of the noise.
@@ -640,14 +538,7 @@ def _closed_start(
     if facts[j, DARK] > 0.0 or facts[j, OCCUPIED] < 3:
         return False, False
     own = scratch.small[OTHER]
-    histogram = histogram_of(pixel, j)
-    clear = False
-    if which == 0:
-        found, clear = start_regression(histogram, basis, scratch.rows, own)
-    elif which == 1:
-        found = start_peak(histogram, scratch.rows, own)
-    else:
-        found = start_cumulants(histogram, own)
+    found, clear = start_regression(histogram_of(pixel, j), basis, scratch.rows, own)
     if not found:
         return False, False
     bias = facts[j, CENTRE] + own[2]
@@ -688,6 +579,7 @@ def keep_start(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
 @kernel(inline=True)
 def fill_starts(
     attempt: int,
+    quick: bool,
     pixel: Pixel,
     basis: NDArray[np.float64],
     evaluate: Any,
@@ -697,6 +589,7 @@ def fill_starts(
 
     Args:
         attempt: 0 ... N_ATTEMPTS - 1.
+        quick: the first start of a single sample is taken although its side lobe is in the noise.
         pixel: its samples.
         basis: from `regression_basis`.
         evaluate: the density.
@@ -705,24 +598,23 @@ def fill_starts(
     Returns:
         Whether a side lobe of one of several samples stands clear of the noise; evaluations.
     """
-    n_samples = pixel.facts.shape[0]
+    n_samples, any_clear, used = pixel.facts.shape[0], False, 0
     trial, heights = scratch.small[HERE], scratch.small[HEIGHTS]
     _no_starts(heights)
     if n_samples == 1:
-        start = scratch.small[KEPT_STARTS]
-        start[1 + SATELLITE] = trial[1 + SATELLITE] = 0.0
         if attempt > 0:
             return False, scan_steps(pixel, evaluate, np.bool_(False), scratch)
-        if _first_start(pixel, basis, evaluate, scratch, start):
+        start = scratch.small[KEPT_STARTS]
+        start[1 + SATELLITE] = trial[1 + SATELLITE] = 0.0
+        found, clear = start_regression(histogram_of(pixel, np.int64(0)), basis, scratch.rows, start)
+        if clear or (quick and found):
             heights[0] = 0.0
         return False, 0
-    any_clear, used = False, 0
-    for which in range(_N_CLOSED if attempt > 0 else 1):
-        for j in range(n_samples):
-            found, clear = _closed_start(which, j, pixel, basis, scratch, trial)
-            any_clear = any_clear or (found and clear)
-            if found:
-                used += keep_start(pixel, evaluate, np.bool_(False), scratch)
+    for j in range(n_samples):
+        found, clear = _regression_start(j, pixel, basis, scratch, trial)
+        any_clear = any_clear or (found and clear)
+        if found:
+            used += keep_start(pixel, evaluate, np.bool_(False), scratch)
     if attempt > 0 or not any_clear:
         no = np.bool_(False)
         used += add_line_starts(pixel, evaluate, no, attempt > 0, scratch)
@@ -740,36 +632,3 @@ def add_line_starts(pixel: Pixel, evaluate: Any, cells: bool, thorough: bool, sc
             if _line_start(scale, _LINE_NOISES[place], place == 0, pixel, line, cells, trial):
                 used += keep_start(pixel, evaluate, cells, scratch)
     return used
-
-
-@kernel
-def start_tile(
-    counts: NDArray[np.generic],
-    origin: NDArray[np.int64],
-    basis: NDArray[np.float64],
-    out: NDArray[np.float64],
-) -> None:
-    """Fill ``out`` (n, 3, 4), which comes as NaN, with (H, g, mu, sigma) of the three closed-form starts."""
-    n_most = counts.shape[1]
-    mask, theta = np.zeros(n_most, np.uint8), np.empty(4)
-    scratch, pixel = (
-        make_scratch(1, n_most, False),
-        make_pixel(np.zeros(1, np.bool_), n_most, 0, 0),
-    )
-    for row in range(counts.shape[0]):
-        centre = load(counts[row], mask, pixel.bins[0], pixel.facts[0])
-        if pixel.facts[0, OCCUPIED] < 3:
-            continue
-        histogram = histogram_of(pixel, np.int64(0))
-        for which in range(3):
-            if which == 0:
-                found, _ = start_regression(histogram, basis, scratch.rows, theta)
-            elif which == 1:
-                found = start_peak(histogram, scratch.rows, theta)
-            else:
-                found = start_cumulants(histogram, theta)
-            if found:
-                out[row, which, 0] = math.exp(theta[0])
-                out[row, which, 1] = 1.0 / theta[1]
-                out[row, which, 2] = float(origin[row] + centre) + theta[2]
-                out[row, which, 3] = math.exp(0.5 * theta[3])

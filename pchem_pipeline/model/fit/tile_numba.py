@@ -13,7 +13,14 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.algebra_numba import enclose, invert_arrow, to_natural
 from pchem_pipeline.model.errors.information_numba import fill_squared_scores
 from pchem_pipeline.model.fit.climb_numba import Limits, min_log_variance
-from pchem_pipeline.model.fit.search_numba import FIT_NOT_CONVERGED, NO_DATA, TOO_FEW_BINS, Task, Tools
+from pchem_pipeline.model.fit.search_numba import (
+    FIT_NOT_CONVERGED,
+    NO_DATA,
+    TOO_FEW_BINS,
+    Task,
+    Tools,
+)
+from pchem_pipeline.model.fit.starts_numba import start_regression
 from pchem_pipeline.model.law.cells_numba import Law, resolve
 from pchem_pipeline.model.law.pixel_numba import (
     AT_BEST,
@@ -22,6 +29,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     DARK,
     FIRST,
     FIXED,
+    HERE,
     LOG_VARIANCE,
     MEAN,
     N_BINS,
@@ -33,6 +41,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     VARIANCE,
     Pixel,
     Scratch,
+    histogram_of,
     load,
     make_pixel,
     make_scratch,
@@ -193,6 +202,23 @@ def make_room(given: Histograms, law: Law) -> Pixel:
     n_exposures = max(law.exposures.shape[3], law.added.shape[3])
     room: Pixel = make_pixel(given.dark, most, n_peaks, n_exposures)
     return room
+
+
+@kernel
+def start_tile(given: Histograms, law: Law, basis: FloatArray, parameters: FloatArray) -> None:
+    """Fill (H, g, mu, sigma) of single samples from the regression, shape (n, 4); they come as NaN."""
+    room = make_room(given, law)
+    scratch = make_scratch(1, room.bins.shape[2] - 1, False)
+    theta = scratch.small[HERE]
+    for index in range(given.counts.shape[0]):
+        pixel = load_pixel(given, index, room)
+        if pixel.facts[0, OCCUPIED] < 3:
+            continue
+        if start_regression(histogram_of(pixel, np.int64(0)), basis, scratch.rows, theta)[0]:
+            parameters[index, 0] = math.exp(theta[0])
+            parameters[index, 1] = 1.0 / theta[1 + STEP]
+            parameters[index, 2] = theta[1 + BIAS] + pixel.centre
+            parameters[index, 3] = math.exp(0.5 * theta[1 + LOG_VARIANCE])
 
 
 @kernel
