@@ -9,14 +9,20 @@ All arguments broadcast. Units: H and sigma_R in e-, g in e-/DN, mu, sigma and x
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from pchem_pipeline.model.law import pcd_numba
+from scipy.special import gammaln, logsumexp, ndtr, wrightomega, xlogy
+from scipy.stats import poisson
 
 _Array = NDArray[np.float64]
+
+_NEGLIGIBLE = 41.0  # nats: exp(-41) is below the resolution of a double
+_REACH = 9.0  # standard deviations of a Gaussian beyond which nothing is left of it
+_TERMS = 2**22  # of a sum over electron numbers, at once
 
 
 class PcdMoments(NamedTuple):
@@ -28,9 +34,11 @@ class PcdMoments(NamedTuple):
     fourth: _Array
 
 
-def _flat(*arguments: ArrayLike) -> tuple[list[_Array], tuple[int, ...]]:
-    arrays = np.broadcast_arrays(*[np.asarray(a, dtype=np.float64) for a in arguments])
-    return [np.ascontiguousarray(a).reshape(-1) for a in arrays], arrays[0].shape
+def _by_parts(terms: Callable[..., _Array], width: int, *arguments: _Array) -> _Array:
+    """Compute a function of flat arrays, as many elements at once as ``width`` terms of each allow."""
+    n_parts = arguments[0].size * width // _TERMS + 1
+    parts = (np.array_split(a, n_parts) for a in arguments)
+    return np.concatenate([terms(*some) for some in zip(*parts, strict=True)])
 
 
 def log_pcd(
@@ -54,10 +62,30 @@ def log_pcd(
     Returns:
         log f_X(x), nats of 1/DN, of the broadcast shape; NaN where a parameter is NaN or not valid.
     """
-    flat, shape = _flat(x, quanta_exposure, conversion_gain, bias, read_noise_dn)
-    out = np.empty(flat[0].size)
-    pcd_numba.log_densities(*flat, out)
-    return out.reshape(shape)
+    at, exposure, gain, offset, sigma = np.broadcast_arrays(
+        *[np.asarray(a, np.float64) for a in (x, quanta_exposure, conversion_gain, bias, read_noise_dn)]
+    )
+    values, answer = gain * (at - offset), np.full(at.shape, np.nan)
+    valid = (exposure >= 0) & (gain > 0) & (sigma > 0) & np.isfinite(values + exposure + sigma)
+    y, h, s = values[valid], exposure[valid], (gain * sigma)[valid]
+    if y.size == 0:
+        return answer
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # the largest term has d/dk = 0: log(H / (k + 1/2)) + (y - k) / s^2 = 0
+        mode = np.where(h > 0, s**2 * wrightomega(np.log(h / s**2) + (y + 0.5) / s**2).real, 0.0)
+    # from there a term falls as the Gaussian does, and as the Poisson weights do
+    reach = np.minimum(math.sqrt(2 * _NEGLIGIBLE) * s, np.sqrt(2 * _NEGLIGIBLE * mode) + _NEGLIGIBLE)
+    around = np.arange(-int(reach.max()) - 2, int(reach.max()) + 3)
+
+    def summed(y: _Array, h: _Array, s: _Array, mode: _Array) -> _Array:
+        k = np.floor(mode)[:, None] + around
+        y, h, s = y[:, None], h[:, None], s[:, None]
+        terms = xlogy(k, h) - gammaln(np.maximum(k, 0) + 1.0) - 0.5 * ((y - k) / s) ** 2
+        return np.asarray(logsumexp(np.where(k < 0, -np.inf, terms), axis=1))
+
+    constant = -h - np.log(sigma[valid]) - 0.5 * math.log(2 * math.pi)
+    answer[valid] = constant + _by_parts(summed, around.size, y, h, s, mode)
+    return answer
 
 
 def pcd(
@@ -95,10 +123,21 @@ def pcd_mass(
     Returns:
         P(X = x), of the broadcast shape.
     """
-    flat, shape = _flat(x, quanta_exposure, conversion_gain, bias, analog_read_noise_e)
-    out = np.empty(flat[0].size)
-    pcd_numba.masses(*flat, out)
-    return out.reshape(shape)
+    at, exposure, gain, offset, noise = np.broadcast_arrays(
+        *[np.asarray(a, np.float64) for a in (x, quanta_exposure, conversion_gain, bias, analog_read_noise_e)]
+    )
+    flat = [np.ravel(a) for a in (gain * (at - offset), exposure, 0.5 * gain, noise)]
+    reach = float(np.max(_REACH * flat[3] + flat[2], initial=0.0))
+    around = np.arange(-int(reach) - 1, int(reach) + 2)
+
+    def summed(y: _Array, h: _Array, half: _Array, s: _Array) -> _Array:
+        k = np.round(y)[:, None] + around
+        off = np.abs(y[:, None] - k)  # the tails above are those below
+        with np.errstate(divide="ignore", invalid="ignore"):
+            low, high = (off - half[:, None]) / s[:, None], (off + half[:, None]) / s[:, None]
+        return np.asarray((poisson.pmf(k, h[:, None]) * (ndtr(-low) - ndtr(-high))).sum(axis=1))
+
+    return _by_parts(summed, around.size, *flat).reshape(at.shape)
 
 
 def pcd_moments(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from pchem_pipeline.model.law import pcd_numba
 from pchem_pipeline.model.law.pcd import (
     log_pcd,
     pcd,
@@ -77,18 +76,3 @@ def test_mass_is_the_integral_of_the_density() -> None:
     sigma = 0.3 / 0.09
     integral = np.trapezoid(pcd(x[:, None] + fine, 1.5, 0.09, 100.2, sigma), fine, axis=1)
     np.testing.assert_allclose(pcd_mass(x, 1.5, 0.09, 100.2, 0.3), integral, atol=1e-9)
-
-
-def test_compiled_equals_plain() -> None:
-    rng = np.random.default_rng(2)
-    arguments = [
-        rng.uniform(80, 140, 30),
-        rng.uniform(0.1, 5, 30),
-        rng.uniform(0.05, 0.2, 30),
-        np.full(30, 100.0),
-    ]
-    for kernel, last in ((pcd_numba.log_densities, 3.0), (pcd_numba.masses, 0.3)):
-        compiled, plain = np.empty(30), np.empty(30)
-        kernel(*arguments, np.full(30, last), compiled)
-        kernel.py_func(*arguments, np.full(30, last), plain)
-        np.testing.assert_allclose(compiled, plain, rtol=1e-12)
