@@ -248,7 +248,7 @@ def _inside(effect: Effect, context: EffectContext) -> NDArray[np.bool_]:
 def _checked(effect: Effect, plane: Plane, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
     name = f"effect {effect.tag!r} ({type(effect).__module__})"
     try:
-        result = effect.apply(_frozen(values), context)
+        result: Any = effect.apply(_frozen(values), context)
     except Exception as error:
         raise PchEmError(
             f"{name} failed: {type(error).__name__}: {error}; correct it or leave it out"

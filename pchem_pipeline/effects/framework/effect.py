@@ -388,7 +388,7 @@ def registered_effects() -> dict[str, type[Effect]]:
     return dict(_registered)
 
 
-def tag_of(effect: type[Effect]) -> str:
+def tag_of(effect: Any) -> str:
     """Return the tag of an effect class.
 
     Raises:
