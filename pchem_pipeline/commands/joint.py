@@ -10,11 +10,10 @@ from typing import Any
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.commands.first_screen import run_to_first_screen
 from pchem_pipeline.commands.new_run import settings_of, settings_there
-from pchem_pipeline.config.load import dump_config, make_config
+from pchem_pipeline.config.load import dump_config, make_config, write_config
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.runner.session import Command
 from pchem_pipeline.stages.table import pipeline_of
-from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath, place_of
 
 
@@ -56,7 +55,7 @@ def find_joint(
     if path.exists():
         config = settings_there(path, content, "joint")
     if is_new:
-        write_atomic(path, dump_config(config).encode())
+        write_config(path, dump_config(config))
     return Target(config, path.parent, place, path), is_new
 
 
