@@ -22,6 +22,8 @@ from pchem_pipeline.store.files import remove_file, write_atomic
 _MOST_VALUES, _MOST_KEYS = 1_000_000, 1000
 #: complaints that are listed, and characters of a key or value in them
 _MOST_LISTED, _MOST_SHOWN = 20, 200
+#: end of the name of a file that holds the model of a YAML
+_EFFECTS = ".effects.yaml"
 
 
 class _StrictLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -67,6 +69,10 @@ def load_config(path: Path) -> RunConfig:
         ConfigError: the file is missing, is not YAML, or a setting is wrong; or the model in it is no longer
             the one that ``RUN.effects.yaml`` replaces.
     """
+    if path.name.endswith(_EFFECTS):
+        owner = path.with_name(f"{path.name.removesuffix(_EFFECTS)}.yaml")
+        if owner.exists():
+            raise ConfigError(f"{path}: holds the model of {owner.name}; give that file")
     config, found = _own_config(path), found_model(path)
     if found is None:
         return config
@@ -82,7 +88,7 @@ def load_config(path: Path) -> RunConfig:
 def effects_file(path: Path) -> Path:
     """Return where the model that counts instead of a YAML's own is kept: ``RUN.effects.yaml`` beside it."""
     path = path.resolve()
-    return path.with_name(f"{path.stem}.effects.yaml")
+    return path.with_name(f"{path.stem}{_EFFECTS}")
 
 
 def found_model(path: Path) -> FoundModel | None:

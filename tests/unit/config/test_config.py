@@ -211,6 +211,8 @@ def test_a_model_of_the_yaml_that_was_changed_meanwhile_is_refused(tmp_path):
         ConfigError, match=r"run\.yaml: the section model was changed.* delete run\.effects\.yaml"
     ):
         load_config(path)
+    with pytest.raises(ConfigError, match=r"holds the model of run\.yaml; give that file"):
+        load_config(effects_file(path))
     effects_file(path).unlink()
     assert load_config(path).model == model({**ROW, "row_noise_dn": 0.8})
 
