@@ -198,6 +198,10 @@ def joint(
         list[Path] | None, typer.Option(help="runs: one whose frames hold no electrons (repeatable)")
     ] = None,
     store: Annotated[Path | None, typer.Option(help="runs: store of the fit [default: joint.zarr]")] = None,
+    against: Annotated[
+        Literal["integration_time", "none"] | None,
+        typer.Option(help="runs: over what H is a line; none: no charge rate [default: integration_time]"),
+    ] = None,
     strict: Strict = False,
     *,
     command: Command,
@@ -208,7 +212,7 @@ def joint(
     """
     from pchem_pipeline.commands.joint import find_joint, run_joint
 
-    target, is_new = find_joint(targets, bias or [], store, write=not command.options.dry_run)
+    target, is_new = find_joint(targets, bias or [], store, against, write=not command.options.dry_run)
     run_joint(target, command, typer.echo, is_new=is_new, strict=strict)
 
 
@@ -237,7 +241,7 @@ def status(
 @app.command()
 def model(
     target: Target,
-    use: Annotated[int | None, typer.Option(min=1, help="put this version in force, in the YAML too")] = None,
+    use: Annotated[int | None, typer.Option(min=1, help="put this version in force")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one line of JSON, for machines")] = False,
 ) -> None:
     """List the versions of the model and what rests on each; go back to one.

@@ -23,13 +23,12 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.commands.new_run import settings_of, settings_there
 from pchem_pipeline.commands.notebook import open_run, require_xarray
-from pchem_pipeline.config.load import dump_config, make_config
+from pchem_pipeline.config.load import dump_config, make_config, write_config
 from pchem_pipeline.frames.writing import write_frames
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.session import Command, run_stages, up_to
 from pchem_pipeline.stages.table import pipeline_of
-from pchem_pipeline.store.files import write_atomic
 
 if TYPE_CHECKING:
     from pchem_pipeline.commands.notebook import Run
@@ -151,7 +150,7 @@ def _target(place: Path, given: Mapping[str, Any], settings: Mapping[str, Mappin
         config = settings_there(path, content, "run")
     else:
         place.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, dump_config(config).encode())
+        write_config(path, dump_config(config))
     return Target(config, path.parent, place, path)
 
 

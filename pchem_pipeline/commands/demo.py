@@ -14,7 +14,7 @@ import numpy as np
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.commands.model import adopt_verdict
-from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.config.load import dump_config, write_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.verdict import read_verdict
 from pchem_pipeline.effects.framework.compose import effect_words
@@ -24,7 +24,6 @@ from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import Command, run_stages
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 from pchem_pipeline.stages.table import pipeline_of
-from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
@@ -67,7 +66,7 @@ def run_demo(
             "simulate": simulate,
         }
     )
-    write_atomic(path, dump_config(config).encode())
+    write_config(path, dump_config(config))
     target, command = find_run(path), Command(quiet=quiet)
     run_stages(target, pipeline_of(target.config), command)
     table = comparison_table(RunStore.open(target.store))

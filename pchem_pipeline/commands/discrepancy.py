@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from pchem_pipeline.base.errors import StoreError
-from pchem_pipeline.commands.model import adopt_verdict, yaml_of
-from pchem_pipeline.config.edit import check_writable
+from pchem_pipeline.commands.model import adopt_verdict
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, read_verdict
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
@@ -34,9 +33,6 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
     if effort is not None:
         target = target.changed("discrepancy", effort=effort)
     add = refit and target.config.discrepancy.add
-    path = yaml_of(target) if add else None
-    if path is not None:
-        check_writable(path)
     missing = [s.stage for s in run_status(target) if s.stage in _BEFORE and s.state != "complete"]
     if "ingest" in missing:
         run_stages(target, ["ingest"], command)
@@ -47,8 +43,7 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
     if add:
         target, words = adopt_verdict(target)
         if words:
-            written = "" if path is None else f" (it is in {path} now)"
-            Reporter(command.progress, quiet=command.quiet, log=command.log_json).info(words + written)
+            Reporter(command.progress, quiet=command.quiet, log=command.log_json).info(words)
     if refit:
         done = {s.stage for s in run_status(target) if s.state != "missing"}
         stages = [name for name in _AFTERWARDS if name in done]

@@ -10,16 +10,20 @@ from typing import Any
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.commands.first_screen import run_to_first_screen
 from pchem_pipeline.commands.new_run import settings_of, settings_there
-from pchem_pipeline.config.load import dump_config, make_config
+from pchem_pipeline.config.load import dump_config, make_config, write_config
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.runner.session import Command
 from pchem_pipeline.stages.table import pipeline_of
-from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath, place_of
 
 
 def find_joint(
-    targets: Sequence[Path], bias: Sequence[Path] = (), store: Path | None = None, *, write: bool = True
+    targets: Sequence[Path],
+    bias: Sequence[Path] = (),
+    store: Path | None = None,
+    against: str | None = None,
+    *,
+    write: bool = True,
 ) -> tuple[Target, bool]:
     """Return the run of several samples that ``targets`` name, and whether its YAML was written just now.
 
@@ -36,8 +40,12 @@ def find_joint(
                 f"{targets[0]} is a single run, and a joint fit needs several; give them all, "
                 "or a YAML with input.samples"
             )
-        if store is not None:
-            raise ConfigError(f"--store: only for runs; {targets[0]} has its own run.store, change it there")
+        for option, value in (("run.store", store), ("input.against", against)):
+            if value is not None:
+                name = option.partition(".")[2]
+                raise ConfigError(
+                    f"--{name}: only for runs; {targets[0]} has its own {option}, change it there"
+                )
         return found, False
     place = place_of(store or Path("joint.zarr")).resolve()
     remote, path = isinstance(place, RemotePath), settings_of(place)
@@ -46,8 +54,8 @@ def find_joint(
     for sample in samples[len(targets) :]:
         sample["bias"] = True
     given: dict[str, Any] = {"samples": samples}
-    if len(targets) == 1:
-        given["against"] = "none"  # a line needs two exposures
+    if against is not None or len(targets) == 1:
+        given["against"] = against or "none"  # a line needs two exposures
     content = {"run": {"store": str(place) if remote else place.name}, "input": given}
     config = make_config(content, "the command line")
     for each in runs:
@@ -56,7 +64,7 @@ def find_joint(
     if path.exists():
         config = settings_there(path, content, "joint")
     if is_new:
-        write_atomic(path, dump_config(config).encode())
+        write_config(path, dump_config(config))
     return Target(config, path.parent, place, path), is_new
 
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pchem_pipeline.base.errors import ConfigError, quoted
-from pchem_pipeline.config.edit import write_model
-from pchem_pipeline.config.load import dump_config, load_config
+from pchem_pipeline.config.load import dump_config, load_config, write_model
 from pchem_pipeline.discrepancy.verdict import parameters_of, read_verdict
 from pchem_pipeline.effects.framework.compose import effect_words
 from pchem_pipeline.effects.framework.effect import Effect
@@ -114,47 +113,48 @@ def _effect_words(effect: Effect) -> str:
 
 
 def use_model(target: Target, number: int) -> str:
-    """Put a version of the model in force, in store and YAML; return in words what is stale thereby.
+    """Put a version of the model in force, for store and YAML; return in words what is stale thereby.
 
     Args:
         target: the run.
         number: of the version.
 
     Raises:
-        ConfigError: there is no such version, or the YAML cannot be edited.
+        ConfigError: there is no such version, or the YAML is no configuration.
         LockedError: another process works on the run.
-        StoreError: there is no run, or it or the YAML cannot be written.
+        StoreError: there is no run, or it or the file beside the YAML cannot be written.
     """
     store = target.stored(writable=True)
     with store.locked():
         before = _kept(store, target)
         version = version_with(store, number)
-        changed = _put_in_force(store, target, version)
+        changed, file = _put_in_force(store, target, version)
     if before.number == number:
         words = f"model {number} was in force already: {_words(version)}"
     else:
-        words = _change_words(changed, before, version)
+        words = _change_words(changed, before, version, file)
     return "\n".join([words, *_stale_lines(changed)])
 
 
-def _change_words(target: Target, before: ModelVersion, version: ModelVersion) -> str:
-    """Say which version is in force now, and how to go back to the one before."""
-    place = quoted(yaml_of(target) or target.store)
+def _change_words(target: Target, before: ModelVersion, version: ModelVersion, file: Path | None) -> str:
+    """Say which version is in force now, the file that holds it, and how to go back to the one before."""
+    place = quoted(_yaml_of(target) or target.store)
+    held = "" if file is None else f" (in {file})"
     back = f"to go back: pchem model {place} --use {before.number}"
-    return f"model {version.number} is in force: {_words(version)}; {back}"
+    return f"model {version.number} is in force: {_words(version)}{held}; {back}"
 
 
 def _stale_lines(target: Target) -> list[str]:
     """Say which results are stale, and what does them again."""
     stale = [state.stage for state in run_status(target) if state.state == "stale"]
-    place = quoted(yaml_of(target) or target.store)
+    place = quoted(_yaml_of(target) or target.store)
     usual = [name for name in stale if not STAGES[name].on_demand]
     lines = [f"stale: {', '.join(usual)}; to do them again: pchem run {place}"] if usual else []
     lines += [f"stale: {name}; to do it again: pchem {name} {place}" for name in stale if name not in usual]
     return lines or ["nothing is stale"]
 
 
-def yaml_of(target: Target) -> Path | None:
+def _yaml_of(target: Target) -> Path | None:
     """Return the YAML of a run, where it is there and is of this run: that of a copy names the first one's.
 
     Raises:
@@ -169,25 +169,24 @@ def yaml_of(target: Target) -> Path | None:
 
 def _kept(store: RunStore, target: Target) -> ModelVersion:
     """Return the version in force; what stands in the YAML and no command has seen yet becomes one, too."""
-    path = yaml_of(target)
+    path = _yaml_of(target)
     if path is not None:
         keep_in_force(store, model_in_force(store, load_config(path).model))
     return keep_in_force(store, model_in_force(store, target.config.model))
 
 
-def _put_in_force(store: RunStore, target: Target, version: ModelVersion) -> Target:
-    """Put a version in force; the YAML first, which may be refused."""
-    settings, path = version.settings, yaml_of(target)
-    if path is not None:
-        write_model(path, settings)
+def _put_in_force(store: RunStore, target: Target, version: ModelVersion) -> tuple[Target, Path | None]:
+    """Put a version in force, for the YAML first, which may be refused; return run and file of the model."""
+    settings, path = version.settings, _yaml_of(target)
+    file = None if path is None else write_model(path, settings)
     config = target.config.model_copy(update={"model": settings})
     store.write_config(dump_config(config))
     keep_in_force(store, version)
-    return replace(target, config=config)
+    return replace(target, config=config), file
 
 
 def adopt_verdict(target: Target) -> tuple[Target, str]:
-    """Make the model of a run's verdict a version, and put it in force, in the store and in the YAML.
+    """Make the model of a run's verdict a version, and put it in force, in the store and for the YAML.
 
     Args:
         target: a run whose search is complete.
@@ -196,9 +195,9 @@ def adopt_verdict(target: Target) -> tuple[Target, str]:
         The run with that model; what changed and how to go back, empty where the verdict changes nothing.
 
     Raises:
-        ConfigError: the YAML cannot be edited.
+        ConfigError: the YAML is no configuration.
         LockedError: another process works on the run.
-        StoreError: the store or the YAML cannot be written.
+        StoreError: the store or the file beside the YAML cannot be written.
     """
     store = target.stored(writable=True)
     with store.locked():
@@ -212,8 +211,8 @@ def adopt_verdict(target: Target) -> tuple[Target, str]:
         version = verdict_version(store, settings, start, group=_SEARCH, closed_fraction=closed)
         if version.digest == before.digest:
             return target, ""
-        changed = _put_in_force(store, target, version)
-        return changed, _change_words(changed, before, version)
+        changed, file = _put_in_force(store, target, version)
+        return changed, _change_words(changed, before, version, file)
 
 
 def models_json(models: Sequence[ListedModel]) -> str:

@@ -13,7 +13,14 @@ from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quoted
 from pchem_pipeline.commands.compare.settings import settings_that_differ
-from pchem_pipeline.config.load import dump_config, load_config, make_config, parse_config, yaml_content
+from pchem_pipeline.config.load import (
+    dump_config,
+    load_config,
+    make_config,
+    parse_config,
+    write_config,
+    yaml_content,
+)
 from pchem_pipeline.config.template import SCHEMA_NAME, commented_config, json_schema
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.target import Target, find_run
@@ -44,7 +51,7 @@ def write_template(
     beside = path.with_name(SCHEMA_NAME) if schema else None
     text = commented_config(path.name, files=given, simulated=simulated, schema=schema)
     parse_config(text, str(path))
-    write_atomic(path, text.encode())
+    write_config(path, text)
     if beside is None:
         return [path]
     write_atomic(beside, json_schema().encode())
@@ -98,7 +105,7 @@ def find_or_start(
     target = Target(config, path.parent, place, path)
     text = unwritten(target)
     if write and text is not None:
-        write_atomic(path, text.encode())
+        write_config(path, text)
     return target, True
 
 
@@ -174,7 +181,7 @@ def first_try(target: Target, text: str | None) -> Iterator[None]:
     had_yaml = text is None or path is None or path.exists()
     had_run = isinstance(target.store, RemotePath) or (target.store / ".pchem").is_dir()
     if text is not None and path is not None:
-        write_atomic(path, text.encode())
+        write_config(path, text)
     try:
         with nothing_left_of_a_refusal(target.store):
             yield

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -346,7 +345,7 @@ class Run:
         columns = [np.array([float(maps[name][y, x]) for _, y, x in chosen]) for name in PARAMETERS]
         masses = bin_masses(columns, histograms, model.at(index))
         found = pixel_fits(chosen, maps, fit, histograms, masses, channel=channel)
-        return [Pixel(each) for each in found]
+        return [Pixel(**vars(each)) for each in found]
 
     def _arrays(self, group: str, names: Sequence[str]) -> Mapping[str, Any]:
         """Return arrays of the store that read the pixels asked for alone."""
@@ -387,15 +386,8 @@ def lazy_dataset(store: RunStore, group: str) -> xr.Dataset:
     return xr.Dataset(found, attrs=store.attributes(group))
 
 
-@dataclass(frozen=True, repr=False)
-class Pixel:
-    """One pixel: its histogram, its parameters with standard errors, and what is drawn of it.
-
-    Attributes:
-        found: what the report knows of it.
-    """
-
-    found: PixelFit
+class Pixel(PixelFit):
+    """One pixel: its parameters with standard errors, its histogram, and what is drawn of it."""
 
     def __repr__(self) -> str:
         words = []
@@ -412,57 +404,27 @@ class Pixel:
         head = f"pixel y = {self.y}, x = {self.x}: {self.status or 'good fit'}"
         return f"<p>{escape(head)}</p>{html_table(('parameter', 'value'), rows)}"
 
-    @property
-    def y(self) -> int:
-        """Row."""
-        return self.found.y
-
-    @property
-    def x(self) -> int:
-        """Column."""
-        return self.found.x
-
-    @property
-    def parameters(self) -> Mapping[str, float]:
-        """The parameters by name, in the units of the store; NaN where the fit failed."""
-        return self.found.parameters
-
-    @property
-    def stderr(self) -> Mapping[str, float]:
-        """Their standard errors."""
-        return self.found.stderr
-
-    @property
-    def status(self) -> str:
-        """Words of ``fit_status``; empty for a good fit."""
-        return self.found.status
-
-    @property
-    def goodness_p(self) -> float:
-        """Probability of a larger chi-square if the model holds."""
-        return self.found.goodness_p
-
     @cached_property
     def histogram(self) -> xr.DataArray:
         """Number of frames at each DN, over the DN that occur."""
-        return self._over_dn(self.found.counts, "frames at each DN")
+        return self._over_dn(self.counts, "frames at each DN")
 
     @cached_property
     def expected(self) -> xr.DataArray:
         """Number of frames expected at each DN from the fit; NaN where there is none."""
-        values = np.full(self.found.counts.size, np.nan)
+        values = np.full(self.counts.size, np.nan)
         if has_fit(self.parameters):
             theta = (self.parameters[name] for name in PARAMETERS)
-            dn = self.found.origin + np.arange(self.found.counts.size, dtype=np.float64)
-            density = pcd(dn, *theta) if self.found.mass is None else self.found.mass
-            values = self.found.counts.sum() * density
+            dn = self.origin + np.arange(self.counts.size, dtype=np.float64)
+            density = pcd(dn, *theta) if self.mass is None else self.mass
+            values = self.counts.sum() * density
         return self._over_dn(values, "frames expected at each DN")
 
     def _over_dn(self, values: NDArray[Any], words: str) -> xr.DataArray:
         import xarray as xr
 
-        dn = self.found.origin + np.arange(values.size)
-        seen = np.flatnonzero(self.found.counts)
+        dn = self.origin + np.arange(values.size)
+        seen = np.flatnonzero(self.counts)
         part = slice(seen[0], seen[-1] + 1) if seen.size else slice(0)
         return xr.DataArray(
             values[part],
@@ -477,9 +439,8 @@ class Pixel:
         Args:
             width: of the figure, mm, or a text such as ``"3.5in"``.
         """
-        return draw_chart(Look(width_of(width)), pixels_chart([self.found]))
+        return draw_chart(Look(width_of(width)), pixels_chart([self]))
 
     def plot_cells(self, width: float | str = COLUMN_MM) -> Drawing:
         """Draw the density with the edges between electron numbers, as the report does."""
-        found = self.found
-        return draw_chart(Look(width_of(width)), cells_chart(cell_tables(found.parameters, found)))
+        return draw_chart(Look(width_of(width)), cells_chart(cell_tables(self.parameters, self)))

@@ -12,7 +12,7 @@ import numpy as np
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.commands.apply.characterisation import check_run, read_calibration
-from pchem_pipeline.config.load import make_config, yaml_text
+from pchem_pipeline.config.load import make_config, write_config, yaml_text
 from pchem_pipeline.frames.formats.map_files import read_image
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.simulate.scene import with_scene
@@ -127,7 +127,7 @@ def write_twin(
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **twin.truth.arrays())
     write_atomic(maps, buffer.getvalue())
-    write_atomic(output, text.encode())
+    write_config(output, text)
     return [output, maps]
 
 

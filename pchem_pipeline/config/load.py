@@ -1,4 +1,4 @@
-"""Reading a run's YAML, with errors that name the key and the cure."""
+"""Reading and writing a run's YAML, with errors that name the key and the cure."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import to_jsonable_python
 
 from pchem_pipeline.base.errors import ConfigError, quoted
-from pchem_pipeline.base.settings import SECRET
+from pchem_pipeline.base.settings import SECRET, Section
 from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.effects.framework.settings import ModelSettings
+from pchem_pipeline.store.files import remove_file, write_atomic
 
 #: values of a configuration: 100,000 named files are not unusual
 _MOST_VALUES, _MOST_KEYS = 1_000_000, 1000
 #: complaints that are listed, and characters of a key or value in them
 _MOST_LISTED, _MOST_SHOWN = 20, 200
+#: end of the name of a file that holds the model of a YAML
+_EFFECTS = ".effects.yaml"
 
 
 class _StrictLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -51,21 +55,107 @@ def _refused(node: yaml.Node, words: str) -> yaml.YAMLError:
 _StrictLoader.add_constructor("tag:yaml.org,2002:int", _StrictLoader.construct_yaml_int)
 
 
+class FoundModel(Section):
+    """Content of ``RUN.effects.yaml``: the model that counts instead of the one in ``RUN.yaml``."""
+
+    model: ModelSettings
+    instead_of: ModelSettings
+
+
 def load_config(path: Path) -> RunConfig:
-    """Return the configuration in a YAML file.
+    """Return the configuration in a YAML file, with the model of ``RUN.effects.yaml`` where there is one.
 
     Raises:
-        ConfigError: the file is missing, is not YAML, or a setting is wrong.
+        ConfigError: the file is missing, is not YAML, or a setting is wrong; or the model in it is no longer
+            the one that ``RUN.effects.yaml`` replaces.
     """
+    if path.name.endswith(_EFFECTS):
+        owner = path.with_name(f"{path.name.removesuffix(_EFFECTS)}.yaml")
+        if owner.exists():
+            raise ConfigError(f"{path}: holds the model of {owner.name}; give that file")
+    config, found = _own_config(path), found_model(path)
+    if found is None:
+        return config
+    if found.instead_of != config.model:
+        file = effects_file(path)
+        raise ConfigError(
+            f"{path}: the section model was changed since {file} was written, whose model counts instead; "
+            f"delete {file.name} to use the section as it is now, or undo the change to keep that model"
+        )
+    return config.model_copy(update={"model": found.model})
+
+
+def effects_file(path: Path) -> Path:
+    """Return where the model that counts instead of a YAML's own is kept: ``RUN.effects.yaml`` beside it."""
+    path = path.resolve()
+    return path.with_name(f"{path.stem}{_EFFECTS}")
+
+
+def found_model(path: Path) -> FoundModel | None:
+    """Return what is in the ``RUN.effects.yaml`` of a YAML file, None where there is none.
+
+    Raises:
+        ConfigError: it is not YAML, or a setting is wrong.
+    """
+    file = effects_file(path)
+    if not file.exists():
+        return None
+    try:
+        return FoundModel.model_validate(
+            yaml_content(_text(file), str(file)), context={"folder": file.parent}
+        )
+    except ValidationError as error:
+        raise ConfigError(f"{file}: {complaints(error, FoundModel)}") from error
+
+
+def write_model(path: Path, model: ModelSettings) -> Path:
+    """Make a model the one of a YAML file, which stays as it is.
+
+    Args:
+        path: of the YAML.
+        model: kept in ``RUN.effects.yaml``, which goes where this is the YAML's own model.
+
+    Returns:
+        The file that holds the model now.
+
+    Raises:
+        ConfigError: the YAML is no configuration.
+        StoreError: the file cannot be written.
+    """
+    file, own = effects_file(path), _own_config(path).model
+    if model == own:
+        remove_file(file)
+        return path
+    content = FoundModel(model=model, instead_of=own).model_dump(mode="json")
+    head = f"# The model of {path.name}; delete this file to use the section model there.\n"
+    write_atomic(file, (head + yaml_text(content)).encode())
+    return file
+
+
+def write_config(path: Path, text: str) -> None:
+    """Write the YAML of a new run; a model found for an earlier YAML of that name is removed.
+
+    Raises:
+        StoreError: it cannot be written.
+    """
+    remove_file(effects_file(path))
+    write_atomic(path, text.encode())
+
+
+def _own_config(path: Path) -> RunConfig:
+    """Return what a YAML file says by itself."""
+    return parse_config(_text(path), str(path), path.parent)
+
+
+def _text(path: Path) -> str:
     if path.exists() and not path.is_file():
         raise ConfigError(f"{path}: no regular file; write the settings to one")
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; write one with: pchem init {quoted(path)}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error})") from error
-    return parse_config(text, str(path), path.parent)
 
 
 def parse_config(text: str, name: str = "config", folder: Path | None = None) -> RunConfig:

@@ -12,7 +12,7 @@ from typing import Any
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, InputError, StoreError
 from pchem_pipeline.compute.executor import Notices, SerialExecutor, make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
-from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.config.load import dump_config, effects_file, found_model
 from pchem_pipeline.run.compilation import announced
 from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.run.fingerprint import StageState, status
@@ -168,6 +168,7 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
         )
         stack.callback(reporter.close)
         stack.enter_context(store.locked())
+        _tell_model(target, reporter)
         progress_file.show({"stage": ""})
         stop = stack.enter_context(stop_on_signals())
         store.write_config(dump_config(own))  # what a single command was given is no setting of the run
@@ -185,6 +186,14 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
             options=command.options,
             config_path=target.config_path,
         )
+
+
+def _tell_model(target: Target, reporter: Reporter) -> None:
+    """Say where the model of a run is not that of its YAML."""
+    path = target.config_path
+    found = None if path is None else found_model(path)
+    if path is not None and found is not None and found.model == target.config.model:
+        reporter.info(f"the model is that of {effects_file(path).name}, instead of the one in {path.name}")
 
 
 def _location(target: Target) -> dict[str, Any]:

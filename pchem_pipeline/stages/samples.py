@@ -181,7 +181,8 @@ def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> NDArray
         if time is None:
             raise ConfigError(
                 f"{where} has no integration time, so there is no slope for the charge rate; set "
-                "input.integration_time of that run, s, or input.against: none"
+                "input.integration_time in the YAML of that run, s, or do without the slope: pchem joint "
+                "RUNS --against none (in the YAML of a joint run: input.against: none)"
             )
         found[i] = time
     return found

@@ -8,16 +8,10 @@ missing or without its checksum by whoever reads it.
 from __future__ import annotations
 
 import os
-import secrets
 import shutil
 from pathlib import Path
 
 Data = bytes | bytearray | memoryview
-
-
-def aside(path: Path) -> Path:
-    """Return a name beside ``path`` that no other process uses; what a kill leaves there is removed later."""
-    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
 
 
 def make_folder(path: Path) -> None:
@@ -69,17 +63,3 @@ def sync_all(path: Path) -> None:
     parts = [path, *(path.rglob("*") if path.is_dir() else ())]
     for part in sorted(parts, key=Path.is_dir):  # files come before folders
         (sync_folder if part.is_dir() else sync_file)(part)
-
-
-def put(path: Path, data: Data, *, sync: bool = False) -> None:
-    """Write a file, so that whoever reads it finds the old or the new one, whole."""
-    part = aside(path)
-    make_folder(path.parent)
-    try:
-        write(part, data)
-        if sync:
-            sync_file(part)
-        replace(part, path)
-    except BaseException:
-        remove(part)
-        raise

@@ -9,6 +9,7 @@ import json
 import math
 import os
 import re
+import secrets
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -57,7 +58,7 @@ def is_fatal(error: BaseException) -> bool:
     return isinstance(error, OSError) and error.errno in _CURES
 
 
-def write_atomic(path: Path, data: bytes, *, sync: bool = True) -> None:
+def write_atomic(path: Path, data: disk.Data, *, sync: bool = True) -> None:
     """Write a small file, so that whoever reads it finds the old or the new one, whole.
 
     A file that is there keeps its mode.
@@ -77,7 +78,9 @@ def write_atomic(path: Path, data: bytes, *, sync: bool = True) -> None:
         path.write_bytes(data)
         return
     before, after = (disk.sync_file, disk.sync_folder) if sync else (None, None)
-    with _put_in_place(path, disk.aside(path), before, after) as part:
+    # a name that no other process uses; what a kill leaves there is removed later
+    aside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    with _put_in_place(path, aside, before, after) as part:
         disk.write(part, data)
 
 
@@ -137,7 +140,7 @@ def _remove(aside: Path) -> None:
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file or an object, if it is there.
+    """Remove a file or an object, if it is there; no power cut brings it back among what is written next.
 
     Raises:
         StoreError: the file system, or the object storage, refused.
@@ -146,13 +149,15 @@ def remove_file(path: Path) -> None:
         path.unlink(missing_ok=True)
         return
     try:
-        disk.remove(path)
+        if path.exists():
+            disk.remove(path)
+            disk.sync_folder(path.parent)
     except OSError as error:
         raise storage_error(error, path) from error
 
 
 def remove_folder(path: Path) -> None:
-    """Remove a folder with all that is in it, if it is there.
+    """Remove a folder with all that is in it, if it is there; see `remove_file`.
 
     Raises:
         StoreError: the file system, or the object storage, refused.
@@ -161,20 +166,9 @@ def remove_folder(path: Path) -> None:
         path.remove_folder()
         return
     try:
-        disk.remove_tree(path)
-    except OSError as error:
-        raise storage_error(error, path) from error
-
-
-def sync_folder(path: Path) -> None:
-    """Wait until the names in a folder are on the disk, if it is there.
-
-    Raises:
-        StoreError: the disk could not take it.
-    """
-    try:
         if path.is_dir():
-            disk.sync_folder(path)
+            disk.remove_tree(path)
+            disk.sync_folder(path.parent)
     except OSError as error:
         raise storage_error(error, path) from error
 

@@ -17,10 +17,8 @@ from pchem_pipeline.store.files import (
     read_record,
     remove_file,
     remove_folder,
-    sync_folder,
     write_record,
 )
-from pchem_pipeline.store.remote_path import RemotePath
 
 #: seconds for which a look at the record holds: a worker that hung for less was not overtaken
 _LOOK = 1.0
@@ -150,7 +148,6 @@ class Records:
     def unmark_all(self, stage: str) -> None:
         """Drop all markers of a stage, which has its record still."""
         remove_folder(self._folder / "done" / stage)
-        self._forgotten(self._folder / "done")
 
     def mark(self, stage: str, fingerprint: str, key: str, summary: dict[str, Any]) -> None:
         """Say that a unit of a stage is whole in the store.
@@ -164,16 +161,8 @@ class Records:
 
     def unmark(self, stage: str, fingerprint: str, keys: Iterable[str]) -> None:
         """Say that units have to be done again."""
-        marked = self.done(stage, fingerprint) & set(keys)
-        for key in sorted(marked):
+        for key in sorted(self.done(stage, fingerprint) & set(keys)):
             remove_file(self._marker(stage, fingerprint, key))
-        if marked:
-            self._forgotten(self._marker(stage, fingerprint, "x").parent)
-
-    def _forgotten(self, folder: Path) -> None:
-        """Wait until markers are gone from the disk, before what they stood for is written anew."""
-        if not isinstance(folder, RemotePath):
-            sync_folder(folder)
 
     def done(self, stage: str, fingerprint: str) -> set[str]:
         """Return the keys of the finished units of a stage in its present form."""

@@ -38,7 +38,6 @@ from pchem_pipeline.store.files import (
     remove_file,
     remove_folder,
     storage_error,
-    sync_folder,
     write_atomic,
 )
 from pchem_pipeline.store.lock import locked
@@ -93,11 +92,7 @@ class RunStore:
             disk.make_folder(path)
             attributes = {"pchem_schema": SCHEMA_VERSION}
             zarr.create_group(zarr_store(path, writable=True), zarr_format=3, attributes=attributes)
-        store = cls.open(path, writable=True)
-        if not isinstance(path, RemotePath):
-            for folder in (path, path.parent):
-                sync_folder(folder)
-        return store
+        return cls.open(path, writable=True)
 
     @classmethod
     def open(cls, path: Path, *, writable: bool = False) -> RunStore:
@@ -312,8 +307,6 @@ class RunStore:
     def delete(self, name: str) -> None:
         """Remove an array or a group, if it exists, also one whose description a power cut has lost."""
         remove_folder(self.path / name)
-        if not isinstance(self.path, RemotePath):  # a power cut must not bring it back among what is new
-            sync_folder((self.path / name).parent)
 
     def attributes(self, name: str = "") -> dict[str, Any]:
         """Return the attributes of a group or array (of the root by default); empty where there is none."""

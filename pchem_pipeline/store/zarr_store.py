@@ -19,7 +19,7 @@ from zarr.storage import FsspecStore, LocalStore, WrapperStore
 
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.store import disk
-from pchem_pipeline.store.files import checked, cure_of, with_digest
+from pchem_pipeline.store.files import checked, cure_of, with_digest, write_atomic
 from pchem_pipeline.store.remote_path import RemotePath
 
 _DESCRIPTION = "zarr.json"
@@ -48,7 +48,7 @@ class DiskStore(LocalStore):
         path = self.root / key
         # the root must not be lost, nor an older description with the new one; a new array may be
         described = path.name == _DESCRIPTION and (key == _DESCRIPTION or path.exists())
-        disk.put(path, value.as_numpy_array().data, sync=described)
+        write_atomic(path, value.as_numpy_array().data, sync=described)
 
     async def delete(self, key: str) -> None:
         """Remove a value."""

@@ -80,13 +80,11 @@ def test_the_effect_is_named_with_its_size_and_closes_the_gap(searched):
     assert {"charge_lag", "charge_diffusion", "spurious_charge"} <= set(found["untestable"])
 
 
-def test_the_model_grows_in_the_users_file_and_its_comments_stay(searched):
-    shell, _, _ = searched
-    text = (shell.folder / "run.yaml").read_text()
-    for line in CAMERA.strip().splitlines():
-        assert line in text
-    assert "model:" in text
-    assert "tag: row_noise" in text.split("model:")[1]
+def test_the_model_grows_beside_the_users_file_which_stays(searched):
+    shell, result, _ = searched
+    assert (shell.folder / "run.yaml").read_text() == CAMERA
+    assert "tag: row_noise" in (shell.folder / "run.effects.yaml").read_text()
+    assert f"(in {shell.folder.resolve() / 'run.effects.yaml'})" in result.stderr
 
 
 def test_the_fit_runs_with_the_extended_model_and_loses_its_bias(searched):
@@ -109,10 +107,11 @@ def test_going_back_to_an_older_model_and_forth_gives_the_same_bits(searched, tm
     assert listed[1].split() == ["1", "config", "discrepancy", "PCD"]
     assert listed[2].startswith("* 2 ")
     assert "PCD + row_noise 1.2" in listed[2]
-    after, text = read(other, "fit/read_noise_dn"), (other.folder / "run.yaml").read_text()
+    beside = other.folder / "run.effects.yaml"
+    after, text = read(other, "fit/read_noise_dn"), beside.read_text()
     words = other.ok("model", "run.yaml", "--use", "1").stdout
     assert "stale: fit; to do them again: pchem run" in words
-    assert "row_noise" not in (other.folder / "run.yaml").read_text().split("model:")[1]
+    assert not beside.exists()
     assert "fit         stale - model 2 -> 1  model 2" in other.ok("status", "run.yaml").stdout
     other.ok("run", "run.yaml", "--until", "fit")
     assert np.array_equal(read(other, "fit/read_noise_dn"), before, equal_nan=True)
@@ -120,7 +119,7 @@ def test_going_back_to_an_older_model_and_forth_gives_the_same_bits(searched, tm
     again = other.ok("discrepancy", "run.yaml")
     assert "discrepancy: up to date" in again.stderr
     assert "model 2 is in force" in again.stderr
-    assert (other.folder / "run.yaml").read_text() == text
+    assert beside.read_text() == text
     assert np.array_equal(read(other, "fit/read_noise_dn"), after, equal_nan=True)
 
 
@@ -145,13 +144,14 @@ def test_a_search_ends_at_its_limit_and_goes_further_with_a_higher_one(fitted, t
 
 
 def test_an_effect_that_the_model_has_is_not_added_twice(searched, fitted, tmp_path):
-    text = (searched[0].folder / "run.yaml").read_text()
-    other = copy_of(fitted, tmp_path, text)
+    text = (searched[0].folder / "run.effects.yaml").read_text()
+    other = copy_of(fitted, tmp_path)
+    (tmp_path / "run.effects.yaml").write_text(text)
     other.ok("discrepancy", "run.yaml")
     found = verdict(other)
     assert found["verdict"] == "consistent"
     assert [e["tag"] for e in found["model_effects"]] == ["row_noise"]
-    assert (tmp_path / "run.yaml").read_text() == text
+    assert (tmp_path / "run.effects.yaml").read_text() == text
 
 
 @pytest.mark.parametrize(("moment", "number"), [(0.8, signal.SIGTERM), (2.0, signal.SIGKILL)])

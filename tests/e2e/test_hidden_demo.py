@@ -26,7 +26,7 @@ def test_a_hidden_effect_is_found_and_told(shell):
     excess = (true**2 + hidden**2) ** 0.5 - true
     assert float(plain[3]) - float(extended[3]) == pytest.approx(excess, rel=0.3)
     assert result["effects"] == ["row_noise"]
-    assert "tag: row_noise" in (shell.folder / "out" / "demo.yaml").read_text().split("model:")[1]
+    assert "tag: row_noise" in (shell.folder / "out" / "demo.effects.yaml").read_text()
     page = (run / "discrepancy.html").read_text(encoding="utf-8")
     assert "What the model is missing" in page
     for name in ("maps", "codes", "frames", "lines", "gap", "pulls"):

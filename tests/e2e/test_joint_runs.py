@@ -297,7 +297,7 @@ def test_a_search_looks_at_all_samples_and_the_fit_takes_what_it_names(joint, ke
         (
             [("timeless.yaml", ""), ("dark_2s.zarr", "")],
             {},
-            "(timeless.yaml) has no integration time, so there is no",
+            "or do without the slope: pchem joint RUNS --against none (in the YAML",
         ),
         ([("dark_1s.zarr", ""), ("bias.zarr", "bias: true")], {}, "a slope needs two exposures"),
         (
@@ -351,6 +351,11 @@ def test_what_is_no_joint_fit_says_so(joint):
         find_joint([joint / "dark_1s.yaml", joint / "dark_2s.yaml"], store=joint / "dark.zarr")
     with pytest.raises(ConfigError, match="no such file"):
         find_joint([joint / "nothing.yaml"])
+    with pytest.raises(ConfigError, match=r"--against: only for runs; .*input\.against"):
+        find_joint([joint / "dark.yaml"], against="none")
+    runs = [joint / "dark_1s.yaml", joint / "dark_2s.yaml"]
+    target, _ = find_joint(runs, store=joint / "unordered.zarr", against="none", write=False)
+    assert target.config.input.against == "none"
 
 
 def test_charge_that_does_not_grow_with_time_is_found_by_the_samples_together(tmp_path, kernels):

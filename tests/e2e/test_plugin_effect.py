@@ -82,7 +82,7 @@ def test_a_plug_in_is_found_named_and_added_and_broken_ones_are_left_out(with_pl
         assert reason in found["defects"][tag]
         assert any(tag in line and reason in line for line in result.stderr.splitlines())
     assert any("lost_offset" in line for line in result.stderr.splitlines())
-    assert "chessboard_offset" in (with_plugin.folder / "run.yaml").read_text()
+    assert "chessboard_offset" in (with_plugin.folder / "run.effects.yaml").read_text()
     # from now on the fit knows it
     with_plugin.ok("histogram", "run.yaml")
     with_plugin.ok("fit", "run.yaml")

@@ -22,7 +22,7 @@ from pchem_pipeline.run.stage import WHOLE, Options, StageContext, open_store
 from pchem_pipeline.runner import execute as runner
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.store import disk
-from pchem_pipeline.store.files import write_json
+from pchem_pipeline.store.files import write_atomic, write_json
 from pchem_pipeline.store.run_store import RunStore
 
 SENSOR = SensorInfo("frames", 10, 8, 16, "uint16", 14, 4.87, "copy", {})
@@ -176,8 +176,7 @@ def test_a_power_cut_knows_files_by_their_whole_paths(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with monkeypatch.context() as patch:
         forgetful = ForgetfulDisk(patch)
-        disk.put(Path("out.zarr/a"), b"x", sync=True)
-        disk.sync_folder(Path("out.zarr"))
+        write_atomic(Path("out.zarr/a"), b"x")
         disk.sync_folder(tmp_path)
     left = forgetful.after_power_cut(len(forgetful.log), np.random.default_rng(1))
     assert left == {tmp_path / "out.zarr" / "a": b"x"}

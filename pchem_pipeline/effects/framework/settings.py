@@ -14,7 +14,8 @@ class ModelSettings(Section):
     effects: EffectList = Field(
         default=(),
         description="effects beyond the PCD with which pixels are fitted and ensembles predicted; "
-        "pchem discrepancy adds those that it names; a simulated camera has its own list, simulate.effects",
+        "pchem discrepancy writes those that it names to RUN.effects.yaml, which counts instead of this "
+        "section; a simulated camera has its own list, simulate.effects",
     )
     set_aside_e: tuple[tuple[float | None, float | None], ...] = Field(
         default=(),

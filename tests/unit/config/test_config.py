@@ -1,13 +1,26 @@
 import itertools
 import json
+from typing import Any, get_args
 
 import pytest
 import yaml
 from helpers.places import ROOT
+from pydantic import BaseModel
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.config.load import dump_config, load_config, parse_config, setting_of
+from pchem_pipeline.config.load import (
+    dump_config,
+    effects_file,
+    load_config,
+    parse_config,
+    setting_of,
+    write_config,
+    write_model,
+)
 from pchem_pipeline.config.template import commented_config, json_schema
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.effects.framework.registry import effect_classes
+from pchem_pipeline.effects.framework.settings import ModelSettings
 
 CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
 
@@ -157,3 +170,107 @@ def test_yaml_in_many_scripts():
     config = parse_config(f"run: {{store: '{text}.zarr'}}\ninput: {{files: ['{text}.npy']}}")
     assert parse_config(dump_config(config)) == config
     assert text in dump_config(config)
+
+
+# -- a model beside the YAML --------------------------------------------------------------------
+
+ROW = {"tag": "row_noise", "row_noise_dn": 1.2}
+TEXT = """# mine
+input: {files: ['a.npy']}   # "here"
+model:
+  effects: [{tag: row_noise, row_noise_dn: 0.7}]  # found by hand
+"""
+
+
+def model(*effects: dict[str, Any], aside: Any = ()) -> ModelSettings:
+    return ModelSettings.model_validate({"effects": list(effects), "set_aside_e": aside})
+
+
+def test_a_model_beside_the_yaml_counts_until_the_yaml_has_it_again(tmp_path):
+    path, link = tmp_path / "run.yaml", tmp_path / "link" / "run.yaml"
+    path.write_text(TEXT)
+    link.parent.mkdir()
+    link.symlink_to(path)
+    wanted = model(ROW, {"tag": "clipping", "high": 900}, aside=[[None, 0.5]])
+    assert write_model(link, wanted) == effects_file(path) == tmp_path / "run.effects.yaml"
+    assert load_config(path).model == load_config(link).model == wanted
+    assert load_config(path).input == parse_config(TEXT).input
+    path.write_text(TEXT.replace("found by hand", "a comment") + "fit: {gap_threshold: 4}\n")
+    assert load_config(path).model == wanted
+    assert write_model(path, parse_config(TEXT).model) == path
+    assert not effects_file(path).exists()
+    assert path.read_text() == TEXT.replace("found by hand", "a comment") + "fit: {gap_threshold: 4}\n"
+
+
+def test_a_model_of_the_yaml_that_was_changed_meanwhile_is_refused(tmp_path):
+    path = tmp_path / "run.yaml"
+    path.write_text(TEXT)
+    write_model(path, model(ROW))
+    path.write_text(TEXT.replace("0.7", "0.8"))
+    with pytest.raises(
+        ConfigError, match=r"run\.yaml: the section model was changed.* delete run\.effects\.yaml"
+    ):
+        load_config(path)
+    with pytest.raises(ConfigError, match=r"holds the model of run\.yaml; give that file"):
+        load_config(effects_file(path))
+    effects_file(path).unlink()
+    assert load_config(path).model == model({**ROW, "row_noise_dn": 0.8})
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("model: [", "not valid YAML"),
+        ("model: {}", r"instead_of: Field required"),
+        ("{model: {effects: [{tag: row_noise, row_noise_dn: -1}]}, instead_of: {}}", "model.effects.0"),
+        ("{model: {effect: []}, instead_of: {}}", r"did you mean effects\?"),
+    ],
+)
+def test_a_damaged_file_beside_the_yaml_is_refused_by_name(tmp_path, text, words):
+    path = tmp_path / "run.yaml"
+    path.write_text(TEXT)
+    effects_file(path).write_text(text)
+    with pytest.raises(ConfigError, match=rf"run\.effects\.yaml: .*{words}"):
+        load_config(path)
+
+
+def test_a_new_yaml_has_its_own_model(tmp_path):
+    path = tmp_path / "run.yaml"
+    path.write_text(TEXT)
+    write_model(path, model())
+    write_config(path, TEXT)
+    assert load_config(path) == parse_config(TEXT)
+
+
+def test_every_effect_can_be_written(tmp_path):
+    path = tmp_path / "run.yaml"
+    path.write_text(TEXT)
+    shared = {"of": "row", "share": 1.0, "changes": "gain", "signal_dn": 7.5, "burst": 0.1}
+    measured = {"tag": "empirical_noise", "noise_dn": 1.5, "modes": [shared], "region": {"columns": [[3, 9]]}}
+    for effect in [
+        *(e for kind in effect_classes().values() for e in kind.typical()),
+        *model(measured).effects,
+    ]:
+        wanted = ModelSettings(effects=(effect,))
+        write_model(path, wanted)
+        assert load_config(path).model == wanted, effect.tag
+
+
+def test_no_setting_is_called_what_yaml_takes_for_true_or_false() -> None:
+    def names(kind: type[BaseModel], seen: set[type]) -> set[str]:
+        seen.add(kind)
+        found = set(kind.model_fields)
+        for field in kind.model_fields.values():
+            for part in parts(field.annotation):
+                if part not in seen:
+                    found |= names(part, seen)
+        return found
+
+    def parts(annotation: Any) -> list[type[BaseModel]]:
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            return [annotation]
+        return [part for inner in get_args(annotation) for part in parts(inner)]
+
+    for kind in (RunConfig, *effect_classes().values()):
+        for name in names(kind, set()):
+            assert yaml.safe_load(name) == name, (kind, name)

@@ -211,9 +211,14 @@ def test_a_verdict_is_put_in_force_and_taken_back(run: Path) -> None:
     before, text = arrays_of(run.parent / "run.zarr", ("fit", "maps")), run.read_text(encoding="utf-8")
     verdict(run, ROW)
     target, words = adopt_verdict(find_run(run))
-    assert words == f"model 2 is in force: PCD + row_noise 1.2 DN; to go back: pchem model {run} --use 1"
+    beside = run.with_name("run.effects.yaml")
+    held = f"model 2 is in force: PCD + row_noise 1.2 DN (in {beside})"
+    assert words == f"{held}; to go back: pchem model {run} --use 1"
+    assert run.read_text(encoding="utf-8") == text
+    shown = CliRunner().invoke(app.app, ["fit", str(run)], catch_exceptions=False).stderr
+    assert "the model is that of run.effects.yaml, instead of the one in run.yaml" in shown
     assert load_config(run).model == settings(ROW) == target.config.model
-    assert states(run)["fit"] == ("stale - model 1 -> 2", 1)
+    assert states(run)["fit"] == ("complete", 2)
     # what the search found is not what it started from
     assert states(run)["discrepancy"] == ("complete", 1)
     run_stages(find_run(run), DONE, QUIET)
@@ -227,6 +232,7 @@ def test_a_verdict_is_put_in_force_and_taken_back(run: Path) -> None:
     words = use_model(find_run(run), 1)
     assert "stale: fit, maps; to do them again: pchem run" in words
     assert run.read_text(encoding="utf-8") == text
+    assert not beside.exists()
     # through the store, too, whose copy of the YAML goes with it
     assert find_run(run.parent / "run.zarr").config.model == settings()
     run_stages(find_run(run), DONE, QUIET)
@@ -274,10 +280,15 @@ def test_the_yaml_of_another_run_stays(finished: Path, run: Path) -> None:
     assert find_run(run.parent / "run.zarr").config.model == settings(ROW)
 
 
-def test_a_yaml_that_cannot_be_written_leaves_all_as_it_is(run: Path) -> None:
+def test_a_model_that_cannot_be_written_leaves_all_as_it_is(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise StoreError("no permission to write there")
+
     verdict(run, ROW)
-    run.chmod(0o444)
-    with pytest.raises(StoreError, match="read-only"):
+    monkeypatch.setattr("pchem_pipeline.config.load.write_atomic", refuse)
+    with pytest.raises(StoreError, match="no permission"):
         adopt_verdict(find_run(run))
     assert find_run(run.parent / "run.zarr").config.model == settings()
     assert states(run)["fit"] == ("complete", 1)

@@ -166,7 +166,7 @@ def test_no_method_touches_the_local_disk(tmp_path, monkeypatch):
 
 #: modules whose paths are of this machine: camera files, YAML files, logs, the package itself
 OF_THE_DISK = {
-    "base/kernel_cache.py", "commands/append.py", "config/edit.py",
+    "base/kernel_cache.py", "commands/append.py",
     "effects/framework/pixel_sets.py", "frames/histogram_files.py", "frames/identity.py",
     "frames/registry.py", "frames/resolve.py", "run/progress.py", "stages/simulate.py",
     "store/disk.py", "store/files.py", "store/lock.py",
