@@ -8,7 +8,7 @@ they collect charge it has their shot noise too: all pixels of the frame then mo
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -16,13 +16,7 @@ from pydantic import Field, field_validator
 from pchem_pipeline.effects.estimators.clamps import best_clamp
 from pchem_pipeline.effects.framework.effect import Count, Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.region import Span
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
 _WHOLE_SENSOR = 1 << 30  # rows: as far as there are any
 
@@ -99,7 +93,7 @@ class BlackClamp(Effect):
         """Return more rows than there are: the clamp may be anywhere."""
         return _WHOLE_SENSOR
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal at the ADC (frame, y, x), DN, less what the clamp sees; draws nothing."""
         truth = context.truth
         usual = truth["bias"] + truth["quanta_exposure"] / truth["conversion_gain"]

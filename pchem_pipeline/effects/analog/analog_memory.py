@@ -11,20 +11,14 @@ cannot show.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 from scipy import special
 
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
 _WHICH = 0xFFFFFFFE  # draw that is no frame's
 _LINEAR = 0.15  # e- of a bright sample before, up to which a correlation is in proportion to the memory
@@ -82,30 +76,30 @@ class AnalogMemory(Effect):
         """Return 1: the frame before."""
         return 1
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with that of the frame before.
 
         The first frame of the block has none before it (it is only the history of the others).
         """
-        result: NDArray[Any] = values.copy()
+        result: AnyArray = values.copy()
         if context.charge is not None:
             result[1:] += self._memories(context) * self._left(context.charge[:-1])
         return result
 
-    def _memories(self, context: EffectContext) -> NDArray[np.float64] | float:
+    def _memories(self, context: EffectContext) -> FloatArray | float:
         """Return the memory of the pixels, shape (1, y, x), or of all."""
         if self.spread == 0:
             return self.memory
         normal = special.ndtri(context.random.uniform(("y", "x"), _WHICH))
         return np.asarray(self.memory * np.exp(self.spread * normal - self.spread**2 / 2.0))
 
-    def _left(self, charge: NDArray[Any]) -> NDArray[Any]:
+    def _left(self, charge: AnyArray) -> AnyArray:
         """Return what is left of a charge where all of it is remembered, e-."""
         if self.saturation_e is None:
             return charge
         return np.asarray(-self.saturation_e * np.expm1(-charge / self.saturation_e))
 
-    def _left_of(self, exposure: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _left_of(self, exposure: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the mean, e-, and mean square, e-^2, of what is left of Poisson electrons."""
         if self.saturation_e is None:
             return exposure, exposure * (1.0 + exposure)
@@ -153,11 +147,7 @@ class AnalogMemory(Effect):
 
 
 def _lognormal(
-    seen: NDArray[np.float64],
-    response: NDArray[np.float64],
-    limit: NDArray[np.float64],
-    pairs: int,
-    memory: float,
+    seen: FloatArray, response: FloatArray, limit: FloatArray, pairs: int, memory: float
 ) -> tuple[float, float] | None:
     """Return the likeliest mean and spread of lognormal memories of pixels; None where they may be alike.
 

@@ -9,7 +9,7 @@ of the same camera may do. A slow sine is ``periodic_pickup`` at a few cycles pe
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+from typing import ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -30,13 +30,15 @@ from pchem_pipeline.effects.estimators.time_profiles import (
 )
 from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    PixelMaps,
+    SampleLaw,
+    TimeSeries,
+)
 
 _NODES = (3, 5, 9, 17, 33)
 _FRAMES_PER_NODE = 12
@@ -94,7 +96,7 @@ class BiasDrift(Effect):
         check_path(self.tag, self.shape, self.path)
         return self
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the offset referred to the input."""
         if self.shape == "walk":
             offset = _walk(context)
@@ -102,7 +104,7 @@ class BiasDrift(Effect):
             offset = self._path_at(run_position(context.frames, context.n_frames))
         return add_offset(values, (self.drift_dn * offset)[:, None, None], context)
 
-    def _path_at(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _path_at(self, position: FloatArray) -> FloatArray:
         """Return the shape at positions 0..1 in the run, in units of ``drift_dn``, zero on average."""
         if self.shape == "settling":
             return settling(position, self.settling_fraction)
@@ -157,14 +159,14 @@ class BiasDrift(Effect):
         return with_offsets(model, maps, quantile_means(offsets, _LOBES))
 
 
-def _walk(context: EffectContext) -> NDArray[np.float64]:
+def _walk(context: EffectContext) -> FloatArray:
     """Return a random walk over the run with an end of unit variance, at the block's frames."""
     steps = context.random.generator().standard_normal(context.n_frames)
     walk = np.cumsum(steps) / np.sqrt(context.n_frames)
     return np.asarray(walk[context.frames.clip(0, context.n_frames - 1)] - walk.mean())
 
 
-def _slope(position: NDArray[np.float64], means: NDArray[np.float64]) -> tuple[float, float]:
+def _slope(position: FloatArray, means: FloatArray) -> tuple[float, float]:
     """Return the slope of the means against the position, and its standard error, DN per run."""
     centred = position - position.mean()
     square = float((centred**2).sum())
@@ -190,11 +192,11 @@ class _Curve(NamedTuple):
     """A fit of the means: Bayesian information criterion, coefficients in DN, time constant in runs."""
 
     criterion: float
-    values: NDArray[np.float64]
+    values: FloatArray
     fraction: float = np.nan
 
 
-def _settled(position: NDArray[np.float64], means: NDArray[np.float64]) -> _Curve | None:
+def _settled(position: FloatArray, means: FloatArray) -> _Curve | None:
     """Return mean and size of the best exponential approach to the end; None if a line does as well."""
     one = np.ones_like(position)
 
@@ -206,7 +208,7 @@ def _settled(position: NDArray[np.float64], means: NDArray[np.float64]) -> _Curv
     return _better_than_line(best, position, means)
 
 
-def _best_path(position: NDArray[np.float64], means: NDArray[np.float64]) -> _Curve | None:
+def _best_path(position: FloatArray, means: FloatArray) -> _Curve | None:
     """Return the values of the piecewise linear path at its nodes; None if a line does as well."""
     paths = []
     for count in _NODES:
@@ -219,16 +221,14 @@ def _best_path(position: NDArray[np.float64], means: NDArray[np.float64]) -> _Cu
     return None if best is None else _better_than_line(best, position, means)
 
 
-def _better_than_line(
-    curve: _Curve, position: NDArray[np.float64], means: NDArray[np.float64]
-) -> _Curve | None:
+def _better_than_line(curve: _Curve, position: FloatArray, means: FloatArray) -> _Curve | None:
     line = _criterion(means, np.stack([np.ones_like(position), position], 1))[0]
     return curve if curve.criterion < line - _WORTH_A_CURVE else None
 
 
-def _criterion(means: NDArray[np.float64], basis: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+def _criterion(means: FloatArray, basis: FloatArray) -> tuple[float, FloatArray]:
     """Return the Bayesian information criterion of a least-squares fit, and its coefficients."""
-    values: NDArray[np.float64] = np.linalg.lstsq(basis, means, rcond=1e-6)[0].astype(np.float64)
+    values: FloatArray = np.linalg.lstsq(basis, means, rcond=1e-6)[0].astype(np.float64)
     rest = float(((means - basis @ values) ** 2).sum())
     n = means.size
     return float(n * np.log(max(rest, 1e-300) / n) + basis.shape[1] * np.log(n)), values

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -19,19 +19,23 @@ from pchem_pipeline.effects.estimators.levels.change_points import noise_varianc
 from pchem_pipeline.effects.estimators.levels.two_levels import likeliest_parts
 from pchem_pipeline.effects.framework.effect import Count, Dn, Effect, PerFrame, Plane, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    BoolArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+    TimeSeries,
+)
 
 Path = tuple[tuple[int, float], ...]
 
 # how the quadrants' means add up to those of the parts that jump together
 Parts = Literal["quadrants", "top_bottom", "left_right"]
-_PARTS: dict[Parts, NDArray[np.float64]] = {
+_PARTS: dict[Parts, FloatArray] = {
     "quadrants": np.eye(4),
     "top_bottom": np.array([[0.5, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.5]]),
     "left_right": np.array([[0.5, 0.0, 0.5, 0.0], [0.0, 0.5, 0.0, 0.5]]),
@@ -95,21 +99,21 @@ class BiasJumps(Effect):
                 raise ValueError("bias_jumps: frames of a path must increase; sort them")
         return self
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the offsets referred to the input."""
         levels = self.amplitude_dn * self._levels(context)
         factors = {"quadrants": (2, 1), "top_bottom": (1, 0), "left_right": (0, 1)}[self.parts]
         # rows and columns are in order: each quadrant is a rectangle
         row = int(np.searchsorted(context.rows, context.shape[0] // 2))
         column = context.shape[1] // 2
-        result: NDArray[Any] = values.copy()
+        result: AnyArray = values.copy()
         for below, ys in enumerate((slice(0, row), slice(row, None))):
             for right, xs in enumerate((slice(0, column), slice(column, None))):
                 offset = levels[:, factors[0] * below + factors[1] * right, None, None]
                 result[:, ys, xs] += offset * context.truth["conversion_gain"][ys, xs]
         return result
 
-    def _levels(self, context: EffectContext) -> NDArray[np.float64]:
+    def _levels(self, context: EffectContext) -> FloatArray:
         """Return the levels at the block's frames in units of ``amplitude_dn``, (frame, part)."""
         frames = context.frames.clip(0, context.n_frames - 1)
         found = np.zeros((frames.size, len(_PARTS[self.parts])))
@@ -122,7 +126,7 @@ class BiasJumps(Effect):
                 found[:, part] = levels[np.searchsorted(starts[1:], frames, side="right")]
         return found
 
-    def _drawn(self, context: EffectContext, part: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _drawn(self, context: EffectContext, part: int) -> tuple[IntArray, FloatArray]:
         """Return the frames at which random levels begin, the first being 0, and the levels."""
         generator = context.random.generator(draw=part)
         starts, first = [np.zeros(1, np.int64)], generator.integers(self.levels)
@@ -190,7 +194,7 @@ class BiasJumps(Effect):
         return with_offsets(model, maps, self.amplitude_dn * quantile_means(values, _LOBES))
 
 
-def _steps(path: Path, n_frames: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _steps(path: Path, n_frames: int) -> tuple[IntArray, FloatArray]:
     """Return the frames at which levels begin and the levels, zero on average over the run."""
     starts = np.array([frame for frame, _ in path], np.int64)
     levels = np.array([level for _, level in path], np.float64)
@@ -201,7 +205,7 @@ def _steps(path: Path, n_frames: int) -> tuple[NDArray[np.int64], NDArray[np.flo
     return starts, levels - float((levels * lasting).sum() / n_frames)
 
 
-def _values(paths: tuple[Path, ...]) -> NDArray[np.float64]:
+def _values(paths: tuple[Path, ...]) -> FloatArray:
     """Return the levels that the paths go through, each as often as it lasts, zero on average.
 
     The length of the run is not known here: the last level is taken to last as long as the others do.
@@ -217,7 +221,7 @@ def _values(paths: tuple[Path, ...]) -> NDArray[np.float64]:
     return np.concatenate(found)
 
 
-def _correlated(frames: NDArray[np.int64], means: NDArray[np.float64]) -> tuple[float, float, float]:
+def _correlated(frames: IntArray, means: FloatArray) -> tuple[float, float, float]:
     """Return significance, amplitude (DN) and rate of two-level jumps that best explain the correlation.
 
     The autocovariance of a level that jumps at rate q between ``-a/2`` and ``a/2`` is ``a^2 / 4 (1 - 2 q)^l``
@@ -249,7 +253,7 @@ def _correlated(frames: NDArray[np.int64], means: NDArray[np.float64]) -> tuple[
     return best
 
 
-def _quadrants(shape: tuple[int, ...]) -> list[NDArray[np.bool_]]:
+def _quadrants(shape: tuple[int, ...]) -> list[BoolArray]:
     """Return which pixels are in each quadrant, (y, x): top left, top right, bottom left, bottom right."""
     bottom, right = (np.arange(n) >= n // 2 for n in shape)
     return [
@@ -259,7 +263,7 @@ def _quadrants(shape: tuple[int, ...]) -> list[NDArray[np.bool_]]:
     ]
 
 
-def _as_path(time: TimeSeries, starts: NDArray[np.int64], levels: NDArray[np.float64]) -> Path:
+def _as_path(time: TimeSeries, starts: IntArray, levels: FloatArray) -> Path:
     """Return levels with the frames at which they begin (the middle of a gap in time)."""
     cuts = starts[1:]
     begins = [int(time.frames[0]), *((time.frames[cuts - 1] + time.frames[cuts] + 1) // 2).tolist()]

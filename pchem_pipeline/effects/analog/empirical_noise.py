@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -18,19 +18,19 @@ from pydantic import Field, model_validator
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.context import Dim
 from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.shared_offset import add_offset
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import Dim, EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
-
-FloatArray = np.ndarray[Any, np.dtype[np.float64]]
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 #: A distance: frames, rows, columns.
 Lag = tuple[int, int, int]
@@ -303,7 +303,7 @@ class EmpiricalNoise(Effect):
         "the power, `lags` (frames, rows, columns) and the `correlation` at each; its `profile`",
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the noise referred to the input."""
         total: Any = 0.0
         electrons: Any = 0.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -19,15 +19,8 @@ from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
-from pchem_pipeline.effects.framework.region import Region
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.effects.framework.region import Span
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.framework.region import Region, Span
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
 #: What a sample follows: another one, or each other one of a row, a column or a frame.
 Source = Literal["sample", "row", "column", "frame"]
@@ -100,7 +93,7 @@ class ResponseTerm(Section):
         what = f"each {'other ' if not any(self.place) else ''}sample of the {self.of}"
         return what + (f" {where}" if any(self.place) else "")
 
-    def seen(self, charge: NDArray[np.float64], exposure: NDArray[np.float64]) -> NDArray[np.float64]:
+    def seen(self, charge: FloatArray, exposure: FloatArray) -> FloatArray:
         """Return the charge that each sample follows, about its mean (frame, y, x), e-.
 
         Args:
@@ -117,9 +110,7 @@ class ResponseTerm(Section):
         return np.where(known, found, 0.0)
 
 
-def excess_moments(
-    exposure: NDArray[np.float64], above: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def excess_moments(exposure: FloatArray, above: float) -> tuple[FloatArray, FloatArray]:
     """Return the mean and the variance of what Poisson counts have above a number, e- and e-^2.
 
     Args:
@@ -183,7 +174,7 @@ class EmpiricalResponse(Effect):
             for term in self.terms
         )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with parts of the charge of other samples about its mean."""
         charge = np.asarray(context.charge, np.float64)
         exposure = np.asarray(context.truth["quanta_exposure"], np.float64)

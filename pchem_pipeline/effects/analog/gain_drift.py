@@ -8,9 +8,10 @@ drift u_t) (K + R) / g)`` with u_t from -1/2 at the first frame to 1/2 at the la
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.common_modes import run_position
@@ -22,13 +23,15 @@ from pchem_pipeline.effects.estimators.time_profiles import (
     settling_time,
 )
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    PixelMaps,
+    SampleLaw,
+    TimeSeries,
+)
 
 _NODES = (3, 5, 9, 17)
 _SIGMAS = 2.5
@@ -87,10 +90,10 @@ class GainDrift(Effect):
             raise ValueError("gain_drift: drift times path takes the gain to zero; make one of them smaller")
         return self
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, scaled by the time profile of the gain; draws nothing."""
         profile = self._profile(run_position(context.frames, context.n_frames))
-        result: NDArray[Any] = values * (1.0 + self.drift * profile)[:, None, None]
+        result: AnyArray = values * (1.0 + self.drift * profile)[:, None, None]
         return result
 
     @classmethod
@@ -134,7 +137,7 @@ class GainDrift(Effect):
         profile = self.drift * self._profile(np.linspace(0.0, 1.0, 1001))
         return model.with_variance(per_electron2=float(profile.var()))
 
-    def _profile(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _profile(self, position: FloatArray) -> FloatArray:
         """Return the shape at positions 0..1 in the run, in units of ``drift``, zero on average."""
         if self.shape == "settling":
             return settling(position, self.settling_fraction)
@@ -147,27 +150,21 @@ def _improvement(nodes: int) -> float:
     return free + 3.0 * float(np.sqrt(2.0 * free))
 
 
-def _chi_square(
-    values: NDArray[np.float64], error: NDArray[np.float64], basis: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64]]:
+def _chi_square(values: FloatArray, error: FloatArray, basis: FloatArray) -> tuple[float, FloatArray]:
     """Return chi squared of a weighted least-squares fit, and its coefficients."""
     found = np.linalg.lstsq(basis / error[:, None], values / error, rcond=1e-6)[0]
     return float((((values - basis @ found) / error) ** 2).sum()), np.asarray(found, np.float64)
 
 
-def _along(
-    gain: NDArray[np.float64], error: NDArray[np.float64], profile: NDArray[np.float64]
-) -> tuple[float, float]:
+def _along(gain: FloatArray, error: FloatArray, profile: FloatArray) -> tuple[float, float]:
     """Return chi squared that a time profile at its best scale leaves, and the scale within limits."""
     left, (_, size) = _chi_square(gain, error, np.stack([np.ones_like(profile), profile], 1))
     return left, float(np.clip(size, -0.5, 0.5))
 
 
-def _best_path(
-    gain: NDArray[np.float64], error: NDArray[np.float64], position: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64]]:
+def _best_path(gain: FloatArray, error: FloatArray, position: FloatArray) -> tuple[float, FloatArray]:
     """Return chi squared of the path of the smallest Bayesian information criterion, and its nodes."""
-    fits: list[tuple[float, NDArray[np.float64]]] = []
+    fits: list[tuple[float, FloatArray]] = []
     for count in _NODES:
         if fits and 3 * count > gain.size:
             break
@@ -177,9 +174,7 @@ def _best_path(
     return min(fits, key=lambda fit: fit[0] + fit[1].size * np.log(gain.size))
 
 
-def _block_gains(
-    evidence: Evidence, time: TimeSeries
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _block_gains(evidence: Evidence, time: TimeSeries) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return relative gain, standard error and position in the run of each block; empty if not of the gain.
 
     Where the gain alone drifts, the common mean of the residuals moves too, by the mean of ``H / g`` (in part
@@ -209,9 +204,7 @@ def _block_gains(
     return both, weight**-0.5, position
 
 
-def _block_means(
-    series: NDArray[np.float64], blocks: Sequence[NDArray[np.intp]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _block_means(series: FloatArray, blocks: Sequence[NDArray[np.intp]]) -> tuple[FloatArray, FloatArray]:
     """Return the means of a series of frames in blocks, less that of all, and their standard errors."""
     means = np.array([series[b].mean() for b in blocks]) - series.mean()
     scatter = float(np.sqrt(np.mean([series[b].var() for b in blocks])))

@@ -10,7 +10,7 @@ imagers with such tails are attributed to random telegraph noise of the source f
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -18,13 +18,7 @@ from pydantic import Field
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
 from pchem_pipeline.effects.estimators.response import first_order
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-from pchem_pipeline.model.law.sample_law import SampleLaw
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
 _TAIL_PIXELS, _TAIL_DOUBT = 40, 0.15
 # widths that are guessed, at a share so small that samples and moments go in proportion to it
@@ -66,10 +60,10 @@ class HeavyTailedNoise(Effect):
         description="noise of such a sample relative to that of the others, no unit",
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the noise of some samples enlarged."""
         noisy = context.random.uniform(("frame", "y", "x")) < self.share
-        result: NDArray[Any] = values.copy()
+        result: AnyArray = values.copy()
         if context.read_noise is not None:
             result[noisy] += (self.factor - 1.0) * context.read_noise[noisy]
         return result

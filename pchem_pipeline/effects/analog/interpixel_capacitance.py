@@ -9,19 +9,21 @@ diffusion or crosstalk by light the coupling is noiseless and deterministic: no 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    PixelMaps,
+    SampleLaw,
+    TimeSeries,
+)
 
 
 @register_effect
@@ -64,12 +66,12 @@ class InterpixelCapacitance(Effect):
         """Return 1: the rows above and below."""
         return 1
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the neighbours' charge; draws nothing.
 
         At the edges of the sensor the missing neighbours take and give nothing.
         """
-        result: NDArray[Any] = values.copy()
+        result: AnyArray = values.copy()
         if context.charge is None:
             return result
         charge = context.charge.astype(np.float64)
@@ -141,7 +143,7 @@ def _coupling(evidence: Evidence, time: TimeSeries, axis: str) -> tuple[float, f
     return time.neighbours[name] / response, 1.0 / (response * np.sqrt(pairs))
 
 
-def _neighbour_mean(one: NDArray[np.float64], other: NDArray[np.float64], axis: str) -> float:
+def _neighbour_mean(one: FloatArray, other: FloatArray, axis: str) -> float:
     """Return the mean of one map times the other at the neighbour, both ways; NaN without neighbours."""
     front, back = (slice(None), slice(None, -1)), (slice(None), slice(1, None))
     if axis == "y":

@@ -9,7 +9,7 @@ classic.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -22,15 +22,10 @@ from pchem_pipeline.effects.estimators.common_modes import (
 )
 from pchem_pipeline.effects.estimators.lines import coherent_line, incoherent_line
 from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, Radians, Turns, register_effect
+from pchem_pipeline.effects.framework.evidence import Wave
+from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, Wave
-    from pchem_pipeline.effects.framework.region import Span
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
 Pickup = TypeVar("Pickup", bound="PeriodicPickup")
 
@@ -86,7 +81,7 @@ class PeriodicPickup(Effect):
     phase: Radians = Field(default=0.0, ge=-100, le=100, description="phase at row, column and frame 0, rad")
     random_phase: bool = Field(default=False, description="true: a new random phase in every frame")
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the sine referred to the input."""
         turn = 2j * np.pi
         start = np.exp(turn * self.cycles_per_frame * context.frames + 1j * self.phase)[:, None, None]

@@ -9,7 +9,7 @@ own (correlated pink noise of near-infrared arrays: Rauscher 2015; Pyxel ``corre
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -18,13 +18,7 @@ from pchem_pipeline.effects.estimators.read_order import RECORD, pink_amplitudes
 from pchem_pipeline.effects.framework.effect import Count, Dn, Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.shared_offset import add_offset
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
 
 @register_effect
@@ -71,7 +65,7 @@ class ReadOrderNoise(Effect):
     def _with_taps(self, factor: float) -> Self:
         return self.model_copy(update={"taps": max(round(self.taps * factor), 1)})
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the noise of the taps referred to the input."""
         if self.noise_dn == 0:
             return values.copy()

@@ -8,7 +8,7 @@ the bias map.)
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -21,13 +21,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
 )
 from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
 
 @register_effect
@@ -55,7 +49,7 @@ class ReadoutAlternation(Effect):
         ge=-1e6, le=1e6, description="offset of even frames, and minus that of odd ones, DN"
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the offset referred to the input; draws nothing."""
         sign = 1.0 - 2.0 * (context.frames % 2)
         return add_offset(values, (self.alternation_dn * sign)[:, None, None], context)

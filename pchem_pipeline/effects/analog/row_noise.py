@@ -8,16 +8,14 @@ because the eye finds stripes long before the pixel statistics do.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.common_modes import line_noise
 from pchem_pipeline.effects.framework.effect import Dn, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedNoise
-
-if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.evidence import Evidence
+from pchem_pipeline.effects.types import Evidence
 
 
 @register_effect

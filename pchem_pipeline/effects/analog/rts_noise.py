@@ -11,7 +11,7 @@ seen.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -28,13 +28,15 @@ from pchem_pipeline.effects.framework.effect import (
     Ratio,
     register_effect,
 )
-from pchem_pipeline.model.law.sample_law import SampleLaw
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    BoolArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 # draws that are no frame's
 _WHERE, _SIZE, _FULL, _EMPTY = 0xFFFFFFFE, 0xFFFFFFFF, 0xFFFFFFFD, 0xFFFFFFFC
@@ -132,15 +134,15 @@ class RtsNoise(Effect):
         "differ from trap to trap; 0: alike in all",
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the steps of the pixels that have a trap."""
-        result: NDArray[Any] = values.copy()
+        result: AnyArray = values.copy()
         _, y, x = np.nonzero(context.random.uniform(("y", "x"), _WHERE) < self.fraction)
         if not y.size:
             return result
 
-        def uniform(draw: int) -> NDArray[np.float64]:
-            found: NDArray[np.float64] = context.random.uniform(("y", "x"), draw)[0, y, x]
+        def uniform(draw: int) -> FloatArray:
+            found: FloatArray = context.random.uniform(("y", "x"), draw)[0, y, x]
             return found
 
         step = self._steps(uniform)
@@ -153,7 +155,7 @@ class RtsNoise(Effect):
             result[:, y, x] += step * self._differences(context.random.uniform(("frame", "y", "x"))[:, y, x])
         return result
 
-    def _steps(self, uniform: Callable[[int], NDArray[np.float64]]) -> NDArray[np.float64] | float:
+    def _steps(self, uniform: Callable[[int], FloatArray]) -> FloatArray | float:
         """Return the steps of traps, e-, given the uniform numbers of each for a draw."""
         if self.spread == "exponential":
             return np.asarray(self.amplitude_e * -np.log(uniform(_SIZE)))
@@ -161,9 +163,7 @@ class RtsNoise(Effect):
             return np.asarray(self.amplitude_e * np.exp(_LOGNORMAL * special.ndtri(uniform(_SIZE))))
         return self.amplitude_e
 
-    def _traps(
-        self, uniform: Callable[[int], NDArray[np.float64]]
-    ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
+    def _traps(self, uniform: Callable[[int], FloatArray]) -> tuple[FloatArray | float, FloatArray | float]:
         """Return the probabilities of slow traps to be full, and their correlation times, frames."""
         if self.times_spread == 0 or not 0 < self.probability < 1:
             return self.probability, self.correlation_frames
@@ -173,14 +173,14 @@ class RtsNoise(Effect):
         )
         return full / (full + empty), full * empty / (full + empty)
 
-    def _differences(self, uniform: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _differences(self, uniform: FloatArray) -> FloatArray:
         """Return signal less reset, in steps of the trap, from uniform numbers of any shape."""
         # position within the half that a number falls in: the half is the sign
         inside = np.abs(2.0 * uniform - 1.0)
         rank = np.floor((inside - (1.0 - self.probability)) / max(self.probability, 1e-300) * self._places())
         rank = rank.clip(-1, self._places() - 1)
         height = np.minimum(rank + 1.0, self._places() - rank) / self.samples
-        found: NDArray[np.float64] = np.where(rank < 0, 0.0, np.sign(uniform - 0.5) * height)
+        found: FloatArray = np.where(rank < 0, 0.0, np.sign(uniform - 0.5) * height)
         return found
 
     def _places(self) -> int:
@@ -317,7 +317,7 @@ class RtsNoise(Effect):
         )
 
 
-def _profile(evidence: Evidence) -> list[NDArray[np.float64]]:
+def _profile(evidence: Evidence) -> list[FloatArray]:
     """Return what outlying pixels are compared by: form of the peaks and some scores of the usable pixels."""
     usable = evidence.maps.usable
     return [
@@ -326,19 +326,17 @@ def _profile(evidence: Evidence) -> list[NDArray[np.float64]]:
     ]
 
 
-def _departure(profile: NDArray[np.float64]) -> NDArray[np.float64]:
+def _departure(profile: FloatArray) -> FloatArray:
     """Return how far a profile departs from none: upwards in peaks and He4, either way in the others."""
     return np.concatenate([profile[:2], np.abs(profile[2:])])
 
 
-def _outlying(evidence: Evidence) -> NDArray[np.bool_]:
+def _outlying(evidence: Evidence) -> BoolArray:
     """Return which usable pixels stand out in something."""
     return np.asarray((_departure(np.array(_profile(evidence))) > _LIMITS[:, None]).any(axis=0))
 
 
-def _expected_profiles(
-    kinds: Sequence[SampleLaw], laws: Sequence[PixelLaw], n_frames: int
-) -> NDArray[np.float64]:
+def _expected_profiles(kinds: Sequence[SampleLaw], laws: Sequence[PixelLaw], n_frames: int) -> FloatArray:
     """Return the same for pixels of other laws, the median over the pixels: (kind, profile).
 
     The PCD is fitted to the exact law of such pixels, since it takes up much of the steps.
@@ -350,7 +348,7 @@ def _expected_profiles(
         change = fit.on_codes(*mass) - fit.mass
         scores = [fit.score_shift(name, change) * np.sqrt(n_frames) for name in _PROFILE]
         rows.append([fit.goodness(change, n_frames), *scores])
-    found: NDArray[np.float64] = np.median(np.array(rows).reshape(len(kinds), len(laws), -1), axis=1)
+    found: FloatArray = np.median(np.array(rows).reshape(len(kinds), len(laws), -1), axis=1)
     return found
 
 

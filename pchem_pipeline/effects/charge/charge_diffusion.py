@@ -10,18 +10,14 @@ and part of H.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.electrons import sent_to_neighbours
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
+from pchem_pipeline.effects.types import AnyArray, EffectContext
 
 
 @register_effect
@@ -48,7 +44,7 @@ class ChargeDiffusion(Effect):
         """Return 1 row: the neighbours above and below."""
         return 1
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, as collected."""
         result = values.copy()
         if self.fraction == 0:

@@ -9,17 +9,13 @@ Hondongwa 2014, "A Review of the Pinned Photodiode"; 0.1 e- and less in the pump
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.electrons import binomial_upper
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
+from pchem_pipeline.effects.types import AnyArray, EffectContext
 
 
 @register_effect
@@ -47,13 +43,13 @@ class ChargeLag(Effect):
         """Return 1 frame: the one whose electrons are late."""
         return 1
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, as read; the first frame gets nothing from before."""
         if self.fraction == 0:
             return values.copy()
         u = context.random.uniform(("frame", "y", "x"))
         late = binomial_upper(u.reshape(-1), values.reshape(-1), self.fraction).reshape(values.shape)
-        result: NDArray[Any] = values - late
+        result: AnyArray = values - late
         result[1:] += late[:-1]
         return result
 

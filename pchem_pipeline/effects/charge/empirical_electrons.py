@@ -9,7 +9,7 @@ samples; nothing is said about why.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -20,13 +20,15 @@ from pchem_pipeline.effects.estimators.electrons import binomial_upper
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 #: What happens to electrons: some that have others in their sample are lost or moved, or each brings others,
 #: or all of a sample are lost together.
@@ -114,7 +116,7 @@ class EmpiricalElectrons(Effect):
         """Return how many frames before it matter."""
         return _DEPTH * max(mode.place[0] for mode in self.modes)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, without those that go and with those that come."""
         own, chance = values.astype(np.int64), self._chances()
         for number, mode in enumerate(self.modes):
@@ -174,7 +176,7 @@ class EmpiricalElectrons(Effect):
         return f"electron numbers{place} that are not independent ({'; '.join(told)})"
 
 
-def _gone(electrons: NDArray[np.int64], u: NDArray[np.float64], chance: float) -> NDArray[np.int64]:
+def _gone(electrons: IntArray, u: FloatArray, chance: float) -> IntArray:
     """Return how many electrons of each sample go, each with a chance for every other one."""
     gone = np.zeros(electrons.shape, np.int64)
     here = np.nonzero(electrons > 1)
@@ -183,7 +185,7 @@ def _gone(electrons: NDArray[np.int64], u: NDArray[np.float64], chance: float) -
     return gone
 
 
-def _arrived(electrons: NDArray[np.int64], place: tuple[int, int, int]) -> NDArray[np.int64]:
+def _arrived(electrons: IntArray, place: tuple[int, int, int]) -> IntArray:
     """Return how many electrons come from the samples of which each is at a place, 0 from beyond the edge."""
     if not any(place):
         return electrons

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+from typing import ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
@@ -28,15 +28,16 @@ from pydantic import Field
 from pchem_pipeline.effects.estimators.count_scores import charlier_information
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
-
-FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    BoolArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 _WHICH = 0xFFFFFFFE  # draw that is no frame's
 # probability that the state of a trap goes back farther than the frames that are simulated for it
@@ -103,7 +104,7 @@ class Trapping(Effect):
         known = min(self.release, 1.0 - abs(1.0 - self.release - self.capture))
         return math.ceil(math.log(_RARE) / math.log1p(-known)) if self.capture > 0 else 0
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, as read: less what is caught, with what is released.
 
         A trap that was neither filled nor emptied for as long as :meth:`history` is taken for empty, so that
@@ -168,7 +169,7 @@ def _chance(capture: float, release: float, some: FloatArray) -> FloatArray:
     return np.asarray(capture * release / (release + capture * some))
 
 
-def _states(filled: NDArray[np.bool_], emptied: NDArray[np.bool_], history: int) -> NDArray[np.int64]:
+def _states(filled: BoolArray, emptied: BoolArray, history: int) -> IntArray:
     """Return whether traps are full before and behind each frame, (frame + 1, y, x), 0 or 1.
 
     Args:

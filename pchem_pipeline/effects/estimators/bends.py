@@ -9,17 +9,12 @@ the residuals for sines of many periods and for breaks at many places.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.estimators.codes import usable_codes
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.types import BoolArray, Evidence, FloatArray, IntArray, PixelMaps
 
 _PIXELS = 256
 _PERIODS = 48
@@ -53,7 +48,7 @@ class Curve:
 
     first: float
     spacing: float
-    values: NDArray[np.float64]
+    values: FloatArray
 
 
 @dataclass(frozen=True)
@@ -67,10 +62,10 @@ class SampledPixels:
         tangents: change of the masses with H, mu, sigma, g, orthonormal under ``1 / mass``, (n, 4, cells).
     """
 
-    first: NDArray[np.int64]
-    density: NDArray[np.float64]
-    mass: NDArray[np.float64]
-    tangents: NDArray[np.float64]
+    first: IntArray
+    density: FloatArray
+    mass: FloatArray
+    tangents: FloatArray
 
 
 @dataclass(frozen=True)
@@ -93,10 +88,10 @@ class CurveResponse:
         expected: counts per code, (codes,).
     """
 
-    edges: NDArray[np.float64]
-    response: NDArray[np.float64]
-    residuals: NDArray[np.float64]
-    expected: NDArray[np.float64]
+    edges: FloatArray
+    response: FloatArray
+    residuals: FloatArray
+    expected: FloatArray
 
     @classmethod
     def of(cls, evidence: Evidence) -> CurveResponse | None:
@@ -109,14 +104,12 @@ class CurveResponse:
         response = _response(pixels, codes) * (samples / np.sqrt(expected))[:, None]
         return cls(np.append(codes, codes[-1] + 1) - 0.5, response, residuals * np.sqrt(expected), expected)
 
-    def fits(self, deviations: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def fits(self, deviations: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return by how much pairs of deviations (kinds, 2, codes + 1) lower chi2, and their factors."""
         found = [_fit(self.response @ pair.T, self.residuals) for pair in deviations]
         return np.array([gain for gain, _ in found]), np.array([factors for _, factors in found])
 
-    def worth(
-        self, gains: NDArray[np.float64], known: float = 0.0, least: float = _LEAST_GAIN
-    ) -> NDArray[np.bool_]:
+    def worth(self, gains: FloatArray, known: float = 0.0, least: float = _LEAST_GAIN) -> BoolArray:
         """Return which gains are more than a known one, and what chance and what else is amiss brings."""
         total = float((self.residuals**2).sum())
         left = np.maximum(1.0, (total - gains) / max(self.residuals.size - 6, 1))
@@ -165,13 +158,13 @@ def best_curve(evidence: Evidence) -> Curve | None:
     return best
 
 
-def _straight(response: CurveResponse, deviation: NDArray[np.float64]) -> np.polynomial.Polynomial:
+def _straight(response: CurveResponse, deviation: FloatArray) -> np.polynomial.Polynomial:
     """Return the straight line through a deviation (codes + 1,): bias and gain of the pixels take it up."""
     counts = np.append(response.expected, 0.0) + np.append(0.0, response.expected)
     return np.polynomial.Polynomial.fit(response.edges, deviation, 1, w=np.sqrt(counts))
 
 
-def _fit_knots(response: CurveResponse, basis: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+def _fit_knots(response: CurveResponse, basis: FloatArray) -> tuple[FloatArray, float]:
     """Return values at the knots of a basis (codes + 1, knots), LSB, and by how much they lower chi2.
 
     What hardly shows (a straight line, which bias and gain take up, above all) is left at nothing.
@@ -184,9 +177,7 @@ def _fit_knots(response: CurveResponse, basis: NDArray[np.float64]) -> tuple[NDA
     return values, float((seen**2 - (seen - kept) ** 2).sum())
 
 
-def through_knots(
-    knots: NDArray[np.float64], values: NDArray[np.float64], places: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def through_knots(knots: FloatArray, values: FloatArray, places: FloatArray) -> FloatArray:
     """Return natural cubic splines through values (knots, ...) at places; beyond the ends as at the ends."""
     from scipy.interpolate import CubicSpline
 
@@ -226,13 +217,13 @@ def sampled_tangents(maps: PixelMaps) -> SampledPixels | None:
     return None if chosen is None else _tangents(*chosen)
 
 
-def _in_use(expected: NDArray[np.float64]) -> float:
+def _in_use(expected: FloatArray) -> float:
     """Return over how many DN the middle 98 % of the samples spread."""
     share = np.cumsum(expected) / expected.sum()
     return float(np.searchsorted(share, 0.99) - np.searchsorted(share, 0.01) + 1)
 
 
-def _sample(maps: PixelMaps) -> tuple[NDArray[np.float64], ...] | None:
+def _sample(maps: PixelMaps) -> tuple[FloatArray, ...] | None:
     """Return H, g, mu, sigma of pixels spread over the sensor, each (n, 1), without the widest histograms."""
     parts = np.stack([part[maps.usable] for part in maps.maps]).astype(np.float64)
     parts = parts[:, np.isfinite(parts).all(axis=0)]
@@ -244,12 +235,7 @@ def _sample(maps: PixelMaps) -> tuple[NDArray[np.float64], ...] | None:
     return tuple(part[::step, None] for part in parts)
 
 
-def _tangents(
-    exposure: NDArray[np.float64],
-    gain: NDArray[np.float64],
-    bias: NDArray[np.float64],
-    noise: NDArray[np.float64],
-) -> SampledPixels:
+def _tangents(exposure: FloatArray, gain: FloatArray, bias: FloatArray, noise: FloatArray) -> SampledPixels:
     """Return masses and tangents of the pixels' PCDs (exact rounded mass and its derivatives)."""
     from scipy.special import gammaln, ndtr
 
@@ -275,7 +261,7 @@ def _tangents(
     return SampledPixels(first, density, mass, tangents.transpose(0, 2, 1))
 
 
-def _response(pixels: SampledPixels, codes: NDArray[np.int64]) -> NDArray[np.float64]:
+def _response(pixels: SampledPixels, codes: IntArray) -> FloatArray:
     """Return the change of the mass of the codes per DN of deviation at their edges, (codes, codes + 1).
 
     Summed over the sample of pixels, with what their fits take up projected out.
@@ -299,7 +285,7 @@ def _response(pixels: SampledPixels, codes: NDArray[np.int64]) -> NDArray[np.flo
     return total[n_cells:-n_cells, n_cells:-n_cells]
 
 
-def _fit(design: NDArray[np.float64], scaled: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+def _fit(design: FloatArray, scaled: FloatArray) -> tuple[float, FloatArray]:
     """Return by how much a sine and a cosine lower chi2 of the codes, and their factors."""
-    factors: NDArray[np.float64] = np.linalg.lstsq(design, scaled, rcond=None)[0].astype(np.float64)
+    factors: FloatArray = np.linalg.lstsq(design, scaled, rcond=None)[0].astype(np.float64)
     return float((scaled**2).sum() - ((scaled - design @ factors) ** 2).sum()), factors

@@ -8,17 +8,19 @@ charge: on average by ``alpha = Var(r) / sigma^2`` (Stein's identity for the Gau
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
-
-FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    BoolArray,
+    Evidence,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 #: Standard errors from which on an excess is worth a hypothesis. One split of the frames sees less than all
 #: of them together, and a wrong hypothesis is thrown out by the comparison that follows: so not too many.
@@ -29,12 +31,12 @@ WORTH_A_GUESS = 2.0
 _NARROW = 0.1
 
 
-def run_position(frames: NDArray[np.int64], n_run: int) -> FloatArray:
+def run_position(frames: IntArray, n_run: int) -> FloatArray:
     """Return where frames lie in the run: 0 the first, 1 the last; frames before the run like the first."""
     return np.asarray(frames.clip(0, n_run - 1) / max(n_run - 1, 1), np.float64)
 
 
-def responsivity(evidence: Evidence, inside: NDArray[np.bool_] | None = None) -> float:
+def responsivity(evidence: Evidence, inside: BoolArray | None = None) -> float:
     """Return the mean change of r per DN of a common offset, in (0, 1] (see the module's text).
 
     Args:
@@ -48,7 +50,7 @@ def responsivity(evidence: Evidence, inside: NDArray[np.bool_] | None = None) ->
     return float(np.clip(ratio.mean(), 0.02, 1.0)) if ratio.size else 1.0
 
 
-def mean_response(evidence: Evidence, inside: NDArray[np.bool_] | None = None) -> float:
+def mean_response(evidence: Evidence, inside: BoolArray | None = None) -> float:
     """Return the mean change of r over its standard deviation per DN of a common offset, 1/DN.
 
     Args:
@@ -60,7 +62,7 @@ def mean_response(evidence: Evidence, inside: NDArray[np.bool_] | None = None) -
     return float(np.mean((evidence.readout_std / maps.read_noise_dn**2)[some]))
 
 
-def mean_variance(evidence: Evidence, axis: int | tuple[int, int] = (0, 1)) -> NDArray[np.float64]:
+def mean_variance(evidence: Evidence, axis: int | tuple[int, int] = (0, 1)) -> FloatArray:
     """Return the variance, DN^2, that the pixels' own noise gives to means of r over usable pixels.
 
     ``axis`` as in a sum over (y, x): both for frame means, 1 for row means, 0 for column means; NaN where
@@ -72,13 +74,13 @@ def mean_variance(evidence: Evidence, axis: int | tuple[int, int] = (0, 1)) -> N
     return np.asarray(np.where(n > 0, total / np.maximum(n, 1) ** 2, np.nan), np.float64)
 
 
-def successive(frames: NDArray[Any]) -> NDArray[np.bool_]:
+def successive(frames: AnyArray) -> BoolArray:
     """Return which frames follow the one before as closely as any here do, (n - 1,); of a period, all."""
     apart = np.diff(frames)
     return np.asarray(apart == apart.min(initial=apart.max(initial=1)))
 
 
-def line_excess(means: NDArray[Any], variance: NDArray[np.float64]) -> tuple[float, float]:
+def line_excess(means: AnyArray, variance: FloatArray) -> tuple[float, float]:
     """Return the variance of the lines' offsets beyond that of their pixels, and its standard error, DN^2.
 
     Args:

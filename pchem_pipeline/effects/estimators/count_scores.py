@@ -9,15 +9,10 @@ is the score's variance.
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.evidence import Evidence
-
-FloatArray = NDArray[np.float64]
+from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray
 
 # the information is smooth in both: nodes of its table, e-
 _EXPOSURES = np.geomspace(0.02, 60.0, 25)
@@ -74,7 +69,7 @@ def charlier_information(exposure: FloatArray, noise: FloatArray) -> FloatArray:
     return information
 
 
-def _place(nodes: FloatArray, values: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+def _place(nodes: FloatArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
     index = np.clip(np.searchsorted(nodes, values) - 1, 0, nodes.size - 2)
     return index, np.clip((values - nodes[index]) / (nodes[index + 1] - nodes[index]), 0.0, 1.0)
 

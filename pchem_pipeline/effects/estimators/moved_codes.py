@@ -7,16 +7,12 @@ they leave is computed to first order for a sample of pixels, as for bends of th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pchem_pipeline.effects.estimators.bends import sampled_tangents
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.evidence import Evidence
+from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray
 
 
 class MovedShare(NamedTuple):
@@ -27,7 +23,7 @@ class MovedShare(NamedTuple):
     gain: float
 
 
-def moved_shares(evidence: Evidence, targets: NDArray[np.int64]) -> list[MovedShare]:
+def moved_shares(evidence: Evidence, targets: IntArray) -> list[MovedShare]:
     """Return for each of several kinds of moves the share of samples that explains the counts best.
 
     Args:
@@ -64,9 +60,7 @@ def moved_shares(evidence: Evidence, targets: NDArray[np.int64]) -> list[MovedSh
     return found
 
 
-def _regressed(
-    pattern: NDArray[np.float64], residual: NDArray[np.float64], expected: NDArray[np.float64]
-) -> MovedShare:
+def _regressed(pattern: FloatArray, residual: FloatArray, expected: FloatArray) -> MovedShare:
     """Return the factor of a pattern in the residuals of Poisson counts, by two weighted least squares."""
     share, error = 0.0, np.inf
     for _ in range(2):

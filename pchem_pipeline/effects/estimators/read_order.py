@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pchem_pipeline.effects.estimators.common_modes import mean_variance, responsivity
-
-if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
-
-FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+from pchem_pipeline.effects.types import Evidence, FloatArray, TimeSeries
 
 _TAPS = (1, 2, 4, 8)
 _LAGS = 8  # rows

@@ -7,20 +7,15 @@ that the effect does to it (:mod:`pchem_pipeline.effects.estimators.pixel_law`),
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
-from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.types import Evidence, FloatArray, SampleLaw
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.effects.framework.evidence import Evidence
-
-FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 EffectType = TypeVar("EffectType", bound="Effect")
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+
+from pchem_pipeline.effects.types import FloatArray
 
 # time constants in lengths of the run: shorter ones are hardly a drift, longer ones are straight lines
 _SETTLING = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
 
 
-def settling(position: NDArray[np.float64], fraction: float) -> NDArray[np.float64]:
+def settling(position: FloatArray, fraction: float) -> FloatArray:
     """Return an exponential approach to the end, of mean 0 and range 1 over the run.
 
     Args:
@@ -20,7 +21,7 @@ def settling(position: NDArray[np.float64], fraction: float) -> NDArray[np.float
     """
     whole = -np.expm1(-1.0 / fraction)
     mean = (1.0 - fraction * whole) / whole
-    profile: NDArray[np.float64] = -np.expm1(-position / fraction) / whole - mean
+    profile: FloatArray = -np.expm1(-position / fraction) / whole - mean
     return profile
 
 
@@ -40,7 +41,7 @@ def settling_time(left: Callable[[float], float]) -> float:
     return float(np.exp(found.x)) if found.fun < losses[best] else _SETTLING[best]
 
 
-def along_path(position: NDArray[np.float64], path: Sequence[float]) -> NDArray[np.float64]:
+def along_path(position: FloatArray, path: Sequence[float]) -> FloatArray:
     """Return a broken line through nodes at equal distances along the run, of mean 0 over the run.
 
     Args:

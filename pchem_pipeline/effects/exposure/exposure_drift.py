@@ -9,7 +9,7 @@ drifts by 1 %.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+from typing import ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -17,13 +17,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
 from pchem_pipeline.effects.estimators.time_profiles import along_path, settling, settling_time
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
 _T = TypeVar("_T", bound="ExposureDrift")
 
@@ -90,7 +84,7 @@ class ExposureDrift(Effect):
             raise ValueError("exposure_drift: path needs at least two different values; leave it empty")
         return self
 
-    def profile(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+    def profile(self, position: FloatArray) -> FloatArray:
         """Return the profile s, of mean 0 and range 1 over the run, at times 0..1 (first to last frame)."""
         if self.path:
             return along_path(position, self.path) / float(np.ptp(self.path))
@@ -98,13 +92,13 @@ class ExposureDrift(Effect):
             return settling(position, self.settling_fraction)
         return position - 0.5
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the drifting exposure (frame, y, x), e-; draws nothing."""
         last = context.n_frames - 1
         # frames before the run are simulated only as memory of the first: as exposed as that one
         position = context.frames.clip(0, last) / last if last > 0 else np.full(context.frames.shape, 0.5)
         factor = np.maximum(1.0 + self.drift * self.profile(position), 0.0)
-        result: NDArray[Any] = values * factor[:, None, None]
+        result: AnyArray = values * factor[:, None, None]
         return result
 
     @classmethod
@@ -148,7 +142,7 @@ class ExposureDrift(Effect):
         return model.with_exposures(*exposure_nodes(factors))
 
 
-def _fit(unit: _T, profile: ExposureProfile, position: NDArray[np.float64], noise: float) -> tuple[float, _T]:
+def _fit(unit: _T, profile: ExposureProfile, position: FloatArray, noise: float) -> tuple[float, _T]:
     """Return the chi-square that a time profile explains, and it at its fitted strength."""
     shape = unit.profile(position)
     shape = shape - shape.mean()
@@ -157,7 +151,7 @@ def _fit(unit: _T, profile: ExposureProfile, position: NDArray[np.float64], nois
 
 
 def _fit_path(
-    cls: type[_T], profile: ExposureProfile, position: NDArray[np.float64], noise: float
+    cls: type[_T], profile: ExposureProfile, position: FloatArray, noise: float
 ) -> tuple[float, _T]:
     """Return the same for a broken line with free nodes, as many as pay; the chi-square less their price."""
     deviation = profile.deviation - profile.deviation.mean()

@@ -9,9 +9,10 @@ electronics warm up, is not.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.charge_sums import block_charge, exposure_nodes
@@ -22,12 +23,7 @@ from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.spot import Falloff, spot_found_in, spot_image, spot_seen_in
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, IntArray, PixelMaps
 
 _GRID = 16  # cells along either side of the map of what grows
 _STRAIGHT = 50.0  # runs: a time constant so long is a straight line
@@ -93,25 +89,25 @@ class Glow(Effect):
         """Return it with its centre counted on the sensor."""
         return self.model_copy(update=spot_found_in(vars(self), rows, columns, shape))
 
-    def pattern(self, rows: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    def pattern(self, rows: IntArray, shape: tuple[int, ...]) -> FloatArray:
         """Return the spot in some rows relative to its brightest pixel, shape (rows, columns)."""
         centre = (self.centre_y, self.centre_x)
         return spot_image(rows, np.arange(shape[1]), shape, centre, self.radius, self.falloff)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the exposure with the glow (frame, y, x), e-."""
         if self.burst_share is None:
             size = run_position(context.frames, context.n_frames)
         else:
             size = (context.random.uniform(("frame",))[:, 0, 0] < self.burst_share).astype(np.float64)
-        result: NDArray[Any] = values.copy()
+        result: AnyArray = values.copy()
         bright = size > 0
         pattern = self.peak_e * self.pattern(context.rows, context.shape)
         result[bright] += size[bright, None, None] * pattern
         return result
 
     def added_exposure(
-        self, frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], maps: PixelMaps
+        self, frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps
     ) -> AddedExposure | None:
         """Return the glow's levels: with and without a burst, or three of its growth."""
         if self.peak_e == 0:
@@ -147,7 +143,7 @@ class Glow(Effect):
             {"peak_e": spot.peak, "falloff": spot.falloff, "burst_share": burst_share, **spot.place}
         )
 
-    def representative(self, frames: NDArray[np.int64]) -> tuple[Self, float]:
+    def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return rare bursts more often than they are, and how much rarer they are."""
         shown = min(_FEWEST_SHOWN / max(frames.size, 1), 1.0)
         if self.burst_share is None or self.burst_share >= shown:

@@ -9,9 +9,10 @@ image on a coarse grid.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import block_charge, block_signal, exposure_nodes
@@ -28,12 +29,7 @@ from pchem_pipeline.effects.framework.effect import (
 )
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.spot import spot_found_in, spot_image, spot_seen_in
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, IntArray, PixelMaps
 
 # rows and columns of the grids: to find something, and to describe it
 _GRIDS = (8, 32)
@@ -150,31 +146,29 @@ class Persistence(Effect):
             update={"image": _numbers(values / brightest), "peak_e": self.peak_e * brightest}
         )
 
-    def _image_at(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _image_at(self, y: FloatArray, x: FloatArray) -> FloatArray:
         """Return the image, relative to its largest value, at places 0..1 of the sensor."""
         grid = np.asarray(self.image)
-        values: NDArray[np.float64] = (
-            _hats(y, grid.shape[0]) @ (grid / grid.max()) @ _hats(x, grid.shape[1]).T
-        )
+        values: FloatArray = _hats(y, grid.shape[0]) @ (grid / grid.max()) @ _hats(x, grid.shape[1]).T
         return values
 
-    def pattern(self, rows: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.float64]:
+    def pattern(self, rows: IntArray, shape: tuple[int, int]) -> FloatArray:
         """Return the earlier image in some rows, relative to its largest value, shape (rows, columns)."""
         columns = np.arange(shape[1])
         if self.image:
             return self._image_at((rows + 0.5) / shape[0], (columns + 0.5) / shape[1])
         return spot_image(rows, columns, shape, (self.centre_y, self.centre_x), self.radius)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the exposure with what the earlier image left (frame, y, x), e-; draws nothing."""
         if self.peak_e == 0:
             return values.copy()
         left = self._left(context.frames)
-        result: NDArray[Any] = values + left[:, None, None] * self.pattern(context.rows, context.shape)
+        result: AnyArray = values + left[:, None, None] * self.pattern(context.rows, context.shape)
         return result
 
     def added_exposure(
-        self, frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], maps: PixelMaps
+        self, frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps
     ) -> AddedExposure | None:
         """Return the ghost, with three levels for its time profile."""
         left = self._left(numbers)
@@ -188,11 +182,11 @@ class Persistence(Effect):
             nodes[:, None, None] * image, np.broadcast_to(weights[:, None, None], (nodes.size, rows, columns))
         )
 
-    def _left(self, frames: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _left(self, frames: IntArray) -> FloatArray:
         """Return what is left of the largest value in each frame, e-."""
         # frames before the run are simulated only as memory of the first: as exposed as that one
         t = np.maximum(frames, 0)
-        left: NDArray[np.float64] = np.exp(-t / self.decay_frames)
+        left: FloatArray = np.exp(-t / self.decay_frames)
         if self.slow_decay_frames is not None:
             left = (1.0 - self.slow_share) * left + self.slow_share * np.exp(-t / self.slow_decay_frames)
         return self.peak_e * left
@@ -244,12 +238,12 @@ class Persistence(Effect):
         return found
 
 
-def _numbers(image: NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:
+def _numbers(image: FloatArray) -> tuple[tuple[float, ...], ...]:
     """Return a grid for the YAML."""
     return tuple(tuple(float(round(v, 3)) for v in row) for row in image)
 
 
-def _hats(position: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+def _hats(position: FloatArray, n: int) -> FloatArray:
     """Return weights (positions, n) of linear interpolation between the centres of n cells in 0..1."""
     centres = (np.arange(n) + 0.5) / n
     return np.stack([np.interp(position, centres, row) for row in np.eye(n)], axis=1)

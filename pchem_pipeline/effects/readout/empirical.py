@@ -10,7 +10,7 @@ about why.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -18,16 +18,20 @@ from pydantic import Field, model_validator
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.context import Dim
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import Dim, EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.effects.framework.region import Span
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.framework.region import Span
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    BoolArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 #: What is moved together.
 Together = Literal["sample", "row", "column", "frame"]
@@ -64,7 +68,7 @@ class Move(Section):
             raise ValueError("shift_dn: towards a neighbour it is not negative")
         return self
 
-    def of(self, own: NDArray[np.int64], other: NDArray[np.int64] | None) -> NDArray[np.int64]:
+    def of(self, own: IntArray, other: IntArray | None) -> IntArray:
         """Return samples moved, DN; ``other`` are their neighbours."""
         if other is None:
             return own + self.shift_dn
@@ -136,7 +140,7 @@ class Empirical(Effect):
         """Return as an effect on the sensor what was found in some of its rows and columns."""
         return self.seen_in(rows, columns, shape)  # of two parities each is the other of the other
 
-    def shares(self) -> NDArray[np.float64]:
+    def shares(self) -> FloatArray:
         """Return the share of the samples that each move has."""
         weight = np.array([move.weight for move in self.moves])
         return np.asarray(self.share * weight / weight.sum())
@@ -156,7 +160,7 @@ class Empirical(Effect):
         """Return how many frames before it matter: those of the neighbours, and of theirs."""
         return _DEPTH * max(-move.towards[0] if move.towards else 0 for move in self.moves)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN, with some samples moved."""
         drawn = context.random.uniform(_DIMS[self.together])
         which = np.searchsorted(np.cumsum(self.shares()), drawn.ravel(), side="right").reshape(drawn.shape)
@@ -170,7 +174,7 @@ class Empirical(Effect):
         for _ in range(_DEPTH if self.history() else 1):
             before, found = found, own
             for number, move in enumerate(self.moves):
-                here: NDArray[np.bool_] = which == number
+                here: BoolArray = which == number
                 if not here.any():
                     continue
                 other = None
@@ -220,7 +224,7 @@ class Empirical(Effect):
         return f"{per_cent(self.share)} of the {what}{place} differ from the model as if they were moved{how}"
 
 
-def _averaged(values: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _averaged(values: IntArray, chosen: BoolArray) -> IntArray:
     """Return frames (frame, y, x) whose squares from chosen pixels on are their mean; none overlap."""
     result = values.copy()
     corners = [

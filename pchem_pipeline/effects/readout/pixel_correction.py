@@ -9,20 +9,16 @@ exceeds the median of its eight neighbours by more than so many DN comes out as 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.prediction import PREDICTORS, Predictor, predicted
 from pchem_pipeline.effects.framework.effect import Code, Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.framework.evidence import PredictedSamples
 from pchem_pipeline.effects.framework.replacement import Replacement
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PredictedSamples
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray
 
 # standard deviations by which samples must equal their prediction too often, and exceed it too seldom
 _EQUAL, _ABOVE = 4.0, 3.0
@@ -69,7 +65,7 @@ class PixelCorrection(Effect):
         """Return 1: the rows beside."""
         return 1
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN, corrected; those at the border stay as they are."""
         rule = self.replacement(values)
         replaced = (values - rule.value > rule.excess) & rule.inside
@@ -77,7 +73,7 @@ class PixelCorrection(Effect):
             replaced &= context.random.uniform(("frame", "y", "x")) < self.share
         return np.where(replaced, rule.value, values).astype(values.dtype)
 
-    def replacement(self, frames: NDArray[Any]) -> Replacement:
+    def replacement(self, frames: AnyArray) -> Replacement:
         """Return the rule: what the neighbours predict, inside the border."""
         value, inside = frames.astype(np.int32), np.zeros(frames.shape[1:], np.bool_)
         if min(inside.shape) >= 3:
@@ -128,7 +124,7 @@ def _threshold(seen: PredictedSamples) -> tuple[int, float] | None:
     return int(seen.thresholds[place]), share
 
 
-def _replaced_share(own: float, moments: NDArray[np.float64]) -> float:
+def _replaced_share(own: float, moments: FloatArray) -> float:
     """Return the share s of replaced samples from how many are above their own and others' predictions.
 
     A sample x exceeds the prediction of a chance frame with probability q(x). Of the samples before the
