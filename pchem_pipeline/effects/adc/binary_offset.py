@@ -49,6 +49,9 @@ class BinaryOffset(Effect):
         default=(1.0,), max_length=24, description="relative offset of each bit, the least significant first"
     )
 
+    #: offsets by the lowest bits of 0.3 DN, and of the other sign
+    typical_values = ({"offset_dn": 0.3}, {"offset_dn": -0.3}, {"offset_dn": 0.3, "bits": (0.0, 1.0)})
+
     @field_validator("bits")
     @classmethod
     def _some_bit(cls, bits: tuple[float, ...]) -> tuple[float, ...]:
@@ -68,11 +71,6 @@ class BinaryOffset(Effect):
                 if relative:
                     result[:, :, x] += self.offset_dn * relative * ((before >> bit & 1) - 0.5)
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return offsets by the lowest bits of 0.3 DN, and of the other sign."""
-        return cls(offset_dn=0.3), cls(offset_dn=-0.3), cls(offset_dn=0.3, bits=(0.0, 1.0))
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -59,6 +59,9 @@ class BlackClamp(Effect):
         default=None, ge=1, description="number of these pixels, for the law of a sample; null: left as it is"
     )
 
+    #: clamps that take off a tenth of the mean of the frame, and of eight columns and rows
+    typical_values = ({"follow": 0.1}, {"follow": 0.1, "columns": (0, 8)}, {"follow": 0.1, "rows": (0, 8)})
+
     @field_validator("rows", "columns")
     @classmethod
     def _some(cls, span: Span | None) -> Span | None:
@@ -102,11 +105,6 @@ class BlackClamp(Effect):
             return values.copy()
         deviation = (values[:, *place] - usual[place]).mean(axis=(1, 2), keepdims=True)
         return np.asarray(values - self.follow * deviation)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return clamps that take off a tenth of the mean of the frame, and of eight columns and rows."""
-        return cls(follow=0.1), cls(follow=0.1, columns=(0, 8)), cls(follow=0.1, rows=(0, 8))
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -62,6 +62,9 @@ class GainStitch(Effect):
         description="point at which both gains give the same, DN; null: the level, so without a step",
     )
 
+    #: gains that differ by 1 % above 130 DN, of either sign
+    typical_values = ({"gain_change": 0.01, "level_dn": 130.0}, {"gain_change": -0.01, "level_dn": 130.0})
+
     @property
     def _origin(self) -> float:
         return self.level_dn if self.origin_dn is None else self.origin_dn
@@ -70,11 +73,6 @@ class GainStitch(Effect):
         """Return the signal at the ADC (frame, y, x), DN, joined; draws nothing."""
         joined = values + self.gain_change * (values - self._origin)
         return np.asarray(np.where(values > self.level_dn, joined, values))
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return gains that differ by 1 % above 130 DN, of either sign."""
-        return cls(gain_change=0.01, level_dn=130.0), cls(gain_change=-0.01, level_dn=130.0)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

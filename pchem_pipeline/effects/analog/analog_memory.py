@@ -72,6 +72,9 @@ class AnalogMemory(Effect):
         description="charge of the frame before at which the memory levels off, e-; none: in proportion",
     )
 
+    #: residue, overshoot, and a residue that differs
+    typical_values = ({"memory": 0.0024}, {"memory": -0.0024}, {"memory": 0.0024, "spread": 1.0})
+
     def history(self) -> int:
         """Return 1: the frame before."""
         return 1
@@ -106,11 +109,6 @@ class AnalogMemory(Effect):
         # E[exp(-n K / S)], the generating function of K
         once, twice = (np.exp(exposure * np.expm1(-n / self.saturation_e)) for n in (1.0, 2.0))
         return self.saturation_e * (1.0 - once), self.saturation_e**2 * (1.0 - 2.0 * once + twice)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return residue, overshoot, and a residue that differs."""
-        return cls(memory=0.0024), cls(memory=-0.0024), cls(memory=0.0024, spread=1.0)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -87,6 +87,9 @@ class BiasJumps(Effect):
         "in units of amplitude_dn]",
     )
 
+    #: at 0.085 DN, with rare and with frequent jumps
+    typical_values = ({"amplitude_dn": 0.085, "rate": 1e-3}, {"amplitude_dn": 0.085, "rate": 1e-2})
+
     @model_validator(mode="after")
     def _path_for_each_part(self) -> Self:
         wanted = len(_PARTS[self.parts])
@@ -138,11 +141,6 @@ class BiasJumps(Effect):
         moves = generator.integers(1, self.levels, frames.size - 1)
         levels = (first + np.concatenate([[0], np.cumsum(moves)])) % self.levels
         return frames, np.asarray(levels - (self.levels - 1) / 2.0, np.float64)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.085 DN, with rare and with frequent jumps."""
-        return cls(amplitude_dn=0.085, rate=1e-3), cls(amplitude_dn=0.085, rate=1e-2)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -40,10 +40,8 @@ class ColumnNoise(SharedNoise):
     }
     column_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the columns' offsets, DN")
 
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.32 DN."""
-        return (cls(column_noise_dn=0.32),)
+    #: at 0.32 DN
+    typical_values = ({"column_noise_dn": 0.32},)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -155,6 +155,9 @@ class EmpiricalResponse(Effect):
         description="what samples follow: `of` (sample, row, column, frame), `place`, relative `weight`",
     )
 
+    #: a sample that follows the one read four before it
+    typical_values = ({"response": 0.01, "terms": (ResponseTerm(place=(0, 0, -4)),)},)
+
     def halo(self) -> int:
         """Return how far across rows samples follow others, px."""
         return max(
@@ -183,11 +186,6 @@ class EmpiricalResponse(Effect):
             columns = slice(*term.columns) if term.columns else slice(None)
             found[..., columns] += self.response * term.weight * term.seen(charge, exposure)[..., columns]
         return found
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return a sample that follows the one read four before it."""
-        return (cls(response=0.01, terms=(ResponseTerm(place=(0, 0, -4)),)),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

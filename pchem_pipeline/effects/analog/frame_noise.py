@@ -54,10 +54,8 @@ class FrameNoise(SharedNoise):
     }
     frame_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the frames' offsets, DN")
 
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.12 DN."""
-        return (cls(frame_noise_dn=0.12),)
+    #: at 0.12 DN
+    typical_values = ({"frame_noise_dn": 0.12},)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -62,6 +62,9 @@ class InterpixelCapacitance(Effect):
         description="(coupling along x less that along y) / (sum of the two), no unit",
     )
 
+    #: as in a monolithic sensor
+    typical_values = ({"coupling": 0.0016},)
+
     def halo(self) -> int:
         """Return 1: the rows above and below."""
         return 1
@@ -84,11 +87,6 @@ class InterpixelCapacitance(Effect):
         result[:, :, :-1] += across
         result[:, :, 1:] -= across
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it as in a monolithic sensor."""
-        return (cls(coupling=0.0016),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

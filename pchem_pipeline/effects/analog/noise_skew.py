@@ -55,6 +55,9 @@ class NoiseSkew(Effect):
         "negative: tail to low DN",
     )
 
+    #: a tail to high DN and one to low DN
+    typical_values = ({"share": 0.4}, {"share": -0.4})
+
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with a part of the noise exchanged for an exponential one."""
         exponential = np.log(context.random.uniform(("frame", "y", "x")))
@@ -64,11 +67,6 @@ class NoiseSkew(Effect):
             exponential -= (1.0 - self._gaussian) * context.read_noise
         exponential += values
         return exponential
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return a tail to high DN and one to low DN."""
-        return cls(share=0.4), cls(share=-0.4)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -58,6 +58,9 @@ class Nonlinearity(Effect):
         description="kept: what bends comes before the read noise (sense node); bent: after it (amplifiers)",
     )
 
+    #: steps that grow and steps that shrink
+    typical_values = ({"step_change": 2e-3}, {"step_change": -2e-3})
+
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, on a bent comb; draws nothing."""
         if self.noise == "bent":
@@ -68,11 +71,6 @@ class Nonlinearity(Effect):
         bend *= 0.5 * self.step_change
         bend += values
         return bend
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return steps that grow and steps that shrink."""
-        return cls(step_change=2e-3), cls(step_change=-2e-3)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

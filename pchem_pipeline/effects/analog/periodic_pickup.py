@@ -81,6 +81,14 @@ class PeriodicPickup(Effect):
     phase: Radians = Field(default=0.0, ge=-100, le=100, description="phase at row, column and frame 0, rad")
     random_phase: bool = Field(default=False, description="true: a new random phase in every frame")
 
+    #: at 0.092 DN: along rows and frames, frames alone, at random phase, along columns
+    typical_values = (
+        {"amplitude_dn": 0.092, "cycles_per_row": 0.17, "cycles_per_frame": 0.23},
+        {"amplitude_dn": 0.092, "cycles_per_frame": 0.23},
+        {"amplitude_dn": 0.092, "cycles_per_row": 0.17, "random_phase": True},
+        {"amplitude_dn": 0.092, "cycles_per_column": 0.17, "cycles_per_frame": 0.23},
+    )
+
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the sine referred to the input."""
         turn = 2j * np.pi
@@ -92,16 +100,6 @@ class PeriodicPickup(Effect):
         if self.cycles_per_column:
             along = along * np.exp(turn * self.cycles_per_column * np.arange(context.shape[1]))
         return add_offset(values, self.amplitude_dn * along.imag, context)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.092 DN: along rows and frames, frames alone, at random phase, along columns."""
-        return (
-            cls(amplitude_dn=0.092, cycles_per_row=0.17, cycles_per_frame=0.23),
-            cls(amplitude_dn=0.092, cycles_per_frame=0.23),
-            cls(amplitude_dn=0.092, cycles_per_row=0.17, random_phase=True),
-            cls(amplitude_dn=0.092, cycles_per_column=0.17, cycles_per_frame=0.23),
-        )
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

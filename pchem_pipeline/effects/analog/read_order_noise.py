@@ -54,6 +54,9 @@ class ReadOrderNoise(Effect):
         default=1, ge=1, le=4096, description="blocks of columns read at the same time, noise of their own"
     )
 
+    #: at 0.5 DN, of one tap and of four
+    typical_values = ({"noise_dn": 0.5}, {"noise_dn": 0.5, "taps": 4})
+
     def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with as many taps as these columns have of its width."""
         return self._with_taps((columns[1] - columns[0]) / shape[1])
@@ -82,11 +85,6 @@ class ReadOrderNoise(Effect):
             noise[t] = series.transpose(1, 0, 2).reshape(rows, taps * width)[context.rows, :columns]
         noise *= self.noise_dn
         return add_offset(values, noise, context)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.5 DN, of one tap and of four."""
-        return cls(noise_dn=0.5), cls(noise_dn=0.5, taps=4)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -49,15 +49,13 @@ class ReadoutAlternation(Effect):
         ge=-1e6, le=1e6, description="offset of even frames, and minus that of odd ones, DN"
     )
 
+    #: at 0.024 DN, with both signs
+    typical_values = ({"alternation_dn": 0.024}, {"alternation_dn": -0.024})
+
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the offset referred to the input; draws nothing."""
         sign = 1.0 - 2.0 * (context.frames % 2)
         return add_offset(values, (self.alternation_dn * sign)[:, None, None], context)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.024 DN, with both signs."""
-        return cls(alternation_dn=0.024), cls(alternation_dn=-0.024)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -41,10 +41,8 @@ class RowNoise(SharedNoise):
     }
     row_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the rows' offsets, DN")
 
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.35 DN."""
-        return (cls(row_noise_dn=0.35),)
+    #: at 0.35 DN
+    typical_values = ({"row_noise_dn": 0.35},)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -134,6 +134,15 @@ class RtsNoise(Effect):
         "differ from trap to trap; 0: alike in all",
     )
 
+    #: double sampling at two steps, multiple sampling, and a slow trap
+    typical_values = (
+        {"fraction": 0.014, "amplitude_e": 1.0},
+        {"fraction": 0.014, "amplitude_e": 2.5, "probability": 0.1},
+        {"fraction": 0.014, "amplitude_e": 1.0, "spread": "exponential"},
+        {"fraction": 0.014, "amplitude_e": 1.5, "samples": 4},
+        {"fraction": 0.014, "amplitude_e": 0.5, "probability": 0.5, "sampling": "single"},
+    )
+
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the steps of the pixels that have a trap."""
         result: AnyArray = values.copy()
@@ -186,17 +195,6 @@ class RtsNoise(Effect):
     def _places(self) -> int:
         """Return between how many successive samples a jump can fall."""
         return 2 * self.samples - 1
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return double sampling at two steps, multiple sampling, and a slow trap."""
-        return (
-            cls(fraction=0.014, amplitude_e=1.0),
-            cls(fraction=0.014, amplitude_e=2.5, probability=0.1),
-            cls(fraction=0.014, amplitude_e=1.0, spread="exponential"),
-            cls(fraction=0.014, amplitude_e=1.5, samples=4),
-            cls(fraction=0.014, amplitude_e=0.5, probability=0.5, sampling="single"),
-        )
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -51,6 +51,9 @@ class SignalDependentNoise(Effect):
         "of a sample share it (noise_e k)",
     )
 
+    #: both growths
+    typical_values = ({"noise_e": 0.06}, {"noise_e": 0.03, "growth": "linear"})
+
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the noise of its electrons."""
         noise = context.random.normal(("frame", "y", "x"))
@@ -59,11 +62,6 @@ class SignalDependentNoise(Effect):
         noise *= self.noise_e
         noise += values
         return noise
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return both growths."""
-        return cls(noise_e=0.06), cls(noise_e=0.03, growth="linear")
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

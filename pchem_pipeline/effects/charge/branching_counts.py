@@ -58,6 +58,9 @@ class BranchingCounts(Effect):
         ge=0, le=0.5, description="mean number of further electrons made by each electron (l), no unit"
     )
 
+    #: at half a percent, and at the tenth of a silicon photomultiplier
+    typical_values = ({"branching": 0.0052},)
+
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-; thinned by 1 - l first, so that the mean stays."""
         if self.branching == 0:
@@ -70,11 +73,6 @@ class BranchingCounts(Effect):
             return 1 + np.searchsorted(below, v)
 
         return regrouped(values, u, self.branching, lambda index: (self.branching, grow), extra)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at half a percent, and at the tenth of a silicon photomultiplier."""
-        return (cls(branching=0.0052),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -9,8 +9,7 @@ and part of H.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -40,6 +39,9 @@ class ChargeDiffusion(Effect):
     )
     fraction: Ratio = Field(ge=0, le=0.9, description="probability that an electron moves, no unit")
 
+    #: at a fifth
+    typical_values = ({"fraction": 0.2},)
+
     def halo(self) -> int:
         """Return 1 row: the neighbours above and below."""
         return 1
@@ -57,8 +59,3 @@ class ChargeDiffusion(Effect):
         arrives = leaves & (to_y >= 0) & (to_y < values.shape[1])
         np.add.at(result, (frame[arrives], to_y[arrives], to_x[arrives]), 1)
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at a fifth."""
-        return (cls(fraction=0.2),)

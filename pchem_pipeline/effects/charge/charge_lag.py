@@ -8,8 +8,7 @@ Hondongwa 2014, "A Review of the Pinned Photodiode"; 0.1 e- and less in the pump
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -39,6 +38,9 @@ class ChargeLag(Effect):
         ge=0, le=0.9, description="probability that an electron is one frame late, no unit"
     )
 
+    #: at a fifth
+    typical_values = ({"fraction": 0.2},)
+
     def history(self) -> int:
         """Return 1 frame: the one whose electrons are late."""
         return 1
@@ -52,8 +54,3 @@ class ChargeLag(Effect):
         result: AnyArray = values - late
         result[1:] += late[:-1]
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at a fifth."""
-        return (cls(fraction=0.2),)

@@ -110,6 +110,9 @@ class CosmicRays(Effect):
         default=3.0, gt=0, description="standard deviation of such a cloud along an axis, um"
     )
 
+    #: at one track in 80 frames
+    typical_values = ({"tracks_per_frame": 0.012},)
+
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, with those of the tracks; touches frames with tracks."""
         result = values.copy()
@@ -166,11 +169,6 @@ class CosmicRays(Effect):
         tracks = ("length_um", "electrons_per_um") if self.cloud_share < 1.0 else ()
         clouds = ("cloud_share", "cloud_electrons", "cloud_um") if self.cloud_share > 0.0 else ()
         return tracks + clouds
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at one track in 80 frames."""
-        return (cls(tracks_per_frame=0.012),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -96,6 +96,9 @@ class EmpiricalElectrons(Effect):
         min_length=1, max_length=8, description="what happens: its `fate`, `place` and relative `weight`"
     )
 
+    #: electrons of which each hundredth brings another one to the next frame
+    typical_values = ({"chance": 0.01, "modes": (ElectronMode(fate="followed", place=(1, 0, 0)),)},)
+
     @property
     def unlisted(self) -> bool:
         """Whether electrons go one by one, or bring others to later frames."""
@@ -158,11 +161,6 @@ class EmpiricalElectrons(Effect):
         """Return the chance, or mean number, of each mode."""
         largest = max(mode.weight for mode in self.modes)
         return [self.chance * mode.weight / largest for mode in self.modes]
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return electrons of which each hundredth brings another one to the next frame."""
-        return (cls(chance=0.01, modes=(ElectronMode(fate="followed", place=(1, 0, 0)),)),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -48,6 +48,9 @@ class OpticalCrosstalk(Effect):
         ge=0, le=0.5, description="probability that an electron makes one more in a neighbour, no unit"
     )
 
+    #: at one percent
+    typical_values = ({"probability": 0.0112},)
+
     def halo(self) -> int:
         """Return 1 row: the neighbours above and below."""
         return 1
@@ -62,11 +65,6 @@ class OpticalCrosstalk(Effect):
         inside = (y >= 0) & (y < values.shape[1]) & (x >= 0) & (x < values.shape[2])
         np.add.at(result, (frame[inside], y[inside], x[inside]), 1)
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at one percent."""
-        return (cls(probability=0.0112),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

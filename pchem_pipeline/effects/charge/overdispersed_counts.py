@@ -63,6 +63,9 @@ class OverdispersedCounts(Effect):
         description="how the exposures are distributed; gamma: electron numbers are negative binomial",
     )
 
+    #: at a = 0.0064, an exposure that jitters by 8 %
+    typical_values = ({"relative_variance": 0.0064},)
+
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, made of Poisson ones of mean ``context.exposure``."""
         assert context.exposure is not None  # the chain gives it from this plane on
@@ -102,11 +105,6 @@ class OverdispersedCounts(Effect):
             np.broadcast_to(exposure, values.shape) * np.maximum(factor - 1.0, 0.0), 2
         )
         return np.asarray(values - lost.reshape(values.shape) + added, values.dtype)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at a = 0.0064, an exposure that jitters by 8 %."""
-        return (cls(relative_variance=0.0064),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -7,8 +7,7 @@ Poisson electrons is Poisson: at one exposure time they are part of H.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -40,6 +39,9 @@ class SpuriousCharge(Effect):
         ge=0, le=1e6, description="mean number of spurious electrons per pixel and frame, e-"
     )
 
+    #: at 0.3 e-
+    typical_values = ({"mean_e": 0.3},)
+
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, spurious ones included."""
         if self.mean_e == 0:
@@ -50,8 +52,3 @@ class SpuriousCharge(Effect):
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with this charge on top of H, which is then the exposure without it."""
         return model.with_added_exposure([[self.mean_e]], [[1.0]])
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.3 e-."""
-        return (cls(mean_e=0.3),)

@@ -98,6 +98,13 @@ class Trapping(Effect):
     )
     fraction: Ratio = Field(default=1.0, ge=0, le=1, description="share of the pixels with a trap, no unit")
 
+    #: in all pixels, fast and slow, and in a tenth of them
+    typical_values = (
+        {"capture": 0.03, "release": 0.4},
+        {"capture": 0.3, "release": 0.06},
+        {"capture": 0.3, "release": 0.3, "fraction": 0.1},
+    )
+
     def history(self) -> int:
         """Return how many frames ago a trap was last filled or emptied whatever its state was, at most."""
         # chances above one half also make it change places, which leaves its state open
@@ -117,15 +124,6 @@ class Trapping(Effect):
         emptied = u < self.release
         full = _states(filled, emptied, self.history())
         return values + full[:-1] - full[1:]
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it in all pixels, fast and slow, and in a tenth of them."""
-        return (
-            cls(capture=0.03, release=0.4),
-            cls(capture=0.3, release=0.06),
-            cls(capture=0.3, release=0.3, fraction=0.1),
-        )
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

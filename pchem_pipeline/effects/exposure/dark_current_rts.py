@@ -85,6 +85,12 @@ class DarkCurrentRts(Effect):
         default=200.0, ge=0.5, description="mean time in the upper level, frames"
     )
 
+    #: in 1.1 % of the pixels, slow and fast
+    typical_values = (
+        {"fraction": 0.011},
+        {"fraction": 0.011, "dwell_low_frames": 20.0, "dwell_high_frames": 20.0},
+    )
+
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the blinking exposure (frame, y, x), e-; touches the pixels that blink only."""
         result = values.copy()
@@ -150,11 +156,6 @@ class DarkCurrentRts(Effect):
     def details(self) -> tuple[str, ...]:
         """Return the step and both dwell times: second moments tell only what they come to together."""
         return ("step_e", "dwell_low_frames", "dwell_high_frames") if self.step_e > 0.0 else ()
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it in 1.1 % of the pixels, slow and fast."""
-        return (cls(fraction=0.011), cls(fraction=0.011, dwell_low_frames=20.0, dwell_high_frames=20.0))
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

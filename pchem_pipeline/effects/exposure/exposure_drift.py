@@ -74,6 +74,14 @@ class ExposureDrift(Effect):
         "unit (its mean and range are taken out); empty: a straight line",
     )
 
+    #: at 1.6 % end to end, rising and falling, straight and settling
+    typical_values = (
+        {"drift": 0.016},
+        {"drift": -0.016},
+        {"drift": 0.016, "settling_fraction": 0.2},
+        {"drift": -0.016, "settling_fraction": 0.2},
+    )
+
     @model_validator(mode="after")
     def _one_profile(self) -> Self:
         if self.path and self.settling_fraction is not None:
@@ -100,16 +108,6 @@ class ExposureDrift(Effect):
         factor = np.maximum(1.0 + self.drift * self.profile(position), 0.0)
         result: AnyArray = values * factor[:, None, None]
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 1.6 % end to end, rising and falling, straight and settling."""
-        return (
-            cls(drift=0.016),
-            cls(drift=-0.016),
-            cls(drift=0.016, settling_fraction=0.2),
-            cls(drift=-0.016, settling_fraction=0.2),
-        )
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

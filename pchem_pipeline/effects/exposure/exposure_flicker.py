@@ -83,6 +83,13 @@ class ExposureFlicker(Effect):
         default=(), max_length=64, description="share of the frames at each of the levels; empty: equal"
     )
 
+    #: at 2 %: from frame to frame, slower, and on the mains (100 Hz at 30 frames/s)
+    typical_values = (
+        {"rms": 0.02},
+        {"rms": 0.02, "correlation_frames": 5.0},
+        {"rms": 0.02, "period_frames": 3.0},
+    )
+
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
         if self.period_frames is not None and (self.correlation_frames > 0 or self.levels):
@@ -141,11 +148,6 @@ class ExposureFlicker(Effect):
         path = np.asarray(lfilter([1.0], [1.0, -kept], steps))
         fluctuation: FloatArray = path[context.frames.clip(0, context.n_frames - 1)]
         return fluctuation
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 2 %: from frame to frame, slower, and on the mains (100 Hz at 30 frames/s)."""
-        return (cls(rms=0.02), cls(rms=0.02, correlation_frames=5.0), cls(rms=0.02, period_frames=3.0))
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -81,6 +81,9 @@ class Glow(Effect):
         description="exponential: to 1/e within the radius; gaussian: of that standard deviation",
     )
 
+    #: a corner that bursts in one frame of fifty, by 1 e-, and one that grows by 0.3 e-
+    typical_values = ({"peak_e": 1.0, "burst_share": 0.02}, {"peak_e": 0.3})
+
     def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its centre counted from these rows and columns, and the size that it has there."""
         return self.model_copy(update=spot_seen_in(vars(self), self.falloff, rows, columns, shape))
@@ -123,11 +126,6 @@ class Glow(Effect):
             sizes[:, None, None] * image,
             np.broadcast_to(weights[:, None, None], (sizes.size, *image.shape)),
         )
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return a corner that bursts in one frame of fifty, by 1 e-, and one that grows by 0.3 e-."""
-        return cls(peak_e=1.0, burst_share=0.02), cls(peak_e=0.3)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -95,6 +95,9 @@ class Persistence(Effect):
         "whole sensor (rows of numbers >= 0, the largest counts as 1, linear in between); empty: the spot",
     )
 
+    #: a spot of 0.15 e- that fades within a quarter of a run of 4000 frames
+    typical_values = ({"peak_e": 0.15, "decay_frames": 1000.0},)
+
     @model_validator(mode="after")
     def _image_is_a_grid(self) -> Self:
         if not self.image:
@@ -190,11 +193,6 @@ class Persistence(Effect):
         if self.slow_decay_frames is not None:
             left = (1.0 - self.slow_share) * left + self.slow_share * np.exp(-t / self.slow_decay_frames)
         return self.peak_e * left
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return a spot of 0.15 e- that fades within a quarter of a run of 4000 frames."""
-        return (cls(peak_e=0.15, decay_frames=1000.0),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

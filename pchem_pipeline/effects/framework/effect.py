@@ -105,6 +105,7 @@ class Effect(Section):
         measured_only: whether it is no hypothesis, but what is measured where all of those have failed.
         far_reaching: whether samples depend on others anywhere in their frame, so that a part of the sensor
             by itself does not show it.
+        typical_values: parameters as met in practice, one set for each of its kinds (signs, patterns).
         attained: parameters that may well be at a limit: a frequency at half a cycle, a missing code. A fit
             that drives any other one there has taken another effect for this one.
     """
@@ -124,6 +125,7 @@ class Effect(Section):
     rough_law: ClassVar[bool] = False
     measured_only: ClassVar[bool] = False
     far_reaching: ClassVar[bool] = False
+    typical_values: ClassVar[tuple[Mapping[str, Any], ...]] = ()
     attained: ClassVar[tuple[str, ...]] = ()
     region: Region | None = Field(default=None, description="where on the sensor it acts; null: everywhere")
     when: When | None = Field(default=None, description="in which frames it acts; null: in all")
@@ -196,11 +198,11 @@ class Effect(Section):
 
     @classmethod
     def typical(cls) -> Sequence[Self]:
-        """Return it at strengths met in practice, one for each of its kinds (signs, patterns).
+        """Return it with each of its :attr:`typical_values`.
 
         Used as guesses where :meth:`estimate` has nothing better, and for demonstrations.
         """
-        return ()
+        return tuple(cls.model_validate(values) for values in cls.typical_values)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

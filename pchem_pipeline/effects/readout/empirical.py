@@ -119,6 +119,9 @@ class Empirical(Effect):
         "columns of this parity on (0 even, 1 odd); null: none does",
     )
 
+    #: a hundredth of the samples 8 DN too low
+    typical_values = ({"share": 0.01, "moves": (Move(shift_dn=-8),)},)
+
     @model_validator(mode="after")
     def _has_moves(self) -> Self:
         if not sum(move.weight for move in self.moves) > 0:
@@ -183,11 +186,6 @@ class Empirical(Effect):
                     here = here & known
                 found = np.where(here, move.of(own, other), found)
         return found.clip(0, 2**context.bit_depth - 1).astype(values.dtype)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return a hundredth of the samples 8 DN too low."""
-        return (cls(share=0.01, moves=(Move(shift_dn=-8),)),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

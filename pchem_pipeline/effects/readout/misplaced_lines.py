@@ -64,6 +64,13 @@ class MisplacedLines(Effect):
     )
     lines: Literal["rows", "columns"] = Field(default="rows", description="which lines")
 
+    #: rows that change places, come late, and lose a sample, one in a hundred
+    typical_values = (
+        {"share": 1e-2},
+        {"share": 1e-2, "move": "late"},
+        {"share": 1e-2, "move": "sample_lost"},
+    )
+
     def halo(self) -> int:
         """Return 2: whether a row changes places with the next depends on the two before."""
         return 2
@@ -103,11 +110,6 @@ class MisplacedLines(Effect):
             "line_twice": {"before": some},
         }[self.move]
         return {self.lines: np.array([found.get(place, 0.0) for place in PLACES])}
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return rows that change places, come late, and lose a sample, one in a hundred."""
-        return cls(share=1e-2), cls(share=1e-2, move="late"), cls(share=1e-2, move="sample_lost")
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -61,6 +61,9 @@ class PixelCorrection(Effect):
         description="median or mean: of the eight neighbours; row: mean of the left and the right one",
     )
 
+    #: at 60 DN above the median
+    typical_values = ({"threshold_dn": 60},)
+
     def halo(self) -> int:
         """Return 1: the rows beside."""
         return 1
@@ -80,11 +83,6 @@ class PixelCorrection(Effect):
             value[:, 1:-1, 1:-1] = predicted(frames, self.predictor)
             inside[1:-1, 1:-1] = True
         return Replacement(value, inside, self.threshold_dn, self.share)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 60 DN above the median."""
-        return (cls(threshold_dn=60),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -64,6 +64,9 @@ class RepeatedFrames(Effect):
         default=None, description="first row and the row after the last that are repeated; null: all rows"
     )
 
+    #: at one frame in a thousand
+    typical_values = ({"probability": 1e-3},)
+
     @field_validator("rows")
     @classmethod
     def _some_rows(cls, rows: tuple[int, int] | None) -> tuple[int, int] | None:
@@ -109,11 +112,6 @@ class RepeatedFrames(Effect):
         result: AnyArray = values.copy()
         result[:, chosen] = values[source][:, chosen]
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at one frame in a thousand."""
-        return (cls(probability=1e-3),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -42,6 +42,9 @@ class RepeatedLines(Effect):
     share: Ratio = Field(ge=0, le=0.5, description="probability that a line repeats the one before, no unit")
     lines: Literal["rows", "columns"] = Field(default="rows", description="which lines")
 
+    #: one row, and one column, in a thousand
+    typical_values = ({"share": 1e-3}, {"share": 1e-3, "lines": "columns"})
+
     def halo(self) -> int:
         """Return 1 for rows: the one above."""
         return 1 if self.lines == "rows" else 0
@@ -56,11 +59,6 @@ class RepeatedLines(Effect):
             repeats = context.random.uniform(("frame", "x"))[:, :, 1:] < self.share
             result[:, :, 1:] = np.where(repeats, values[:, :, :-1], values[:, :, 1:])
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return one row, and one column, in a thousand."""
-        return cls(share=1e-3), cls(share=1e-3, lines="columns")
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
