@@ -16,11 +16,9 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.common_modes import (
     WORTH_A_GUESS,
-    quantile_means,
     responsivity,
     run_position,
     successive,
-    with_offsets,
 )
 from pchem_pipeline.effects.estimators.time_profiles import (
     along_path,
@@ -28,10 +26,10 @@ from pchem_pipeline.effects.estimators.time_profiles import (
     settling,
     settling_time,
 )
-from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, Ratio, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
+from pchem_pipeline.effects.families.offsets import OffsetEffect, quantile_means
+from pchem_pipeline.effects.framework.effect import Dn, Ratio, register_effect
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 from pchem_pipeline.effects.types import (
-    AnyArray,
     EffectContext,
     Evidence,
     FloatArray,
@@ -42,12 +40,11 @@ from pchem_pipeline.effects.types import (
 
 _NODES = (3, 5, 9, 17, 33)
 _FRAMES_PER_NODE = 12
-_LOBES = 7
 _WORTH_A_CURVE = 4.0  # of the Bayesian information criterion, beyond a line
 
 
 @register_effect
-class BiasDrift(Effect):
+class BiasDrift(OffsetEffect):
     """Slow offset of all pixels, zero on average over the run.
 
     Signature: block means of the readout residual move together, by the same number of DN in every pixel,
@@ -55,7 +52,6 @@ class BiasDrift(Effect):
     """
 
     tag: Literal["bias_drift"] = Field(default="bias_drift", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "bias (pedestal) drift"
     source: ClassVar[str] = "Rauscher 2015, PASP 127, 1144 (pedestal drift); Janesick 2001, ch. 7"
     signature: ClassVar[tuple[str, ...]] = (
@@ -91,30 +87,42 @@ class BiasDrift(Effect):
         description="bias at equally spaced frames from first to last of the run, in units of drift_dn",
     )
 
+    #: at 0.09 DN: rising, falling, there and back
+    typical_values = (
+        {"drift_dn": 0.09},
+        {"drift_dn": -0.09},
+        {"drift_dn": 0.09, "shape": "path", "path": (-0.5, 0.5, -0.5)},
+    )
+
     @model_validator(mode="after")
     def _path_where_it_belongs(self) -> Self:
         check_path(self.tag, self.shape, self.path)
         return self
 
-    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
-        """Return the signal (frame, y, x), e-, with the offset referred to the input."""
+    def offsets(self, context: EffectContext) -> FloatArray:
+        """Return the offsets of the frames, DN."""
         if self.shape == "walk":
             offset = _walk(context)
         else:
             offset = self._path_at(run_position(context.frames, context.n_frames))
-        return add_offset(values, (self.drift_dn * offset)[:, None, None], context)
+        return np.asarray((self.drift_dn * offset)[:, None, None])
+
+    def offset_values(self) -> FloatArray:
+        """Return values, DN, that the path goes through."""
+        return quantile_means(self.drift_dn * self._path_at(np.linspace(0.0, 1.0, 1001)))
+
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
+        """Return the law smeared over the path; of a walk that with its variance."""
+        if self.shape == "walk":
+            # mean square of a walk around its own mean: a sixth of the variance of its end
+            return model.with_variance(dn2=self.drift_dn**2 / 6.0)
+        return super().sample_law(model, maps)
 
     def _path_at(self, position: FloatArray) -> FloatArray:
         """Return the shape at positions 0..1 in the run, in units of ``drift_dn``, zero on average."""
         if self.shape == "settling":
             return settling(position, self.settling_fraction)
         return along_path(position, self.path or (-0.5, 0.5))
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.09 DN: rising, falling, there and back."""
-        bow = cls(drift_dn=0.09, shape="path", path=(-0.5, 0.5, -0.5))
-        return cls(drift_dn=0.09), cls(drift_dn=-0.09), bow
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -149,14 +157,6 @@ class BiasDrift(Effect):
     def shared_offset(self) -> SharedOffset:
         """Return the offset of a frame: others may be at any place of the drift."""
         return SharedOffset("frame", self.drift_dn**2)
-
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law smeared over the path (a variance where the drift is small against the noise)."""
-        if self.shape == "walk":
-            # mean square of a walk around its own mean: a sixth of the variance of its end
-            return model.with_variance(dn2=self.drift_dn**2 / 6.0)
-        offsets = self.drift_dn * self._path_at(np.linspace(0.0, 1.0, 1001))
-        return with_offsets(model, maps, quantile_means(offsets, _LOBES))
 
 
 def _walk(context: EffectContext) -> FloatArray:

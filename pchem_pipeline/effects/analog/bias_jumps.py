@@ -14,20 +14,18 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.estimators.common_modes import quantile_means, responsivity, with_offsets
+from pchem_pipeline.effects.estimators.common_modes import responsivity
 from pchem_pipeline.effects.estimators.levels.change_points import noise_variance
 from pchem_pipeline.effects.estimators.levels.two_levels import likeliest_parts
-from pchem_pipeline.effects.framework.effect import Count, Dn, Effect, PerFrame, Plane, register_effect
+from pchem_pipeline.effects.families.offsets import OffsetEffect, quantile_means
+from pchem_pipeline.effects.framework.effect import Count, Dn, PerFrame, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 from pchem_pipeline.effects.types import (
-    AnyArray,
     BoolArray,
     EffectContext,
     Evidence,
     FloatArray,
     IntArray,
-    PixelMaps,
-    SampleLaw,
     TimeSeries,
 )
 
@@ -40,14 +38,13 @@ _PARTS: dict[Parts, FloatArray] = {
     "top_bottom": np.array([[0.5, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.5]]),
     "left_right": np.array([[0.5, 0.0, 0.5, 0.0], [0.0, 0.5, 0.0, 0.5]]),
 }
-_LOBES = 7
 _LAGS = 40
 # of the best of some ten rates
 _SIGNIFICANT = 2.5
 
 
 @register_effect
-class BiasJumps(Effect):
+class BiasJumps(OffsetEffect):
     """Piecewise constant offset of each quadrant or half of the sensor, independent of the others.
 
     An odd middle row or column belongs to the bottom or right.
@@ -57,7 +54,6 @@ class BiasJumps(Effect):
     """
 
     tag: Literal["bias_jumps"] = Field(default="bias_jumps", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "bias jumps (popcorn mesa noise of an output)"
     source: ClassVar[str] = "WFPC2 Data Handbook (STScI), bias jumps; Rauscher 2015, PASP 127, 1144"
     signature: ClassVar[tuple[str, ...]] = (
@@ -102,19 +98,20 @@ class BiasJumps(Effect):
                 raise ValueError("bias_jumps: frames of a path must increase; sort them")
         return self
 
-    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
-        """Return the signal (frame, y, x), e-, with the offsets referred to the input."""
-        levels = self.amplitude_dn * self._levels(context)
-        factors = {"quadrants": (2, 1), "top_bottom": (1, 0), "left_right": (0, 1)}[self.parts]
-        # rows and columns are in order: each quadrant is a rectangle
-        row = int(np.searchsorted(context.rows, context.shape[0] // 2))
-        column = context.shape[1] // 2
-        result: AnyArray = values.copy()
-        for below, ys in enumerate((slice(0, row), slice(row, None))):
-            for right, xs in enumerate((slice(0, column), slice(column, None))):
-                offset = levels[:, factors[0] * below + factors[1] * right, None, None]
-                result[:, ys, xs] += offset * context.truth["conversion_gain"][ys, xs]
-        return result
+    def offsets(self, context: EffectContext) -> FloatArray:
+        """Return the offsets of the parts in a block of frames, DN."""
+        below, right = {"quadrants": (2, 1), "top_bottom": (1, 0), "left_right": (0, 1)}[self.parts]
+        rows, columns = (size // 2 for size in context.shape)
+        part = below * (context.rows >= rows)[:, None] + right * (np.arange(context.shape[1]) >= columns)
+        return np.asarray(self.amplitude_dn * self._levels(context)[:, part])
+
+    def offset_values(self) -> FloatArray:
+        """Return the levels, DN; of paths those of all parts, since the pixels' places are not known here."""
+        if self.path:
+            values = _values(self.path)
+        else:
+            values = np.asarray(np.arange(self.levels) - (self.levels - 1) / 2.0, np.float64)
+        return self.amplitude_dn * quantile_means(values)
 
     def _levels(self, context: EffectContext) -> FloatArray:
         """Return the levels at the block's frames in units of ``amplitude_dn``, (frame, part)."""
@@ -179,17 +176,6 @@ class BiasJumps(Effect):
     def shared_offset(self) -> SharedOffset:
         """Return that frames have one: at which level others are is not known."""
         return SharedOffset("frame", None)
-
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law of copies at the levels (a variance where they are close against the noise).
-
-        The pixels' places are not known here, so a path counts with the mean law of the quadrants.
-        """
-        if self.path:
-            values = _values(self.path)
-        else:
-            values = np.asarray(np.arange(self.levels) - (self.levels - 1) / 2.0, np.float64)
-        return with_offsets(model, maps, self.amplitude_dn * quantile_means(values, _LOBES))
 
 
 def _steps(path: Path, n_frames: int) -> tuple[IntArray, FloatArray]:

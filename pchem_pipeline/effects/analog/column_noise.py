@@ -7,15 +7,13 @@ do not change from frame to frame are part of the bias map and not this effect.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.common_modes import line_noise
+from pchem_pipeline.effects.families.offsets import SharedNoise
 from pchem_pipeline.effects.framework.effect import Dn, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedNoise
-from pchem_pipeline.effects.types import Evidence
 
 
 @register_effect
@@ -42,9 +40,3 @@ class ColumnNoise(SharedNoise):
 
     #: at 0.32 DN
     typical_values = ({"column_noise_dn": 0.32},)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the excess variance of column means within their frames (moment estimate)."""
-        found = line_noise(evidence, "column")
-        return () if found is None else (cls(column_noise_dn=found),)

@@ -21,8 +21,8 @@ from pchem_pipeline.effects.estimators.common_modes import (
     responsivity,
     successive,
 )
+from pchem_pipeline.effects.families.offsets import SharedNoise
 from pchem_pipeline.effects.framework.effect import Dn, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedNoise
 from pchem_pipeline.effects.types import Evidence, FloatArray, TimeSeries
 
 

@@ -83,6 +83,13 @@ class GainDrift(Effect):
         description="gain at equally spaced frames from the first to the last of the run, in units of drift",
     )
 
+    #: a gain that rises, falls, and does both
+    typical_values = (
+        {"drift": 0.006},
+        {"drift": -0.006},
+        {"drift": 0.006, "shape": "path", "path": (-0.5, 0.5, -0.5)},
+    )
+
     @model_validator(mode="after")
     def _path_where_it_belongs(self) -> Self:
         check_path(self.tag, self.shape, self.path)
@@ -95,12 +102,6 @@ class GainDrift(Effect):
         profile = self._profile(run_position(context.frames, context.n_frames))
         result: AnyArray = values * (1.0 + self.drift * profile)[:, None, None]
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return a gain that rises, falls, and does both."""
-        bow = cls(drift=0.006, shape="path", path=(-0.5, 0.5, -0.5))
-        return cls(drift=0.006), cls(drift=-0.006), bow
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

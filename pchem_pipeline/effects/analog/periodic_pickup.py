@@ -15,25 +15,22 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.common_modes import (
-    chebyshev_nodes,
     mean_response,
     responsivity,
-    with_offsets,
 )
 from pchem_pipeline.effects.estimators.lines import coherent_line, incoherent_line
-from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, Radians, Turns, register_effect
+from pchem_pipeline.effects.families.offsets import OffsetEffect, sine_values
+from pchem_pipeline.effects.framework.effect import Dn, Radians, Turns, register_effect
 from pchem_pipeline.effects.framework.evidence import Wave
 from pchem_pipeline.effects.framework.region import Span
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
-from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
 
 Pickup = TypeVar("Pickup", bound="PeriodicPickup")
 
-_LOBES = 5
-
 
 @register_effect
-class PeriodicPickup(Effect):
+class PeriodicPickup(OffsetEffect):
     """Sine along rows, columns and frames.
 
     Signature: the spectrum of the row means (over frames and rows) of the readout residual has one line, and
@@ -43,7 +40,6 @@ class PeriodicPickup(Effect):
     """
 
     tag: Literal["periodic_pickup"] = Field(default="periodic_pickup", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "periodic pickup (pattern noise, EMI)"
     source: ClassVar[str] = (
         "Jansen et al. 2003, HST Calibration Workshop (herring-bone noise of the STIS CCD)"
@@ -89,8 +85,8 @@ class PeriodicPickup(Effect):
         {"amplitude_dn": 0.092, "cycles_per_column": 0.17, "cycles_per_frame": 0.23},
     )
 
-    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
-        """Return the signal (frame, y, x), e-, with the sine referred to the input."""
+    def offsets(self, context: EffectContext) -> FloatArray:
+        """Return the sine in a block of frames, DN."""
         turn = 2j * np.pi
         start = np.exp(turn * self.cycles_per_frame * context.frames + 1j * self.phase)[:, None, None]
         if self.random_phase:
@@ -99,7 +95,11 @@ class PeriodicPickup(Effect):
         along = start * np.exp(turn * self.cycles_per_row * context.rows)[None, :, None]
         if self.cycles_per_column:
             along = along * np.exp(turn * self.cycles_per_column * np.arange(context.shape[1]))
-        return add_offset(values, self.amplitude_dn * along.imag, context)
+        return np.asarray(self.amplitude_dn * along.imag)
+
+    def offset_values(self) -> FloatArray:
+        """Return values, DN, of a sine at random phase (arcsine law)."""
+        return self.amplitude_dn * sine_values(5)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -157,10 +157,6 @@ class PeriodicPickup(Effect):
         if self.cycles_per_row == 0.0 and self.cycles_per_column == 0.0:
             return SharedOffset("frame", variance)
         return SharedOffset("wave", variance, self.cycles_per_row, self.cycles_per_column)
-
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law smeared by the arcsine law (a variance where the amplitude is small)."""
-        return with_offsets(model, maps, self.amplitude_dn * chebyshev_nodes(_LOBES))
 
 
 def _without_doubles(found: Sequence[tuple[float, Pickup]]) -> list[Pickup]:

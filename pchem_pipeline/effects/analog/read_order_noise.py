@@ -15,14 +15,14 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.read_order import RECORD, pink_amplitudes, pink_noise_of
-from pchem_pipeline.effects.framework.effect import Count, Dn, Effect, Plane, register_effect
+from pchem_pipeline.effects.families.offsets import OffsetEffect
+from pchem_pipeline.effects.framework.effect import Count, Dn, register_effect
 from pchem_pipeline.effects.framework.region import Span
-from pchem_pipeline.effects.framework.shared_offset import add_offset
-from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
+from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
 
 
 @register_effect
-class ReadOrderNoise(Effect):
+class ReadOrderNoise(OffsetEffect):
     """Noise with a spectrum of ``1 / f`` along the samples of a tap, from one cycle per frame on.
 
     Signature: row means of the readout residual scatter, those of adjacent rows alike, and neighbours along
@@ -30,7 +30,6 @@ class ReadOrderNoise(Effect):
     """
 
     tag: Literal["read_order_noise"] = Field(default="read_order_noise", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "1/f noise in the order of reading"
     source: ClassVar[str] = "Rauscher 2015, PASP 127, 1144 (correlated pink noise)"
     signature: ClassVar[tuple[str, ...]] = (
@@ -68,15 +67,15 @@ class ReadOrderNoise(Effect):
     def _with_taps(self, factor: float) -> Self:
         return self.model_copy(update={"taps": max(round(self.taps * factor), 1)})
 
-    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
-        """Return the signal (frame, y, x), e-, with the noise of the taps referred to the input."""
+    def offsets(self, context: EffectContext) -> FloatArray:
+        """Return the noise of the taps in a block of frames, DN."""
         if self.noise_dn == 0:
-            return values.copy()
+            return np.zeros((1, 1, 1))
         rows, columns = context.shape
         taps = min(self.taps, columns)
         width = -(-columns // taps)
         amplitudes = pink_amplitudes(rows * width)
-        noise = np.empty((values.shape[0], context.rows.size, columns))
+        noise = np.empty((context.frames.size, context.rows.size, columns))
         for t, frame in enumerate(context.frames):
             random = context.random.generator(frame=int(frame))
             white = np.fft.rfft(random.standard_normal((taps, RECORD * rows * width)))
@@ -84,14 +83,10 @@ class ReadOrderNoise(Effect):
             series = record[:, : rows * width].reshape(taps, rows, width)
             noise[t] = series.transpose(1, 0, 2).reshape(rows, taps * width)[context.rows, :columns]
         noise *= self.noise_dn
-        return add_offset(values, noise, context)
+        return noise
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return the noise that the covariances of rows and of neighbours show, for the likeliest taps."""
         found = pink_noise_of(evidence)
         return [cls(noise_dn=noise, taps=taps) for noise, taps in found]
-
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law with the variance of the noise: exact, a Gaussian on a Gaussian."""
-        return model.with_variance(dn2=self.noise_dn**2)

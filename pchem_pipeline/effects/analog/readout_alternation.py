@@ -17,15 +17,15 @@ from pchem_pipeline.effects.estimators.common_modes import (
     WORTH_A_GUESS,
     mean_variance,
     responsivity,
-    with_offsets,
 )
-from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
-from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
+from pchem_pipeline.effects.families.offsets import OffsetEffect
+from pchem_pipeline.effects.framework.effect import Dn, register_effect
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
 
 
 @register_effect
-class ReadoutAlternation(Effect):
+class ReadoutAlternation(OffsetEffect):
     """Offset of alternating sign, the same in every pixel: ``+alternation_dn`` in frames 0, 2, 4, ...
 
     Signature: the mean readout residual of even frames exceeds that of odd ones by ``2 alternation_dn``;
@@ -36,7 +36,6 @@ class ReadoutAlternation(Effect):
     tag: Literal["readout_alternation"] = Field(
         default="readout_alternation", description="name of the effect"
     )
-    plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "even-odd readout alternation (ping-pong offset)"
     source: ClassVar[str] = "Black and Hodges 1980, IEEE J. Solid-State Circuits 15, 1022 (interleaved ADCs)"
     signature: ClassVar[tuple[str, ...]] = ("frame.readout.alternating", "frame.readout.lag1")
@@ -52,10 +51,14 @@ class ReadoutAlternation(Effect):
     #: at 0.024 DN, with both signs
     typical_values = ({"alternation_dn": 0.024}, {"alternation_dn": -0.024})
 
-    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
-        """Return the signal (frame, y, x), e-, with the offset referred to the input; draws nothing."""
+    def offsets(self, context: EffectContext) -> FloatArray:
+        """Return the offsets of the frames, DN; draws nothing."""
         sign = 1.0 - 2.0 * (context.frames % 2)
-        return add_offset(values, (self.alternation_dn * sign)[:, None, None], context)
+        return np.asarray((self.alternation_dn * sign)[:, None, None], np.float64)
+
+    def offset_values(self) -> FloatArray:
+        """Return the offsets of even and of odd frames, DN."""
+        return self.alternation_dn * np.array([-1.0, 1.0])
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -77,7 +80,3 @@ class ReadoutAlternation(Effect):
     def shared_offset(self) -> SharedOffset:
         """Return the offset of a frame, either of two."""
         return SharedOffset("frame", self.alternation_dn**2)
-
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law of two copies, equally likely (a variance where they are close together)."""
-        return with_offsets(model, maps, self.alternation_dn * np.array([-1.0, 1.0]))

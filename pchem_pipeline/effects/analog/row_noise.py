@@ -7,15 +7,13 @@ because the eye finds stripes long before the pixel statistics do.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.common_modes import line_noise
+from pchem_pipeline.effects.families.offsets import SharedNoise
 from pchem_pipeline.effects.framework.effect import Dn, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedNoise
-from pchem_pipeline.effects.types import Evidence
 
 
 @register_effect
@@ -43,9 +41,3 @@ class RowNoise(SharedNoise):
 
     #: at 0.35 DN
     typical_values = ({"row_noise_dn": 0.35},)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the excess variance of row means within their frames (moment estimate)."""
-        found = line_noise(evidence, "row")
-        return () if found is None else (cls(row_noise_dn=found),)
