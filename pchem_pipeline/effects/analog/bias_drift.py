@@ -9,7 +9,7 @@ of the same camera may do. A slow sine is ``periodic_pickup`` at a few cycles pe
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, NamedTuple, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -21,8 +21,12 @@ from pchem_pipeline.effects.estimators.common_modes import (
     successive,
 )
 from pchem_pipeline.effects.estimators.time_profiles import (
-    along_path,
+    Fit,
     check_path,
+    fitted,
+    fitted_profile,
+    hats,
+    profile_at,
     settling,
     settling_time,
 )
@@ -120,9 +124,8 @@ class BiasDrift(OffsetEffect):
 
     def _path_at(self, position: FloatArray) -> FloatArray:
         """Return the shape at positions 0..1 in the run, in units of ``drift_dn``, zero on average."""
-        if self.shape == "settling":
-            return settling(position, self.settling_fraction)
-        return along_path(position, self.path or (-0.5, 0.5))
+        fraction = self.settling_fraction if self.shape == "settling" else None
+        return profile_at(position, fraction, self.path)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -135,24 +138,34 @@ class BiasDrift(OffsetEffect):
             return ()
         time, alpha = evidence.time, responsivity(evidence)
         position = run_position(time.frames, time.n_run)
-        slope, error = _slope(position, time.frame_readout)
-        linear = [cls(drift_dn=slope / alpha)] if abs(slope) > WORTH_A_GUESS * error else []
-        settled, path = _settled(position, time.frame_readout), _best_path(position, time.frame_readout)
-        if settled is not None:
-            size, fraction = settled.values[1] / alpha, settled.fraction
-            linear.insert(0, cls(drift_dn=size, shape="settling", settling_fraction=fraction))
-        if path is None:
-            if linear or evidence.strongest("frame.readout.slow") <= 3.0:
-                return linear
+        means, frames = time.frame_readout, position.size
+
+        def criterion(fit: Fit) -> float:
+            return frames * float(np.log(max(fit.chi2, 1e-300) / frames)) + fit.price(frames)
+
+        line = fitted_profile(means, position)
+        fraction = settling_time(lambda f: criterion(fitted_profile(means, settling(position, f))))
+        settled = fitted_profile(means, settling(position, fraction))
+        paths = [fitted(means, hats(position, n)) for n in _NODES if frames >= _FRAMES_PER_NODE * n]
+        path = min(paths, key=criterion, default=line)
+        slope, error = _slope(position, means)
+        found = [cls(drift_dn=slope / alpha)] if abs(slope) > WORTH_A_GUESS * error else []
+        least = criterion(line) - _WORTH_A_CURVE
+        if criterion(settled) < least:
+            size = settled.values[1] / alpha
+            found.insert(0, cls(drift_dn=size, shape="settling", settling_fraction=fraction))
+        if not criterion(path) < least:
+            if found or evidence.strongest("frame.readout.slow") <= 3.0:
+                return found
             return [cls(drift_dn=max(_wander(time), 1e-9) / alpha, shape="walk")]
         nodes = path.values
         size = float(np.ptp(nodes)) or 1.0
         bent = cls(drift_dn=size / alpha, shape="path", path=tuple(np.round(nodes / size, 6).tolist()))
         # a random walk of variance s^2 u has steps of variance s^2 / (nodes - 1) between nodes
         walk = cls(drift_dn=float(np.sqrt((np.diff(nodes) ** 2).sum())) / alpha, shape="walk")
-        if settled is not None and settled.criterion < path.criterion:
-            return [*linear, bent, walk]
-        return [bent, *linear, walk]
+        if criterion(settled) < min(least, criterion(path)):
+            return [*found, bent, walk]
+        return [bent, *found, walk]
 
     def shared_offset(self) -> SharedOffset:
         """Return the offset of a frame: others may be at any place of the drift."""
@@ -186,49 +199,3 @@ def _wander(time: TimeSeries) -> float:
     inside = np.diff(time.frame_readout)[successive(time.frames)].var() / 2.0
     excess = float(blocks.var() - inside / lengths.max()) if blocks.size > 1 else 0.0
     return float(np.sqrt(6.0 * max(excess, 0.0)))
-
-
-class _Curve(NamedTuple):
-    """A fit of the means: Bayesian information criterion, coefficients in DN, time constant in runs."""
-
-    criterion: float
-    values: FloatArray
-    fraction: float = np.nan
-
-
-def _settled(position: FloatArray, means: FloatArray) -> _Curve | None:
-    """Return mean and size of the best exponential approach to the end; None if a line does as well."""
-    one = np.ones_like(position)
-
-    def curve(fraction: float) -> _Curve:
-        basis = np.stack([one, settling(position, fraction)], axis=1)
-        return _Curve(*_criterion(means, basis), fraction=fraction)
-
-    best = curve(settling_time(lambda fraction: curve(fraction).criterion))
-    return _better_than_line(best, position, means)
-
-
-def _best_path(position: FloatArray, means: FloatArray) -> _Curve | None:
-    """Return the values of the piecewise linear path at its nodes; None if a line does as well."""
-    paths = []
-    for count in _NODES:
-        if position.size < _FRAMES_PER_NODE * count:
-            break
-        knots = np.linspace(0.0, 1.0, count)
-        hats = np.clip(1.0 - np.abs(position[:, None] - knots) * (count - 1), 0.0, None)
-        paths.append(_Curve(*_criterion(means, hats)))
-    best = min(paths, key=lambda path: path.criterion, default=None)
-    return None if best is None else _better_than_line(best, position, means)
-
-
-def _better_than_line(curve: _Curve, position: FloatArray, means: FloatArray) -> _Curve | None:
-    line = _criterion(means, np.stack([np.ones_like(position), position], 1))[0]
-    return curve if curve.criterion < line - _WORTH_A_CURVE else None
-
-
-def _criterion(means: FloatArray, basis: FloatArray) -> tuple[float, FloatArray]:
-    """Return the Bayesian information criterion of a least-squares fit, and its coefficients."""
-    values: FloatArray = np.linalg.lstsq(basis, means, rcond=1e-6)[0].astype(np.float64)
-    rest = float(((means - basis @ values) ** 2).sum())
-    n = means.size
-    return float(n * np.log(max(rest, 1e-300) / n) + basis.shape[1] * np.log(n)), values

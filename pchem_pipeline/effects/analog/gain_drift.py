@@ -17,8 +17,11 @@ from pydantic import Field, model_validator
 from pchem_pipeline.effects.estimators.common_modes import run_position
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
 from pchem_pipeline.effects.estimators.time_profiles import (
-    along_path,
     check_path,
+    fitted,
+    fitted_profile,
+    hats,
+    profile_at,
     settling,
     settling_time,
 )
@@ -115,22 +118,27 @@ class GainDrift(Effect):
         gain, error, position = _block_gains(evidence, evidence.time)
         if gain.size < 3:
             return ()
-        price = float(np.log(gain.size))
-        flat = _chi_square(gain, error, np.ones((gain.size, 1)))[0]
-        line, slope = _along(gain, error, position - 0.5)
-        fraction = settling_time(lambda s: _along(gain, error, settling(position, s))[0])
-        curve, size = _along(gain, error, settling(position, fraction))
-        straight = line + 2.0 * price
+        flat = fitted(gain, np.ones((gain.size, 1)), error)
+        fraction = settling_time(lambda f: fitted_profile(gain, settling(position, f), error).chi2)
+        curve = fitted_profile(gain, settling(position, fraction), error)
+        line = fitted_profile(gain, position - 0.5, error)
+        # three nodes can always be told; more of them where three blocks come on each
+        paths = [fitted(gain, hats(position, n), error) for n in _NODES if n == 3 or 3 * n <= gain.size]
+        path = min(paths, key=lambda fit: fit.chi2 + fit.price(gain.size))
+        straight = line.chi2 + line.price(gain.size)
         found: list[tuple[float, Self]] = []
-        if flat - line > _SIGMAS**2:
-            found.append((straight, cls(drift=slope)))
-        if flat - curve > _improvement(3) and curve + 3.0 * price < straight:
-            found.append((curve + 3.0 * price, cls(drift=size, shape="settling", settling_fraction=fraction)))
-        left, path = _best_path(gain, error, position)
-        if flat - left > _improvement(path.size) and left + path.size * price < straight:
-            size = min(float(np.ptp(path)), 0.4)
-            nodes = tuple(np.round(path / np.ptp(path), 4).tolist())
-            found.append((left + path.size * price, cls(drift=size, shape="path", path=nodes)))
+        if flat.chi2 - line.chi2 > _SIGMAS**2:
+            found.append((straight, cls(drift=_limited(line.values[1]))))
+        # the time constant is a number more
+        left = curve.chi2 + curve.price(gain.size) + float(np.log(gain.size))
+        if flat.chi2 - curve.chi2 > _improvement(3) and left < straight:
+            size = _limited(curve.values[1])
+            found.append((left, cls(drift=size, shape="settling", settling_fraction=fraction)))
+        left = path.chi2 + path.price(gain.size)
+        if flat.chi2 - path.chi2 > _improvement(path.values.size) and left < straight:
+            spread = float(np.ptp(path.values))
+            nodes = tuple(np.round(path.values / spread, 4).tolist())
+            found.append((left, cls(drift=min(spread, 0.4), shape="path", path=nodes)))
         return [effect for _, effect in sorted(found, key=lambda pair: pair[0])]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
@@ -140,39 +148,19 @@ class GainDrift(Effect):
 
     def _profile(self, position: FloatArray) -> FloatArray:
         """Return the shape at positions 0..1 in the run, in units of ``drift``, zero on average."""
-        if self.shape == "settling":
-            return settling(position, self.settling_fraction)
-        return along_path(position, self.path or (-0.5, 0.5))
+        fraction = self.settling_fraction if self.shape == "settling" else None
+        return profile_at(position, fraction, self.path)
+
+
+def _limited(drift: float) -> float:
+    """Return a drift within the limits of its field."""
+    return float(np.clip(drift, -0.5, 0.5))
 
 
 def _improvement(nodes: int) -> float:
     """Return by how much chi squared falls by chance, plus three standard deviations of that."""
     free = nodes - 1
     return free + 3.0 * float(np.sqrt(2.0 * free))
-
-
-def _chi_square(values: FloatArray, error: FloatArray, basis: FloatArray) -> tuple[float, FloatArray]:
-    """Return chi squared of a weighted least-squares fit, and its coefficients."""
-    found = np.linalg.lstsq(basis / error[:, None], values / error, rcond=1e-6)[0]
-    return float((((values - basis @ found) / error) ** 2).sum()), np.asarray(found, np.float64)
-
-
-def _along(gain: FloatArray, error: FloatArray, profile: FloatArray) -> tuple[float, float]:
-    """Return chi squared that a time profile at its best scale leaves, and the scale within limits."""
-    left, (_, size) = _chi_square(gain, error, np.stack([np.ones_like(profile), profile], 1))
-    return left, float(np.clip(size, -0.5, 0.5))
-
-
-def _best_path(gain: FloatArray, error: FloatArray, position: FloatArray) -> tuple[float, FloatArray]:
-    """Return chi squared of the path of the smallest Bayesian information criterion, and its nodes."""
-    fits: list[tuple[float, FloatArray]] = []
-    for count in _NODES:
-        if fits and 3 * count > gain.size:
-            break
-        knots = np.linspace(0.0, 1.0, count)
-        hats = np.clip(1.0 - np.abs(position[:, None] - knots) * (count - 1), 0.0, None)
-        fits.append(_chi_square(gain, error, hats))
-    return min(fits, key=lambda fit: fit[0] + fit[1].size * np.log(gain.size))
 
 
 def _block_gains(evidence: Evidence, time: TimeSeries) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
-from pchem_pipeline.effects.estimators.time_profiles import along_path, settling, settling_time
+from pchem_pipeline.effects.estimators.time_profiles import hats, profile_at, settling_time
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
@@ -94,11 +94,8 @@ class ExposureDrift(Effect):
 
     def profile(self, position: FloatArray) -> FloatArray:
         """Return the profile s, of mean 0 and range 1 over the run, at times 0..1 (first to last frame)."""
-        if self.path:
-            return along_path(position, self.path) / float(np.ptp(self.path))
-        if self.settling_fraction is not None:
-            return settling(position, self.settling_fraction)
-        return position - 0.5
+        found = profile_at(position, self.settling_fraction, self.path)
+        return found / float(np.ptp(self.path)) if self.path else found
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the drifting exposure (frame, y, x), e-; draws nothing."""
@@ -155,11 +152,11 @@ def _fit_path(
     deviation = profile.deviation - profile.deviation.mean()
     best = (0.0, cls(drift=0.0))
     for n in _NODES:
-        hats = np.stack([np.interp(position, np.linspace(0.0, 1.0, n), row) for row in np.eye(n)], axis=1)
+        basis = hats(position, n)
         # a little stiffness, so that nodes without frames follow their neighbours
         stiff = 1e-3 * position.size / n * np.diff(np.eye(n), 2, axis=0)
-        nodes = np.linalg.solve(hats.T @ hats + stiff.T @ stiff, hats.T @ deviation)
-        left = deviation - hats @ nodes
+        nodes = np.linalg.solve(basis.T @ basis + stiff.T @ stiff, basis.T @ deviation)
+        left = deviation - basis @ nodes
         net = float(deviation @ deviation - left @ left) / noise - _PRICE_OF_NODE * (n - 1)
         spread = float(np.ptp(nodes))
         if net > best[0] and spread > 0:

@@ -18,6 +18,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
 from pchem_pipeline.effects.estimators.common_modes import successive
 from pchem_pipeline.effects.estimators.levels.level_mixtures import Levels, few_levels
+from pchem_pipeline.effects.estimators.time_profiles import fitted, hats
 from pchem_pipeline.effects.framework.effect import Effect, Frames, Plane, Ratio, Turns, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
@@ -235,11 +236,8 @@ def _sine(cls: type[_T], profile: ExposureProfile) -> list[_T]:
 
 def _slow(position: FloatArray, deviation: FloatArray) -> FloatArray:
     """Return the least squares broken line of ``_SLOWEST`` pieces: the gaps between blocks would alias it."""
-    hats = np.stack(
-        [np.interp(position, np.linspace(0, 1, _SLOWEST + 1), h) for h in np.eye(_SLOWEST + 1)], 1
-    )
-    slow: FloatArray = hats @ np.linalg.lstsq(hats, deviation, rcond=1e-9)[0]
-    return slow
+    basis = hats(position, _SLOWEST + 1)
+    return np.asarray(basis @ fitted(deviation, basis).values)
 
 
 def _refined(series: FloatArray, frequency: float) -> float:
