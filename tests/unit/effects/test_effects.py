@@ -157,15 +157,6 @@ def test_effects_are_frozen_and_have_no_reach_by_default():
         shine.extra = 2.0
 
 
-@pytest.mark.parametrize(
-    ("limits", "words"),
-    [({}, "does nothing"), ({"low": 5, "high": 5}, "not below"), ({"low": -1}, "greater")],
-)
-def test_impossible_clipping_is_refused(limits, words):
-    with pytest.raises(ValidationError, match=words):
-        Clipping(**limits)
-
-
 def test_effects_can_be_given_by_tag_alone_only_if_they_need_nothing():
     with pytest.raises(ValidationError, match="row_noise_dn"):
         SimulateSettings(effects=["row_noise"])

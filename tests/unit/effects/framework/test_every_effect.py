@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.charge_material import a_sensor, simulated
+from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
@@ -190,3 +191,71 @@ def test_the_largest_strengths_work(effect):
 @pytest.mark.parametrize("effect", EVERY, ids=repr)
 def test_a_run_of_one_frame_and_a_sensor_of_one_pixel(effect):
     assert frames(effect, shape=(1, 1), n=1)[0].shape == (1, 1, 1)
+
+
+def beyond_limits():
+    """Yield for every limit of every field a value beyond it."""
+    for tag, kind in KINDS.items():
+        for name, field in kind.model_fields.items():
+            for limit in field.metadata:
+                for bound, step in (("ge", -1), ("gt", 0), ("lt", 0), ("le", 1)):
+                    if (value := getattr(limit, bound, None)) is not None:
+                        yield pytest.param(tag, {name: value + step}, name, id=f"{tag}.{name} {bound}")
+            if kind.unit(name) and "float" in str(field.annotation):
+                yield pytest.param(tag, {name: float("nan")}, name, id=f"{tag}.{name} finite")
+
+
+@pytest.mark.parametrize(("tag", "values", "name"), list(beyond_limits()))
+def test_numbers_beyond_their_limits_are_refused_by_name(tag, values, name):
+    effect = next(iter(KINDS[tag].typical()), None)
+    given = {"tag": tag, "low": 3} if effect is None else effect.model_dump()
+    with pytest.raises(ValidationError, match=rf"(?s){name}.*(greater|less|finite|at least|at most)"):
+        KINDS[tag].model_validate(given | values)
+
+
+@pytest.mark.parametrize(
+    ("tag", "values", "words"),
+    [
+        ("adc_dnl", {"dnl_lsb": 0.1, "pattern": "edges"}, "belong together"),
+        ("adc_dnl", {"dnl_lsb": 0.1, "edges": [0.1]}, "belong together"),
+        (
+            "adc_dnl",
+            {"dnl_lsb": 0.1, "pattern": "bit", "per_column": True},
+            "per_column is for pattern random",
+        ),
+        ("adc_inl", {"inl_lsb": 20, "period_dn": 50}, "turns the curve back"),
+        ("adc_inl", {"inl_lsb": 20, "form": "curve", "curve": [0, 1, 0, -1]}, "turns the curve back"),
+        ("adc_inl", {"inl_lsb": 1, "form": "curve"}, "belong together"),
+        ("adc_inl", {"inl_lsb": 1, "curve": [0, 1, 0, -1]}, "belong together"),
+        ("adc_inl", {"inl_lsb": 1, "form": "curve", "curve": [0, 1]}, "at least 4 values, got 2"),
+        ("bias_drift", {"drift_dn": 1, "shape": "path"}, "needs `path` with 2 values"),
+        ("bias_drift", {"drift_dn": 1, "path": [1, 2]}, "leave one of them out"),
+        ("bias_jumps", {"amplitude_dn": 1, "path": [[[0, 1]]]}, "each of 4 quadrants, got 1"),
+        ("bias_jumps", {"amplitude_dn": 1, "path": [[[5, 1], [2, 0]], [], [], []]}, "must increase"),
+        ("bias_jumps", {"amplitude_dn": 1, "parts": "top_bottom", "path": [[]] * 4}, "2 top_bottom, got 4"),
+        ("binary_offset", {"offset_dn": 1.0, "bits": (0.0, 0.0)}, "all 0"),
+        ("black_clamp", {"follow": 0.1, "rows": (3, 3)}, "holds no line"),
+        ("clipping", {}, "does nothing"),
+        ("clipping", {"low": 5, "high": 5}, "not below"),
+        ("exposure_drift", {"drift": 0.1, "path": (1.0, 1.0)}, "two different values"),
+        ("exposure_drift", {"drift": 0.1, "path": (1.0, 2.0), "settling_fraction": 0.1}, "give one of them"),
+        ("exposure_drift", {"drift": 0.1, "path": (1.0, np.nan)}, "finite"),
+        ("exposure_flicker", {"rms": 0.1, "period_frames": 5.0, "correlation_frames": 2.0}, "leave one"),
+        ("exposure_flicker", {"rms": 0.1, "levels": (1, 2), "period_frames": 3.0}, "a sine has no levels"),
+        ("exposure_flicker", {"rms": 0.1, "levels": (1.0, 1.0)}, "two different"),
+        ("exposure_flicker", {"rms": 0.1, "levels": (1, 2), "shares": (0.5,)}, "1 shares for 2 levels"),
+        ("exposure_flicker", {"rms": 0.1, "levels": (1, 2), "shares": (0.5, 0.6)}, "sum to 1"),
+        ("gain_drift", {"drift": 0.1, "shape": "path"}, "needs `path`"),
+        ("gain_drift", {"drift": 0.1, "path": (0.0, 1.0)}, "leave one of them out"),
+        ("gain_drift", {"drift": 0.5, "shape": "path", "path": (0.0, 0.0, 10.0)}, "gain to zero"),
+        ("persistence", {"peak_e": 1, "decay_frames": 1, "image": ((1.0,), (1.0, 2.0))}, "different lengths"),
+        ("persistence", {"peak_e": 1, "decay_frames": 1, "image": ((-1.0, 1.0),)}, "numbers >= 0"),
+        ("repeated_frames", {"frames": [0]}, "frame 0 is the first"),
+        ("repeated_frames", {"rows": [3, 3]}, "hold none"),
+        ("row_noise", {}, "row_noise_dn"),
+        ("row_noise", {"row_noise_dn": "much"}, "valid number"),
+    ],
+)
+def test_parameters_that_contradict_each_other_are_refused(tag, values, words):
+    with pytest.raises(ValidationError, match=words):
+        KINDS[tag].model_validate({"tag": tag, **values})
