@@ -22,6 +22,7 @@ from pchem_pipeline.effects.estimators.codes import (
     roughness,
     usable_codes,
 )
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.framework.effect import Code, Count, Effect, Lsb, Plane, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -66,7 +67,7 @@ class AdcDnl(Effect):
     )
     strength: ClassVar[str] = "dnl_lsb"
     power: ClassVar[float] = 2.0
-    attained: ClassVar[tuple[str, ...]] = ("dnl_lsb",)
+    may_be_at_bound: ClassVar[tuple[str, ...]] = ("dnl_lsb",)
     separate: ClassVar[Mapping[str, str]] = {
         "gain_stitch": "a ramp over many codes: a stitch moves all codes above it, DNL single ones",
         "clipping": "a shifted bias: unequal widths are at all codes, a limit at the extreme one",
@@ -167,7 +168,7 @@ class AdcDnl(Effect):
         found = [] if bit is None else [cls(dnl_lsb=bit[1], pattern="bit", bit=bit[0])]
         if few is not None:
             found += cls._from_shifts(codes, few)
-        if significance > 2.5:
+        if significance > SIGNIFICANT:
             found += cls._from_shifts(codes, edge_shifts(residuals, expected, variance))
         return found
 
@@ -205,11 +206,8 @@ def _best_bit(codes: IntArray, residuals: FloatArray, expected: FloatArray) -> t
     for bit in range(8):
         edges = (np.arange(codes[0], codes[-1] + 2) >> bit & 1) - 0.5
         pattern = np.diff(np.diff(edges)) * weight
-        square = float((pattern**2).sum())
-        if square <= 0:
-            continue
-        error = float((pattern * rough).sum()) / square
-        gain = error**2 * square
+        found = multiple_of(pattern, rough)
+        error, gain = found.value, found.sigmas**2
         # what is left must not be much rougher than the counts, or it is not one bit
         left = (total - gain) / rough.size
         if gain > _BIT_GAIN and left < 1.5 and (best is None or gain > best[2]):

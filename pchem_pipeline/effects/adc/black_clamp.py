@@ -40,7 +40,8 @@ class BlackClamp(Effect):
         "space.x.rk",
     )
     strength: ClassVar[str] = "follow"
-    attained: ClassVar[tuple[str, ...]] = ("follow",)
+    reach_rows = _WHOLE_SENSOR  # the clamp may be anywhere
+    may_be_at_bound: ClassVar[tuple[str, ...]] = ("follow",)
     separate: ClassVar[Mapping[str, str]] = {
         "frame_noise": "the camera's clamp switched off; noise of frames does not follow their charge",
         "exposure_flicker": "the camera's clamp switched off, or covered pixels: they follow the light",
@@ -69,7 +70,7 @@ class BlackClamp(Effect):
             raise ValueError(f"black_clamp: {list(span)} holds no line; give [first, behind the last]")
         return span
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with what lies of its clamp in these rows and columns; without any it does nothing."""
         spans = [
             (max(first, low) - low, min(last, high) - low)
@@ -79,7 +80,7 @@ class BlackClamp(Effect):
             return self.model_copy(update={"follow": 0.0, "rows": None, "columns": None})
         return self.model_copy(update={"rows": spans[0], "columns": spans[1]})
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its rows and columns counted on the sensor."""
         size = (rows[1] - rows[0], columns[1] - columns[0])
         moved = [
@@ -91,10 +92,6 @@ class BlackClamp(Effect):
 
     def _spans(self, shape: tuple[int, int]) -> tuple[Span, Span]:
         return self.rows or (0, shape[0]), self.columns or (0, shape[1])
-
-    def halo(self) -> int:
-        """Return more rows than there are: the clamp may be anywhere."""
-        return _WHOLE_SENSOR
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal at the ADC (frame, y, x), DN, less what the clamp sees; draws nothing."""

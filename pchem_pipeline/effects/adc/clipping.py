@@ -9,7 +9,6 @@ this effect: the ADC always makes it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -85,9 +84,7 @@ class Clipping(Effect):
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law that counts at the limits what lies beyond them."""
-        lows = [limit for limit in (model.clip_low, self.low) if limit is not None]
-        highs = [limit for limit in (model.clip_high, self.high) if limit is not None]
-        return replace(model, clip_low=max(lows, default=None), clip_high=min(highs, default=None))
+        return model.with_clip(self.low, self.high)
 
 
 def _piles_up(code: CodeResiduals, limit: int, *, above: bool) -> bool:

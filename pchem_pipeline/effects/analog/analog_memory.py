@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import Field
 from scipy import special
 
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
@@ -46,6 +47,7 @@ class AnalogMemory(Effect):
         "time.cross.readout_charge.chi",
     )  # fmt: skip
     strength: ClassVar[str] = "memory"
+    reach_frames = 1
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {
         "flicker_noise": "frames without any exposure: flicker remains there, memory does not",
@@ -74,10 +76,6 @@ class AnalogMemory(Effect):
 
     #: residue, overshoot, and a residue that differs
     typical_values = ({"memory": 0.0024}, {"memory": -0.0024}, {"memory": 0.0024, "spread": 1.0})
-
-    def history(self) -> int:
-        """Return 1: the frame before."""
-        return 1
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with that of the frame before.
@@ -124,11 +122,10 @@ class AnalogMemory(Effect):
         response = evidence.readout_std * evidence.charge_std / maps.read_noise_dn**2 / maps.conversion_gain
         good = maps.usable & np.isfinite(seen) & np.isfinite(response)
         seen, response = seen[good], response[good]
-        below = float((response**2).sum()) * pairs
-        above = float((response * seen).sum()) * pairs
-        if below <= 0 or abs(above) < 2.5 * np.sqrt(below):
+        found = multiple_of(response, seen, pairs)
+        if not abs(found.sigmas) > SIGNIFICANT:
             return ()
-        memory = float(np.clip(above / below, -0.5, 0.5))
+        memory = float(np.clip(found.value, -0.5, 0.5))
         k = maps.quanta_exposure[good] + evidence.charge_std[good]
         differing = _lognormal(seen, response, _LINEAR / k * response, pairs, memory)
         if differing is None:

@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.effects.estimators.common_modes import responsivity
 from pchem_pipeline.effects.estimators.levels.change_points import noise_variance
 from pchem_pipeline.effects.estimators.levels.two_levels import likeliest_parts
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.families.offsets import OffsetEffect, quantile_means
 from pchem_pipeline.effects.framework.effect import Count, Dn, PerFrame, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset
@@ -39,8 +40,6 @@ _PARTS: dict[Parts, FloatArray] = {
     "left_right": np.array([[0.5, 0.0, 0.5, 0.0], [0.0, 0.5, 0.0, 0.5]]),
 }
 _LAGS = 40
-# of the best of some ten rates
-_SIGNIFICANT = 2.5
 
 
 @register_effect
@@ -62,7 +61,7 @@ class BiasJumps(OffsetEffect):
         "frame.readout.lag1",
         "time.lag1.readout.mean",
     )
-    erratic: ClassVar[bool] = True
+    random_realisation: ClassVar[bool] = True
     strength: ClassVar[str] = "amplitude_dn"
     power: ClassVar[float] = 2.0
     separate: ClassVar[Mapping[str, str]] = {
@@ -152,7 +151,7 @@ class BiasJumps(OffsetEffect):
         time, alpha = evidence.time, responsivity(evidence)
         means = time.quadrant_readout.astype(np.float64)
         drawn = [(*_correlated(time.frames, means @ mix.T), name) for name, mix in _PARTS.items()]
-        drawn = sorted((d for d in drawn if d[0] > _SIGNIFICANT), reverse=True)
+        drawn = sorted((d for d in drawn if d[0] > SIGNIFICANT), reverse=True)
         random = [cls(amplitude_dn=a / alpha, rate=rate, parts=name) for _, a, rate, name in drawn[:2]]
         gaps = np.diff(time.frames, prepend=-1).astype(np.float64)
         parts, found = likeliest_parts(means, gaps, _PARTS)
@@ -229,11 +228,10 @@ def _correlated(frames: IntArray, means: FloatArray) -> tuple[float, float, floa
     best = (0.0, 0.0, 0.0)
     for rate in np.geomspace(1e-3, 0.25, 12):
         shape = (1.0 - 2.0 * rate) ** lags
-        square = float((weight * shape**2).sum())
-        size = float((weight * shape * covariance).sum()) / square
-        if size > 0:
-            amplitude = 2.0 * float(np.sqrt(size / (1.0 - 1.0 / n_parts)))
-            best = max(best, (size * float(np.sqrt(square)) / error, amplitude, float(rate)))
+        size = multiple_of(shape, covariance, weight / error**2)
+        if size.value > 0:
+            amplitude = 2.0 * float(np.sqrt(size.value / (1.0 - 1.0 / n_parts)))
+            best = max(best, (size.sigmas, amplitude, float(rate)))
     return best
 
 

@@ -25,7 +25,6 @@ from pchem_pipeline.effects.framework.shared_offset import add_offset
 from pchem_pipeline.effects.types import (
     AnyArray,
     EffectContext,
-    Evidence,
     FloatArray,
     IntArray,
     PixelMaps,
@@ -137,7 +136,7 @@ class NoiseMode(Section):
         """Whether it is an offset that changes its sign from sample to sample and frame to frame."""
         return self.of == "sample" and self.wave is not None and root_mean_square(self.wave) == 1.0
 
-    def words(self, rms: float | None) -> str:
+    def describe(self, rms: float | None) -> str:
         """Return in words what varies by so many DN (None: that is said elsewhere), and who shares it."""
         own = self.of == "sample" and (self.lags or self.wave is not None)
         whole = "" if own else f"the same in a whole {self.of}"
@@ -294,7 +293,7 @@ class EmpiricalNoise(Effect):
     source: ClassVar[str] = "Wold 1938, Priestley 1981 (a stationary process by its spectrum)"
     strength: ClassVar[str] = "noise_dn"
     power: ClassVar[float] = 2.0
-    measured_only: ClassVar[bool] = True
+    empirical: ClassVar[bool] = True
     noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of all of it, DN")
     modes: tuple[NoiseMode, ...] = Field(
         min_length=1,
@@ -333,13 +332,8 @@ class EmpiricalNoise(Effect):
         mode = NoiseMode(of="sample", share=1.0, lags=((0, 1, 0),), correlation=(0.4,))
         return (cls(noise_dn=0.5, modes=(mode,)),)
 
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return none: it is measured where all else has failed, and competes with nothing."""
-        return ()
-
     @property
-    def unlisted(self) -> bool:
+    def empirical_unnamed(self) -> bool:
         """Whether it is a gain or noise without a memory, light that a line shares, or an offset in turns."""
         return all(
             mode.takes_turns
@@ -355,12 +349,12 @@ class EmpiricalNoise(Effect):
         """How many modes there are."""
         return len(self.modes)
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with shapes and profiles that reach as far in a window."""
         whole, size = ((0, shape[0]), (0, shape[1])), (rows[1] - rows[0], columns[1] - columns[0])
         return self._with(each.reaching(whole, (-rows[0], -columns[0]), size) for each in self.modes)
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with shapes and profiles that reach over the window in which they were found."""
         window = (0, rows[1] - rows[0]), (0, columns[1] - columns[0])
         return self._with(each.reaching(window, (rows[0], columns[0]), shape) for each in self.modes)
@@ -392,11 +386,11 @@ class EmpiricalNoise(Effect):
                 model = model.with_noise(weights, width=widths)
         return model
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         of_all = len(self.modes) == 1 and self.modes[0].changes == "offset" and self.modes[0].burst is None
-        parts = "; ".join(mode.words(None if of_all else self.share_of(mode)) for mode in self.modes)
+        parts = "; ".join(mode.describe(None if of_all else self.share_of(mode)) for mode in self.modes)
         if all(mode.changes == "offset" for mode in self.modes):
             return f"noise of {self.noise_dn:.2g} DN{place} that samples share ({parts})"
         changed = dict.fromkeys(_CHANGED.get(mode.changes, "offset") for mode in self.modes)

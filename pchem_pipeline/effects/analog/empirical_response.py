@@ -20,7 +20,7 @@ from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 from pchem_pipeline.effects.framework.region import Region, Span
-from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, FloatArray, PixelMaps, SampleLaw
 
 #: What a sample follows: another one, or each other one of a row, a column or a frame.
 Source = Literal["sample", "row", "column", "frame"]
@@ -78,7 +78,7 @@ class ResponseTerm(Section):
             return None
         return self.columns[0] + self.place[2] if any(self.place[:2]) and self.place[2] else None
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return in words what is followed."""
         if self.of == "sample":
             what = f"what exceeds {self.above:g} e- in " if self.above else ""
@@ -142,7 +142,7 @@ class EmpiricalResponse(Effect):
     title: ClassVar[str] = "measured response to the charge of other samples, without an explanation"
     source: ClassVar[str] = "Volterra 1930, Priestley 1981 (linear responses)"
     strength: ClassVar[str] = "response"
-    measured_only: ClassVar[bool] = True
+    empirical: ClassVar[bool] = True
     far_reaching: ClassVar[bool] = True
     response: Ratio = Field(
         ge=0,
@@ -170,7 +170,7 @@ class EmpiricalResponse(Effect):
         return max(-term.place[0] for term in self.terms)
 
     @property
-    def unlisted(self) -> bool:
+    def empirical_unnamed(self) -> bool:
         """Whether samples follow others than neighbours and their own one frame before, or a part of it."""
         return any(
             term.of != "sample" or term.mirrored or term.above or sum(map(abs, term.place)) > 1
@@ -187,16 +187,11 @@ class EmpiricalResponse(Effect):
             found[..., columns] += self.response * term.weight * term.seen(charge, exposure)[..., columns]
         return found
 
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return none: it is measured where all else has failed, and competes with nothing."""
-        return ()
-
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with the columns of its terms, and the places of mirror images, as a window has them."""
         return self._moved((rows, columns), shape, -1)
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with the columns of its terms, and places of mirror images, as the sensor has them."""
         return self._moved((rows, columns), shape, 1)
 
@@ -251,13 +246,13 @@ class EmpiricalResponse(Effect):
         )
         return model.with_variance(e2=self.response**2 * power)
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         followed: dict[str, list[str]] = {}
         for term in sorted(self.terms, key=lambda term: -abs(term.weight)):
-            only = f" in {Region(columns=(term.columns,)).words()}" if term.columns else ""
-            followed.setdefault(term.words(), []).append(
+            only = f" in {Region(columns=(term.columns,)).describe()}" if term.columns else ""
+            followed.setdefault(term.describe(), []).append(
                 f"{100.0 * self.response * term.weight:+.2g} %{only}"
             )
         told = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:_FEW]]

@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.long_memory import between_grid_points, frame_key
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.framework.context import RandomSource
 from pchem_pipeline.effects.framework.effect import Effect, Frames, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
@@ -111,12 +112,11 @@ class FlickerNoise(Effect):
             for tau in _TIMES if spectrum == "lorentzian" else _TIMES[_TIMES >= 25.0]:
                 unit = cls(share=1.0, correlation_frames=float(tau), spectrum=spectrum)
                 shape = response * _shape(evidence.time, unit._times())
-                information = float(((shape / error) ** 2).sum())
-                if np.isfinite(information) and information > 0:
-                    share = float((shape * seen / error**2).sum()) / information
-                    best.append((share * np.sqrt(information), unit.scaled(share)))
+                share = multiple_of(shape, seen, error**-2.0)
+                if np.isfinite(share.error):
+                    best.append((share.sigmas, unit.scaled(share.value)))
         best.sort(key=lambda item: item[0], reverse=True)
-        return [effect for _, effect in _spread_out(best)] if best and best[0][0] > 2.5 else ()
+        return [effect for _, effect in _spread_out(best)] if best and best[0][0] > SIGNIFICANT else ()
 
 
 def _spread_out(ranked: list[tuple[float, _Flicker]]) -> list[tuple[float, _Flicker]]:

@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.common_modes import run_position
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.estimators.time_profiles import (
     check_path,
     fitted,
@@ -37,7 +38,6 @@ from pchem_pipeline.effects.types import (
 )
 
 _NODES = (3, 5, 9, 17)
-_SIGMAS = 2.5
 _LEAST_RESPONSE = 0.15
 _SMALL = 1e-4  # relative change of the gain
 
@@ -127,7 +127,7 @@ class GainDrift(Effect):
         path = min(paths, key=lambda fit: fit.chi2 + fit.price(gain.size))
         straight = line.chi2 + line.price(gain.size)
         found: list[tuple[float, Self]] = []
-        if flat.chi2 - line.chi2 > _SIGMAS**2:
+        if flat.chi2 - line.chi2 > SIGNIFICANT**2:
             found.append((straight, cls(drift=_limited(line.values[1]))))
         # the time constant is a number more
         left = curve.chi2 + curve.price(gain.size) + float(np.log(gain.size))

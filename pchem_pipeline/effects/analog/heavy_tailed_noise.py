@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.estimators.response import first_order
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
@@ -92,7 +93,7 @@ class HeavyTailedNoise(Effect):
             other, other_error = tail.first_order(effect)
             weight = error**-2.0 + other_error**-2.0
             mean = (factor * error**-2.0 + other * other_error**-2.0) / weight if weight > 0 else 0.0
-            if mean * np.sqrt(weight) > 2.5:
+            if mean * np.sqrt(weight) > SIGNIFICANT:
                 disagreement = (factor - other) ** 2 / (error**2 + other_error**2)
                 found.append((disagreement, effect.scaled(mean)))
         return [effect for _, effect in sorted(found, key=lambda item: item[0])[:_MOST]]

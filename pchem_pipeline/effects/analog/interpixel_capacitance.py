@@ -14,6 +14,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -45,6 +46,7 @@ class InterpixelCapacitance(Effect):
         "space.x.rk", "space.y.rk", "space.x.rr", "space.y.rr", "space.x.kk", "space.y.kk",
     )  # fmt: skip
     strength: ClassVar[str] = "coupling"
+    reach_rows = 1
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {
         "optical_crosstalk": "single hot pixels: light makes whole electrons in the neighbours, "
@@ -64,10 +66,6 @@ class InterpixelCapacitance(Effect):
 
     #: as in a monolithic sensor
     typical_values = ({"coupling": 0.0016},)
-
-    def halo(self) -> int:
-        """Return 1: the rows above and below."""
-        return 1
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the neighbours' charge; draws nothing.
@@ -94,13 +92,10 @@ class InterpixelCapacitance(Effect):
         if evidence.time is None:
             return ()
         (x, x_error), (y, y_error) = (_coupling(evidence, evidence.time, axis) for axis in ("x", "y"))
-        weight, other = x_error**-2.0, y_error**-2.0
-        if weight + other == 0:
+        mean = multiple_of(np.ones(2), np.array([x, y]), np.array([x_error, y_error]) ** -2.0)
+        if not mean.sigmas > SIGNIFICANT:
             return ()
-        mean = (x * weight + y * other) / (weight + other)
-        if mean * np.sqrt(weight + other) < 2.5:
-            return ()
-        found = [cls(coupling=min(mean, 0.2))]
+        found = [cls(coupling=min(mean.value, 0.2))]
         if abs(x - y) > 3.0 * np.hypot(x_error, y_error):
             x, y = max(x, 0.0), max(y, 0.0)
             found.insert(0, cls(coupling=min((x + y) / 2.0, 0.2), anisotropy=(x - y) / (x + y)))

@@ -54,7 +54,7 @@ class PeriodicPickup(OffsetEffect):
     )
     strength: ClassVar[str] = "amplitude_dn"
     power: ClassVar[float] = 2.0
-    attained: ClassVar[tuple[str, ...]] = ("cycles_per_row", "cycles_per_frame", "cycles_per_column")
+    may_be_at_bound: ClassVar[tuple[str, ...]] = ("cycles_per_row", "cycles_per_frame", "cycles_per_column")
     separate: ClassVar[Mapping[str, str]] = {
         "row_noise": "a spectrum of the row means within a frame: pickup is a line, row noise is flat",
         "frame_noise": "a spectrum of the frame means: pickup is a line, frame noise is flat",
@@ -138,11 +138,11 @@ class PeriodicPickup(OffsetEffect):
             random_phase=not steady,
         )
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with the phase at the first row and column of a window."""
         return self._begun(rows[0], columns[0])
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with the phase at the first row and column of the sensor."""
         return self._begun(-rows[0], -columns[0])
 

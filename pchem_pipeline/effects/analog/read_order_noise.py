@@ -56,11 +56,11 @@ class ReadOrderNoise(OffsetEffect):
     #: at 0.5 DN, of one tap and of four
     typical_values = ({"noise_dn": 0.5}, {"noise_dn": 0.5, "taps": 4})
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with as many taps as these columns have of its width."""
         return self._with_taps((columns[1] - columns[0]) / shape[1])
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with taps of the same width on all columns; one tap is one whatever the window."""
         return self if self.taps == 1 else self._with_taps(shape[1] / (columns[1] - columns[0]))
 

@@ -18,6 +18,7 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.count_scores import count_excess
 from pchem_pipeline.effects.estimators.electrons import regrouped
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -79,7 +80,7 @@ class BranchingCounts(Effect):
         """Return l from the scores of the second Charlier polynomial, where they exceed 2.5 sigma."""
         c, stderr = count_excess(evidence, power=-1.0)
         # Var K = H + 2 l H + ... against H + c H
-        return (cls(branching=min(1.0 - (1.0 + c) ** -0.5, 0.5)),) if c > 2.5 * stderr else ()
+        return (cls(branching=min(1.0 - (1.0 + c) ** -0.5, 0.5)),) if c > SIGNIFICANT * stderr else ()
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with generalised Poisson electron numbers."""

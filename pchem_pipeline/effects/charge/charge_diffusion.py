@@ -33,6 +33,7 @@ class ChargeDiffusion(Effect):
     title: ClassVar[str] = "charge diffusion"
     source: ClassVar[str] = "Janesick 2001, Scientific Charge-Coupled Devices, ch. 4"
     strength: ClassVar[str] = "fraction"
+    reach_rows = 1
     untestable: ClassVar[str] = (
         "Poisson electrons that each move by chance stay independent Poisson electrons, so only the map of H "
         "changes; an edge, a spot or single X-rays would show it"
@@ -41,10 +42,6 @@ class ChargeDiffusion(Effect):
 
     #: at a fifth
     typical_values = ({"fraction": 0.2},)
-
-    def halo(self) -> int:
-        """Return 1 row: the neighbours above and below."""
-        return 1
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, as collected."""

@@ -30,6 +30,7 @@ class ChargeLag(Effect):
     title: ClassVar[str] = "charge transfer lag"
     source: ClassVar[str] = "Fossum and Hondongwa 2014, IEEE J. Electron Devices Soc. 2, 33; Mirasol 1963"
     strength: ClassVar[str] = "fraction"
+    reach_frames = 1
     untestable: ClassVar[str] = (
         "Poisson electrons that are each delayed by chance stay independent Poisson electrons; a bright "
         "frame followed by dark ones would show it"
@@ -40,10 +41,6 @@ class ChargeLag(Effect):
 
     #: at a fifth
     typical_values = ({"fraction": 0.2},)
-
-    def history(self) -> int:
-        """Return 1 frame: the one whose electrons are late."""
-        return 1
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, as read; the first frame gets nothing from before."""

@@ -8,7 +8,6 @@ samples; nothing is said about why.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -23,7 +22,6 @@ from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbo
 from pchem_pipeline.effects.types import (
     AnyArray,
     EffectContext,
-    Evidence,
     FloatArray,
     IntArray,
     PixelMaps,
@@ -62,7 +60,7 @@ class ElectronMode(Section):
             raise ValueError("place: a sample that is emptied has none")
         return self
 
-    def words(self, chance: float) -> str:
+    def describe(self, chance: float) -> str:
         """Return in words how the numbers vary together, with a chance (or a mean number)."""
         if self.fate == "emptied":
             return f"{per_cent(chance)} of the samples have none"
@@ -88,7 +86,7 @@ class EmpiricalElectrons(Effect):
     title: ClassVar[str] = "measured law of electron numbers, without an explanation"
     source: ClassVar[str] = "Cox and Isham 1980, Point processes (factorial cumulants)"
     strength: ClassVar[str] = "chance"
-    measured_only: ClassVar[bool] = True
+    empirical: ClassVar[bool] = True
     chance: Ratio = Field(
         ge=0, le=0.5, description="largest chance or mean number, that of weight 1, no unit"
     )
@@ -100,7 +98,7 @@ class EmpiricalElectrons(Effect):
     typical_values = ({"chance": 0.01, "modes": (ElectronMode(fate="followed", place=(1, 0, 0)),)},)
 
     @property
-    def unlisted(self) -> bool:
+    def empirical_unnamed(self) -> bool:
         """Whether electrons go one by one, or bring others to later frames."""
         return all(
             mode.fate != "emptied" and (mode.fate != "followed" or mode.place[0]) for mode in self.modes
@@ -162,15 +160,10 @@ class EmpiricalElectrons(Effect):
         largest = max(mode.weight for mode in self.modes)
         return [self.chance * mode.weight / largest for mode in self.modes]
 
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return none: it is measured where all else has failed, and competes with nothing."""
-        return ()
-
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
-        told = [mode.words(chance) for mode, chance in zip(self.modes, self._chances(), strict=True)]
+        told = [mode.describe(chance) for mode, chance in zip(self.modes, self._chances(), strict=True)]
         return f"electron numbers{place} that are not independent ({'; '.join(told)})"
 
 

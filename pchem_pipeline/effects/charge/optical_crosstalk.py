@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.electrons import sent_to_neighbours
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
@@ -39,6 +40,7 @@ class OpticalCrosstalk(Effect):
     )
     signature: ClassVar[tuple[str, ...]] = ("space.x.kk", "space.y.kk")
     strength: ClassVar[str] = "probability"
+    reach_rows = 1
     separate: ClassVar[Mapping[str, str]] = {
         "interpixel_capacitance": "the readout residual and the neighbour's electrons: it follows them there",
         "exposure_flicker": "correlation of distant pixels: none here",
@@ -50,10 +52,6 @@ class OpticalCrosstalk(Effect):
 
     #: at one percent
     typical_values = ({"probability": 0.0112},)
-
-    def halo(self) -> int:
-        """Return 1 row: the neighbours above and below."""
-        return 1
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, with those that came from the neighbours."""
@@ -69,17 +67,14 @@ class OpticalCrosstalk(Effect):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return p from the correlations of neighbours' electron numbers, where these are above 2.5 sigma."""
-        found, weight = 0.0, 0.0
-        for axis, name in ((1, "x.kk"), (0, "y.kk")):
-            response = _response(evidence, axis)
-            pairs = evidence.time.neighbour_pairs.get(name, 0) if evidence.time else 0
-            if evidence.time is None or not pairs or not np.isfinite(response):
-                continue
-            found += pairs * response * evidence.time.neighbours[name]
-            weight += pairs * response**2
-        if weight == 0 or found < 2.5 * np.sqrt(weight):
+        if evidence.time is None:
             return ()
-        return (cls(probability=min(found / weight, 0.5)),)
+        names = ("y.kk", "x.kk")
+        pairs = np.array([evidence.time.neighbour_pairs.get(name, 0) for name in names], np.float64)
+        seen = np.array([evidence.time.neighbours.get(name, 0.0) for name in names])
+        response = np.array([_response(evidence, axis) for axis in range(2)])
+        found = multiple_of(np.nan_to_num(response), seen, pairs)
+        return (cls(probability=min(found.value, 0.5)),) if found.sigmas > SIGNIFICANT else ()
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with a Poisson mean that holds what neighbours as bright as the pixel send."""

@@ -17,6 +17,7 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.count_scores import count_excess
 from pchem_pipeline.effects.estimators.electrons import binomial_upper, regrouped
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -114,7 +115,7 @@ class OverdispersedCounts(Effect):
         tell them apart.
         """
         a, stderr = count_excess(evidence, power=0.0)
-        if not a > 2.5 * stderr:
+        if not a > SIGNIFICANT * stderr:
             return ()
         a = min(a, 1.0)
         exposure = evidence.maps.quanta_exposure[evidence.maps.usable]

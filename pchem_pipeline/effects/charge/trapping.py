@@ -27,6 +27,7 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.count_scores import charlier_information
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -48,7 +49,7 @@ _RELEASES = np.geomspace(0.02, 0.9, 9)
 _FRACTIONS = (0.03, 0.1, 0.3)
 _LIMITS = (0.02, 0.95)  # of a release, and the largest of a capture
 # standard deviations of the covariances in time, and of all, that are worth a hypothesis
-_SEEN, _CLEAR = 2.5, 3.5
+_CLEAR = 3.5
 # standard deviations, as a likelihood ratio, by which only some pixels have a trap; the most that are some
 _CERTAIN, _MOST = 4.0, 0.8
 # standard deviations from what is expected beyond which a pixel counts no more
@@ -229,7 +230,7 @@ class _Trap(NamedTuple):
     @property
     def seen(self) -> bool:
         """Whether it is worth a hypothesis."""
-        return self.height > _CLEAR**2 / 2.0 and self.in_time > _SEEN**2 / 2.0
+        return self.height > _CLEAR**2 / 2.0 and self.in_time > SIGNIFICANT**2 / 2.0
 
     def opposite(self, some: float) -> _Trap:
         """Return the trap that catches as often as this one releases, and releases as this one catches."""

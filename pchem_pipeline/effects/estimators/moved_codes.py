@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pchem_pipeline.effects.estimators.bends import sampled_tangents
+from pchem_pipeline.effects.estimators.regression import multiple_of
 from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray
 
 
@@ -65,8 +66,6 @@ def _regressed(pattern: FloatArray, residual: FloatArray, expected: FloatArray) 
     share, error = 0.0, np.inf
     for _ in range(2):
         weight = 1.0 / np.maximum(expected + share * pattern, 1.0)
-        square = float((weight * pattern**2).sum())
-        if square <= 0.0:
-            return MovedShare(0.0, np.inf, 0.0)
-        share, error = max(float((weight * pattern * residual).sum()) / square, 0.0), square**-0.5
+        found, error = multiple_of(pattern, residual, weight)
+        share = max(found, 0.0)
     return MovedShare(share, error, (share / error) ** 2)

@@ -61,7 +61,7 @@ class DarkCurrentRts(Effect):
         "shape.C2.cnt",
     )
     strength: ClassVar[str] = "fraction"
-    brightens_anew: ClassVar[bool] = True
+    resample_pixels: ClassVar[bool] = True
     separate: ClassVar[Mapping[str, str]] = {
         "rts_noise": "the exposure time: the jumps grow with it here, and not there",
         "flicker_noise": "the jumps are in the electron numbers here, in the readout residual there",

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
+from pchem_pipeline.effects.estimators.regression import multiple_of
 from pchem_pipeline.effects.estimators.time_profiles import hats, profile_at, settling_time
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
@@ -141,8 +142,8 @@ def _fit(unit: _T, profile: ExposureProfile, position: FloatArray, noise: float)
     """Return the chi-square that a time profile explains, and it at its fitted strength."""
     shape = unit.profile(position)
     shape = shape - shape.mean()
-    slope = float(shape @ profile.deviation) / float(shape @ shape)
-    return slope**2 * float(shape @ shape) / noise, unit.scaled(slope)
+    slope = multiple_of(shape, profile.deviation, 1.0 / noise)
+    return slope.sigmas**2, unit.scaled(slope.value)
 
 
 def _fit_path(

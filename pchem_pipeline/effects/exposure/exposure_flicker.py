@@ -18,6 +18,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
 from pchem_pipeline.effects.estimators.common_modes import successive
 from pchem_pipeline.effects.estimators.levels.level_mixtures import Levels, few_levels
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.estimators.time_profiles import fitted, hats
 from pchem_pipeline.effects.framework.effect import Effect, Frames, Plane, Ratio, Turns, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
@@ -52,7 +53,7 @@ class ExposureFlicker(Effect):
     )
     strength: ClassVar[str] = "rms"
     power: ClassVar[float] = 2.0
-    attained: ClassVar[tuple[str, ...]] = ("phase_cycles",)
+    may_be_at_bound: ClassVar[tuple[str, ...]] = ("phase_cycles",)
     separate: ClassVar[Mapping[str, str]] = {
         "glow": "a map of the bright frames: a flicker is bright where H is, a glow at its place",
         "exposure_drift": "a longer run: a flicker does not go on in one direction",
@@ -190,7 +191,7 @@ def _random(cls: type[_T], profile: ExposureProfile) -> list[_T]:
         return []
     found: list[_T] = []
     levels = few_levels(profile.deviation, profile.variance)
-    if fast > 2.5 * fast_error:
+    if fast > SIGNIFICANT * fast_error:
         found.append(cls(rms=min(float(np.sqrt(fast)), 1.0)))
     # fast = s^2 (1 - rho): the lag-1 correlation of an exponential memory
     rho = 1.0 - fast / whole if whole > 3.0 * whole_error else 0.0

@@ -22,7 +22,7 @@ from pchem_pipeline.effects.estimators.spots import Spot, best_bursts, best_spot
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.region import Span
-from pchem_pipeline.effects.framework.spot import Falloff, spot_found_in, spot_image, spot_seen_in
+from pchem_pipeline.effects.framework.spot import Falloff, spot_image, spot_to_sensor, spot_to_window
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, IntArray, PixelMaps
 
 _GRID = 16  # cells along either side of the map of what grows
@@ -53,7 +53,7 @@ class Glow(Effect):
         "time.block.charge.chi",
     )
     strength: ClassVar[str] = "peak_e"
-    attained: ClassVar[tuple[str, ...]] = ("centre_y", "centre_x")
+    may_be_at_bound: ClassVar[tuple[str, ...]] = ("centre_y", "centre_x")
     separate: ClassVar[Mapping[str, str]] = {
         "exposure_flicker": "a map of the bright frames: a flicker is bright where H is, a glow at its place",
         "exposure_drift": "a map of the change along the run: a drift goes with H, a glow has its place",
@@ -84,13 +84,13 @@ class Glow(Effect):
     #: a corner that bursts in one frame of fifty, by 1 e-, and one that grows by 0.3 e-
     typical_values = ({"peak_e": 1.0, "burst_share": 0.02}, {"peak_e": 0.3})
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its centre counted from these rows and columns, and the size that it has there."""
-        return self.model_copy(update=spot_seen_in(vars(self), self.falloff, rows, columns, shape))
+        return self.model_copy(update=spot_to_window(vars(self), self.falloff, rows, columns, shape))
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its centre counted on the sensor."""
-        return self.model_copy(update=spot_found_in(vars(self), rows, columns, shape))
+        return self.model_copy(update=spot_to_sensor(vars(self), rows, columns, shape))
 
     def pattern(self, rows: IntArray, shape: tuple[int, ...]) -> FloatArray:
         """Return the spot in some rows relative to its brightest pixel, shape (rows, columns)."""

@@ -28,7 +28,7 @@ from pchem_pipeline.effects.framework.effect import (
     register_effect,
 )
 from pchem_pipeline.effects.framework.region import Span
-from pchem_pipeline.effects.framework.spot import spot_found_in, spot_image, spot_seen_in
+from pchem_pipeline.effects.framework.spot import spot_image, spot_to_sensor, spot_to_window
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, IntArray, PixelMaps
 
 # rows and columns of the grids: to find something, and to describe it
@@ -61,7 +61,7 @@ class Persistence(Effect):
         "frame.charge.slow",
     )
     strength: ClassVar[str] = "peak_e"
-    attained: ClassVar[tuple[str, ...]] = ("slow_share", "centre_y", "centre_x")
+    may_be_at_bound: ClassVar[tuple[str, ...]] = ("slow_share", "centre_y", "centre_x")
     separate: ClassVar[Mapping[str, str]] = {
         "glow": "a run after a longer time in the dark: persistence is gone, a glow is not",
         "exposure_drift": "a run after a longer time in the dark: the change, not proportional to H, is gone",
@@ -109,17 +109,17 @@ class Persistence(Effect):
             raise ValueError("persistence: image needs numbers >= 0 and one above 0; correct it")
         return self
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its spot or image counted from these rows and columns."""
         if self.image:
             return self._seen_image(rows, columns, shape)
-        return self.model_copy(update=spot_seen_in(vars(self), "gaussian", rows, columns, shape))
+        return self.model_copy(update=spot_to_window(vars(self), "gaussian", rows, columns, shape))
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its spot or image counted on the sensor; an image is dark elsewhere."""
         if self.image:
             return self._found_image(rows, columns, shape)
-        return self.model_copy(update=spot_found_in(vars(self), rows, columns, shape))
+        return self.model_copy(update=spot_to_sensor(vars(self), rows, columns, shape))
 
     def _seen_image(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with the image as a grid over the window, as fine as that over the sensor."""

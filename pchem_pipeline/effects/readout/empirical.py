@@ -9,7 +9,6 @@ about why.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -26,7 +25,6 @@ from pchem_pipeline.effects.types import (
     AnyArray,
     BoolArray,
     EffectContext,
-    Evidence,
     FloatArray,
     IntArray,
     PixelMaps,
@@ -81,7 +79,7 @@ class Move(Section):
             step = np.where(abs(difference) <= self.within_dn, step, 0)
         return np.asarray(own + step)
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return it in words."""
         if self.towards is None:
             return f"by {self.shift_dn:+d} DN"
@@ -107,7 +105,7 @@ class Empirical(Effect):
     title: ClassVar[str] = "measured moves of samples, without an explanation"
     source: ClassVar[str] = "Laird 1978, Lindsay 1983 (mixing laws); Raftery 1985 (mixture transitions)"
     strength: ClassVar[str] = "share"
-    measured_only: ClassVar[bool] = True
+    empirical: ClassVar[bool] = True
     share: Ratio = Field(ge=0, le=1, description="share of the samples that are moved, no unit")
     moves: tuple[Move, ...] = Field(min_length=1, max_length=16, description="how; one of them each")
     together: Together = Field(
@@ -132,16 +130,16 @@ class Empirical(Effect):
             )
         return self
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it as it acts on some rows and columns that are taken for a sensor of their own."""
         if not self.squares:
             return self
         squares = (self.squares[0] + rows[0]) % 2, (self.squares[1] + columns[0]) % 2
         return self.model_copy(update={"squares": squares})
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return as an effect on the sensor what was found in some of its rows and columns."""
-        return self.seen_in(rows, columns, shape)  # of two parities each is the other of the other
+        return self.to_window(rows, columns, shape)  # of two parities each is the other of the other
 
     def shares(self) -> FloatArray:
         """Return the share of the samples that each move has."""
@@ -149,7 +147,7 @@ class Empirical(Effect):
         return np.asarray(self.share * weight / weight.sum())
 
     @property
-    def unlisted(self) -> bool:
+    def empirical_unnamed(self) -> bool:
         """Whether squares come as their mean, or samples come nearer to those of an earlier frame."""
         of_earlier = any(move.towards[0] for move in self.moves if move.towards)
         return self.squares is not None or (self.together == "sample" and of_earlier)
@@ -187,11 +185,6 @@ class Empirical(Effect):
                 found = np.where(here, move.of(own, other), found)
         return found.clip(0, 2**context.bit_depth - 1).astype(values.dtype)
 
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return none: it is measured where all else has failed, and competes with nothing."""
-        return ()
-
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with satellites at the shifts: exact; what neighbours add to it is left out."""
         own = [
@@ -203,7 +196,7 @@ class Empirical(Effect):
         weights = np.append(shares, max(1.0 - float(shares.sum()), 0.0))
         return model.with_noise(weights, shift_dn=np.append(shifts, 0.0))
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         what = {
@@ -217,8 +210,8 @@ class Empirical(Effect):
             )
         shares = self.shares()
         order = np.argsort(-shares)[:_MOST_TOLD]
-        told = [f"{per_cent(shares[i])} {self.moves[i].words()}" for i in order]
-        how = f" {self.moves[0].words()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
+        told = [f"{per_cent(shares[i])} {self.moves[i].describe()}" for i in order]
+        how = f" {self.moves[0].describe()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
         return f"{per_cent(self.share)} of the {what}{place} differ from the model as if they were moved{how}"
 
 

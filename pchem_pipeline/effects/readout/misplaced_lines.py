@@ -46,6 +46,7 @@ class MisplacedLines(Effect):
     source: ClassVar[str] = "GenICam / GigE Vision (packet resend); likelihood ratio of lines at other places"
     signature: ClassVar[tuple[str, ...]] = ("space.misplaced.rows", "space.misplaced.columns")
     strength: ClassVar[str] = "share"
+    reach_rows = 2  # whether a row changes places with the next depends on the two before
     separate: ClassVar[Mapping[str, str]] = {
         "repeated_lines": "equality of neighbouring lines: lines that change places differ from each other",
         "interpixel_capacitance": "a line's samples taken together: a coupling moves all lines a little",
@@ -70,10 +71,6 @@ class MisplacedLines(Effect):
         {"share": 1e-2, "move": "late"},
         {"share": 1e-2, "move": "sample_lost"},
     )
-
-    def halo(self) -> int:
-        """Return 2: whether a row changes places with the next depends on the two before."""
-        return 2
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN; at the end of a line the last sample is repeated."""

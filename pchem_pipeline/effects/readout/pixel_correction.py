@@ -44,6 +44,7 @@ class PixelCorrection(Effect):
     source: ClassVar[str] = "Hamamatsu DCAM-API (HOTPIXELCORRECT_LEVEL); Andor SDK3 (SpuriousNoiseFilter)"
     signature: ClassVar[tuple[str, ...]] = ("space.predicted.equal", "space.predicted.above", "shape.C3.mean")
     strength: ClassVar[str] = "share"
+    reach_rows = 1
     separate: ClassVar[Mapping[str, str]] = {
         "row_noise": "the camera's corrections switched off; noise of rows makes no sample equal its median",
         "frame_noise": "the camera's corrections switched off; a frame's noise moves all of its samples",
@@ -63,10 +64,6 @@ class PixelCorrection(Effect):
 
     #: at 60 DN above the median
     typical_values = ({"threshold_dn": 60},)
-
-    def halo(self) -> int:
-        """Return 1: the rows beside."""
-        return 1
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN, corrected; those at the border stay as they are."""

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, IntArray, PixelMaps, SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, IntArray
 
 # longer runs of repeats are left out of the simulation if they are rarer than this
 _RARE = 1e-12
@@ -141,7 +141,3 @@ class RepeatedFrames(Effect):
         places = (np.arange(shown) * second.size) // shown
         listed = tuple(int(frame) for frame in second[places])
         return type(self)(frames=listed, rows=self.rows), mean / shown
-
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the same law: a repeat is one more sample of it, though not a new one."""
-        return model

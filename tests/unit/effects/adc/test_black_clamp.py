@@ -28,11 +28,11 @@ def test_frames_move_against_the_clamp_s_pixels(place):
 
 def test_a_window_has_its_part_of_the_clamp():
     shape, window = (40, 60), ((10, 30), (0, 20))
-    found = BlackClamp(follow=0.3, columns=(0, 4)).found_in(*window, shape)
+    found = BlackClamp(follow=0.3, columns=(0, 4)).to_sensor(*window, shape)
     assert (found.rows, found.columns) == ((10, 30), (0, 4))
-    seen_again = found.seen_in(*window, shape)
+    seen_again = found.to_window(*window, shape)
     assert (seen_again.rows, seen_again.columns, seen_again.follow) == ((0, 20), (0, 4), 0.3)
-    assert found.seen_in((10, 30), (20, 40), shape).follow == 0.0
+    assert found.to_window((10, 30), (20, 40), shape).follow == 0.0
     part = Part(Region(rows=((5, 15),)))
     looked_at = SensorWindow(*window, shape)
     placed = looked_at.found(BlackClamp(follow=0.3, rows=(0, 4)), Part(looked_at.on_sensor(part.region)))
@@ -40,7 +40,7 @@ def test_a_window_has_its_part_of_the_clamp():
     [acting] = looked_at.effects([placed])
     assert (acting.rows, acting.columns) == ((5, 9), (0, 20))
     whole = BlackClamp(follow=0.3, rows=(0, 4))
-    assert whole.found_in((0, 40), (0, 60), shape) == whole
+    assert whole.to_sensor((0, 40), (0, 60), shape) == whole
 
 
 def test_the_law_has_the_variance_of_the_clamp():

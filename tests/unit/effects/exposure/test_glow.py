@@ -50,11 +50,11 @@ def test_a_spot_is_1_in_its_brightest_pixel_and_falls_with_the_distance():
 def test_a_window_sees_its_part_of_the_glow(effect):
     image = effect.peak_e * effect.pattern(np.arange(40), (40, 60))
     for rows, columns in (((0, 20), (20, 50)), ((16, 40), (0, 30)), ((0, 40), (0, 60))):
-        part = effect.seen_in(rows, columns, (40, 60))
+        part = effect.to_window(rows, columns, (40, 60))
         size = (rows[1] - rows[0], columns[1] - columns[0])
         own = part.peak_e * part.pattern(np.arange(size[0]), size)
         np.testing.assert_allclose(own, image[slice(*rows), slice(*columns)], rtol=1e-9)
-    part = effect.seen_in((0, 20), (20, 50), (40, 60)).found_in((0, 20), (20, 50), (40, 60))
+    part = effect.to_window((0, 20), (20, 50), (40, 60)).to_sensor((0, 20), (20, 50), (40, 60))
     np.testing.assert_allclose(
         [getattr(part, n) for n in ("peak_e", "centre_y", "centre_x", "radius")], [2.0, 0.1, 0.6, 0.3]
     )
