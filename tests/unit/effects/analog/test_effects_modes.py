@@ -34,17 +34,6 @@ def frames_of(*effects: Effect) -> Any:
     return simulate_block(drawn_truth(SHAPE), sensor, (0, N_FRAMES))[0]
 
 
-def test_a_repeat_that_forgets_history_would_be_noticed():
-    class Forgetful(RepeatedFrames):
-        def history(self):
-            return 1
-
-    effect = Forgetful(frames=(4, 5, 6))
-    sensor = SimulateSettings(shape=SHAPE, n_frames=N_FRAMES, seed=8, effects=(effect,))
-    part = simulate_block(drawn_truth(SHAPE), sensor, (5, 9))[0]
-    assert (part != frames_of(RepeatedFrames(frames=(4, 5, 6)))[5:9]).any()
-
-
 # -- moments and shapes ---------------------------------------------------------------------------
 
 

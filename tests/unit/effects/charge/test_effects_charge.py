@@ -19,9 +19,7 @@ from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCoun
 from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
 from pchem_pipeline.effects.estimators.charge_sums import exposure_nodes
 from pchem_pipeline.effects.estimators.electrons import binomial_upper, further_uniform, regrouped
-from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
-from pchem_pipeline.effects.exposure.persistence import Persistence
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -212,22 +210,6 @@ def test_exposures_of_a_run_are_a_mixture_with_its_moments():
     two = exposure_nodes(np.array([0.9, 1.1]))
     assert np.allclose(two[1], [0.9, 1.1])
     assert np.allclose(two[0], 0.5)
-
-
-def test_the_law_of_the_electron_number_and_what_leaves_it_alone():
-    plain = SampleLaw()
-    law = OverdispersedCounts(relative_variance=0.1).sample_law(plain, None)
-    assert (law.law, law.dispersion) == ("negative_binomial", 0.1)
-    law = BranchingCounts(branching=0.2).sample_law(plain, None)
-    assert (law.law, law.dispersion) == ("borel", 0.2)
-    law = OpticalCrosstalk(probability=0.2).sample_law(plain, None)
-    assert law.exposure_factors.tolist() == [1.2]
-    assert 0 < CosmicRays(tracks_per_frame=0.1).sample_law(plain, None).outlier_share < 1e-5
-    for cls in (Persistence, DarkCurrentRts, ChargeLag, ChargeDiffusion):
-        assert cls.typical()[0].sample_law(plain, None) is plain
-    # H is then the exposure without it
-    law = SpuriousCharge(mean_e=0.3).sample_law(plain, None)
-    assert (law.added_exposure.tolist(), law.added_weights.tolist()) == ([[0.3]], [[1.0]])
 
 
 # -- tools -------------------------------------------------------------------------------------------

@@ -62,4 +62,6 @@ def test_samples_without_an_order_in_time_do_no_harm(tag):
     kind, evidence = effect_class(tag), replace(evidence_of("row_noise"), time=None)
     guesses = kind.estimate(evidence)
     assert all(isinstance(guess, kind) for guess in guesses)
-    assert tag not in SILENT or not guesses
+    # what the histograms of pixels and the counts per code tell is told without it
+    in_time = all(name.startswith(("frame.", "time.", "space.")) for name in kind.signature)
+    assert not guesses or not (tag in SILENT or in_time)

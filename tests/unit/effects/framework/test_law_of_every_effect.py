@@ -4,26 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import taken
+from helpers.sensor_of_modes import make, taken
 
-from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
-from pchem_pipeline.effects.adc.adc_inl import AdcInl
-from pchem_pipeline.effects.adc.clipping import Clipping
-from pchem_pipeline.effects.adc.gain_stitch import GainStitch
-from pchem_pipeline.effects.analog.analog_memory import AnalogMemory
-from pchem_pipeline.effects.analog.flicker_noise import FlickerNoise
-from pchem_pipeline.effects.analog.gain_drift import GainDrift
-from pchem_pipeline.effects.analog.heavy_tailed_noise import HeavyTailedNoise
-from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
-from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
-from pchem_pipeline.effects.analog.nonlinearity import Nonlinearity
-from pchem_pipeline.effects.analog.signal_dependent_noise import SignalDependentNoise
-from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
-from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
-from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
-from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
-from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
-from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -34,37 +16,46 @@ SHAPE, N_FRAMES = (34, 34), 400
 CODES = np.arange(50, 700)
 
 EFFECTS = [
-    AnalogMemory(memory=0.05),
-    AnalogMemory(memory=0.2, saturation_e=1.5),
-    FlickerNoise(share=0.5, correlation_frames=1.0),
-    HeavyTailedNoise(share=0.05, factor=3.0),
-    NoiseSkew(share=0.5),
-    NoiseSkew(share=-0.7),
-    Nonlinearity(step_change=0.02),
-    Nonlinearity(step_change=-0.02, noise="bent"),
-    SignalDependentNoise(noise_e=0.1),
-    SignalDependentNoise(noise_e=0.05, growth="linear"),
-    InterpixelCapacitance(coupling=0.01, anisotropy=0.5),
-    GainDrift(drift=0.12, shape="path", path=(0.5, -0.5, 0.5)),
-    AdcDnl(dnl_lsb=0.2, pattern="bit", bit=1),
-    AdcDnl(dnl_lsb=0.3, pattern="edges", first_code=100, edges=(0.5, -1.0, 0.8, 0.3)),
-    AdcDnl(dnl_lsb=1.0, pattern="edges", first_code=108, edges=(1.0, 0.0, 0.5, -0.5)),
-    AdcInl(inl_lsb=1.0, period_dn=37.0, phase=1.0),
-    AdcInl(inl_lsb=1.0, form="curve", first_dn=90.0, spacing_dn=9.0, curve=(0.0, 1.0, -0.5, 0.2, 0.8, 0.0)),
-    Clipping(low=98, high=141),
-    GainStitch(gain_change=0.05, level_dn=121.3),
-    GainStitch(gain_change=-0.05, level_dn=118.0, origin_dn=115.0),
-    OverdispersedCounts(relative_variance=0.1),
-    OverdispersedCounts(relative_variance=0.4),
-    OverdispersedCounts(relative_variance=0.4, exposures="lognormal"),
-    BranchingCounts(branching=0.05),
-    BranchingCounts(branching=0.4),
-    OpticalCrosstalk(probability=0.1),
-    SpuriousCharge(mean_e=0.3),
-    ExposureDrift(drift=0.6),
-    ExposureDrift(drift=0.6, settling_fraction=0.3),
-    ExposureFlicker(rms=0.3, period_frames=5.3),
-    ExposureFlicker(rms=0.3, levels=(1.0, 2.0)),
+    make("analog_memory", memory=0.05),
+    make("analog_memory", memory=0.2, saturation_e=1.5),
+    make("flicker_noise", share=0.5, correlation_frames=1.0),
+    make("heavy_tailed_noise", share=0.05, factor=3.0),
+    make("noise_skew", share=0.5),
+    make("noise_skew", share=-0.7),
+    make("nonlinearity", step_change=0.02),
+    make("nonlinearity", step_change=-0.02, noise="bent"),
+    make("signal_dependent_noise", noise_e=0.1),
+    make("signal_dependent_noise", noise_e=0.05, growth="linear"),
+    make("interpixel_capacitance", coupling=0.01, anisotropy=0.5),
+    make("gain_drift", drift=0.12, shape="path", path=(0.5, -0.5, 0.5)),
+    make("adc_dnl", dnl_lsb=0.2, pattern="bit", bit=1),
+    make("adc_dnl", dnl_lsb=0.3, pattern="edges", first_code=100, edges=(0.5, -1.0, 0.8, 0.3)),
+    make("adc_dnl", dnl_lsb=1.0, pattern="edges", first_code=108, edges=(1.0, 0.0, 0.5, -0.5)),
+    make("adc_inl", inl_lsb=1.0, period_dn=37.0, phase=1.0),
+    make(
+        "adc_inl",
+        inl_lsb=1.0,
+        form="curve",
+        first_dn=90.0,
+        spacing_dn=9.0,
+        curve=(0.0, 1.0, -0.5, 0.2, 0.8, 0.0),
+    ),
+    make("clipping", low=98, high=141),
+    make("gain_stitch", gain_change=0.05, level_dn=121.3),
+    make("gain_stitch", gain_change=-0.05, level_dn=118.0, origin_dn=115.0),
+    make("overdispersed_counts", relative_variance=0.1),
+    make("overdispersed_counts", relative_variance=0.4),
+    make("overdispersed_counts", relative_variance=0.4, exposures="lognormal"),
+    make("branching_counts", branching=0.05),
+    make("branching_counts", branching=0.4),
+    make("optical_crosstalk", probability=0.1),
+    make("spurious_charge", mean_e=0.3),
+    make("charge_lag", fraction=0.3),
+    make("charge_diffusion", fraction=0.3),
+    make("exposure_drift", drift=0.6),
+    make("exposure_drift", drift=0.6, settling_fraction=0.3),
+    make("exposure_flicker", rms=0.3, period_frames=5.3),
+    make("exposure_flicker", rms=0.3, levels=(1.0, 2.0)),
 ]
 
 

@@ -64,17 +64,6 @@ def test_every_sample_comes_from_where_the_move_says(move, lines):
     assert abs(hits - expected) < 5 * np.sqrt(expected)
 
 
-@pytest.mark.parametrize("lines", ["rows", "columns"])
-@pytest.mark.parametrize("move", MOVES)
-def test_a_band_of_rows_is_as_in_the_whole(move, lines):
-    frames, effect = origins(SHAPE, FRAMES), MisplacedLines(share=0.3, move=move, lines=lines)
-    whole = effect.apply(frames, context_of(SHAPE, FRAMES))
-    first, last, halo = 4, 7, effect.halo()
-    rows = np.arange(first - halo, min(last + halo, SHAPE[0]))
-    band = effect.apply(frames[:, rows], context_of(SHAPE, FRAMES, rows=rows))
-    np.testing.assert_array_equal(band[:, halo : halo + last - first], whole[:, first:last])
-
-
 def test_the_ratios_are_those_of_the_likelihoods():
     """A plain transcription: sums of logarithms of the histograms' shares, less those at the own place."""
     frames = np.random.default_rng(2).integers(95, 105, (64, 3, 4)).astype(np.uint16)
