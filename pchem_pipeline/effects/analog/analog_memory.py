@@ -17,11 +17,11 @@ import numpy as np
 from pydantic import Field
 from scipy import special
 
+from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL
 from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
-_WHICH = 0xFFFFFFFE  # draw that is no frame's
 _LINEAR = 0.15  # e- of a bright sample before, up to which a correlation is in proportion to the memory
 _NODES = 40  # of a quadrature over the pixels' memories
 _FAR = 30.0  # standard deviations: what lies farther is as unlikely
@@ -91,7 +91,7 @@ class AnalogMemory(Effect):
         """Return the memory of the pixels, shape (1, y, x), or of all."""
         if self.spread == 0:
             return self.memory
-        normal = special.ndtri(context.random.uniform(("y", "x"), _WHICH))
+        normal = special.ndtri(context.random.uniform(("y", "x"), OF_PIXEL[0]))
         return np.asarray(self.memory * np.exp(self.spread * normal - self.spread**2 / 2.0))
 
     def _left(self, charge: AnyArray) -> AnyArray:

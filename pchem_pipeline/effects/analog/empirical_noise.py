@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import place_words
-from pchem_pipeline.effects.framework.context import Dim
+from pchem_pipeline.effects.framework.context import DIMS, Dim
 from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.shared_offset import add_offset
@@ -37,9 +37,6 @@ Lag = tuple[int, int, int]
 Cycles = tuple[float, float, float]
 Shared = Literal["sample", "row", "column", "frame"]
 Changed = Literal["offset", "gain", "light", "noise"]
-_DIMS: dict[Shared, tuple[Dim, ...]] = {
-    "sample": ("frame", "y", "x"), "row": ("frame", "y"), "column": ("frame", "x"), "frame": ("frame",),
-}  # fmt: skip
 _POINTS = 8  # of the spectrum's grid along an axis, for each unit of the largest distance
 _REACH = 3  # of the moving average along an axis, for each of them
 _MOST_TAPS, _SMALLEST_TAP = 200, 0.01  # of the moving average; of the largest weight
@@ -109,7 +106,7 @@ class NoiseMode(Section):
     def _of_its_axes(self) -> Self:
         if len(self.lags) != len(self.correlation):
             raise ValueError("give one correlation for each of lags")
-        fixed = [axis for axis, dim in enumerate(("frame", "y", "x")) if dim not in _DIMS[self.of]]
+        fixed = [axis for axis, dim in enumerate(("frame", "y", "x")) if dim not in DIMS[self.of]]
         if any(not any(lag) or any(lag[axis] for axis in fixed) for lag in self.lags):
             raise ValueError(f"lags of a {self.of} are (frames, rows, columns), not all 0, and 0 within it")
         if self.profile and (
@@ -166,7 +163,7 @@ class NoiseMode(Section):
         return f"{share:{form}} % of the {of}, {size:.2g} DN {at}of {self.signal_dn:.3g} DN"
 
     def _wave_words(self, wave: Cycles) -> str:
-        lines = [(each, _LINE[dim]) for each, dim in zip(wave, _LINE, strict=True) if dim in _DIMS[self.of]]
+        lines = [(each, _LINE[dim]) for each, dim in zip(wave, _LINE, strict=True) if dim in DIMS[self.of]]
         if root_mean_square(wave) == 1.0 and any(wave):
             return (
                 f"changing its sign from {', from '.join(f'{one} to {one}' for each, one in lines if each)}"
@@ -180,7 +177,7 @@ class NoiseMode(Section):
             return self._on_the_wave(self.wave, number, context)
         if self.burst is None:
             return _field(self, number, context)
-        some = context.random.uniform(_DIMS[self.of], number) < self.burst
+        some = context.random.uniform(DIMS[self.of], number) < self.burst
         return np.asarray(some * (-1.0 if self.negative else 1.0) / np.sqrt(self.burst))
 
     def _on_the_wave(self, wave: Cycles, number: int, context: EffectContext) -> FloatArray:
@@ -189,7 +186,7 @@ class NoiseMode(Section):
         turns: Any = wave[0] * context.frames[:, None, None]
         places: dict[Dim, Any] = {"y": context.rows[:, None], "x": np.arange(context.shape[1])}
         for dim, cycles in zip(("y", "x"), wave[1:], strict=True):
-            turns = turns + cycles * places[dim] if dim in _DIMS[self.of] else turns
+            turns = turns + cycles * places[dim] if dim in DIMS[self.of] else turns
         phase = context.random.uniform((), number) if rms < 1.0 else 0.0
         return np.asarray(np.cos(2.0 * np.pi * (turns + phase)) / rms)
 
@@ -446,14 +443,14 @@ def _of_light(change: FloatArray, number: int, context: EffectContext) -> FloatA
         return more.astype(np.float64)
     from scipy import stats  # takes half a second, and every command that knows of effects imports this
 
-    drawn = context.random.uniform(("frame", "y", "x"), len(_DIMS) + number)
+    drawn = context.random.uniform(("frame", "y", "x"), len(DIMS) + number)
     lost = stats.binom.ppf(drawn, context.charge, np.clip(-change, 0.0, 1.0))
     return np.asarray(more - np.nan_to_num(lost), np.float64)
 
 
 def _field(mode: NoiseMode, number: int, context: EffectContext) -> FloatArray:
     """Return the values of a mode, of variance 1, in a shape that fits (frame, y, x)."""
-    white = context.random.normal(_DIMS[mode.of], number)
+    white = context.random.normal(DIMS[mode.of], number)
     average = _average(mode)
     if len(average.taps) == 1:
         return white

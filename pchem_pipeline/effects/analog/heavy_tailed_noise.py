@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.estimators.response import first_order
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
@@ -91,11 +91,11 @@ class HeavyTailedNoise(Effect):
             effect = cls(share=_SMALL, factor=width)
             factor, error = first_order(evidence, effect, "He4", cut=8.0)
             other, other_error = tail.first_order(effect)
-            weight = error**-2.0 + other_error**-2.0
-            mean = (factor * error**-2.0 + other * other_error**-2.0) / weight if weight > 0 else 0.0
-            if mean * np.sqrt(weight) > SIGNIFICANT:
+            errors = np.array([error, other_error])
+            mean = multiple_of(np.ones(2), np.array([factor, other]), errors**-2.0)
+            if mean.sigmas > SIGNIFICANT:
                 disagreement = (factor - other) ** 2 / (error**2 + other_error**2)
-                found.append((disagreement, effect.scaled(mean)))
+                found.append((disagreement, effect.scaled(mean.value)))
         return [effect for _, effect in sorted(found, key=lambda item: item[0])[:_MOST]]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:

@@ -14,13 +14,12 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of, neighbour_mean
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
     EffectContext,
     Evidence,
-    FloatArray,
     PixelMaps,
     SampleLaw,
     TimeSeries,
@@ -128,19 +127,9 @@ def _coupling(evidence: Evidence, time: TimeSeries, axis: str) -> tuple[float, f
     mixed = (maps.quanta_exposure + noise - readout - charge) / 2.0
     pairs = time.neighbour_pairs.get(name, 0)
     # of the correlation, so each divided by the standard deviations of r_i and k_j
-    first = _neighbour_mean(np.sqrt(readout) / noise, np.sqrt(charge), axis)
-    second = _neighbour_mean(mixed / np.sqrt(readout), mixed / np.sqrt(charge) / noise, axis)
+    first = neighbour_mean(np.sqrt(readout) / noise, np.sqrt(charge), axis)
+    second = neighbour_mean(mixed / np.sqrt(readout), mixed / np.sqrt(charge) / noise, axis)
     response = first + second
     if not (pairs and np.isfinite(response) and response > 0):
         return 0.0, np.inf
     return time.neighbours[name] / response, 1.0 / (response * np.sqrt(pairs))
-
-
-def _neighbour_mean(one: FloatArray, other: FloatArray, axis: str) -> float:
-    """Return the mean of one map times the other at the neighbour, both ways; NaN without neighbours."""
-    front, back = (slice(None), slice(None, -1)), (slice(None), slice(1, None))
-    if axis == "y":
-        front, back = front[::-1], back[::-1]
-    products = np.concatenate([(one[a] * other[b]).ravel() for a, b in ((front, back), (back, front))])
-    products = products[np.isfinite(products)]
-    return float(products.mean()) if products.size else np.nan

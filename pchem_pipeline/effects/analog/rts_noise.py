@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field
 from scipy import special
 
-from pchem_pipeline.effects.estimators.long_memory import frame_key, two_states
+from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL, frame_key, two_states
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
 from pchem_pipeline.effects.framework.effect import (
     Count,
@@ -38,8 +38,7 @@ from pchem_pipeline.effects.types import (
     SampleLaw,
 )
 
-# draws that are no frame's
-_WHERE, _SIZE, _FULL, _EMPTY = 0xFFFFFFFE, 0xFFFFFFFF, 0xFFFFFFFD, 0xFFFFFFFC
+_WHERE, _SIZE, _FULL, _EMPTY = OF_PIXEL
 # standard deviation of the logarithms of lognormal steps
 _LOGNORMAL = 0.4
 # steps, e-, and samples averaged that the estimator looks for, with probabilities

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.electrons import sent_to_neighbours
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of, neighbour_mean
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
@@ -69,10 +69,9 @@ class OpticalCrosstalk(Effect):
         """Return p from the correlations of neighbours' electron numbers, where these are above 2.5 sigma."""
         if evidence.time is None:
             return ()
-        names = ("y.kk", "x.kk")
-        pairs = np.array([evidence.time.neighbour_pairs.get(name, 0) for name in names], np.float64)
-        seen = np.array([evidence.time.neighbours.get(name, 0.0) for name in names])
-        response = np.array([_response(evidence, axis) for axis in range(2)])
+        pairs = np.array([evidence.time.neighbour_pairs.get(f"{axis}.kk", 0) for axis in "xy"], np.float64)
+        seen = np.array([evidence.time.neighbours.get(f"{axis}.kk", 0.0) for axis in "xy"])
+        response = np.array([_response(evidence, axis) for axis in "xy"])
         found = multiple_of(np.nan_to_num(response), seen, pairs)
         return (cls(probability=min(found.value, 0.5)),) if found.sigmas > SIGNIFICANT else ()
 
@@ -81,15 +80,11 @@ class OpticalCrosstalk(Effect):
         return model.with_exposures([1.0], [1.0 + self.probability])
 
 
-def _response(evidence: Evidence, axis: int) -> float:
+def _response(evidence: Evidence, axis: str) -> float:
     """Return the mean correlation of neighbours along an axis per unit of p, NaN without such pairs.
 
     The expected electron number answers to the true one with the slope Var(k) / H.
     """
-    exposure, std = evidence.maps.quanta_exposure, evidence.charge_std
-    first = tuple(slice(None, -1) if a == axis else slice(None) for a in range(2))
-    second = tuple(slice(1, None) if a == axis else slice(None) for a in range(2))
-    seen = evidence.maps.usable & (exposure > 0)
-    good = seen[first] & seen[second]
-    h, s = (exposure[first][good], exposure[second][good]), (std[first][good], std[second][good])
-    return float(np.mean(0.25 * (h[0] + h[1]) * s[0] * s[1] / (h[0] * h[1]))) if good.any() else float("nan")
+    exposure = evidence.maps.quanta_exposure
+    std = np.where(evidence.maps.usable & (exposure > 0), evidence.charge_std, np.nan)
+    return 0.5 * neighbour_mean(std / exposure, std, axis)

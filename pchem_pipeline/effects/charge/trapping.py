@@ -26,6 +26,7 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.count_scores import charlier_information
+from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
 from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
@@ -40,7 +41,6 @@ from pchem_pipeline.effects.types import (
     SampleLaw,
 )
 
-_WHICH = 0xFFFFFFFE  # draw that is no frame's
 # probability that the state of a trap goes back farther than the frames that are simulated for it
 _RARE = 1e-6
 # chances, and shares of the pixels, among which the estimator looks first
@@ -121,7 +121,7 @@ class Trapping(Effect):
         u = context.random.uniform(("frame", "y", "x"))
         filled = (u > 1.0 - self.capture) & (values > 0)
         if self.fraction < 1:
-            filled &= context.random.uniform(("y", "x"), _WHICH) < self.fraction
+            filled &= context.random.uniform(("y", "x"), OF_PIXEL[0]) < self.fraction
         emptied = u < self.release
         full = _states(filled, emptied, self.history())
         return values + full[:-1] - full[1:]

@@ -19,6 +19,8 @@ from pchem_pipeline.effects.types import AnyArray, FloatArray, IntArray
 _FAR = 16.0
 _BITS = 29
 _FRAMES = (1 << _BITS) - 1
+#: Draws that are no frame's, for what a pixel has throughout the run.
+OF_PIXEL = (0xFFFFFFFE, 0xFFFFFFFF, 0xFFFFFFFD, 0xFFFFFFFC)
 
 
 def frame_key(frame: int, process: int = 0) -> int:

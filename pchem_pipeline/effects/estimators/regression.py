@@ -37,3 +37,13 @@ def multiple_of(pattern: FloatArray, seen: FloatArray, weight: FloatArray | floa
     if not (np.isfinite(information) and information > 0):
         return Multiple(0.0, np.inf)
     return Multiple(float((weight * pattern * seen).sum()) / information, information**-0.5)
+
+
+def neighbour_mean(one: FloatArray, other: FloatArray, axis: str) -> float:
+    """Return the mean of one map times the other at the neighbour, both ways; NaN without neighbours."""
+    front, back = (slice(None), slice(None, -1)), (slice(None), slice(1, None))
+    if axis == "y":
+        front, back = front[::-1], back[::-1]
+    products = np.concatenate([(one[a] * other[b]).ravel() for a, b in ((front, back), (back, front))])
+    products = products[np.isfinite(products)]
+    return float(products.mean()) if products.size else np.nan

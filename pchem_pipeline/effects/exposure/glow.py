@@ -143,10 +143,7 @@ class Glow(Effect):
 
     def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return rare bursts more often than they are, and how much rarer they are."""
-        shown = min(_FEWEST_SHOWN / max(frames.size, 1), 1.0)
-        if self.burst_share is None or self.burst_share >= shown:
-            return self, 1.0
-        return self.model_copy(update={"burst_share": shown}), self.burst_share / shown
+        return self._shown_at_least("burst_share", _FEWEST_SHOWN / max(frames.size, 1), 1.0)
 
 
 def _growing(evidence: Evidence) -> Spot | None:

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 
 from pchem_pipeline.effects.estimators.common_modes import line_noise
-from pchem_pipeline.effects.framework.context import Dim
+from pchem_pipeline.effects.framework.context import DIMS
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
@@ -17,8 +17,6 @@ from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, Floa
 # below this ratio of the spread of an offset to the read noise its shape is lost: the fourth cumulant that
 # a Gaussian of the same variance misses is 2e-4 of the squared variance, for the worst (two-valued) law
 _NARROW = 0.1
-#: what the random numbers of an offset depend on
-_KEYS: dict[str, tuple[Dim, ...]] = {"frame": ("frame",), "row": ("frame", "y"), "column": ("frame", "x")}
 
 
 class OffsetEffect(Effect):
@@ -75,7 +73,7 @@ class SharedNoise(OffsetEffect):
 
     def offsets(self, context: EffectContext) -> FloatArray:
         """Return one offset for each frame, or for each row or column of a frame, DN."""
-        return np.asarray(getattr(self, self.strength) * context.random.normal(_KEYS[self.shared_by]))
+        return np.asarray(getattr(self, self.strength) * context.random.normal(DIMS[self.shared_by]))
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

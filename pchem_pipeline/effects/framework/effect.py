@@ -230,6 +230,13 @@ class Effect(Section):
         """
         return self, 1.0
 
+    def _shown_at_least(self, name: str, share: float, most: float) -> tuple[Self, float]:
+        """Return it with a chance of at least so much, and how much rarer what it makes then really is."""
+        now, shown = getattr(self, name), min(share, most)
+        if not now or now >= shown:
+            return self, 1.0
+        return self.model_copy(update={name: shown}), now / shown
+
     def details(self) -> tuple[str, ...]:
         """Return positive numbers beside the strength with which the statistics go smoothly.
 

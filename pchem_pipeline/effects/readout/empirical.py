@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import place_words
-from pchem_pipeline.effects.framework.context import Dim
+from pchem_pipeline.effects.framework.context import DIMS
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 from pchem_pipeline.effects.framework.region import Span
@@ -33,9 +33,6 @@ from pchem_pipeline.effects.types import (
 
 #: What is moved together.
 Together = Literal["sample", "row", "column", "frame"]
-_DIMS: dict[Together, tuple[Dim, ...]] = {
-    "sample": ("frame", "y", "x"), "row": ("frame", "y"), "column": ("frame", "x"), "frame": ("frame",),
-}  # fmt: skip
 _DEPTH = 4  # frames through which a move towards an earlier frame is followed
 _MOST_TOLD = 4
 
@@ -163,7 +160,7 @@ class Empirical(Effect):
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN, with some samples moved."""
-        drawn = context.random.uniform(_DIMS[self.together])
+        drawn = context.random.uniform(DIMS[self.together])
         which = np.searchsorted(np.cumsum(self.shares()), drawn.ravel(), side="right").reshape(drawn.shape)
         own = values.astype(np.int64)
         if self.squares:

@@ -76,7 +76,4 @@ class RepeatedLines(Effect):
 
     def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return rare repeats more often than they are, and how much rarer they are."""
-        shown = min(_FEWEST_SHOWN / max(frames.size, 1), 0.5)
-        if not 0.0 < self.share < shown:
-            return self, 1.0
-        return self.model_copy(update={"share": shown}), self.share / shown
+        return self._shown_at_least("share", _FEWEST_SHOWN / max(frames.size, 1), 0.5)
