@@ -14,7 +14,7 @@ import numpy as np
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.estimators.codes import usable_codes
-from pchem_pipeline.effects.types import BoolArray, Evidence, FloatArray, IntArray, PixelMaps
+from pchem_pipeline.effects.types import BoolArray, Evidence, FloatArray, IntArray, PixelMaps, SampleLaw
 
 _PIXELS = 256
 _PERIODS = 48
@@ -213,8 +213,22 @@ def best_stitch(evidence: Evidence) -> list[Stitch]:
 
 def sampled_tangents(maps: PixelMaps) -> SampledPixels | None:
     """Return masses and tangents of pixels spread over the sensor; None where none is usable."""
-    chosen = _sample(maps)
-    return None if chosen is None else _tangents(*chosen)
+    from pchem_pipeline.model.law.mass import sample_slopes
+
+    pixels = _sample(maps)
+    if pixels is None:
+        return None
+    exposure, gain, bias, noise = (each[:, None] for each in pixels.maps)
+    sigma = np.sqrt(np.maximum(noise**2 - QUANTISATION_VARIANCE, 0.01))
+    first = np.floor(bias - 5.0 * sigma).astype(np.int64)
+    cells = int(np.ceil((10.0 * sigma + (exposure + 5.0 * np.sqrt(exposure) + 2.0) / gain).max()))
+    mass, slopes = sample_slopes(SampleLaw(), pixels, first[:, 0], cells)
+    # a larger bias takes from each code what lies at its upper edge, and gives what lies at its lower one
+    density = np.pad(-np.cumsum(slopes[:, 2], axis=1), ((0, 0), (1, 0)))
+    mass = np.maximum(mass, 1e-12)
+    root = np.sqrt(mass)[:, :, None]
+    tangents = np.linalg.qr(slopes.transpose(0, 2, 1) / root)[0] * root
+    return SampledPixels(first, density, mass, tangents.transpose(0, 2, 1))
 
 
 def _in_use(expected: FloatArray) -> float:
@@ -223,42 +237,14 @@ def _in_use(expected: FloatArray) -> float:
     return float(np.searchsorted(share, 0.99) - np.searchsorted(share, 0.01) + 1)
 
 
-def _sample(maps: PixelMaps) -> tuple[FloatArray, ...] | None:
-    """Return H, g, mu, sigma of pixels spread over the sensor, each (n, 1), without the widest histograms."""
-    parts = np.stack([part[maps.usable] for part in maps.maps]).astype(np.float64)
-    parts = parts[:, np.isfinite(parts).all(axis=0)]
-    if not parts.shape[1]:
+def _sample(maps: PixelMaps) -> PixelMaps | None:
+    """Return pixels spread over the sensor, shape (n,), without the widest histograms."""
+    some = maps.of(maps.usable & np.isfinite(np.stack(maps.maps)).all(axis=0))
+    if not some.bias.size:
         return None
-    widths = (parts[0] + 6.0 * np.sqrt(parts[0])) / parts[1]
-    parts = parts[:, widths <= np.quantile(widths, 0.95)]
-    step = max(1, parts.shape[1] // _PIXELS)
-    return tuple(part[::step, None] for part in parts)
-
-
-def _tangents(exposure: FloatArray, gain: FloatArray, bias: FloatArray, noise: FloatArray) -> SampledPixels:
-    """Return masses and tangents of the pixels' PCDs (exact rounded mass and its derivatives)."""
-    from scipy.special import gammaln, ndtr
-
-    sigma = np.sqrt(np.maximum(noise**2 - QUANTISATION_VARIANCE, 0.01))
-    first = np.floor(bias - 5.0 * sigma).astype(np.int64)
-    most = int(np.ceil((exposure + 6.0 * np.sqrt(exposure) + 3.0).max()))
-    cells = int(np.ceil((10.0 * sigma + (exposure + 5.0 * np.sqrt(exposure) + 2.0) / gain).max()))
-    edges = first - 0.5 + np.arange(cells + 1)
-    cdf, density = np.zeros(edges.shape), np.zeros(edges.shape)
-    by_exposure, by_noise, by_gain = np.zeros(edges.shape), np.zeros(edges.shape), np.zeros(edges.shape)
-    for k in range(most + 1):
-        weight = np.exp(k * np.log(exposure) - exposure - gammaln(k + 1.0))
-        z = (edges - bias - k / gain) / sigma
-        below, bell = ndtr(z), np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
-        cdf += weight * below
-        density += weight * bell / sigma
-        by_exposure += weight * (k / exposure - 1.0) * below
-        by_noise -= weight * bell * z
-        by_gain += weight * bell * k
-    mass = np.maximum(np.diff(cdf, axis=1), 1e-12)
-    raw = np.stack([np.diff(part, axis=1) for part in (by_exposure, -density, by_noise, by_gain)], axis=2)
-    tangents = np.linalg.qr(raw / np.sqrt(mass)[:, :, None])[0] * np.sqrt(mass)[:, :, None]
-    return SampledPixels(first, density, mass, tangents.transpose(0, 2, 1))
+    widths = (some.quanta_exposure + 6.0 * np.sqrt(some.quanta_exposure)) / some.conversion_gain
+    kept = np.flatnonzero(widths <= np.quantile(widths, 0.95))
+    return some.of(kept[:: max(1, kept.size // _PIXELS)])
 
 
 def _response(pixels: SampledPixels, codes: IntArray) -> FloatArray:
