@@ -14,11 +14,10 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from pchem_pipeline.effects.estimators.clamps import best_clamp
+from pchem_pipeline.effects.framework.context import ALL_ROWS
 from pchem_pipeline.effects.framework.effect import Count, Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
-
-_WHOLE_SENSOR = 1 << 30  # rows: as far as there are any
 
 
 @register_effect
@@ -40,7 +39,7 @@ class BlackClamp(Effect):
         "space.x.rk",
     )
     strength: ClassVar[str] = "follow"
-    reach_rows = _WHOLE_SENSOR  # the clamp may be anywhere
+    reach_rows = ALL_ROWS  # the clamp may be anywhere
     may_be_at_bound: ClassVar[tuple[str, ...]] = ("follow",)
     separate: ClassVar[Mapping[str, str]] = {
         "frame_noise": "the camera's clamp switched off; noise of frames does not follow their charge",

@@ -18,7 +18,7 @@ from pydantic import Field
 from scipy import special
 
 from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
+from pchem_pipeline.effects.estimators.regression import CERTAIN, SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
@@ -26,7 +26,6 @@ _LINEAR = 0.15  # e- of a bright sample before, up to which a correlation is in 
 _NODES = 40  # of a quadrature over the pixels' memories
 _FAR = 30.0  # standard deviations: what lies farther is as unlikely
 _USUAL = 0.5  # spread from which a fit begins
-_CERTAIN = 4.0  # standard deviations, as a likelihood ratio, by which memories are not alike
 
 
 @register_effect
@@ -175,6 +174,6 @@ def _lognormal(
         method="Nelder-Mead",
         options={"xatol": 0.01, "fatol": 0.1},
     )
-    if alike.fun - one.fun < _CERTAIN**2 / 2.0:
+    if alike.fun - one.fun < CERTAIN**2 / 2.0:
         return None
     return float(sign * np.exp(one.x[0])), float(np.exp(one.x[1]))

@@ -21,6 +21,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
     successive,
 )
 from pchem_pipeline.effects.estimators.time_profiles import (
+    NODES,
     Fit,
     check_path,
     fitted,
@@ -42,8 +43,7 @@ from pchem_pipeline.effects.types import (
     TimeSeries,
 )
 
-_NODES = (3, 5, 9, 17, 33)
-_FRAMES_PER_NODE = 12
+_FRAMES_PER_NODE = 12  # so that a node's error is well below that of a frame
 _WORTH_A_CURVE = 4.0  # of the Bayesian information criterion, beyond a line
 
 
@@ -146,7 +146,7 @@ class BiasDrift(OffsetEffect):
         line = fitted_profile(means, position)
         fraction = settling_time(lambda f: criterion(fitted_profile(means, settling(position, f))))
         settled = fitted_profile(means, settling(position, fraction))
-        paths = [fitted(means, hats(position, n)) for n in _NODES if frames >= _FRAMES_PER_NODE * n]
+        paths = [fitted(means, hats(position, n)) for n in NODES if frames >= _FRAMES_PER_NODE * n]
         path = min(paths, key=criterion, default=line)
         slope, error = _slope(position, means)
         found = [cls(drift_dn=slope / alpha)] if abs(slope) > WORTH_A_GUESS * error else []

@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.context import ALL_ROWS
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 from pchem_pipeline.effects.framework.region import Region, Span
@@ -28,7 +29,6 @@ Source = Literal["sample", "row", "column", "frame"]
 Axis = Literal["rows", "columns"]
 AXES: dict[Axis, int] = {"rows": 2, "columns": 1}
 _ALONG: dict[Source, tuple[int, ...]] = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}
-_ALL_ROWS = 1 << 20
 _FAR = 8.0  # standard deviations of the charge, and electrons, beyond which there is none
 _FEW = 4  # that are told in words, of terms that follow the same and of others
 
@@ -161,7 +161,7 @@ class EmpiricalResponse(Effect):
     def halo(self) -> int:
         """Return how far across rows samples follow others, px."""
         return max(
-            _ALL_ROWS if 1 in _ALONG[term.of] or "columns" in term.mirrored else abs(term.place[1])
+            ALL_ROWS if 1 in _ALONG[term.of] or "columns" in term.mirrored else abs(term.place[1])
             for term in self.terms
         )
 

@@ -18,6 +18,7 @@ from pchem_pipeline.effects.estimators.common_modes import run_position
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
 from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.estimators.time_profiles import (
+    NODES,
     check_path,
     fitted,
     fitted_profile,
@@ -37,7 +38,6 @@ from pchem_pipeline.effects.types import (
     TimeSeries,
 )
 
-_NODES = (3, 5, 9, 17)
 _LEAST_RESPONSE = 0.15
 _SMALL = 1e-4  # relative change of the gain
 
@@ -123,7 +123,7 @@ class GainDrift(Effect):
         curve = fitted_profile(gain, settling(position, fraction), error)
         line = fitted_profile(gain, position - 0.5, error)
         # three nodes can always be told; more of them where three blocks come on each
-        paths = [fitted(gain, hats(position, n), error) for n in _NODES if n == 3 or 3 * n <= gain.size]
+        paths = [fitted(gain, hats(position, n), error) for n in NODES[:-1] if n == 3 or 3 * n <= gain.size]
         path = min(paths, key=lambda fit: fit.chi2 + fit.price(gain.size))
         straight = line.chi2 + line.price(gain.size)
         found: list[tuple[float, Self]] = []

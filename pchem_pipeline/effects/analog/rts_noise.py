@@ -19,6 +19,7 @@ from scipy import special
 
 from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL, frame_key, two_states
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
+from pchem_pipeline.effects.estimators.regression import FEW_PIXELS
 from pchem_pipeline.effects.framework.effect import (
     Count,
     Effect,
@@ -211,7 +212,7 @@ class RtsNoise(Effect):
         outlying = _outlying(evidence)
         n, count = int(evidence.maps.usable.sum()), int(outlying.sum())
         # where most pixels stand out something else is wrong
-        if count < _FEWEST or count > 0.3 * n:
+        if count < _FEWEST or count > FEW_PIXELS * n:
             return []
         seen = np.array([np.median(values[outlying]) for values in _profile(evidence)])
         chosen = typical_pixels(evidence.maps, 3)[0]
@@ -250,7 +251,7 @@ class RtsNoise(Effect):
             np.asarray(lags, np.float64)[:, maps.usable] for lags in (time.lag_charge, time.lag_readout)
         )
         outlying = np.fmax(charge[0], readout[0]) * np.sqrt(time.n_pairs) > _SLOW
-        if outlying.sum() < 3 or outlying.sum() > 0.3 * outlying.size:
+        if outlying.sum() < 3 or outlying.sum() > FEW_PIXELS * outlying.size:
             return []
         sd_k = evidence.charge_std[maps.usable][outlying]
         sd_r = (evidence.readout_std * maps.conversion_gain)[maps.usable][outlying]

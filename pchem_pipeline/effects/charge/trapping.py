@@ -28,7 +28,7 @@ from pydantic import Field
 from pchem_pipeline.effects.estimators.count_scores import charlier_information
 from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
+from pchem_pipeline.effects.estimators.regression import CERTAIN, SIGNIFICANT
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -48,10 +48,8 @@ _CAPTURES = np.geomspace(0.002, 0.9, 12)
 _RELEASES = np.geomspace(0.02, 0.9, 9)
 _FRACTIONS = (0.03, 0.1, 0.3)
 _LIMITS = (0.02, 0.95)  # of a release, and the largest of a capture
-# standard deviations of the covariances in time, and of all, that are worth a hypothesis
-_CLEAR = 3.5
-# standard deviations, as a likelihood ratio, by which only some pixels have a trap; the most that are some
-_CERTAIN, _MOST = 4.0, 0.8
+_CLEAR = 3.5  # standard deviations of all that pixels show that are worth a hypothesis
+_MOST = 0.8  # share of the pixels with a trap beyond which all have one
 # standard deviations from what is expected beyond which a pixel counts no more
 _CUT = 5.0
 _SMALL = 1e-3  # chance at which the law of a sample is looked at
@@ -143,7 +141,7 @@ class Trapping(Effect):
             other = _refined(pixels, alike.opposite(float(pixels.some.mean())))
             found = [_first_of(alike, other)]
         some = _refined(pixels, max((starts[f] for f in _FRACTIONS), key=lambda one: one.height))
-        clear = some.height - max(alike.height, 0.0) > _CERTAIN**2 / 2.0
+        clear = some.height - max(alike.height, 0.0) > CERTAIN**2 / 2.0
         if clear and some.seen and some.fraction < _MOST:
             found.insert(0, some)
         return [cls(capture=one.capture, release=one.release, fraction=one.fraction) for one in found]

@@ -16,10 +16,10 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.estimators.codes import usable_codes
 from pchem_pipeline.effects.types import BoolArray, Evidence, FloatArray, IntArray, PixelMaps, SampleLaw
 
-_PIXELS = 256
-_PERIODS = 48
-_MOST_CODES = 1500
-_SHORTEST = 8.0
+_PIXELS = 256  # that stand for all: their windows of codes overlap many times
+_PERIODS = 48  # sines that are tried, twice as many as are independent
+_MOST_CODES = 1500  # memory: a square of so many numbers
+_SHORTEST = 8.0  # DN; what changes faster is new from code to code
 # places of a break that are tried, and the share of the samples on either side that it needs
 _LEVELS = 80
 _END = 0.002

@@ -12,15 +12,13 @@ import functools
 
 import numpy as np
 
+from pchem_pipeline.effects.estimators.regression import CUT, CUT_ROUNDS
 from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray
 
 # the information is smooth in both: nodes of its table, e-
 _EXPOSURES = np.geomspace(0.02, 60.0, 25)
 _NOISES = np.geomspace(0.08, 1.6, 14)
 _POINTS_PER_SIGMA = 4
-# standard deviations from what is expected beyond which a score is cut, and rounds of it
-_CUT = 4.0
-_ROUNDS = 4
 
 
 def count_excess(evidence: Evidence, power: float) -> tuple[float, float]:
@@ -45,9 +43,9 @@ def count_excess(evidence: Evidence, power: float) -> tuple[float, float]:
         return 0.0, np.inf
     seen = np.asarray(score[good], np.float64)
     excess = float(np.median(seen) / np.median(slope))
-    for _ in range(_ROUNDS):
+    for _ in range(CUT_ROUNDS):
         expected = excess * slope
-        excess = float(slope @ (expected + np.clip(seen - expected, -_CUT, _CUT))) / weight
+        excess = float(slope @ (expected + np.clip(seen - expected, -CUT, CUT))) / weight
     return excess, weight**-0.5
 
 

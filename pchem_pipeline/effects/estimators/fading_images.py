@@ -8,6 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from pchem_pipeline.effects.estimators.charge_sums import BlockCharge
+from pchem_pipeline.effects.estimators.regression import CUT, CUT_ROUNDS
 from pchem_pipeline.effects.types import FloatArray, IntArray
 
 # a cell must explain this chi-square to tell the time constant, and the differences of four cells that one
@@ -15,9 +16,6 @@ _PRICE_OF_CELL = 6.0
 _PRICE_OF_DETAIL = 9.0
 # of the brightest cell: less than this is dark
 _DARK = 0.05
-# standard errors beyond which a pixel's amplitude is cut, around its cell's, and how often
-_CUT = 4.0
-_CUTS = 4
 
 
 @dataclass(frozen=True)
@@ -60,10 +58,10 @@ class FadingCells:
         inverse = stderr**-2
         # from the middle of each cell: from 0 on a bright image would be cut at so many steps
         amplitude = np.nan_to_num(ndimage.median(found, cell, np.arange(n)))
-        for _ in range(_CUTS):
+        for _ in range(CUT_ROUNDS):
             # single pixels that jump are another effect
             middle = amplitude[cell]
-            amplitude = mean_of(np.clip(found, middle - _CUT * stderr, middle + _CUT * stderr), inverse)
+            amplitude = mean_of(np.clip(found, middle - CUT * stderr, middle + CUT * stderr), inverse)
         held = np.bincount(cell, inverse, n)
         noise = np.where(held > 0, np.maximum(held, 1e-300) ** -0.5, np.inf)
         freedom = max(int((held > 0).sum()) - 1, 1)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, Multiple, multiple_of
+from pchem_pipeline.effects.estimators.regression import CUT, SIGNIFICANT, Multiple, multiple_of
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.types import Evidence, FloatArray, SampleLaw
 
@@ -27,7 +27,7 @@ def strength_of(
     *,
     sigmas: float = SIGNIFICANT,
     signed: bool = False,
-    cut: float = 4.0,
+    cut: float = CUT,
 ) -> list[EffectType]:
     """Return the effect at the strength that the mean of a score shows; empty if it shows none.
 
@@ -62,7 +62,7 @@ def strength_of(
     return [_times(first, float(np.clip(again, 0.1, 10.0)) if np.isfinite(error) else 1.0)]
 
 
-def first_order(evidence: Evidence, effect: Effect, name: str, cut: float = 4.0) -> Multiple:
+def first_order(evidence: Evidence, effect: Effect, name: str, cut: float = CUT) -> Multiple:
     """Return how many times an effect's influence on the mean of a score is seen.
 
     Args:

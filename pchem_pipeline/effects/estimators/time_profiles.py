@@ -9,8 +9,10 @@ import numpy as np
 
 from pchem_pipeline.effects.types import FloatArray
 
-# time constants in lengths of the run: shorter ones are hardly a drift, longer ones are straight lines
-_SETTLING = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
+#: Time constants, lengths of the run: shorter ones are hardly a drift, longer ones are straight lines.
+SETTLING = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
+#: Nodes of a path that is fitted: each twice as fine as the one before.
+NODES = (3, 5, 9, 17, 33)
 
 
 def settling(position: FloatArray, fraction: float) -> FloatArray:
@@ -34,12 +36,12 @@ def settling_time(left: Callable[[float], float]) -> float:
     """
     from scipy.optimize import minimize_scalar  # not for every command that knows of effects
 
-    losses = [left(fraction) for fraction in _SETTLING]
+    losses = [left(fraction) for fraction in SETTLING]
     best = int(np.argmin(losses))
-    ends = _SETTLING[max(best - 1, 0)], _SETTLING[min(best + 1, len(_SETTLING) - 1)]
+    ends = SETTLING[max(best - 1, 0)], SETTLING[min(best + 1, len(SETTLING) - 1)]
     options = {"xatol": 0.01}
     found = minimize_scalar(lambda log: left(float(np.exp(log))), bounds=np.log(ends), options=options)
-    return float(np.exp(found.x)) if found.fun < losses[best] else _SETTLING[best]
+    return float(np.exp(found.x)) if found.fun < losses[best] else SETTLING[best]
 
 
 def along_path(position: FloatArray, path: Sequence[float]) -> FloatArray:

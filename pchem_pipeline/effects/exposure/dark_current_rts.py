@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.charge_sums import BlockCharge, block_charge
+from pchem_pipeline.effects.estimators.regression import FEW_PIXELS
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Frames, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
@@ -31,7 +32,6 @@ from pchem_pipeline.model.law.telegraph import Telegraph
 
 # a pixel stands out beyond this standard normal number: one in 150,000 by chance
 _STANDS_OUT = 4.35
-_MOST_OF_A_SENSOR = 0.3
 # share of the time in the upper level, and law of the steps
 _KINDS: tuple[tuple[float, Literal["equal", "exponential"]], ...] = (
     (0.5, "equal"),
@@ -143,7 +143,7 @@ class DarkCurrentRts(Effect):
                 if telegraph is not None:
                     found[int(y), int(x)] = telegraph
         # where most of them seem to blink, it is something else
-        if not 0 < len(found) <= _MOST_OF_A_SENSOR * good.size:
+        if not 0 < len(found) <= FEW_PIXELS * good.size:
             return None
         levels = max(telegraph.added.size for telegraph in found.values())
         exposure, weight = np.zeros((levels, *good.shape)), np.zeros((levels, *good.shape))
@@ -170,7 +170,7 @@ class DarkCurrentRts(Effect):
             return ()
         found = _outliers(evidence, blocks)
         n = int(found.sum())
-        if n < 3 or n > _MOST_OF_A_SENSOR * found.size:
+        if n < 3 or n > FEW_PIXELS * found.size:
             return ()
         variance, tau = _telegraph(evidence, blocks, found)
         if not variance > 0:

@@ -16,14 +16,13 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
 from pchem_pipeline.effects.estimators.regression import multiple_of
-from pchem_pipeline.effects.estimators.time_profiles import hats, profile_at, settling_time
+from pchem_pipeline.effects.estimators.time_profiles import NODES, hats, profile_at, settling_time
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
 _T = TypeVar("_T", bound="ExposureDrift")
 
-# nodes of a free path, and the chi-square that each must explain
-_NODES = (5, 9, 17, 33)
+# chi-square that each node of a free path must explain
 _PRICE_OF_NODE = 2.5
 # chi-square that the choice of the time constant explains by chance
 _PRICE_OF_SETTLING = 3.0
@@ -152,7 +151,7 @@ def _fit_path(
     """Return the same for a broken line with free nodes, as many as pay; the chi-square less their price."""
     deviation = profile.deviation - profile.deviation.mean()
     best = (0.0, cls(drift=0.0))
-    for n in _NODES:
+    for n in NODES[1:]:
         basis = hats(position, n)
         # a little stiffness, so that nodes without frames follow their neighbours
         stiff = 1e-3 * position.size / n * np.diff(np.eye(n), 2, axis=0)

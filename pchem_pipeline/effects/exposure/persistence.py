@@ -18,6 +18,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.effects.estimators.charge_sums import block_charge, block_signal, exposure_nodes
 from pchem_pipeline.effects.estimators.fading_images import FadingCells, fading_of
 from pchem_pipeline.effects.estimators.spots import best_spot
+from pchem_pipeline.effects.estimators.time_profiles import SETTLING
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import (
     Effect,
@@ -39,7 +40,7 @@ _MOST_CELLS = 48
 _MORE = 1.25
 _BRIGHTEST = 1e6  # e- per frame that an afterglow begins with
 # time constants tried, in lengths of the run
-_DECAYS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0)
+_DECAYS = (*SETTLING, 2.0)
 
 
 @register_effect

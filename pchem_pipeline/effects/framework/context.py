@@ -19,6 +19,9 @@ DIMS: Mapping[str, tuple[Dim, ...]] = {
     "frame": ("frame",),
 }
 
+#: As many rows as any sensor has: the halo of an effect that reaches across all of it.
+ALL_ROWS = 1 << 20
+
 
 class RandomSource(Protocol):
     """Random numbers of one effect, keyed on position: the same at every tiling.
