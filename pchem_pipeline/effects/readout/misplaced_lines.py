@@ -16,6 +16,7 @@ from pydantic import Field
 from pchem_pipeline.effects.framework.context import Dim
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.evidence import PLACES
+from pchem_pipeline.effects.framework.neighbours import along_axis
 from pchem_pipeline.effects.types import AnyArray, BoolArray, EffectContext, Evidence, FloatArray, IntArray
 
 Move = Literal["swapped", "early", "late", "sample_lost", "sample_twice", "line_lost", "line_twice"]
@@ -76,7 +77,7 @@ class MisplacedLines(Effect):
         """Return the digital numbers (frame, y, x), DN; at the end of a line the last sample is repeated."""
         across, along = (_Y, _X) if self.lines == "rows" else (_X, _Y)
         if self.move == "swapped":
-            return _taken(values, self._exchanged(context, across), across)
+            return along_axis(values, self._exchanged(context, across), across)
         of_lines = self.move in ("line_lost", "line_twice")
         axis = across if of_lines else along
         drawn: tuple[Dim, ...] = ("frame",) if of_lines else ("frame", _DIMS[across])
@@ -85,7 +86,7 @@ class MisplacedLines(Effect):
             size, place = _places(context, axis)
             hit = hit & (place >= np.floor(context.random.uniform(drawn, _WHERE) * size))
         later = self.move in ("early", "sample_lost", "line_lost")
-        return _taken(values, np.where(hit, 1 if later else -1, 0), axis)
+        return along_axis(values, np.where(hit, 1 if later else -1, 0), axis)
 
     def _exchanged(self, context: EffectContext, across: int) -> IntArray:
         """Return from how many lines later each line comes; of overlapping pairs the first one counts."""
@@ -146,10 +147,3 @@ def _before(lines: BoolArray, axis: int) -> BoolArray:
     moved = np.roll(lines, 1, axis)
     moved[(slice(None),) * axis + (0,)] = False
     return moved
-
-
-def _taken(values: AnyArray, step: IntArray, axis: int) -> AnyArray:
-    """Return the values so many places later along an axis, those at the ends instead of what is beyond."""
-    at = np.arange(values.shape[axis]).reshape([-1 if a == axis else 1 for a in range(3)])
-    index = np.clip(at + step, 0, values.shape[axis] - 1)
-    return np.take_along_axis(values, np.broadcast_to(index, values.shape), axis)

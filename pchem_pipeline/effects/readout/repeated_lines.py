@@ -12,7 +12,9 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
+from pchem_pipeline.effects.framework.context import DIMS
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.framework.neighbours import along_axis
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, IntArray
 
 _FEWEST_SHOWN = 8.0  # repeats of each line in a simulation that shows what they do
@@ -51,14 +53,9 @@ class RepeatedLines(Effect):
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN, with repeats; the first line has none before it."""
-        result: AnyArray = values.copy()
-        if self.lines == "rows":
-            repeats = context.random.uniform(("frame", "y"))[:, 1:] < self.share
-            result[:, 1:] = np.where(repeats, values[:, :-1], values[:, 1:])
-        else:
-            repeats = context.random.uniform(("frame", "x"))[:, :, 1:] < self.share
-            result[:, :, 1:] = np.where(repeats, values[:, :, :-1], values[:, :, 1:])
-        return result
+        axis, along = (1, "row") if self.lines == "rows" else (2, "column")
+        repeats = context.random.uniform(DIMS[along]) < self.share
+        return along_axis(values, np.where(repeats, -1, 0), axis)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
