@@ -13,7 +13,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.moved_codes import moved_shares
+from pchem_pipeline.effects.estimators.bends import moved_shares
 from pchem_pipeline.effects.framework.effect import Count, Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
