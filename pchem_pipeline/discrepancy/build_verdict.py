@@ -457,7 +457,7 @@ def _sized(effect: Effect, sizes: Mapping[Effect, Size | None]) -> str:
 
 def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Size | None]) -> str:
     """Return what is known of a disagreement that was measured and is not understood."""
-    known = [(effect.words(), sizes.get(effect)) for effect in found.described]
+    known = [(effect.describe(), sizes.get(effect)) for effect in found.described]
     told = [text if size is None else f"{text}, in all {size.words()}" for text, size in known]
     words, them = "; and ".join(told), "it" if len(told) == 1 else "them"
     besides = f" besides {_and(titles)}" if titles else ""

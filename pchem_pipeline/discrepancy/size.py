@@ -85,7 +85,7 @@ def _is_measured_noise(effect: Effect) -> bool:
 
     Where it is light that varies, samples change by whole electrons, most of them by their own chance.
     """
-    if not effect.measured_only or effect.power != 2.0:
+    if not effect.empirical or effect.power != 2.0:
         return False
     return parameters_of(effect, math.nan)[effect.strength].unit == "DN"
 

@@ -218,8 +218,8 @@ class Place(_Part):
         """Return region and frames in words; empty where it is everywhere and always alike."""
         # pixels that are listed one by one are told by :attr:`pixels`
         listed = self.region is None or ("pixels" in self.region and self.pixels)
-        parts = [] if listed else [Region.model_validate(self.region).words()]
-        parts += [] if self.when is None else [When.model_validate(self.when).words()]
+        parts = [] if listed else [Region.model_validate(self.region).describe()]
+        parts += [] if self.when is None else [When.model_validate(self.when).describe()]
         # a statistic of a part has only that; another one may be there elsewhere, too, and weaker
         most = "most in " if parts and "@" not in self.statistic else ""
         return f"{most}{', '.join(parts)}"

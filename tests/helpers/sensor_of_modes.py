@@ -11,12 +11,18 @@ from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
+from pchem_pipeline.effects.framework.registry import effect_class
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.streams import KeyedStreams
 from pchem_pipeline.simulate.truth import TruthMaps
 
 BLOCK = 50
+
+
+def make(tag: str, **fields: Any) -> Effect:
+    """Return an effect by its tag."""
+    return effect_class(tag).model_validate({"tag": tag, **fields})
 
 
 def drawn_truth(shape, seed=5, *, exposure=(0.5, 3.0), noise_e=(0.2, 0.3), step=(8.0, 16.0)) -> TruthMaps:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -213,12 +212,6 @@ def test_repeats_are_counted():
     (part,) = estimated(RepeatedFrames(frames=listed, rows=(0, 6)), third=False)
     assert part.rows == (0, 6)
     assert part.probability == pytest.approx(5 / (N_FRAMES - 1))
-
-
-def test_without_an_order_in_time_nothing_is_said_about_it():
-    histograms_only = replace(evidence_of(RowNoise(row_noise_dn=0.8)), time=None)
-    for effect in CLASSES:
-        assert not effect.estimate(histograms_only) or effect in (AdcDnl, AdcInl, Clipping)
 
 
 def test_steps_of_known_series_under_a_common_mode():

@@ -87,7 +87,7 @@ class Acceptance:
         # about the set at its best fit: strong effects do not add up to what they do together
         allowed = noise.of(lesser(added.slopes, added.parts))
         change, stderr = correction(added.slopes, self.z.final - added.mean, allowed)
-        measured = np.array([type(h.effect).measured_only for h in added.hypotheses])
+        measured = np.array([type(h.effect).empirical for h in added.hypotheses])
         sure = measured | _overwhelming(added.parts, self.z.both - first.mean, first.std)
         clear = np.exp(added.change) > np.where(sure, _MEASURED, _ESTABLISHED) * added.stderr
         proven = 1.0 + change > np.where(measured, _MEASURED, _CONFIRMED) * stderr

@@ -147,7 +147,7 @@ class AddedRounds:
         added = this.added.hypotheses[member]
         rivals = this.compared.rivals_of(added.tag)
         kept = _ambiguous_set(rivals, self.settings.certainty)
-        described = type(added.effect).measured_only
+        described = type(added.effect).empirical
         against = "" if described else against
         named = len(kept) == 1 and not against and not described
         compared = [
@@ -347,5 +347,5 @@ def _ambiguous_set(rivals: Sequence[Contender], certainty: float) -> list[Conten
         if share >= certainty:
             break
     # what goes its own way in every simulation is not beaten by a few nats
-    erratic = [r for r in rivals if type(r.hypothesis.effect).erratic and r.score > -_CLEAR_MARGIN]
+    erratic = [r for r in rivals if type(r.hypothesis.effect).random_realisation and r.score > -_CLEAR_MARGIN]
     return kept + [r for r in erratic if r not in kept]

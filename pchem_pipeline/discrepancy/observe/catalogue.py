@@ -378,7 +378,7 @@ class _Catalogue(dict[str, Statistic]):
         if not at or whole not in self:
             raise KeyError(name)
         known = self[whole]
-        words = ", ".join(each.words() for each in parse_place(place) if each is not None)
+        words = ", ".join(each.describe() for each in parse_place(place) if each is not None)
         more, less = (f"{known.says(sign)}, in {words}" for sign in (1.0, -1.0))
         return replace(known, name=name, sentence=more, opposite=less)
 

@@ -57,7 +57,7 @@ class SensorWindow:
     def effects(self, effects: Sequence[Effect]) -> tuple[Effect, ...]:
         """Return effects as they act on the window, for itself a sensor; those that do not are left out."""
         found = []
-        for effect in (each.seen_in(self.rows, self.columns, self.shape) for each in effects):
+        for effect in (each.to_window(self.rows, self.columns, self.shape) for each in effects):
             mask = self.mask(effect.region)
             if effect.region is None or mask.all():
                 found.append(effect.at_place(None, effect.when))
@@ -72,7 +72,7 @@ class SensorWindow:
             inside = np.argwhere(self.mask(part.region))
             (y0, x0), (y1, x1) = inside.min(axis=0).tolist(), (inside.max(axis=0) + 1).tolist()
             rows, columns = (rows[0] + y0, rows[0] + y1), (columns[0] + x0, columns[0] + x1)
-        effect = effect.found_in(rows, columns, self.shape)
+        effect = effect.to_sensor(rows, columns, self.shape)
         return effect if part is None else effect.at_place(part.region, part.when)
 
     def _known_as(self, region: Region) -> Region | None:

@@ -231,7 +231,7 @@ def _placed(check: Check, place: SensorPlace, sums: StackSums) -> Check:
         inside = place.region.mask(sums.shape)
         excess = float(np.nanmean(shared[inside]) - np.nanmean(shared[~inside]))
         size = max(size, math.sqrt(max(excess, 0.0)))
-    words, numbers = place.region.words(), place.region.numbers()
+    words, numbers = place.region.describe(), place.region.numbers()
     return replace(check, p=p, size=size, where=check.where or words, region=numbers)
 
 
@@ -243,7 +243,7 @@ def _local_drift(sums: StackSums, place: SensorPlace | None) -> Check:
     common = block_deviations(sums)[:, inside].mean(axis=1)
     chance = float(sums.variance[inside].mean()) / (float(sums.lengths.mean()) * inside.sum())
     size = math.sqrt(max(float(np.average(common**2, weights=sums.lengths)) - chance, 0.0))
-    words, numbers = place.region.words(), place.region.numbers()
+    words, numbers = place.region.describe(), place.region.numbers()
     return check_of("local_drift", place.p, size, where=words, region=numbers)
 
 

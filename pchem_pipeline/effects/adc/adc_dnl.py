@@ -10,7 +10,7 @@ converter or of a look-up table behind it, is one whose two edges coincide: a DN
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -22,14 +22,17 @@ from pchem_pipeline.effects.estimators.codes import (
     roughness,
     usable_codes,
 )
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.framework.effect import Code, Count, Effect, Lsb, Plane, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 _CHUNK = 1024
 # random edges further away would change their order, others further than a code leave it
@@ -64,7 +67,7 @@ class AdcDnl(Effect):
     )
     strength: ClassVar[str] = "dnl_lsb"
     power: ClassVar[float] = 2.0
-    attained: ClassVar[tuple[str, ...]] = ("dnl_lsb",)
+    may_be_at_bound: ClassVar[tuple[str, ...]] = ("dnl_lsb",)
     separate: ClassVar[Mapping[str, str]] = {
         "gain_stitch": "a ramp over many codes: a stitch moves all codes above it, DNL single ones",
         "clipping": "a shifted bias: unequal widths are at all codes, a limit at the extreme one",
@@ -98,7 +101,7 @@ class AdcDnl(Effect):
             raise ValueError(f"adc_dnl: per_column is for pattern random, not {self.pattern}; leave it out")
         return self
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal at the ADC (frame, y, x), DN, moved against the edges' shifts."""
         if not values.size:
             return values.copy()
@@ -110,12 +113,10 @@ class AdcDnl(Effect):
         index = code - first
         lower, upper = (shift[i] if columns is None else shift[i, columns] for i in (index, index + 1))
         place = values - code
-        result: NDArray[Any] = values + (place >= 0.5 + upper) - (place < -0.5 + lower)
+        result: AnyArray = values + (place >= 0.5 + upper) - (place < -0.5 + lower)
         return result
 
-    def _shifts(
-        self, first: int, last: int, context: EffectContext, columns: NDArray[np.int64] | None
-    ) -> NDArray[np.float64]:
+    def _shifts(self, first: int, last: int, context: EffectContext, columns: IntArray | None) -> FloatArray:
         """Return the shifts of the edges of codes ``first .. last``, DN: (codes,) or (codes, x)."""
         if self.pattern != "random":
             return self._listed(np.arange(first, last + 1))
@@ -136,7 +137,7 @@ class AdcDnl(Effect):
         shift = chosen * (self.dnl_lsb / np.sqrt(2.0))
         return np.asarray(np.clip(shift, -_FARTHEST_RANDOM, _FARTHEST_RANDOM), np.float64)
 
-    def _listed(self, wanted: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _listed(self, wanted: IntArray) -> FloatArray:
         """Return the shifts of the edges of successive codes that need no random numbers, DN.
 
         Where a list would change the order of two edges they coincide.
@@ -167,12 +168,12 @@ class AdcDnl(Effect):
         found = [] if bit is None else [cls(dnl_lsb=bit[1], pattern="bit", bit=bit[0])]
         if few is not None:
             found += cls._from_shifts(codes, few)
-        if significance > 2.5:
+        if significance > SIGNIFICANT:
             found += cls._from_shifts(codes, edge_shifts(residuals, expected, variance))
         return found
 
     @classmethod
-    def _from_shifts(cls, codes: NDArray[np.int64], shifts: NDArray[np.float64]) -> list[Self]:
+    def _from_shifts(cls, codes: IntArray, shifts: FloatArray) -> list[Self]:
         """Return the effect with these edges, its strength the rms deviation of the widths."""
         used = np.flatnonzero(shifts)
         size = float(np.sqrt(np.mean(np.diff(shifts) ** 2)))
@@ -197,9 +198,7 @@ class AdcDnl(Effect):
         return model.with_edges(first, self._listed(np.arange(first, last + 1)))
 
 
-def _best_bit(
-    codes: NDArray[np.int64], residuals: NDArray[np.float64], expected: NDArray[np.float64]
-) -> tuple[int, float] | None:
+def _best_bit(codes: IntArray, residuals: FloatArray, expected: FloatArray) -> tuple[int, float] | None:
     """Return the bit whose wrong weight explains the rough part of the residuals, and the error, LSB."""
     weight = np.sqrt((expected[:-1] * expected[1:]) / (expected[:-1] + expected[1:]))
     rough = np.diff(residuals) * weight
@@ -207,11 +206,8 @@ def _best_bit(
     for bit in range(8):
         edges = (np.arange(codes[0], codes[-1] + 2) >> bit & 1) - 0.5
         pattern = np.diff(np.diff(edges)) * weight
-        square = float((pattern**2).sum())
-        if square <= 0:
-            continue
-        error = float((pattern * rough).sum()) / square
-        gain = error**2 * square
+        found = multiple_of(pattern, rough)
+        error, gain = found.value, found.sigmas**2
         # what is left must not be much rougher than the counts, or it is not one bit
         left = (total - gain) / rough.size
         if gain > _BIT_GAIN and left < 1.5 and (best is None or gain > best[2]):

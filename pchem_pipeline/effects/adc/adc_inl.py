@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -19,13 +19,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.effects.estimators.bends import Curve, best_bend, best_curve, through_knots
 from pchem_pipeline.effects.estimators.codes import code_range
 from pchem_pipeline.effects.framework.effect import Dn, Effect, Lsb, Plane, Radians, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
 _FEWEST_KNOTS = 4
 # places of the table of a curve from one knot to the next
@@ -110,12 +104,12 @@ class AdcInl(Effect):
         most = 0.99 / steepest if steepest > 0 else math.inf
         return super().scaled(min(factor, most / self.inl_lsb) if self.inl_lsb > 0 else factor)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal at the ADC (frame, y, x), DN, bent; draws nothing."""
-        result: NDArray[Any] = values + self._deviation(values)
+        result: AnyArray = values + self._deviation(values)
         return result
 
-    def _deviation(self, values: NDArray[Any]) -> NDArray[np.float64]:
+    def _deviation(self, values: AnyArray) -> FloatArray:
         if self.form == "curve":
             table = _table(self.curve)
             places = (values - self.first_dn) / self._fine
@@ -171,7 +165,7 @@ class AdcInl(Effect):
 
 
 @lru_cache(maxsize=64)
-def _table(curve: tuple[float, ...]) -> NDArray[np.float64]:
+def _table(curve: tuple[float, ...]) -> FloatArray:
     """Return the curve at many places."""
     knots = np.arange(float(len(curve)))
     return through_knots(knots, np.array(curve), np.arange(_FINER * knots[-1] + 1) / _FINER)

@@ -8,19 +8,14 @@ instruments, up to 4.5 DN, and it does not average away (Boone et al. 2018).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator
 
 from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, PreviousBits
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.framework.evidence import PreviousBits
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
 _LEAST_GAIN = 16.0  # fall of chi2 that the best of 8 bits must bring: by chance once in 2,000 stacks
 _MORE_GAIN = 25.0  # that of a further bit
@@ -54,6 +49,9 @@ class BinaryOffset(Effect):
         default=(1.0,), max_length=24, description="relative offset of each bit, the least significant first"
     )
 
+    #: offsets by the lowest bits of 0.3 DN, and of the other sign
+    typical_values = ({"offset_dn": 0.3}, {"offset_dn": -0.3}, {"offset_dn": 0.3, "bits": (0.0, 1.0)})
+
     @field_validator("bits")
     @classmethod
     def _some_bit(cls, bits: tuple[float, ...]) -> tuple[float, ...]:
@@ -61,7 +59,7 @@ class BinaryOffset(Effect):
             raise ValueError("binary_offset: bits are all 0; give the relative offset of at least one")
         return bits
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal at the ADC (frame, y, x), DN; draws nothing.
 
         Column by column, since a sample's code has the offset in it; the first of a row has none.
@@ -73,11 +71,6 @@ class BinaryOffset(Effect):
                 if relative:
                     result[:, :, x] += self.offset_dn * relative * ((before >> bit & 1) - 0.5)
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return offsets by the lowest bits of 0.3 DN, and of the other sign."""
-        return cls(offset_dn=0.3), cls(offset_dn=-0.3), cls(offset_dn=0.3, bits=(0.0, 1.0))
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -103,7 +96,7 @@ class BinaryOffset(Effect):
         return model.with_variance(dn2=0.25 * self.offset_dn**2 * rest)
 
 
-def _pursued(seen: PreviousBits) -> NDArray[np.float64]:
+def _pursued(seen: PreviousBits) -> FloatArray:
     """Return the offset of each bit, DN: one bit after the other that lowers chi2 the most, all refitted."""
     offsets = np.zeros(seen.product.size)
     chosen: list[int] = []

@@ -8,23 +8,16 @@ they collect charge it has their shot noise too: all pixels of the frame then mo
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator
 
 from pchem_pipeline.effects.estimators.clamps import best_clamp
+from pchem_pipeline.effects.framework.context import ALL_ROWS
 from pchem_pipeline.effects.framework.effect import Count, Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.region import Span
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
-
-_WHOLE_SENSOR = 1 << 30  # rows: as far as there are any
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
 
 @register_effect
@@ -46,7 +39,8 @@ class BlackClamp(Effect):
         "space.x.rk",
     )
     strength: ClassVar[str] = "follow"
-    attained: ClassVar[tuple[str, ...]] = ("follow",)
+    reach_rows = ALL_ROWS  # the clamp may be anywhere
+    may_be_at_bound: ClassVar[tuple[str, ...]] = ("follow",)
     separate: ClassVar[Mapping[str, str]] = {
         "frame_noise": "the camera's clamp switched off; noise of frames does not follow their charge",
         "exposure_flicker": "the camera's clamp switched off, or covered pixels: they follow the light",
@@ -65,6 +59,9 @@ class BlackClamp(Effect):
         default=None, ge=1, description="number of these pixels, for the law of a sample; null: left as it is"
     )
 
+    #: clamps that take off a tenth of the mean of the frame, and of eight columns and rows
+    typical_values = ({"follow": 0.1}, {"follow": 0.1, "columns": (0, 8)}, {"follow": 0.1, "rows": (0, 8)})
+
     @field_validator("rows", "columns")
     @classmethod
     def _some(cls, span: Span | None) -> Span | None:
@@ -72,7 +69,7 @@ class BlackClamp(Effect):
             raise ValueError(f"black_clamp: {list(span)} holds no line; give [first, behind the last]")
         return span
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with what lies of its clamp in these rows and columns; without any it does nothing."""
         spans = [
             (max(first, low) - low, min(last, high) - low)
@@ -82,7 +79,7 @@ class BlackClamp(Effect):
             return self.model_copy(update={"follow": 0.0, "rows": None, "columns": None})
         return self.model_copy(update={"rows": spans[0], "columns": spans[1]})
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its rows and columns counted on the sensor."""
         size = (rows[1] - rows[0], columns[1] - columns[0])
         moved = [
@@ -95,11 +92,7 @@ class BlackClamp(Effect):
     def _spans(self, shape: tuple[int, int]) -> tuple[Span, Span]:
         return self.rows or (0, shape[0]), self.columns or (0, shape[1])
 
-    def halo(self) -> int:
-        """Return more rows than there are: the clamp may be anywhere."""
-        return _WHOLE_SENSOR
-
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal at the ADC (frame, y, x), DN, less what the clamp sees; draws nothing."""
         truth = context.truth
         usual = truth["bias"] + truth["quanta_exposure"] / truth["conversion_gain"]
@@ -108,11 +101,6 @@ class BlackClamp(Effect):
             return values.copy()
         deviation = (values[:, *place] - usual[place]).mean(axis=(1, 2), keepdims=True)
         return np.asarray(values - self.follow * deviation)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return clamps that take off a tenth of the mean of the frame, and of eight columns and rows."""
-        return cls(follow=0.1), cls(follow=0.1, columns=(0, 8)), cls(follow=0.1, rows=(0, 8))
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

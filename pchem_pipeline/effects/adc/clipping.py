@@ -9,20 +9,14 @@ this effect: the ADC always makes it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.framework.effect import Code, Effect, Plane, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import CodeResiduals, Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.framework.evidence import CodeResiduals
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
 # counts expected beyond the limit, and standard errors of the pile-up at it
 _EXPECTED_BEYOND = 8.0
@@ -67,10 +61,10 @@ class Clipping(Effect):
             raise ValueError(f"clipping: low {self.low} is not below high {self.high}; swap them")
         return self
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal at the ADC (frame, y, x), DN, inside the limits; draws nothing."""
         # the limits are whole DN, so to limit before rounding is to limit after it
-        result: NDArray[Any] = np.clip(values, self.low, self.high)
+        result: AnyArray = np.clip(values, self.low, self.high)
         return result
 
     @classmethod
@@ -90,9 +84,7 @@ class Clipping(Effect):
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law that counts at the limits what lies beyond them."""
-        lows = [limit for limit in (model.clip_low, self.low) if limit is not None]
-        highs = [limit for limit in (model.clip_high, self.high) if limit is not None]
-        return replace(model, clip_low=max(lows, default=None), clip_high=min(highs, default=None))
+        return model.with_clip(self.low, self.high)
 
 
 def _piles_up(code: CodeResiduals, limit: int, *, above: bool) -> bool:

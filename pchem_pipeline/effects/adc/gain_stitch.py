@@ -9,7 +9,7 @@ matched about another point.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -17,13 +17,7 @@ from pydantic import Field
 from pchem_pipeline.effects.estimators.bends import Stitch, best_stitch
 from pchem_pipeline.effects.estimators.codes import code_range
 from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
 _FARTHEST = 1e6  # of the point at which both gains agree, DN
 _FLATTEST = 1e-4  # gain changes below it are a step: with its point of agreement this many DN away
@@ -68,19 +62,17 @@ class GainStitch(Effect):
         description="point at which both gains give the same, DN; null: the level, so without a step",
     )
 
+    #: gains that differ by 1 % above 130 DN, of either sign
+    typical_values = ({"gain_change": 0.01, "level_dn": 130.0}, {"gain_change": -0.01, "level_dn": 130.0})
+
     @property
     def _origin(self) -> float:
         return self.level_dn if self.origin_dn is None else self.origin_dn
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal at the ADC (frame, y, x), DN, joined; draws nothing."""
         joined = values + self.gain_change * (values - self._origin)
         return np.asarray(np.where(values > self.level_dn, joined, values))
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return gains that differ by 1 % above 130 DN, of either sign."""
-        return cls(gain_change=0.01, level_dn=130.0), cls(gain_change=-0.01, level_dn=130.0)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

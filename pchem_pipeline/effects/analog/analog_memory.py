@@ -11,27 +11,21 @@ cannot show.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 from scipy import special
 
+from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL
+from pchem_pipeline.effects.estimators.regression import CERTAIN, SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, Ratio, register_effect
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
-
-_WHICH = 0xFFFFFFFE  # draw that is no frame's
 _LINEAR = 0.15  # e- of a bright sample before, up to which a correlation is in proportion to the memory
 _NODES = 40  # of a quadrature over the pixels' memories
 _FAR = 30.0  # standard deviations: what lies farther is as unlikely
 _USUAL = 0.5  # spread from which a fit begins
-_CERTAIN = 4.0  # standard deviations, as a likelihood ratio, by which memories are not alike
 
 
 @register_effect
@@ -52,6 +46,7 @@ class AnalogMemory(Effect):
         "time.cross.readout_charge.chi",
     )  # fmt: skip
     strength: ClassVar[str] = "memory"
+    reach_frames = 1
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {
         "flicker_noise": "frames without any exposure: flicker remains there, memory does not",
@@ -78,45 +73,39 @@ class AnalogMemory(Effect):
         description="charge of the frame before at which the memory levels off, e-; none: in proportion",
     )
 
-    def history(self) -> int:
-        """Return 1: the frame before."""
-        return 1
+    #: residue, overshoot, and a residue that differs
+    typical_values = ({"memory": 0.0024}, {"memory": -0.0024}, {"memory": 0.0024, "spread": 1.0})
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with that of the frame before.
 
         The first frame of the block has none before it (it is only the history of the others).
         """
-        result: NDArray[Any] = values.copy()
+        result: AnyArray = values.copy()
         if context.charge is not None:
             result[1:] += self._memories(context) * self._left(context.charge[:-1])
         return result
 
-    def _memories(self, context: EffectContext) -> NDArray[np.float64] | float:
+    def _memories(self, context: EffectContext) -> FloatArray | float:
         """Return the memory of the pixels, shape (1, y, x), or of all."""
         if self.spread == 0:
             return self.memory
-        normal = special.ndtri(context.random.uniform(("y", "x"), _WHICH))
+        normal = special.ndtri(context.random.uniform(("y", "x"), OF_PIXEL[0]))
         return np.asarray(self.memory * np.exp(self.spread * normal - self.spread**2 / 2.0))
 
-    def _left(self, charge: NDArray[Any]) -> NDArray[Any]:
+    def _left(self, charge: AnyArray) -> AnyArray:
         """Return what is left of a charge where all of it is remembered, e-."""
         if self.saturation_e is None:
             return charge
         return np.asarray(-self.saturation_e * np.expm1(-charge / self.saturation_e))
 
-    def _left_of(self, exposure: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _left_of(self, exposure: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the mean, e-, and mean square, e-^2, of what is left of Poisson electrons."""
         if self.saturation_e is None:
             return exposure, exposure * (1.0 + exposure)
         # E[exp(-n K / S)], the generating function of K
         once, twice = (np.exp(exposure * np.expm1(-n / self.saturation_e)) for n in (1.0, 2.0))
         return self.saturation_e * (1.0 - once), self.saturation_e**2 * (1.0 - 2.0 * once + twice)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return residue, overshoot, and a residue that differs."""
-        return cls(memory=0.0024), cls(memory=-0.0024), cls(memory=0.0024, spread=1.0)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -132,11 +121,10 @@ class AnalogMemory(Effect):
         response = evidence.readout_std * evidence.charge_std / maps.read_noise_dn**2 / maps.conversion_gain
         good = maps.usable & np.isfinite(seen) & np.isfinite(response)
         seen, response = seen[good], response[good]
-        below = float((response**2).sum()) * pairs
-        above = float((response * seen).sum()) * pairs
-        if below <= 0 or abs(above) < 2.5 * np.sqrt(below):
+        found = multiple_of(response, seen, pairs)
+        if not abs(found.sigmas) > SIGNIFICANT:
             return ()
-        memory = float(np.clip(above / below, -0.5, 0.5))
+        memory = float(np.clip(found.value, -0.5, 0.5))
         k = maps.quanta_exposure[good] + evidence.charge_std[good]
         differing = _lognormal(seen, response, _LINEAR / k * response, pairs, memory)
         if differing is None:
@@ -153,11 +141,7 @@ class AnalogMemory(Effect):
 
 
 def _lognormal(
-    seen: NDArray[np.float64],
-    response: NDArray[np.float64],
-    limit: NDArray[np.float64],
-    pairs: int,
-    memory: float,
+    seen: FloatArray, response: FloatArray, limit: FloatArray, pairs: int, memory: float
 ) -> tuple[float, float] | None:
     """Return the likeliest mean and spread of lognormal memories of pixels; None where they may be alike.
 
@@ -190,6 +174,6 @@ def _lognormal(
         method="Nelder-Mead",
         options={"xatol": 0.01, "fatol": 0.1},
     )
-    if alike.fun - one.fun < _CERTAIN**2 / 2.0:
+    if alike.fun - one.fun < CERTAIN**2 / 2.0:
         return None
     return float(sign * np.exp(one.x[0])), float(np.exp(one.x[1]))

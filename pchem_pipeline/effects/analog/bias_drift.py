@@ -9,43 +9,46 @@ of the same camera may do. A slow sine is ``periodic_pickup`` at a few cycles pe
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.common_modes import (
     WORTH_A_GUESS,
-    quantile_means,
     responsivity,
     run_position,
     successive,
-    with_offsets,
 )
 from pchem_pipeline.effects.estimators.time_profiles import (
-    along_path,
+    NODES,
+    Fit,
     check_path,
+    fitted,
+    fitted_profile,
+    hats,
+    profile_at,
     settling,
     settling_time,
 )
-from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, Ratio, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
+from pchem_pipeline.effects.families.offsets import OffsetEffect, quantile_means
+from pchem_pipeline.effects.framework.effect import Dn, Ratio, register_effect
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.types import (
+    EffectContext,
+    Evidence,
+    FloatArray,
+    PixelMaps,
+    SampleLaw,
+    TimeSeries,
+)
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import SampleLaw
-
-_NODES = (3, 5, 9, 17, 33)
-_FRAMES_PER_NODE = 12
-_LOBES = 7
+_FRAMES_PER_NODE = 12  # so that a node's error is well below that of a frame
 _WORTH_A_CURVE = 4.0  # of the Bayesian information criterion, beyond a line
 
 
 @register_effect
-class BiasDrift(Effect):
+class BiasDrift(OffsetEffect):
     """Slow offset of all pixels, zero on average over the run.
 
     Signature: block means of the readout residual move together, by the same number of DN in every pixel,
@@ -53,7 +56,6 @@ class BiasDrift(Effect):
     """
 
     tag: Literal["bias_drift"] = Field(default="bias_drift", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "bias (pedestal) drift"
     source: ClassVar[str] = "Rauscher 2015, PASP 127, 1144 (pedestal drift); Janesick 2001, ch. 7"
     signature: ClassVar[tuple[str, ...]] = (
@@ -89,30 +91,41 @@ class BiasDrift(Effect):
         description="bias at equally spaced frames from first to last of the run, in units of drift_dn",
     )
 
+    #: at 0.09 DN: rising, falling, there and back
+    typical_values = (
+        {"drift_dn": 0.09},
+        {"drift_dn": -0.09},
+        {"drift_dn": 0.09, "shape": "path", "path": (-0.5, 0.5, -0.5)},
+    )
+
     @model_validator(mode="after")
     def _path_where_it_belongs(self) -> Self:
         check_path(self.tag, self.shape, self.path)
         return self
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
-        """Return the signal (frame, y, x), e-, with the offset referred to the input."""
+    def offsets(self, context: EffectContext) -> FloatArray:
+        """Return the offsets of the frames, DN."""
         if self.shape == "walk":
             offset = _walk(context)
         else:
             offset = self._path_at(run_position(context.frames, context.n_frames))
-        return add_offset(values, (self.drift_dn * offset)[:, None, None], context)
+        return np.asarray((self.drift_dn * offset)[:, None, None])
 
-    def _path_at(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+    def offset_values(self) -> FloatArray:
+        """Return values, DN, that the path goes through."""
+        return quantile_means(self.drift_dn * self._path_at(np.linspace(0.0, 1.0, 1001)))
+
+    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
+        """Return the law smeared over the path; of a walk that with its variance."""
+        if self.shape == "walk":
+            # mean square of a walk around its own mean: a sixth of the variance of its end
+            return model.with_variance(dn2=self.drift_dn**2 / 6.0)
+        return super().sample_law(model, maps)
+
+    def _path_at(self, position: FloatArray) -> FloatArray:
         """Return the shape at positions 0..1 in the run, in units of ``drift_dn``, zero on average."""
-        if self.shape == "settling":
-            return settling(position, self.settling_fraction)
-        return along_path(position, self.path or (-0.5, 0.5))
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.09 DN: rising, falling, there and back."""
-        bow = cls(drift_dn=0.09, shape="path", path=(-0.5, 0.5, -0.5))
-        return cls(drift_dn=0.09), cls(drift_dn=-0.09), bow
+        fraction = self.settling_fraction if self.shape == "settling" else None
+        return profile_at(position, fraction, self.path)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -125,46 +138,48 @@ class BiasDrift(Effect):
             return ()
         time, alpha = evidence.time, responsivity(evidence)
         position = run_position(time.frames, time.n_run)
-        slope, error = _slope(position, time.frame_readout)
-        linear = [cls(drift_dn=slope / alpha)] if abs(slope) > WORTH_A_GUESS * error else []
-        settled, path = _settled(position, time.frame_readout), _best_path(position, time.frame_readout)
-        if settled is not None:
-            size, fraction = settled.values[1] / alpha, settled.fraction
-            linear.insert(0, cls(drift_dn=size, shape="settling", settling_fraction=fraction))
-        if path is None:
-            if linear or evidence.strongest("frame.readout.slow") <= 3.0:
-                return linear
+        means, frames = time.frame_readout, position.size
+
+        def criterion(fit: Fit) -> float:
+            return frames * float(np.log(max(fit.chi2, 1e-300) / frames)) + fit.price(frames)
+
+        line = fitted_profile(means, position)
+        fraction = settling_time(lambda f: criterion(fitted_profile(means, settling(position, f))))
+        settled = fitted_profile(means, settling(position, fraction))
+        paths = [fitted(means, hats(position, n)) for n in NODES if frames >= _FRAMES_PER_NODE * n]
+        path = min(paths, key=criterion, default=line)
+        slope, error = _slope(position, means)
+        found = [cls(drift_dn=slope / alpha)] if abs(slope) > WORTH_A_GUESS * error else []
+        least = criterion(line) - _WORTH_A_CURVE
+        if criterion(settled) < least:
+            size = settled.values[1] / alpha
+            found.insert(0, cls(drift_dn=size, shape="settling", settling_fraction=fraction))
+        if not criterion(path) < least:
+            if found or evidence.strongest("frame.readout.slow") <= 3.0:
+                return found
             return [cls(drift_dn=max(_wander(time), 1e-9) / alpha, shape="walk")]
         nodes = path.values
         size = float(np.ptp(nodes)) or 1.0
         bent = cls(drift_dn=size / alpha, shape="path", path=tuple(np.round(nodes / size, 6).tolist()))
         # a random walk of variance s^2 u has steps of variance s^2 / (nodes - 1) between nodes
         walk = cls(drift_dn=float(np.sqrt((np.diff(nodes) ** 2).sum())) / alpha, shape="walk")
-        if settled is not None and settled.criterion < path.criterion:
-            return [*linear, bent, walk]
-        return [bent, *linear, walk]
+        if criterion(settled) < min(least, criterion(path)):
+            return [*found, bent, walk]
+        return [bent, *found, walk]
 
     def shared_offset(self) -> SharedOffset:
         """Return the offset of a frame: others may be at any place of the drift."""
         return SharedOffset("frame", self.drift_dn**2)
 
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law smeared over the path (a variance where the drift is small against the noise)."""
-        if self.shape == "walk":
-            # mean square of a walk around its own mean: a sixth of the variance of its end
-            return model.with_variance(dn2=self.drift_dn**2 / 6.0)
-        offsets = self.drift_dn * self._path_at(np.linspace(0.0, 1.0, 1001))
-        return with_offsets(model, maps, quantile_means(offsets, _LOBES))
 
-
-def _walk(context: EffectContext) -> NDArray[np.float64]:
+def _walk(context: EffectContext) -> FloatArray:
     """Return a random walk over the run with an end of unit variance, at the block's frames."""
     steps = context.random.generator().standard_normal(context.n_frames)
     walk = np.cumsum(steps) / np.sqrt(context.n_frames)
     return np.asarray(walk[context.frames.clip(0, context.n_frames - 1)] - walk.mean())
 
 
-def _slope(position: NDArray[np.float64], means: NDArray[np.float64]) -> tuple[float, float]:
+def _slope(position: FloatArray, means: FloatArray) -> tuple[float, float]:
     """Return the slope of the means against the position, and its standard error, DN per run."""
     centred = position - position.mean()
     square = float((centred**2).sum())
@@ -184,51 +199,3 @@ def _wander(time: TimeSeries) -> float:
     inside = np.diff(time.frame_readout)[successive(time.frames)].var() / 2.0
     excess = float(blocks.var() - inside / lengths.max()) if blocks.size > 1 else 0.0
     return float(np.sqrt(6.0 * max(excess, 0.0)))
-
-
-class _Curve(NamedTuple):
-    """A fit of the means: Bayesian information criterion, coefficients in DN, time constant in runs."""
-
-    criterion: float
-    values: NDArray[np.float64]
-    fraction: float = np.nan
-
-
-def _settled(position: NDArray[np.float64], means: NDArray[np.float64]) -> _Curve | None:
-    """Return mean and size of the best exponential approach to the end; None if a line does as well."""
-    one = np.ones_like(position)
-
-    def curve(fraction: float) -> _Curve:
-        basis = np.stack([one, settling(position, fraction)], axis=1)
-        return _Curve(*_criterion(means, basis), fraction=fraction)
-
-    best = curve(settling_time(lambda fraction: curve(fraction).criterion))
-    return _better_than_line(best, position, means)
-
-
-def _best_path(position: NDArray[np.float64], means: NDArray[np.float64]) -> _Curve | None:
-    """Return the values of the piecewise linear path at its nodes; None if a line does as well."""
-    paths = []
-    for count in _NODES:
-        if position.size < _FRAMES_PER_NODE * count:
-            break
-        knots = np.linspace(0.0, 1.0, count)
-        hats = np.clip(1.0 - np.abs(position[:, None] - knots) * (count - 1), 0.0, None)
-        paths.append(_Curve(*_criterion(means, hats)))
-    best = min(paths, key=lambda path: path.criterion, default=None)
-    return None if best is None else _better_than_line(best, position, means)
-
-
-def _better_than_line(
-    curve: _Curve, position: NDArray[np.float64], means: NDArray[np.float64]
-) -> _Curve | None:
-    line = _criterion(means, np.stack([np.ones_like(position), position], 1))[0]
-    return curve if curve.criterion < line - _WORTH_A_CURVE else None
-
-
-def _criterion(means: NDArray[np.float64], basis: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-    """Return the Bayesian information criterion of a least-squares fit, and its coefficients."""
-    values: NDArray[np.float64] = np.linalg.lstsq(basis, means, rcond=1e-6)[0].astype(np.float64)
-    rest = float(((means - basis @ values) ** 2).sum())
-    n = means.size
-    return float(n * np.log(max(rest, 1e-300) / n) + basis.shape[1] * np.log(n)), values

@@ -9,41 +9,41 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.estimators.common_modes import quantile_means, responsivity, with_offsets
+from pchem_pipeline.effects.estimators.common_modes import responsivity
 from pchem_pipeline.effects.estimators.levels.change_points import noise_variance
 from pchem_pipeline.effects.estimators.levels.two_levels import likeliest_parts
-from pchem_pipeline.effects.framework.effect import Count, Dn, Effect, PerFrame, Plane, register_effect
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
+from pchem_pipeline.effects.families.offsets import OffsetEffect, quantile_means
+from pchem_pipeline.effects.framework.effect import Count, Dn, PerFrame, register_effect
 from pchem_pipeline.effects.framework.shared_offset import SharedOffset
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    BoolArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    TimeSeries,
+)
 
 Path = tuple[tuple[int, float], ...]
 
 # how the quadrants' means add up to those of the parts that jump together
 Parts = Literal["quadrants", "top_bottom", "left_right"]
-_PARTS: dict[Parts, NDArray[np.float64]] = {
+_PARTS: dict[Parts, FloatArray] = {
     "quadrants": np.eye(4),
     "top_bottom": np.array([[0.5, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.5]]),
     "left_right": np.array([[0.5, 0.0, 0.5, 0.0], [0.0, 0.5, 0.0, 0.5]]),
 }
-_LOBES = 7
 _LAGS = 40
-# of the best of some ten rates
-_SIGNIFICANT = 2.5
 
 
 @register_effect
-class BiasJumps(Effect):
+class BiasJumps(OffsetEffect):
     """Piecewise constant offset of each quadrant or half of the sensor, independent of the others.
 
     An odd middle row or column belongs to the bottom or right.
@@ -53,7 +53,6 @@ class BiasJumps(Effect):
     """
 
     tag: Literal["bias_jumps"] = Field(default="bias_jumps", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "bias jumps (popcorn mesa noise of an output)"
     source: ClassVar[str] = "WFPC2 Data Handbook (STScI), bias jumps; Rauscher 2015, PASP 127, 1144"
     signature: ClassVar[tuple[str, ...]] = (
@@ -62,7 +61,7 @@ class BiasJumps(Effect):
         "frame.readout.lag1",
         "time.lag1.readout.mean",
     )
-    erratic: ClassVar[bool] = True
+    random_realisation: ClassVar[bool] = True
     strength: ClassVar[str] = "amplitude_dn"
     power: ClassVar[float] = 2.0
     separate: ClassVar[Mapping[str, str]] = {
@@ -83,6 +82,9 @@ class BiasJumps(Effect):
         "in units of amplitude_dn]",
     )
 
+    #: at 0.085 DN, with rare and with frequent jumps
+    typical_values = ({"amplitude_dn": 0.085, "rate": 1e-3}, {"amplitude_dn": 0.085, "rate": 1e-2})
+
     @model_validator(mode="after")
     def _path_for_each_part(self) -> Self:
         wanted = len(_PARTS[self.parts])
@@ -95,21 +97,22 @@ class BiasJumps(Effect):
                 raise ValueError("bias_jumps: frames of a path must increase; sort them")
         return self
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
-        """Return the signal (frame, y, x), e-, with the offsets referred to the input."""
-        levels = self.amplitude_dn * self._levels(context)
-        factors = {"quadrants": (2, 1), "top_bottom": (1, 0), "left_right": (0, 1)}[self.parts]
-        # rows and columns are in order: each quadrant is a rectangle
-        row = int(np.searchsorted(context.rows, context.shape[0] // 2))
-        column = context.shape[1] // 2
-        result: NDArray[Any] = values.copy()
-        for below, ys in enumerate((slice(0, row), slice(row, None))):
-            for right, xs in enumerate((slice(0, column), slice(column, None))):
-                offset = levels[:, factors[0] * below + factors[1] * right, None, None]
-                result[:, ys, xs] += offset * context.truth["conversion_gain"][ys, xs]
-        return result
+    def offsets(self, context: EffectContext) -> FloatArray:
+        """Return the offsets of the parts in a block of frames, DN."""
+        below, right = {"quadrants": (2, 1), "top_bottom": (1, 0), "left_right": (0, 1)}[self.parts]
+        rows, columns = (size // 2 for size in context.shape)
+        part = below * (context.rows >= rows)[:, None] + right * (np.arange(context.shape[1]) >= columns)
+        return np.asarray(self.amplitude_dn * self._levels(context)[:, part])
 
-    def _levels(self, context: EffectContext) -> NDArray[np.float64]:
+    def offset_values(self) -> FloatArray:
+        """Return the levels, DN; of paths those of all parts, since the pixels' places are not known here."""
+        if self.path:
+            values = _values(self.path)
+        else:
+            values = np.asarray(np.arange(self.levels) - (self.levels - 1) / 2.0, np.float64)
+        return self.amplitude_dn * quantile_means(values)
+
+    def _levels(self, context: EffectContext) -> FloatArray:
         """Return the levels at the block's frames in units of ``amplitude_dn``, (frame, part)."""
         frames = context.frames.clip(0, context.n_frames - 1)
         found = np.zeros((frames.size, len(_PARTS[self.parts])))
@@ -122,7 +125,7 @@ class BiasJumps(Effect):
                 found[:, part] = levels[np.searchsorted(starts[1:], frames, side="right")]
         return found
 
-    def _drawn(self, context: EffectContext, part: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _drawn(self, context: EffectContext, part: int) -> tuple[IntArray, FloatArray]:
         """Return the frames at which random levels begin, the first being 0, and the levels."""
         generator = context.random.generator(draw=part)
         starts, first = [np.zeros(1, np.int64)], generator.integers(self.levels)
@@ -134,11 +137,6 @@ class BiasJumps(Effect):
         moves = generator.integers(1, self.levels, frames.size - 1)
         levels = (first + np.concatenate([[0], np.cumsum(moves)])) % self.levels
         return frames, np.asarray(levels - (self.levels - 1) / 2.0, np.float64)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.085 DN, with rare and with frequent jumps."""
-        return cls(amplitude_dn=0.085, rate=1e-3), cls(amplitude_dn=0.085, rate=1e-2)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -153,7 +151,7 @@ class BiasJumps(Effect):
         time, alpha = evidence.time, responsivity(evidence)
         means = time.quadrant_readout.astype(np.float64)
         drawn = [(*_correlated(time.frames, means @ mix.T), name) for name, mix in _PARTS.items()]
-        drawn = sorted((d for d in drawn if d[0] > _SIGNIFICANT), reverse=True)
+        drawn = sorted((d for d in drawn if d[0] > SIGNIFICANT), reverse=True)
         random = [cls(amplitude_dn=a / alpha, rate=rate, parts=name) for _, a, rate, name in drawn[:2]]
         gaps = np.diff(time.frames, prepend=-1).astype(np.float64)
         parts, found = likeliest_parts(means, gaps, _PARTS)
@@ -178,19 +176,8 @@ class BiasJumps(Effect):
         """Return that frames have one: at which level others are is not known."""
         return SharedOffset("frame", None)
 
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law of copies at the levels (a variance where they are close against the noise).
 
-        The pixels' places are not known here, so a path counts with the mean law of the quadrants.
-        """
-        if self.path:
-            values = _values(self.path)
-        else:
-            values = np.asarray(np.arange(self.levels) - (self.levels - 1) / 2.0, np.float64)
-        return with_offsets(model, maps, self.amplitude_dn * quantile_means(values, _LOBES))
-
-
-def _steps(path: Path, n_frames: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _steps(path: Path, n_frames: int) -> tuple[IntArray, FloatArray]:
     """Return the frames at which levels begin and the levels, zero on average over the run."""
     starts = np.array([frame for frame, _ in path], np.int64)
     levels = np.array([level for _, level in path], np.float64)
@@ -201,7 +188,7 @@ def _steps(path: Path, n_frames: int) -> tuple[NDArray[np.int64], NDArray[np.flo
     return starts, levels - float((levels * lasting).sum() / n_frames)
 
 
-def _values(paths: tuple[Path, ...]) -> NDArray[np.float64]:
+def _values(paths: tuple[Path, ...]) -> FloatArray:
     """Return the levels that the paths go through, each as often as it lasts, zero on average.
 
     The length of the run is not known here: the last level is taken to last as long as the others do.
@@ -217,7 +204,7 @@ def _values(paths: tuple[Path, ...]) -> NDArray[np.float64]:
     return np.concatenate(found)
 
 
-def _correlated(frames: NDArray[np.int64], means: NDArray[np.float64]) -> tuple[float, float, float]:
+def _correlated(frames: IntArray, means: FloatArray) -> tuple[float, float, float]:
     """Return significance, amplitude (DN) and rate of two-level jumps that best explain the correlation.
 
     The autocovariance of a level that jumps at rate q between ``-a/2`` and ``a/2`` is ``a^2 / 4 (1 - 2 q)^l``
@@ -241,15 +228,14 @@ def _correlated(frames: NDArray[np.int64], means: NDArray[np.float64]) -> tuple[
     best = (0.0, 0.0, 0.0)
     for rate in np.geomspace(1e-3, 0.25, 12):
         shape = (1.0 - 2.0 * rate) ** lags
-        square = float((weight * shape**2).sum())
-        size = float((weight * shape * covariance).sum()) / square
-        if size > 0:
-            amplitude = 2.0 * float(np.sqrt(size / (1.0 - 1.0 / n_parts)))
-            best = max(best, (size * float(np.sqrt(square)) / error, amplitude, float(rate)))
+        size = multiple_of(shape, covariance, weight / error**2)
+        if size.value > 0:
+            amplitude = 2.0 * float(np.sqrt(size.value / (1.0 - 1.0 / n_parts)))
+            best = max(best, (size.sigmas, amplitude, float(rate)))
     return best
 
 
-def _quadrants(shape: tuple[int, ...]) -> list[NDArray[np.bool_]]:
+def _quadrants(shape: tuple[int, ...]) -> list[BoolArray]:
     """Return which pixels are in each quadrant, (y, x): top left, top right, bottom left, bottom right."""
     bottom, right = (np.arange(n) >= n // 2 for n in shape)
     return [
@@ -259,7 +245,7 @@ def _quadrants(shape: tuple[int, ...]) -> list[NDArray[np.bool_]]:
     ]
 
 
-def _as_path(time: TimeSeries, starts: NDArray[np.int64], levels: NDArray[np.float64]) -> Path:
+def _as_path(time: TimeSeries, starts: IntArray, levels: FloatArray) -> Path:
     """Return levels with the frames at which they begin (the middle of a gap in time)."""
     cuts = starts[1:]
     begins = [int(time.frames[0]), *((time.frames[cuts - 1] + time.frames[cuts] + 1) // 2).tolist()]

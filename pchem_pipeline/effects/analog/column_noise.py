@@ -7,17 +7,13 @@ do not change from frame to frame are part of the bias map and not this effect.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.common_modes import line_noise
+from pchem_pipeline.effects.families.offsets import SharedNoise
 from pchem_pipeline.effects.framework.effect import Dn, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedNoise
-
-if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.evidence import Evidence
 
 
 @register_effect
@@ -42,13 +38,5 @@ class ColumnNoise(SharedNoise):
     }
     column_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the columns' offsets, DN")
 
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.32 DN."""
-        return (cls(column_noise_dn=0.32),)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the excess variance of column means within their frames (moment estimate)."""
-        found = line_noise(evidence, "column")
-        return () if found is None else (cls(column_noise_dn=found),)
+    #: at 0.32 DN
+    typical_values = ({"column_noise_dn": 0.32},)

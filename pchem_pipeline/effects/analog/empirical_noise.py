@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -18,19 +18,18 @@ from pydantic import Field, model_validator
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.context import DIMS, Dim
 from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.shared_offset import add_offset
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import Dim, EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
-
-FloatArray = np.ndarray[Any, np.dtype[np.float64]]
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 #: A distance: frames, rows, columns.
 Lag = tuple[int, int, int]
@@ -38,9 +37,6 @@ Lag = tuple[int, int, int]
 Cycles = tuple[float, float, float]
 Shared = Literal["sample", "row", "column", "frame"]
 Changed = Literal["offset", "gain", "light", "noise"]
-_DIMS: dict[Shared, tuple[Dim, ...]] = {
-    "sample": ("frame", "y", "x"), "row": ("frame", "y"), "column": ("frame", "x"), "frame": ("frame",),
-}  # fmt: skip
 _POINTS = 8  # of the spectrum's grid along an axis, for each unit of the largest distance
 _REACH = 3  # of the moving average along an axis, for each of them
 _MOST_TAPS, _SMALLEST_TAP = 200, 0.01  # of the moving average; of the largest weight
@@ -110,7 +106,7 @@ class NoiseMode(Section):
     def _of_its_axes(self) -> Self:
         if len(self.lags) != len(self.correlation):
             raise ValueError("give one correlation for each of lags")
-        fixed = [axis for axis, dim in enumerate(("frame", "y", "x")) if dim not in _DIMS[self.of]]
+        fixed = [axis for axis, dim in enumerate(("frame", "y", "x")) if dim not in DIMS[self.of]]
         if any(not any(lag) or any(lag[axis] for axis in fixed) for lag in self.lags):
             raise ValueError(f"lags of a {self.of} are (frames, rows, columns), not all 0, and 0 within it")
         if self.profile and (
@@ -137,7 +133,7 @@ class NoiseMode(Section):
         """Whether it is an offset that changes its sign from sample to sample and frame to frame."""
         return self.of == "sample" and self.wave is not None and root_mean_square(self.wave) == 1.0
 
-    def words(self, rms: float | None) -> str:
+    def describe(self, rms: float | None) -> str:
         """Return in words what varies by so many DN (None: that is said elsewhere), and who shares it."""
         own = self.of == "sample" and (self.lags or self.wave is not None)
         whole = "" if own else f"the same in a whole {self.of}"
@@ -167,7 +163,7 @@ class NoiseMode(Section):
         return f"{share:{form}} % of the {of}, {size:.2g} DN {at}of {self.signal_dn:.3g} DN"
 
     def _wave_words(self, wave: Cycles) -> str:
-        lines = [(each, _LINE[dim]) for each, dim in zip(wave, _LINE, strict=True) if dim in _DIMS[self.of]]
+        lines = [(each, _LINE[dim]) for each, dim in zip(wave, _LINE, strict=True) if dim in DIMS[self.of]]
         if root_mean_square(wave) == 1.0 and any(wave):
             return (
                 f"changing its sign from {', from '.join(f'{one} to {one}' for each, one in lines if each)}"
@@ -181,7 +177,7 @@ class NoiseMode(Section):
             return self._on_the_wave(self.wave, number, context)
         if self.burst is None:
             return _field(self, number, context)
-        some = context.random.uniform(_DIMS[self.of], number) < self.burst
+        some = context.random.uniform(DIMS[self.of], number) < self.burst
         return np.asarray(some * (-1.0 if self.negative else 1.0) / np.sqrt(self.burst))
 
     def _on_the_wave(self, wave: Cycles, number: int, context: EffectContext) -> FloatArray:
@@ -190,7 +186,7 @@ class NoiseMode(Section):
         turns: Any = wave[0] * context.frames[:, None, None]
         places: dict[Dim, Any] = {"y": context.rows[:, None], "x": np.arange(context.shape[1])}
         for dim, cycles in zip(("y", "x"), wave[1:], strict=True):
-            turns = turns + cycles * places[dim] if dim in _DIMS[self.of] else turns
+            turns = turns + cycles * places[dim] if dim in DIMS[self.of] else turns
         phase = context.random.uniform((), number) if rms < 1.0 else 0.0
         return np.asarray(np.cos(2.0 * np.pi * (turns + phase)) / rms)
 
@@ -294,7 +290,7 @@ class EmpiricalNoise(Effect):
     source: ClassVar[str] = "Wold 1938, Priestley 1981 (a stationary process by its spectrum)"
     strength: ClassVar[str] = "noise_dn"
     power: ClassVar[float] = 2.0
-    measured_only: ClassVar[bool] = True
+    empirical: ClassVar[bool] = True
     noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of all of it, DN")
     modes: tuple[NoiseMode, ...] = Field(
         min_length=1,
@@ -303,7 +299,7 @@ class EmpiricalNoise(Effect):
         "the power, `lags` (frames, rows, columns) and the `correlation` at each; its `profile`",
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the noise referred to the input."""
         total: Any = 0.0
         electrons: Any = 0.0
@@ -333,13 +329,8 @@ class EmpiricalNoise(Effect):
         mode = NoiseMode(of="sample", share=1.0, lags=((0, 1, 0),), correlation=(0.4,))
         return (cls(noise_dn=0.5, modes=(mode,)),)
 
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return none: it is measured where all else has failed, and competes with nothing."""
-        return ()
-
     @property
-    def unlisted(self) -> bool:
+    def empirical_unnamed(self) -> bool:
         """Whether it is a gain or noise without a memory, light that a line shares, or an offset in turns."""
         return all(
             mode.takes_turns
@@ -355,12 +346,12 @@ class EmpiricalNoise(Effect):
         """How many modes there are."""
         return len(self.modes)
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with shapes and profiles that reach as far in a window."""
         whole, size = ((0, shape[0]), (0, shape[1])), (rows[1] - rows[0], columns[1] - columns[0])
         return self._with(each.reaching(whole, (-rows[0], -columns[0]), size) for each in self.modes)
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with shapes and profiles that reach over the window in which they were found."""
         window = (0, rows[1] - rows[0]), (0, columns[1] - columns[0])
         return self._with(each.reaching(window, (rows[0], columns[0]), shape) for each in self.modes)
@@ -392,11 +383,11 @@ class EmpiricalNoise(Effect):
                 model = model.with_noise(weights, width=widths)
         return model
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         of_all = len(self.modes) == 1 and self.modes[0].changes == "offset" and self.modes[0].burst is None
-        parts = "; ".join(mode.words(None if of_all else self.share_of(mode)) for mode in self.modes)
+        parts = "; ".join(mode.describe(None if of_all else self.share_of(mode)) for mode in self.modes)
         if all(mode.changes == "offset" for mode in self.modes):
             return f"noise of {self.noise_dn:.2g} DN{place} that samples share ({parts})"
         changed = dict.fromkeys(_CHANGED.get(mode.changes, "offset") for mode in self.modes)
@@ -452,14 +443,14 @@ def _of_light(change: FloatArray, number: int, context: EffectContext) -> FloatA
         return more.astype(np.float64)
     from scipy import stats  # takes half a second, and every command that knows of effects imports this
 
-    drawn = context.random.uniform(("frame", "y", "x"), len(_DIMS) + number)
+    drawn = context.random.uniform(("frame", "y", "x"), len(DIMS) + number)
     lost = stats.binom.ppf(drawn, context.charge, np.clip(-change, 0.0, 1.0))
     return np.asarray(more - np.nan_to_num(lost), np.float64)
 
 
 def _field(mode: NoiseMode, number: int, context: EffectContext) -> FloatArray:
     """Return the values of a mode, of variance 1, in a shape that fits (frame, y, x)."""
-    white = context.random.normal(_DIMS[mode.of], number)
+    white = context.random.normal(DIMS[mode.of], number)
     average = _average(mode)
     if len(average.taps) == 1:
         return white

@@ -10,24 +10,18 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.context import ALL_ROWS
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
-from pchem_pipeline.effects.framework.region import Region
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.effects.framework.region import Span
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.framework.region import Region, Span
+from pchem_pipeline.effects.types import AnyArray, EffectContext, FloatArray, PixelMaps, SampleLaw
 
 #: What a sample follows: another one, or each other one of a row, a column or a frame.
 Source = Literal["sample", "row", "column", "frame"]
@@ -35,7 +29,6 @@ Source = Literal["sample", "row", "column", "frame"]
 Axis = Literal["rows", "columns"]
 AXES: dict[Axis, int] = {"rows": 2, "columns": 1}
 _ALONG: dict[Source, tuple[int, ...]] = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}
-_ALL_ROWS = 1 << 20
 _FAR = 8.0  # standard deviations of the charge, and electrons, beyond which there is none
 _FEW = 4  # that are told in words, of terms that follow the same and of others
 
@@ -85,7 +78,7 @@ class ResponseTerm(Section):
             return None
         return self.columns[0] + self.place[2] if any(self.place[:2]) and self.place[2] else None
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return in words what is followed."""
         if self.of == "sample":
             what = f"what exceeds {self.above:g} e- in " if self.above else ""
@@ -100,7 +93,7 @@ class ResponseTerm(Section):
         what = f"each {'other ' if not any(self.place) else ''}sample of the {self.of}"
         return what + (f" {where}" if any(self.place) else "")
 
-    def seen(self, charge: NDArray[np.float64], exposure: NDArray[np.float64]) -> NDArray[np.float64]:
+    def seen(self, charge: FloatArray, exposure: FloatArray) -> FloatArray:
         """Return the charge that each sample follows, about its mean (frame, y, x), e-.
 
         Args:
@@ -117,9 +110,7 @@ class ResponseTerm(Section):
         return np.where(known, found, 0.0)
 
 
-def excess_moments(
-    exposure: NDArray[np.float64], above: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def excess_moments(exposure: FloatArray, above: float) -> tuple[FloatArray, FloatArray]:
     """Return the mean and the variance of what Poisson counts have above a number, e- and e-^2.
 
     Args:
@@ -151,7 +142,7 @@ class EmpiricalResponse(Effect):
     title: ClassVar[str] = "measured response to the charge of other samples, without an explanation"
     source: ClassVar[str] = "Volterra 1930, Priestley 1981 (linear responses)"
     strength: ClassVar[str] = "response"
-    measured_only: ClassVar[bool] = True
+    empirical: ClassVar[bool] = True
     far_reaching: ClassVar[bool] = True
     response: Ratio = Field(
         ge=0,
@@ -164,10 +155,13 @@ class EmpiricalResponse(Effect):
         description="what samples follow: `of` (sample, row, column, frame), `place`, relative `weight`",
     )
 
+    #: a sample that follows the one read four before it
+    typical_values = ({"response": 0.01, "terms": (ResponseTerm(place=(0, 0, -4)),)},)
+
     def halo(self) -> int:
         """Return how far across rows samples follow others, px."""
         return max(
-            _ALL_ROWS if 1 in _ALONG[term.of] or "columns" in term.mirrored else abs(term.place[1])
+            ALL_ROWS if 1 in _ALONG[term.of] or "columns" in term.mirrored else abs(term.place[1])
             for term in self.terms
         )
 
@@ -176,14 +170,14 @@ class EmpiricalResponse(Effect):
         return max(-term.place[0] for term in self.terms)
 
     @property
-    def unlisted(self) -> bool:
+    def empirical_unnamed(self) -> bool:
         """Whether samples follow others than neighbours and their own one frame before, or a part of it."""
         return any(
             term.of != "sample" or term.mirrored or term.above or sum(map(abs, term.place)) > 1
             for term in self.terms
         )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with parts of the charge of other samples about its mean."""
         charge = np.asarray(context.charge, np.float64)
         exposure = np.asarray(context.truth["quanta_exposure"], np.float64)
@@ -193,21 +187,11 @@ class EmpiricalResponse(Effect):
             found[..., columns] += self.response * term.weight * term.seen(charge, exposure)[..., columns]
         return found
 
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return a sample that follows the one read four before it."""
-        return (cls(response=0.01, terms=(ResponseTerm(place=(0, 0, -4)),)),)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return none: it is measured where all else has failed, and competes with nothing."""
-        return ()
-
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with the columns of its terms, and the places of mirror images, as a window has them."""
         return self._moved((rows, columns), shape, -1)
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with the columns of its terms, and places of mirror images, as the sensor has them."""
         return self._moved((rows, columns), shape, 1)
 
@@ -262,13 +246,13 @@ class EmpiricalResponse(Effect):
         )
         return model.with_variance(e2=self.response**2 * power)
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         followed: dict[str, list[str]] = {}
         for term in sorted(self.terms, key=lambda term: -abs(term.weight)):
-            only = f" in {Region(columns=(term.columns,)).words()}" if term.columns else ""
-            followed.setdefault(term.words(), []).append(
+            only = f" in {Region(columns=(term.columns,)).describe()}" if term.columns else ""
+            followed.setdefault(term.describe(), []).append(
                 f"{100.0 * self.response * term.weight:+.2g} %{only}"
             )
         told = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:_FEW]]

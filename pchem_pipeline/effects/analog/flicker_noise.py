@@ -10,19 +10,24 @@ sum of three of them with tau spaced by factors of 8, nearly 1/f in between (McW
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+from typing import ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.long_memory import between_grid_points, frame_key
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
+from pchem_pipeline.effects.framework.context import RandomSource
 from pchem_pipeline.effects.framework.effect import Effect, Frames, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext, RandomSource
-    from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    BoolArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    TimeSeries,
+)
 
 _Flicker = TypeVar("_Flicker", bound="FlickerNoise")
 
@@ -69,7 +74,7 @@ class FlickerNoise(Effect):
         description="lorentzian: one correlation time; one_over_f: it, an eighth and a 64th, of equal power",
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with a part of the noise exchanged for a correlated one."""
         times = self._times()
         noise = _ornstein_uhlenbeck(context.random, context.frames, times[0], 0)
@@ -107,12 +112,11 @@ class FlickerNoise(Effect):
             for tau in _TIMES if spectrum == "lorentzian" else _TIMES[_TIMES >= 25.0]:
                 unit = cls(share=1.0, correlation_frames=float(tau), spectrum=spectrum)
                 shape = response * _shape(evidence.time, unit._times())
-                information = float(((shape / error) ** 2).sum())
-                if np.isfinite(information) and information > 0:
-                    share = float((shape * seen / error**2).sum()) / information
-                    best.append((share * np.sqrt(information), unit.scaled(share)))
+                share = multiple_of(shape, seen, error**-2.0)
+                if np.isfinite(share.error):
+                    best.append((share.sigmas, unit.scaled(share.value)))
         best.sort(key=lambda item: item[0], reverse=True)
-        return [effect for _, effect in _spread_out(best)] if best and best[0][0] > 2.5 else ()
+        return [effect for _, effect in _spread_out(best)] if best and best[0][0] > SIGNIFICANT else ()
 
 
 def _spread_out(ranked: list[tuple[float, _Flicker]]) -> list[tuple[float, _Flicker]]:
@@ -129,14 +133,12 @@ def _spread_out(ranked: list[tuple[float, _Flicker]]) -> list[tuple[float, _Flic
     return kept
 
 
-def _good(evidence: Evidence) -> NDArray[np.bool_]:
+def _good(evidence: Evidence) -> BoolArray:
     """Return the pixels whose residuals vary, (y, x)."""
     return evidence.maps.usable & np.isfinite(evidence.readout_std) & (evidence.readout_std > 0)
 
 
-def _correlations(
-    evidence: Evidence, time: TimeSeries
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def _correlations(evidence: Evidence, time: TimeSeries) -> tuple[FloatArray, FloatArray, float]:
     """Return lags 1 to 3 and the relative excess of block means, their standard errors, and the response."""
     maps = evidence.maps
     response = (evidence.readout_std / maps.read_noise_dn) ** 2
@@ -160,13 +162,13 @@ def _frames_of_block(time: TimeSeries) -> float:
     return float(time.frames.size / max(time.block_start.size, 1))
 
 
-def _shape(time: TimeSeries, times: Sequence[float]) -> NDArray[np.float64]:
+def _shape(time: TimeSeries, times: Sequence[float]) -> FloatArray:
     """Return what a share of 1 gives: correlations at lags 1 to 3, excess of the block means' variance."""
-    found: NDArray[np.float64] = np.mean([_lorentzian_shape(time, tau) for tau in times], axis=0)
+    found: FloatArray = np.mean([_lorentzian_shape(time, tau) for tau in times], axis=0)
     return found
 
 
-def _lorentzian_shape(time: TimeSeries, tau: float) -> NDArray[np.float64]:
+def _lorentzian_shape(time: TimeSeries, tau: float) -> FloatArray:
     lags = np.exp(-np.arange(1, 4) / tau)
     if time.block_readout.shape[0] < 2:
         return lags
@@ -182,16 +184,14 @@ def _lorentzian_shape(time: TimeSeries, tau: float) -> NDArray[np.float64]:
 
 
 def _ornstein_uhlenbeck(
-    random: RandomSource, frames: NDArray[np.int64], correlation_frames: float, process: int
-) -> NDArray[np.float64]:
+    random: RandomSource, frames: IntArray, correlation_frames: float, process: int
+) -> FloatArray:
     """Return a stationary Gaussian process with covariance exp(-lag / tau), (frame, y, x), by pixel."""
 
-    def normal(frame: int) -> NDArray[np.float64]:
+    def normal(frame: int) -> FloatArray:
         return random.normal(("y", "x"), frame_key(frame, process))
 
-    def midpoint(
-        frame: int, before: NDArray[np.float64], after: NDArray[np.float64], half: int
-    ) -> NDArray[np.float64]:
+    def midpoint(frame: int, before: FloatArray, after: FloatArray, half: int) -> FloatArray:
         rho = float(np.exp(-half / correlation_frames))
         state = normal(frame)
         state *= np.sqrt((1.0 - rho**2) / (1.0 + rho**2))

@@ -9,7 +9,7 @@ Charge-Coupled Devices; Rauscher 2015, PASP 127, 1144 draws such pedestals).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -21,13 +21,9 @@ from pchem_pipeline.effects.estimators.common_modes import (
     responsivity,
     successive,
 )
+from pchem_pipeline.effects.families.offsets import SharedNoise
 from pchem_pipeline.effects.framework.effect import Dn, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedNoise
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
+from pchem_pipeline.effects.types import Evidence, FloatArray, TimeSeries
 
 
 @register_effect
@@ -58,10 +54,8 @@ class FrameNoise(SharedNoise):
     }
     frame_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the frames' offsets, DN")
 
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.12 DN."""
-        return (cls(frame_noise_dn=0.12),)
+    #: at 0.12 DN
+    typical_values = ({"frame_noise_dn": 0.12},)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -94,7 +88,7 @@ def _expected(evidence: Evidence, time: TimeSeries) -> float:
     return expected
 
 
-def _steps(time: TimeSeries) -> NDArray[np.float64]:
+def _steps(time: TimeSeries) -> FloatArray:
     """Return differences of the frame means of successive frames, DN, without even-odd contrast."""
     means = time.frame_readout.astype(np.float64).copy()
     for parity in (0, 1):

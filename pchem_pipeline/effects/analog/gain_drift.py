@@ -8,30 +8,36 @@ drift u_t) (K + R) / g)`` with u_t from -1/2 at the first frame to 1/2 at the la
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.common_modes import run_position
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.estimators.time_profiles import (
-    along_path,
+    NODES,
     check_path,
+    fitted,
+    fitted_profile,
+    hats,
+    profile_at,
     settling,
     settling_time,
 )
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    PixelMaps,
+    SampleLaw,
+    TimeSeries,
+)
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import SampleLaw
-
-_NODES = (3, 5, 9, 17)
-_SIGMAS = 2.5
 _LEAST_RESPONSE = 0.15
 _SMALL = 1e-4  # relative change of the gain
 
@@ -80,6 +86,13 @@ class GainDrift(Effect):
         description="gain at equally spaced frames from the first to the last of the run, in units of drift",
     )
 
+    #: a gain that rises, falls, and does both
+    typical_values = (
+        {"drift": 0.006},
+        {"drift": -0.006},
+        {"drift": 0.006, "shape": "path", "path": (-0.5, 0.5, -0.5)},
+    )
+
     @model_validator(mode="after")
     def _path_where_it_belongs(self) -> Self:
         check_path(self.tag, self.shape, self.path)
@@ -87,17 +100,11 @@ class GainDrift(Effect):
             raise ValueError("gain_drift: drift times path takes the gain to zero; make one of them smaller")
         return self
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, scaled by the time profile of the gain; draws nothing."""
         profile = self._profile(run_position(context.frames, context.n_frames))
-        result: NDArray[Any] = values * (1.0 + self.drift * profile)[:, None, None]
+        result: AnyArray = values * (1.0 + self.drift * profile)[:, None, None]
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return a gain that rises, falls, and does both."""
-        bow = cls(drift=0.006, shape="path", path=(-0.5, 0.5, -0.5))
-        return cls(drift=0.006), cls(drift=-0.006), bow
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -111,22 +118,27 @@ class GainDrift(Effect):
         gain, error, position = _block_gains(evidence, evidence.time)
         if gain.size < 3:
             return ()
-        price = float(np.log(gain.size))
-        flat = _chi_square(gain, error, np.ones((gain.size, 1)))[0]
-        line, slope = _along(gain, error, position - 0.5)
-        fraction = settling_time(lambda s: _along(gain, error, settling(position, s))[0])
-        curve, size = _along(gain, error, settling(position, fraction))
-        straight = line + 2.0 * price
+        flat = fitted(gain, np.ones((gain.size, 1)), error)
+        fraction = settling_time(lambda f: fitted_profile(gain, settling(position, f), error).chi2)
+        curve = fitted_profile(gain, settling(position, fraction), error)
+        line = fitted_profile(gain, position - 0.5, error)
+        # three nodes can always be told; more of them where three blocks come on each
+        paths = [fitted(gain, hats(position, n), error) for n in NODES[:-1] if n == 3 or 3 * n <= gain.size]
+        path = min(paths, key=lambda fit: fit.chi2 + fit.price(gain.size))
+        straight = line.chi2 + line.price(gain.size)
         found: list[tuple[float, Self]] = []
-        if flat - line > _SIGMAS**2:
-            found.append((straight, cls(drift=slope)))
-        if flat - curve > _improvement(3) and curve + 3.0 * price < straight:
-            found.append((curve + 3.0 * price, cls(drift=size, shape="settling", settling_fraction=fraction)))
-        left, path = _best_path(gain, error, position)
-        if flat - left > _improvement(path.size) and left + path.size * price < straight:
-            size = min(float(np.ptp(path)), 0.4)
-            nodes = tuple(np.round(path / np.ptp(path), 4).tolist())
-            found.append((left + path.size * price, cls(drift=size, shape="path", path=nodes)))
+        if flat.chi2 - line.chi2 > SIGNIFICANT**2:
+            found.append((straight, cls(drift=_limited(line.values[1]))))
+        # the time constant is a number more
+        left = curve.chi2 + curve.price(gain.size) + float(np.log(gain.size))
+        if flat.chi2 - curve.chi2 > _improvement(3) and left < straight:
+            size = _limited(curve.values[1])
+            found.append((left, cls(drift=size, shape="settling", settling_fraction=fraction)))
+        left = path.chi2 + path.price(gain.size)
+        if flat.chi2 - path.chi2 > _improvement(path.values.size) and left < straight:
+            spread = float(np.ptp(path.values))
+            nodes = tuple(np.round(path.values / spread, 4).tolist())
+            found.append((left, cls(drift=min(spread, 0.4), shape="path", path=nodes)))
         return [effect for _, effect in sorted(found, key=lambda pair: pair[0])]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
@@ -134,11 +146,15 @@ class GainDrift(Effect):
         profile = self.drift * self._profile(np.linspace(0.0, 1.0, 1001))
         return model.with_variance(per_electron2=float(profile.var()))
 
-    def _profile(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _profile(self, position: FloatArray) -> FloatArray:
         """Return the shape at positions 0..1 in the run, in units of ``drift``, zero on average."""
-        if self.shape == "settling":
-            return settling(position, self.settling_fraction)
-        return along_path(position, self.path or (-0.5, 0.5))
+        fraction = self.settling_fraction if self.shape == "settling" else None
+        return profile_at(position, fraction, self.path)
+
+
+def _limited(drift: float) -> float:
+    """Return a drift within the limits of its field."""
+    return float(np.clip(drift, -0.5, 0.5))
 
 
 def _improvement(nodes: int) -> float:
@@ -147,39 +163,7 @@ def _improvement(nodes: int) -> float:
     return free + 3.0 * float(np.sqrt(2.0 * free))
 
 
-def _chi_square(
-    values: NDArray[np.float64], error: NDArray[np.float64], basis: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64]]:
-    """Return chi squared of a weighted least-squares fit, and its coefficients."""
-    found = np.linalg.lstsq(basis / error[:, None], values / error, rcond=1e-6)[0]
-    return float((((values - basis @ found) / error) ** 2).sum()), np.asarray(found, np.float64)
-
-
-def _along(
-    gain: NDArray[np.float64], error: NDArray[np.float64], profile: NDArray[np.float64]
-) -> tuple[float, float]:
-    """Return chi squared that a time profile at its best scale leaves, and the scale within limits."""
-    left, (_, size) = _chi_square(gain, error, np.stack([np.ones_like(profile), profile], 1))
-    return left, float(np.clip(size, -0.5, 0.5))
-
-
-def _best_path(
-    gain: NDArray[np.float64], error: NDArray[np.float64], position: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64]]:
-    """Return chi squared of the path of the smallest Bayesian information criterion, and its nodes."""
-    fits: list[tuple[float, NDArray[np.float64]]] = []
-    for count in _NODES:
-        if fits and 3 * count > gain.size:
-            break
-        knots = np.linspace(0.0, 1.0, count)
-        hats = np.clip(1.0 - np.abs(position[:, None] - knots) * (count - 1), 0.0, None)
-        fits.append(_chi_square(gain, error, hats))
-    return min(fits, key=lambda fit: fit[0] + fit[1].size * np.log(gain.size))
-
-
-def _block_gains(
-    evidence: Evidence, time: TimeSeries
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _block_gains(evidence: Evidence, time: TimeSeries) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return relative gain, standard error and position in the run of each block; empty if not of the gain.
 
     Where the gain alone drifts, the common mean of the residuals moves too, by the mean of ``H / g`` (in part
@@ -209,9 +193,7 @@ def _block_gains(
     return both, weight**-0.5, position
 
 
-def _block_means(
-    series: NDArray[np.float64], blocks: Sequence[NDArray[np.intp]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _block_means(series: FloatArray, blocks: Sequence[NDArray[np.intp]]) -> tuple[FloatArray, FloatArray]:
     """Return the means of a series of frames in blocks, less that of all, and their standard errors."""
     means = np.array([series[b].mean() for b in blocks]) - series.mean()
     scatter = float(np.sqrt(np.mean([series[b].var() for b in blocks])))

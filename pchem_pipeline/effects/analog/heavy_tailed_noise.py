@@ -10,21 +10,16 @@ imagers with such tails are attributed to random telegraph noise of the source f
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.estimators.response import first_order
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-from pchem_pipeline.model.law.sample_law import SampleLaw
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
 _TAIL_PIXELS, _TAIL_DOUBT = 40, 0.15
 # widths that are guessed, at a share so small that samples and moments go in proportion to it
@@ -66,10 +61,10 @@ class HeavyTailedNoise(Effect):
         description="noise of such a sample relative to that of the others, no unit",
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the noise of some samples enlarged."""
         noisy = context.random.uniform(("frame", "y", "x")) < self.share
-        result: NDArray[Any] = values.copy()
+        result: AnyArray = values.copy()
         if context.read_noise is not None:
             result[noisy] += (self.factor - 1.0) * context.read_noise[noisy]
         return result
@@ -96,11 +91,11 @@ class HeavyTailedNoise(Effect):
             effect = cls(share=_SMALL, factor=width)
             factor, error = first_order(evidence, effect, "He4", cut=8.0)
             other, other_error = tail.first_order(effect)
-            weight = error**-2.0 + other_error**-2.0
-            mean = (factor * error**-2.0 + other * other_error**-2.0) / weight if weight > 0 else 0.0
-            if mean * np.sqrt(weight) > 2.5:
+            errors = np.array([error, other_error])
+            mean = multiple_of(np.ones(2), np.array([factor, other]), errors**-2.0)
+            if mean.sigmas > SIGNIFICANT:
                 disagreement = (factor - other) ** 2 / (error**2 + other_error**2)
-                found.append((disagreement, effect.scaled(mean)))
+                found.append((disagreement, effect.scaled(mean.value)))
         return [effect for _, effect in sorted(found, key=lambda item: item[0])[:_MOST]]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:

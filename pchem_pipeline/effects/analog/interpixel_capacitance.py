@@ -9,19 +9,21 @@ diffusion or crosstalk by light the coupling is noiseless and deterministic: no 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of, neighbour_mean
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    Evidence,
+    PixelMaps,
+    SampleLaw,
+    TimeSeries,
+)
 
 
 @register_effect
@@ -43,6 +45,7 @@ class InterpixelCapacitance(Effect):
         "space.x.rk", "space.y.rk", "space.x.rr", "space.y.rr", "space.x.kk", "space.y.kk",
     )  # fmt: skip
     strength: ClassVar[str] = "coupling"
+    reach_rows = 1
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {
         "optical_crosstalk": "single hot pixels: light makes whole electrons in the neighbours, "
@@ -60,16 +63,15 @@ class InterpixelCapacitance(Effect):
         description="(coupling along x less that along y) / (sum of the two), no unit",
     )
 
-    def halo(self) -> int:
-        """Return 1: the rows above and below."""
-        return 1
+    #: as in a monolithic sensor
+    typical_values = ({"coupling": 0.0016},)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the neighbours' charge; draws nothing.
 
         At the edges of the sensor the missing neighbours take and give nothing.
         """
-        result: NDArray[Any] = values.copy()
+        result: AnyArray = values.copy()
         if context.charge is None:
             return result
         charge = context.charge.astype(np.float64)
@@ -84,23 +86,15 @@ class InterpixelCapacitance(Effect):
         return result
 
     @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it as in a monolithic sensor."""
-        return (cls(coupling=0.0016),)
-
-    @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return the regression of the residual on the charge of the neighbour, anisotropic if that shows."""
         if evidence.time is None:
             return ()
         (x, x_error), (y, y_error) = (_coupling(evidence, evidence.time, axis) for axis in ("x", "y"))
-        weight, other = x_error**-2.0, y_error**-2.0
-        if weight + other == 0:
+        mean = multiple_of(np.ones(2), np.array([x, y]), np.array([x_error, y_error]) ** -2.0)
+        if not mean.sigmas > SIGNIFICANT:
             return ()
-        mean = (x * weight + y * other) / (weight + other)
-        if mean * np.sqrt(weight + other) < 2.5:
-            return ()
-        found = [cls(coupling=min(mean, 0.2))]
+        found = [cls(coupling=min(mean.value, 0.2))]
         if abs(x - y) > 3.0 * np.hypot(x_error, y_error):
             x, y = max(x, 0.0), max(y, 0.0)
             found.insert(0, cls(coupling=min((x + y) / 2.0, 0.2), anisotropy=(x - y) / (x + y)))
@@ -133,19 +127,9 @@ def _coupling(evidence: Evidence, time: TimeSeries, axis: str) -> tuple[float, f
     mixed = (maps.quanta_exposure + noise - readout - charge) / 2.0
     pairs = time.neighbour_pairs.get(name, 0)
     # of the correlation, so each divided by the standard deviations of r_i and k_j
-    first = _neighbour_mean(np.sqrt(readout) / noise, np.sqrt(charge), axis)
-    second = _neighbour_mean(mixed / np.sqrt(readout), mixed / np.sqrt(charge) / noise, axis)
+    first = neighbour_mean(np.sqrt(readout) / noise, np.sqrt(charge), axis)
+    second = neighbour_mean(mixed / np.sqrt(readout), mixed / np.sqrt(charge) / noise, axis)
     response = first + second
     if not (pairs and np.isfinite(response) and response > 0):
         return 0.0, np.inf
     return time.neighbours[name] / response, 1.0 / (response * np.sqrt(pairs))
-
-
-def _neighbour_mean(one: NDArray[np.float64], other: NDArray[np.float64], axis: str) -> float:
-    """Return the mean of one map times the other at the neighbour, both ways; NaN without neighbours."""
-    front, back = (slice(None), slice(None, -1)), (slice(None), slice(1, None))
-    if axis == "y":
-        front, back = front[::-1], back[::-1]
-    products = np.concatenate([(one[a] * other[b]).ravel() for a, b in ((front, back), (back, front))])
-    products = products[np.isfinite(products)]
-    return float(products.mean()) if products.size else np.nan

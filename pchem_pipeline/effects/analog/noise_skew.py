@@ -9,20 +9,14 @@ variance 1, so that ``R`` has mean 0, variance ``sigma^2`` and skewness ``2 shar
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.response import strength_of
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
 #: Parts of the exponential up to a share of 0.6 (0.75 of the Gaussian part), and at most.
 _LOBES, _ENOUGH_FOR, _MOST_LOBES = 8, 0.75, 16
@@ -61,7 +55,10 @@ class NoiseSkew(Effect):
         "negative: tail to low DN",
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    #: a tail to high DN and one to low DN
+    typical_values = ({"share": 0.4}, {"share": -0.4})
+
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with a part of the noise exchanged for an exponential one."""
         exponential = np.log(context.random.uniform(("frame", "y", "x")))
         exponential += 1.0
@@ -70,11 +67,6 @@ class NoiseSkew(Effect):
             exponential -= (1.0 - self._gaussian) * context.read_noise
         exponential += values
         return exponential
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return a tail to high DN and one to low DN."""
-        return cls(share=0.4), cls(share=-0.4)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -102,7 +94,7 @@ class NoiseSkew(Effect):
         return float(np.sqrt(1.0 - self.share**2))
 
 
-def _exponential_parts(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _exponential_parts(n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return mean (less 1), weight and variance of n consecutive parts of an exponential of mean 1.
 
     The edges are at equal steps of the fifth root of the survival, so that the tail is resolved, which makes

@@ -10,7 +10,7 @@ large at ``k`` electrons.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -18,14 +18,7 @@ from pydantic import Field
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.estimators.response import strength_of
 from pchem_pipeline.effects.framework.effect import Effect, PerElectron, Plane, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
-
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
 Noise = Literal["kept", "bent"]
 
@@ -65,7 +58,10 @@ class Nonlinearity(Effect):
         description="kept: what bends comes before the read noise (sense node); bent: after it (amplifiers)",
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    #: steps that grow and steps that shrink
+    typical_values = ({"step_change": 2e-3}, {"step_change": -2e-3})
+
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, on a bent comb; draws nothing."""
         if self.noise == "bent":
             bend = values.astype(np.float64)
@@ -75,11 +71,6 @@ class Nonlinearity(Effect):
         bend *= 0.5 * self.step_change
         bend += values
         return bend
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return steps that grow and steps that shrink."""
-        return cls(step_change=2e-3), cls(step_change=-2e-3)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -9,36 +9,28 @@ classic.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.common_modes import (
-    chebyshev_nodes,
     mean_response,
     responsivity,
-    with_offsets,
 )
 from pchem_pipeline.effects.estimators.lines import coherent_line, incoherent_line
-from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, Radians, Turns, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, Wave
-    from pchem_pipeline.effects.framework.region import Span
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.families.offsets import OffsetEffect, sine_values
+from pchem_pipeline.effects.framework.effect import Dn, Radians, Turns, register_effect
+from pchem_pipeline.effects.framework.evidence import Wave
+from pchem_pipeline.effects.framework.region import Span
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
 
 Pickup = TypeVar("Pickup", bound="PeriodicPickup")
 
-_LOBES = 5
-
 
 @register_effect
-class PeriodicPickup(Effect):
+class PeriodicPickup(OffsetEffect):
     """Sine along rows, columns and frames.
 
     Signature: the spectrum of the row means (over frames and rows) of the readout residual has one line, and
@@ -48,7 +40,6 @@ class PeriodicPickup(Effect):
     """
 
     tag: Literal["periodic_pickup"] = Field(default="periodic_pickup", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "periodic pickup (pattern noise, EMI)"
     source: ClassVar[str] = (
         "Jansen et al. 2003, HST Calibration Workshop (herring-bone noise of the STIS CCD)"
@@ -63,7 +54,7 @@ class PeriodicPickup(Effect):
     )
     strength: ClassVar[str] = "amplitude_dn"
     power: ClassVar[float] = 2.0
-    attained: ClassVar[tuple[str, ...]] = ("cycles_per_row", "cycles_per_frame", "cycles_per_column")
+    may_be_at_bound: ClassVar[tuple[str, ...]] = ("cycles_per_row", "cycles_per_frame", "cycles_per_column")
     separate: ClassVar[Mapping[str, str]] = {
         "row_noise": "a spectrum of the row means within a frame: pickup is a line, row noise is flat",
         "frame_noise": "a spectrum of the frame means: pickup is a line, frame noise is flat",
@@ -86,8 +77,16 @@ class PeriodicPickup(Effect):
     phase: Radians = Field(default=0.0, ge=-100, le=100, description="phase at row, column and frame 0, rad")
     random_phase: bool = Field(default=False, description="true: a new random phase in every frame")
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
-        """Return the signal (frame, y, x), e-, with the sine referred to the input."""
+    #: at 0.092 DN: along rows and frames, frames alone, at random phase, along columns
+    typical_values = (
+        {"amplitude_dn": 0.092, "cycles_per_row": 0.17, "cycles_per_frame": 0.23},
+        {"amplitude_dn": 0.092, "cycles_per_frame": 0.23},
+        {"amplitude_dn": 0.092, "cycles_per_row": 0.17, "random_phase": True},
+        {"amplitude_dn": 0.092, "cycles_per_column": 0.17, "cycles_per_frame": 0.23},
+    )
+
+    def offsets(self, context: EffectContext) -> FloatArray:
+        """Return the sine in a block of frames, DN."""
         turn = 2j * np.pi
         start = np.exp(turn * self.cycles_per_frame * context.frames + 1j * self.phase)[:, None, None]
         if self.random_phase:
@@ -96,17 +95,11 @@ class PeriodicPickup(Effect):
         along = start * np.exp(turn * self.cycles_per_row * context.rows)[None, :, None]
         if self.cycles_per_column:
             along = along * np.exp(turn * self.cycles_per_column * np.arange(context.shape[1]))
-        return add_offset(values, self.amplitude_dn * along.imag, context)
+        return np.asarray(self.amplitude_dn * along.imag)
 
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.092 DN: along rows and frames, frames alone, at random phase, along columns."""
-        return (
-            cls(amplitude_dn=0.092, cycles_per_row=0.17, cycles_per_frame=0.23),
-            cls(amplitude_dn=0.092, cycles_per_frame=0.23),
-            cls(amplitude_dn=0.092, cycles_per_row=0.17, random_phase=True),
-            cls(amplitude_dn=0.092, cycles_per_column=0.17, cycles_per_frame=0.23),
-        )
+    def offset_values(self) -> FloatArray:
+        """Return values, DN, of a sine at random phase (arcsine law)."""
+        return self.amplitude_dn * sine_values(5)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -145,11 +138,11 @@ class PeriodicPickup(Effect):
             random_phase=not steady,
         )
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with the phase at the first row and column of a window."""
         return self._begun(rows[0], columns[0])
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with the phase at the first row and column of the sensor."""
         return self._begun(-rows[0], -columns[0])
 
@@ -164,10 +157,6 @@ class PeriodicPickup(Effect):
         if self.cycles_per_row == 0.0 and self.cycles_per_column == 0.0:
             return SharedOffset("frame", variance)
         return SharedOffset("wave", variance, self.cycles_per_row, self.cycles_per_column)
-
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law smeared by the arcsine law (a variance where the amplitude is small)."""
-        return with_offsets(model, maps, self.amplitude_dn * chebyshev_nodes(_LOBES))
 
 
 def _without_doubles(found: Sequence[tuple[float, Pickup]]) -> list[Pickup]:

@@ -9,26 +9,20 @@ own (correlated pink noise of near-infrared arrays: Rauscher 2015; Pyxel ``corre
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.read_order import RECORD, pink_amplitudes, pink_noise_of
-from pchem_pipeline.effects.framework.effect import Count, Dn, Effect, Plane, register_effect
+from pchem_pipeline.effects.families.offsets import OffsetEffect
+from pchem_pipeline.effects.framework.effect import Count, Dn, register_effect
 from pchem_pipeline.effects.framework.region import Span
-from pchem_pipeline.effects.framework.shared_offset import add_offset
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
 
 
 @register_effect
-class ReadOrderNoise(Effect):
+class ReadOrderNoise(OffsetEffect):
     """Noise with a spectrum of ``1 / f`` along the samples of a tap, from one cycle per frame on.
 
     Signature: row means of the readout residual scatter, those of adjacent rows alike, and neighbours along
@@ -36,7 +30,6 @@ class ReadOrderNoise(Effect):
     """
 
     tag: Literal["read_order_noise"] = Field(default="read_order_noise", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "1/f noise in the order of reading"
     source: ClassVar[str] = "Rauscher 2015, PASP 127, 1144 (correlated pink noise)"
     signature: ClassVar[tuple[str, ...]] = (
@@ -60,26 +53,29 @@ class ReadOrderNoise(Effect):
         default=1, ge=1, le=4096, description="blocks of columns read at the same time, noise of their own"
     )
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    #: at 0.5 DN, of one tap and of four
+    typical_values = ({"noise_dn": 0.5}, {"noise_dn": 0.5, "taps": 4})
+
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with as many taps as these columns have of its width."""
         return self._with_taps((columns[1] - columns[0]) / shape[1])
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with taps of the same width on all columns; one tap is one whatever the window."""
         return self if self.taps == 1 else self._with_taps(shape[1] / (columns[1] - columns[0]))
 
     def _with_taps(self, factor: float) -> Self:
         return self.model_copy(update={"taps": max(round(self.taps * factor), 1)})
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
-        """Return the signal (frame, y, x), e-, with the noise of the taps referred to the input."""
+    def offsets(self, context: EffectContext) -> FloatArray:
+        """Return the noise of the taps in a block of frames, DN."""
         if self.noise_dn == 0:
-            return values.copy()
+            return np.zeros((1, 1, 1))
         rows, columns = context.shape
         taps = min(self.taps, columns)
         width = -(-columns // taps)
         amplitudes = pink_amplitudes(rows * width)
-        noise = np.empty((values.shape[0], context.rows.size, columns))
+        noise = np.empty((context.frames.size, context.rows.size, columns))
         for t, frame in enumerate(context.frames):
             random = context.random.generator(frame=int(frame))
             white = np.fft.rfft(random.standard_normal((taps, RECORD * rows * width)))
@@ -87,19 +83,10 @@ class ReadOrderNoise(Effect):
             series = record[:, : rows * width].reshape(taps, rows, width)
             noise[t] = series.transpose(1, 0, 2).reshape(rows, taps * width)[context.rows, :columns]
         noise *= self.noise_dn
-        return add_offset(values, noise, context)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.5 DN, of one tap and of four."""
-        return cls(noise_dn=0.5), cls(noise_dn=0.5, taps=4)
+        return noise
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return the noise that the covariances of rows and of neighbours show, for the likeliest taps."""
         found = pink_noise_of(evidence)
         return [cls(noise_dn=noise, taps=taps) for noise, taps in found]
-
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law with the variance of the noise: exact, a Gaussian on a Gaussian."""
-        return model.with_variance(dn2=self.noise_dn**2)

@@ -8,7 +8,7 @@ the bias map.)
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -17,21 +17,15 @@ from pchem_pipeline.effects.estimators.common_modes import (
     WORTH_A_GUESS,
     mean_variance,
     responsivity,
-    with_offsets,
 )
-from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.families.offsets import OffsetEffect
+from pchem_pipeline.effects.framework.effect import Dn, register_effect
+from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
 
 
 @register_effect
-class ReadoutAlternation(Effect):
+class ReadoutAlternation(OffsetEffect):
     """Offset of alternating sign, the same in every pixel: ``+alternation_dn`` in frames 0, 2, 4, ...
 
     Signature: the mean readout residual of even frames exceeds that of odd ones by ``2 alternation_dn``;
@@ -42,7 +36,6 @@ class ReadoutAlternation(Effect):
     tag: Literal["readout_alternation"] = Field(
         default="readout_alternation", description="name of the effect"
     )
-    plane: ClassVar[Plane] = Plane.ANALOG
     title: ClassVar[str] = "even-odd readout alternation (ping-pong offset)"
     source: ClassVar[str] = "Black and Hodges 1980, IEEE J. Solid-State Circuits 15, 1022 (interleaved ADCs)"
     signature: ClassVar[tuple[str, ...]] = ("frame.readout.alternating", "frame.readout.lag1")
@@ -55,15 +48,17 @@ class ReadoutAlternation(Effect):
         ge=-1e6, le=1e6, description="offset of even frames, and minus that of odd ones, DN"
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
-        """Return the signal (frame, y, x), e-, with the offset referred to the input; draws nothing."""
-        sign = 1.0 - 2.0 * (context.frames % 2)
-        return add_offset(values, (self.alternation_dn * sign)[:, None, None], context)
+    #: at 0.024 DN, with both signs
+    typical_values = ({"alternation_dn": 0.024}, {"alternation_dn": -0.024})
 
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.024 DN, with both signs."""
-        return cls(alternation_dn=0.024), cls(alternation_dn=-0.024)
+    def offsets(self, context: EffectContext) -> FloatArray:
+        """Return the offsets of the frames, DN; draws nothing."""
+        sign = 1.0 - 2.0 * (context.frames % 2)
+        return np.asarray((self.alternation_dn * sign)[:, None, None], np.float64)
+
+    def offset_values(self) -> FloatArray:
+        """Return the offsets of even and of odd frames, DN."""
+        return self.alternation_dn * np.array([-1.0, 1.0])
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -85,7 +80,3 @@ class ReadoutAlternation(Effect):
     def shared_offset(self) -> SharedOffset:
         """Return the offset of a frame, either of two."""
         return SharedOffset("frame", self.alternation_dn**2)
-
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law of two copies, equally likely (a variance where they are close together)."""
-        return with_offsets(model, maps, self.alternation_dn * np.array([-1.0, 1.0]))

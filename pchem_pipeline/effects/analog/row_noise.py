@@ -7,17 +7,13 @@ because the eye finds stripes long before the pixel statistics do.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.common_modes import line_noise
+from pchem_pipeline.effects.families.offsets import SharedNoise
 from pchem_pipeline.effects.framework.effect import Dn, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedNoise
-
-if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.evidence import Evidence
 
 
 @register_effect
@@ -43,13 +39,5 @@ class RowNoise(SharedNoise):
     }
     row_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the rows' offsets, DN")
 
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.35 DN."""
-        return (cls(row_noise_dn=0.35),)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the excess variance of row means within their frames (moment estimate)."""
-        found = line_noise(evidence, "row")
-        return () if found is None else (cls(row_noise_dn=found),)
+    #: at 0.35 DN
+    typical_values = ({"row_noise_dn": 0.35},)

@@ -11,14 +11,15 @@ seen.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 from scipy import special
 
-from pchem_pipeline.effects.estimators.long_memory import frame_key, two_states
+from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL, frame_key, two_states
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
+from pchem_pipeline.effects.estimators.regression import FEW_PIXELS
 from pchem_pipeline.effects.framework.effect import (
     Count,
     Effect,
@@ -28,16 +29,17 @@ from pchem_pipeline.effects.framework.effect import (
     Ratio,
     register_effect,
 )
-from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    BoolArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    PixelMaps,
+    SampleLaw,
+)
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-
-# draws that are no frame's
-_WHERE, _SIZE, _FULL, _EMPTY = 0xFFFFFFFE, 0xFFFFFFFF, 0xFFFFFFFD, 0xFFFFFFFC
+_WHERE, _SIZE, _FULL, _EMPTY = OF_PIXEL
 # standard deviation of the logarithms of lognormal steps
 _LOGNORMAL = 0.4
 # steps, e-, and samples averaged that the estimator looks for, with probabilities
@@ -132,15 +134,24 @@ class RtsNoise(Effect):
         "differ from trap to trap; 0: alike in all",
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    #: double sampling at two steps, multiple sampling, and a slow trap
+    typical_values = (
+        {"fraction": 0.014, "amplitude_e": 1.0},
+        {"fraction": 0.014, "amplitude_e": 2.5, "probability": 0.1},
+        {"fraction": 0.014, "amplitude_e": 1.0, "spread": "exponential"},
+        {"fraction": 0.014, "amplitude_e": 1.5, "samples": 4},
+        {"fraction": 0.014, "amplitude_e": 0.5, "probability": 0.5, "sampling": "single"},
+    )
+
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the steps of the pixels that have a trap."""
-        result: NDArray[Any] = values.copy()
+        result: AnyArray = values.copy()
         _, y, x = np.nonzero(context.random.uniform(("y", "x"), _WHERE) < self.fraction)
         if not y.size:
             return result
 
-        def uniform(draw: int) -> NDArray[np.float64]:
-            found: NDArray[np.float64] = context.random.uniform(("y", "x"), draw)[0, y, x]
+        def uniform(draw: int) -> FloatArray:
+            found: FloatArray = context.random.uniform(("y", "x"), draw)[0, y, x]
             return found
 
         step = self._steps(uniform)
@@ -153,7 +164,7 @@ class RtsNoise(Effect):
             result[:, y, x] += step * self._differences(context.random.uniform(("frame", "y", "x"))[:, y, x])
         return result
 
-    def _steps(self, uniform: Callable[[int], NDArray[np.float64]]) -> NDArray[np.float64] | float:
+    def _steps(self, uniform: Callable[[int], FloatArray]) -> FloatArray | float:
         """Return the steps of traps, e-, given the uniform numbers of each for a draw."""
         if self.spread == "exponential":
             return np.asarray(self.amplitude_e * -np.log(uniform(_SIZE)))
@@ -161,9 +172,7 @@ class RtsNoise(Effect):
             return np.asarray(self.amplitude_e * np.exp(_LOGNORMAL * special.ndtri(uniform(_SIZE))))
         return self.amplitude_e
 
-    def _traps(
-        self, uniform: Callable[[int], NDArray[np.float64]]
-    ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
+    def _traps(self, uniform: Callable[[int], FloatArray]) -> tuple[FloatArray | float, FloatArray | float]:
         """Return the probabilities of slow traps to be full, and their correlation times, frames."""
         if self.times_spread == 0 or not 0 < self.probability < 1:
             return self.probability, self.correlation_frames
@@ -173,30 +182,19 @@ class RtsNoise(Effect):
         )
         return full / (full + empty), full * empty / (full + empty)
 
-    def _differences(self, uniform: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _differences(self, uniform: FloatArray) -> FloatArray:
         """Return signal less reset, in steps of the trap, from uniform numbers of any shape."""
         # position within the half that a number falls in: the half is the sign
         inside = np.abs(2.0 * uniform - 1.0)
         rank = np.floor((inside - (1.0 - self.probability)) / max(self.probability, 1e-300) * self._places())
         rank = rank.clip(-1, self._places() - 1)
         height = np.minimum(rank + 1.0, self._places() - rank) / self.samples
-        found: NDArray[np.float64] = np.where(rank < 0, 0.0, np.sign(uniform - 0.5) * height)
+        found: FloatArray = np.where(rank < 0, 0.0, np.sign(uniform - 0.5) * height)
         return found
 
     def _places(self) -> int:
         """Return between how many successive samples a jump can fall."""
         return 2 * self.samples - 1
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return double sampling at two steps, multiple sampling, and a slow trap."""
-        return (
-            cls(fraction=0.014, amplitude_e=1.0),
-            cls(fraction=0.014, amplitude_e=2.5, probability=0.1),
-            cls(fraction=0.014, amplitude_e=1.0, spread="exponential"),
-            cls(fraction=0.014, amplitude_e=1.5, samples=4),
-            cls(fraction=0.014, amplitude_e=0.5, probability=0.5, sampling="single"),
-        )
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -214,7 +212,7 @@ class RtsNoise(Effect):
         outlying = _outlying(evidence)
         n, count = int(evidence.maps.usable.sum()), int(outlying.sum())
         # where most pixels stand out something else is wrong
-        if count < _FEWEST or count > 0.3 * n:
+        if count < _FEWEST or count > FEW_PIXELS * n:
             return []
         seen = np.array([np.median(values[outlying]) for values in _profile(evidence)])
         chosen = typical_pixels(evidence.maps, 3)[0]
@@ -253,7 +251,7 @@ class RtsNoise(Effect):
             np.asarray(lags, np.float64)[:, maps.usable] for lags in (time.lag_charge, time.lag_readout)
         )
         outlying = np.fmax(charge[0], readout[0]) * np.sqrt(time.n_pairs) > _SLOW
-        if outlying.sum() < 3 or outlying.sum() > 0.3 * outlying.size:
+        if outlying.sum() < 3 or outlying.sum() > FEW_PIXELS * outlying.size:
             return []
         sd_k = evidence.charge_std[maps.usable][outlying]
         sd_r = (evidence.readout_std * maps.conversion_gain)[maps.usable][outlying]
@@ -317,7 +315,7 @@ class RtsNoise(Effect):
         )
 
 
-def _profile(evidence: Evidence) -> list[NDArray[np.float64]]:
+def _profile(evidence: Evidence) -> list[FloatArray]:
     """Return what outlying pixels are compared by: form of the peaks and some scores of the usable pixels."""
     usable = evidence.maps.usable
     return [
@@ -326,19 +324,17 @@ def _profile(evidence: Evidence) -> list[NDArray[np.float64]]:
     ]
 
 
-def _departure(profile: NDArray[np.float64]) -> NDArray[np.float64]:
+def _departure(profile: FloatArray) -> FloatArray:
     """Return how far a profile departs from none: upwards in peaks and He4, either way in the others."""
     return np.concatenate([profile[:2], np.abs(profile[2:])])
 
 
-def _outlying(evidence: Evidence) -> NDArray[np.bool_]:
+def _outlying(evidence: Evidence) -> BoolArray:
     """Return which usable pixels stand out in something."""
     return np.asarray((_departure(np.array(_profile(evidence))) > _LIMITS[:, None]).any(axis=0))
 
 
-def _expected_profiles(
-    kinds: Sequence[SampleLaw], laws: Sequence[PixelLaw], n_frames: int
-) -> NDArray[np.float64]:
+def _expected_profiles(kinds: Sequence[SampleLaw], laws: Sequence[PixelLaw], n_frames: int) -> FloatArray:
     """Return the same for pixels of other laws, the median over the pixels: (kind, profile).
 
     The PCD is fitted to the exact law of such pixels, since it takes up much of the steps.
@@ -350,7 +346,7 @@ def _expected_profiles(
         change = fit.on_codes(*mass) - fit.mass
         scores = [fit.score_shift(name, change) * np.sqrt(n_frames) for name in _PROFILE]
         rows.append([fit.goodness(change, n_frames), *scores])
-    found: NDArray[np.float64] = np.median(np.array(rows).reshape(len(kinds), len(laws), -1), axis=1)
+    found: FloatArray = np.median(np.array(rows).reshape(len(kinds), len(laws), -1), axis=1)
     return found
 
 

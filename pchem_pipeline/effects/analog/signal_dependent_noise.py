@@ -8,20 +8,14 @@ et al. 2010). A gain that differs from sample to sample is common to the sample'
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.response import strength_of
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
 
 @register_effect
@@ -57,7 +51,10 @@ class SignalDependentNoise(Effect):
         "of a sample share it (noise_e k)",
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    #: both growths
+    typical_values = ({"noise_e": 0.06}, {"noise_e": 0.03, "growth": "linear"})
+
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the noise of its electrons."""
         noise = context.random.normal(("frame", "y", "x"))
         if context.charge is not None:
@@ -65,11 +62,6 @@ class SignalDependentNoise(Effect):
         noise *= self.noise_e
         noise += values
         return noise
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return both growths."""
-        return cls(noise_e=0.06), cls(noise_e=0.03, growth="linear")
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -11,21 +11,24 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.count_scores import count_excess
 from pchem_pipeline.effects.estimators.electrons import regrouped
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 
 @register_effect
@@ -56,7 +59,10 @@ class BranchingCounts(Effect):
         ge=0, le=0.5, description="mean number of further electrons made by each electron (l), no unit"
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    #: at half a percent, and at the tenth of a silicon photomultiplier
+    typical_values = ({"branching": 0.0052},)
+
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-; thinned by 1 - l first, so that the mean stays."""
         if self.branching == 0:
             return values.copy()
@@ -64,22 +70,17 @@ class BranchingCounts(Effect):
         grow = -np.expm1(-self.branching)
         below = _borel_beyond_one(self.branching)
 
-        def extra(v: NDArray[np.float64], index: NDArray[np.int64]) -> NDArray[np.int64]:
+        def extra(v: FloatArray, index: IntArray) -> IntArray:
             return 1 + np.searchsorted(below, v)
 
         return regrouped(values, u, self.branching, lambda index: (self.branching, grow), extra)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at half a percent, and at the tenth of a silicon photomultiplier."""
-        return (cls(branching=0.0052),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return l from the scores of the second Charlier polynomial, where they exceed 2.5 sigma."""
         c, stderr = count_excess(evidence, power=-1.0)
         # Var K = H + 2 l H + ... against H + c H
-        return (cls(branching=min(1.0 - (1.0 + c) ** -0.5, 0.5)),) if c > 2.5 * stderr else ()
+        return (cls(branching=min(1.0 - (1.0 + c) ** -0.5, 0.5)),) if c > SIGNIFICANT * stderr else ()
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with generalised Poisson electron numbers."""
@@ -87,7 +88,7 @@ class BranchingCounts(Effect):
 
 
 @functools.lru_cache(maxsize=64)
-def _borel_beyond_one(branching: float) -> NDArray[np.float64]:
+def _borel_beyond_one(branching: float) -> FloatArray:
     """Return P(n <= 2 | n >= 2), P(n <= 3 | n >= 2), ... of a Borel number n, but for the last, 1."""
     mass, masses = branching * np.exp(-2.0 * branching), []
     n = 2
@@ -96,5 +97,5 @@ def _borel_beyond_one(branching: float) -> NDArray[np.float64]:
         # P(n) = exp(-l n) (l n)^(n - 1) / n!
         mass *= branching * np.exp(-branching + (n - 1) * np.log1p(1.0 / n))
         n += 1
-    below: NDArray[np.float64] = (np.cumsum(masses) / np.sum(masses))[:-1]
+    below: FloatArray = (np.cumsum(masses) / np.sum(masses))[:-1]
     return below

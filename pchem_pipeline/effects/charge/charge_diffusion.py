@@ -9,19 +9,14 @@ and part of H.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.electrons import sent_to_neighbours
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
+from pchem_pipeline.effects.types import AnyArray, EffectContext
 
 
 @register_effect
@@ -38,17 +33,17 @@ class ChargeDiffusion(Effect):
     title: ClassVar[str] = "charge diffusion"
     source: ClassVar[str] = "Janesick 2001, Scientific Charge-Coupled Devices, ch. 4"
     strength: ClassVar[str] = "fraction"
+    reach_rows = 1
     untestable: ClassVar[str] = (
         "Poisson electrons that each move by chance stay independent Poisson electrons, so only the map of H "
         "changes; an edge, a spot or single X-rays would show it"
     )
     fraction: Ratio = Field(ge=0, le=0.9, description="probability that an electron moves, no unit")
 
-    def halo(self) -> int:
-        """Return 1 row: the neighbours above and below."""
-        return 1
+    #: at a fifth
+    typical_values = ({"fraction": 0.2},)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, as collected."""
         result = values.copy()
         if self.fraction == 0:
@@ -61,8 +56,3 @@ class ChargeDiffusion(Effect):
         arrives = leaves & (to_y >= 0) & (to_y < values.shape[1])
         np.add.at(result, (frame[arrives], to_y[arrives], to_x[arrives]), 1)
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at a fifth."""
-        return (cls(fraction=0.2),)

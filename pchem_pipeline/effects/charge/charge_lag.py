@@ -8,18 +8,13 @@ Hondongwa 2014, "A Review of the Pinned Photodiode"; 0.1 e- and less in the pump
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.electrons import binomial_upper
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
+from pchem_pipeline.effects.types import AnyArray, EffectContext
 
 
 @register_effect
@@ -35,6 +30,7 @@ class ChargeLag(Effect):
     title: ClassVar[str] = "charge transfer lag"
     source: ClassVar[str] = "Fossum and Hondongwa 2014, IEEE J. Electron Devices Soc. 2, 33; Mirasol 1963"
     strength: ClassVar[str] = "fraction"
+    reach_frames = 1
     untestable: ClassVar[str] = (
         "Poisson electrons that are each delayed by chance stay independent Poisson electrons; a bright "
         "frame followed by dark ones would show it"
@@ -43,21 +39,15 @@ class ChargeLag(Effect):
         ge=0, le=0.9, description="probability that an electron is one frame late, no unit"
     )
 
-    def history(self) -> int:
-        """Return 1 frame: the one whose electrons are late."""
-        return 1
+    #: at a fifth
+    typical_values = ({"fraction": 0.2},)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, as read; the first frame gets nothing from before."""
         if self.fraction == 0:
             return values.copy()
         u = context.random.uniform(("frame", "y", "x"))
         late = binomial_upper(u.reshape(-1), values.reshape(-1), self.fraction).reshape(values.shape)
-        result: NDArray[Any] = values - late
+        result: AnyArray = values - late
         result[1:] += late[:-1]
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at a fifth."""
-        return (cls(fraction=0.2),)

@@ -10,7 +10,7 @@ frame; what one leaves in a pixel is Poisson about its share.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+from typing import ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
@@ -28,13 +28,15 @@ from pchem_pipeline.effects.framework.effect import (
     Ratio,
     register_effect,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 # points per pixel along a track
 _POINTS = 8
@@ -108,7 +110,10 @@ class CosmicRays(Effect):
         default=3.0, gt=0, description="standard deviation of such a cloud along an axis, um"
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    #: at one track in 80 frames
+    typical_values = ({"tracks_per_frame": 0.012},)
+
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, with those of the tracks; touches frames with tracks."""
         result = values.copy()
         u = context.random.uniform(("frame",))[:, 0, 0]
@@ -126,7 +131,7 @@ class CosmicRays(Effect):
 
     def _track(
         self, shape: tuple[int, int], random: np.random.Generator
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    ) -> tuple[IntArray, IntArray, IntArray]:
         """Return rows and columns of the pixels of a track on the whole sensor, and its electrons in each."""
         start = random.random(2) * shape
         angle = 2.0 * np.pi * random.random()
@@ -141,7 +146,7 @@ class CosmicRays(Effect):
 
     def _cloud(
         self, shape: tuple[int, int], random: np.random.Generator
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    ) -> tuple[IntArray, IntArray, IntArray]:
         """Return the same of a cloud; of more electrons it is wider, its density at the middle the same."""
         middle = random.random(2) * shape
         more = float(np.exp(self.cloud_range * random.standard_normal()))
@@ -164,11 +169,6 @@ class CosmicRays(Effect):
         tracks = ("length_um", "electrons_per_um") if self.cloud_share < 1.0 else ()
         clouds = ("cloud_share", "cloud_electrons", "cloud_um") if self.cloud_share > 0.0 else ()
         return tracks + clouds
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at one track in 80 frames."""
-        return (cls(tracks_per_frame=0.012),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -229,7 +229,7 @@ def _poisson_upper(u: float, mean: float) -> int:
     return n
 
 
-def _events(hits: NDArray[np.int64], charge: NDArray[np.float64]) -> list[_Event]:
+def _events(hits: IntArray, charge: FloatArray) -> list[_Event]:
     """Return the events of hits (frame, y, x), shape (n, 3), whose charges are of shape (n,), e-."""
     # frames are two apart, so that only pixels of one frame touch each other
     pairs = KDTree(hits * (2, 1, 1)).query_pairs(1.0, p=np.inf, output_type="ndarray")

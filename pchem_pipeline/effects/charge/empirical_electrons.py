@@ -8,8 +8,7 @@ samples; nothing is said about why.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -20,13 +19,14 @@ from pchem_pipeline.effects.estimators.electrons import binomial_upper
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 #: What happens to electrons: some that have others in their sample are lost or moved, or each brings others,
 #: or all of a sample are lost together.
@@ -60,7 +60,7 @@ class ElectronMode(Section):
             raise ValueError("place: a sample that is emptied has none")
         return self
 
-    def words(self, chance: float) -> str:
+    def describe(self, chance: float) -> str:
         """Return in words how the numbers vary together, with a chance (or a mean number)."""
         if self.fate == "emptied":
             return f"{per_cent(chance)} of the samples have none"
@@ -86,7 +86,7 @@ class EmpiricalElectrons(Effect):
     title: ClassVar[str] = "measured law of electron numbers, without an explanation"
     source: ClassVar[str] = "Cox and Isham 1980, Point processes (factorial cumulants)"
     strength: ClassVar[str] = "chance"
-    measured_only: ClassVar[bool] = True
+    empirical: ClassVar[bool] = True
     chance: Ratio = Field(
         ge=0, le=0.5, description="largest chance or mean number, that of weight 1, no unit"
     )
@@ -94,8 +94,11 @@ class EmpiricalElectrons(Effect):
         min_length=1, max_length=8, description="what happens: its `fate`, `place` and relative `weight`"
     )
 
+    #: electrons of which each hundredth brings another one to the next frame
+    typical_values = ({"chance": 0.01, "modes": (ElectronMode(fate="followed", place=(1, 0, 0)),)},)
+
     @property
-    def unlisted(self) -> bool:
+    def empirical_unnamed(self) -> bool:
         """Whether electrons go one by one, or bring others to later frames."""
         return all(
             mode.fate != "emptied" and (mode.fate != "followed" or mode.place[0]) for mode in self.modes
@@ -114,7 +117,7 @@ class EmpiricalElectrons(Effect):
         """Return how many frames before it matter."""
         return _DEPTH * max(mode.place[0] for mode in self.modes)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, without those that go and with those that come."""
         own, chance = values.astype(np.int64), self._chances()
         for number, mode in enumerate(self.modes):
@@ -157,24 +160,14 @@ class EmpiricalElectrons(Effect):
         largest = max(mode.weight for mode in self.modes)
         return [self.chance * mode.weight / largest for mode in self.modes]
 
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return electrons of which each hundredth brings another one to the next frame."""
-        return (cls(chance=0.01, modes=(ElectronMode(fate="followed", place=(1, 0, 0)),)),)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return none: it is measured where all else has failed, and competes with nothing."""
-        return ()
-
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
-        told = [mode.words(chance) for mode, chance in zip(self.modes, self._chances(), strict=True)]
+        told = [mode.describe(chance) for mode, chance in zip(self.modes, self._chances(), strict=True)]
         return f"electron numbers{place} that are not independent ({'; '.join(told)})"
 
 
-def _gone(electrons: NDArray[np.int64], u: NDArray[np.float64], chance: float) -> NDArray[np.int64]:
+def _gone(electrons: IntArray, u: FloatArray, chance: float) -> IntArray:
     """Return how many electrons of each sample go, each with a chance for every other one."""
     gone = np.zeros(electrons.shape, np.int64)
     here = np.nonzero(electrons > 1)
@@ -183,7 +176,7 @@ def _gone(electrons: NDArray[np.int64], u: NDArray[np.float64], chance: float) -
     return gone
 
 
-def _arrived(electrons: NDArray[np.int64], place: tuple[int, int, int]) -> NDArray[np.int64]:
+def _arrived(electrons: IntArray, place: tuple[int, int, int]) -> IntArray:
     """Return how many electrons come from the samples of which each is at a place, 0 from beyond the edge."""
     if not any(place):
         return electrons

@@ -10,20 +10,15 @@ readout.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.electrons import sent_to_neighbours
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of, neighbour_mean
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
 
 @register_effect
@@ -45,6 +40,7 @@ class OpticalCrosstalk(Effect):
     )
     signature: ClassVar[tuple[str, ...]] = ("space.x.kk", "space.y.kk")
     strength: ClassVar[str] = "probability"
+    reach_rows = 1
     separate: ClassVar[Mapping[str, str]] = {
         "interpixel_capacitance": "the readout residual and the neighbour's electrons: it follows them there",
         "exposure_flicker": "correlation of distant pixels: none here",
@@ -54,11 +50,10 @@ class OpticalCrosstalk(Effect):
         ge=0, le=0.5, description="probability that an electron makes one more in a neighbour, no unit"
     )
 
-    def halo(self) -> int:
-        """Return 1 row: the neighbours above and below."""
-        return 1
+    #: at one percent
+    typical_values = ({"probability": 0.0112},)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, with those that came from the neighbours."""
         result = values.copy()
         if self.probability == 0:
@@ -70,39 +65,26 @@ class OpticalCrosstalk(Effect):
         return result
 
     @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at one percent."""
-        return (cls(probability=0.0112),)
-
-    @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return p from the correlations of neighbours' electron numbers, where these are above 2.5 sigma."""
-        found, weight = 0.0, 0.0
-        for axis, name in ((1, "x.kk"), (0, "y.kk")):
-            response = _response(evidence, axis)
-            pairs = evidence.time.neighbour_pairs.get(name, 0) if evidence.time else 0
-            if evidence.time is None or not pairs or not np.isfinite(response):
-                continue
-            found += pairs * response * evidence.time.neighbours[name]
-            weight += pairs * response**2
-        if weight == 0 or found < 2.5 * np.sqrt(weight):
+        if evidence.time is None:
             return ()
-        return (cls(probability=min(found / weight, 0.5)),)
+        pairs = np.array([evidence.time.neighbour_pairs.get(f"{axis}.kk", 0) for axis in "xy"], np.float64)
+        seen = np.array([evidence.time.neighbours.get(f"{axis}.kk", 0.0) for axis in "xy"])
+        response = np.array([_response(evidence, axis) for axis in "xy"])
+        found = multiple_of(np.nan_to_num(response), seen, pairs)
+        return (cls(probability=min(found.value, 0.5)),) if found.sigmas > SIGNIFICANT else ()
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with a Poisson mean that holds what neighbours as bright as the pixel send."""
         return model.with_exposures([1.0], [1.0 + self.probability])
 
 
-def _response(evidence: Evidence, axis: int) -> float:
+def _response(evidence: Evidence, axis: str) -> float:
     """Return the mean correlation of neighbours along an axis per unit of p, NaN without such pairs.
 
     The expected electron number answers to the true one with the slope Var(k) / H.
     """
-    exposure, std = evidence.maps.quanta_exposure, evidence.charge_std
-    first = tuple(slice(None, -1) if a == axis else slice(None) for a in range(2))
-    second = tuple(slice(1, None) if a == axis else slice(None) for a in range(2))
-    seen = evidence.maps.usable & (exposure > 0)
-    good = seen[first] & seen[second]
-    h, s = (exposure[first][good], exposure[second][good]), (std[first][good], std[second][good])
-    return float(np.mean(0.25 * (h[0] + h[1]) * s[0] * s[1] / (h[0] * h[1]))) if good.any() else float("nan")
+    exposure = evidence.maps.quanta_exposure
+    std = np.where(evidence.maps.usable & (exposure > 0), evidence.charge_std, np.nan)
+    return 0.5 * neighbour_mean(std / exposure, std, axis)

@@ -10,21 +10,24 @@ log-normal, a product of many small factors, is more skewed, which strong mixing
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.count_scores import count_excess
 from pchem_pipeline.effects.estimators.electrons import binomial_upper, regrouped
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 # standard errors by which two kinds of exposures must differ
 _APART = 3.0
@@ -61,7 +64,10 @@ class OverdispersedCounts(Effect):
         description="how the exposures are distributed; gamma: electron numbers are negative binomial",
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    #: at a = 0.0064, an exposure that jitters by 8 %
+    typical_values = ({"relative_variance": 0.0064},)
+
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, made of Poisson ones of mean ``context.exposure``."""
         assert context.exposure is not None  # the chain gives it from this plane on
         a, exposure = self.relative_variance, context.exposure
@@ -72,24 +78,22 @@ class OverdispersedCounts(Effect):
         u = context.random.uniform(("frame", "y", "x"))
         flat = exposure.reshape(-1)
 
-        def law(index: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        def law(index: IntArray) -> tuple[FloatArray, FloatArray]:
             x = np.maximum(a * flat[index], 1e-300)
             log = np.log1p(x)
             return np.maximum(1.0 - log / x, 0.0), np.maximum(1.0 - x / ((1.0 + x) * log), 0.0)
 
-        def extra(v: NDArray[np.float64], index: NDArray[np.int64]) -> NDArray[np.int64]:
+        def extra(v: FloatArray, index: IntArray) -> IntArray:
             return _logarithmic_beyond_one(v, a * flat[index])
 
         # both probabilities are below a H / 2
         return regrouped(values, u, (0.5 * a) * exposure, law, extra)
 
-    def added_scatter_e(self, exposure: NDArray[np.float64]) -> NDArray[np.float64]:
+    def added_scatter_e(self, exposure: FloatArray) -> FloatArray:
         """Return the scatter of the exposure, e- rms: which electrons it moves differs from draw to draw."""
         return np.asarray(np.sqrt(self.relative_variance) * exposure)
 
-    def _thinned_or_added(
-        self, values: NDArray[Any], exposure: NDArray[np.float64], context: EffectContext
-    ) -> NDArray[Any]:
+    def _thinned_or_added(self, values: AnyArray, exposure: FloatArray, context: EffectContext) -> AnyArray:
         """Return Poisson numbers of the mean of each sample, made of those of the mean of all."""
         width = _width(self.relative_variance)
         normal = context.random.normal(("frame", "y", "x"))
@@ -104,11 +108,6 @@ class OverdispersedCounts(Effect):
         return np.asarray(values - lost.reshape(values.shape) + added, values.dtype)
 
     @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at a = 0.0064, an exposure that jitters by 8 %."""
-        return (cls(relative_variance=0.0064),)
-
-    @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return a from the scores of the second Charlier polynomial, where they exceed 2.5 sigma.
 
@@ -116,7 +115,7 @@ class OverdispersedCounts(Effect):
         tell them apart.
         """
         a, stderr = count_excess(evidence, power=0.0)
-        if not a > 2.5 * stderr:
+        if not a > SIGNIFICANT * stderr:
             return ()
         a = min(a, 1.0)
         exposure = evidence.maps.quanta_exposure[evidence.maps.usable]
@@ -142,7 +141,7 @@ def _width(relative_variance: float) -> float:
     return float(np.sqrt(np.log1p(relative_variance)))
 
 
-def _logarithmic_beyond_one(v: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+def _logarithmic_beyond_one(v: FloatArray, x: FloatArray) -> IntArray:
     """Return n - 1 for logarithmic n >= 2, P(n) ~ theta^n / n with theta = x / (1 + x)."""
     theta = x / (1.0 + x)
     extra = np.ones(v.size, np.int64)

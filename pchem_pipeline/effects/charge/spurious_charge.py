@@ -7,20 +7,13 @@ Poisson electrons is Poisson: at one exposure time they are part of H.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, PixelMaps, SampleLaw
 
 
 @register_effect
@@ -46,18 +39,16 @@ class SpuriousCharge(Effect):
         ge=0, le=1e6, description="mean number of spurious electrons per pixel and frame, e-"
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    #: at 0.3 e-
+    typical_values = ({"mean_e": 0.3},)
+
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, spurious ones included."""
         if self.mean_e == 0:
             return values.copy()
-        result: NDArray[Any] = values + context.random.poisson(np.full(values.shape, self.mean_e))
+        result: AnyArray = values + context.random.poisson(np.full(values.shape, self.mean_e))
         return result
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with this charge on top of H, which is then the exposure without it."""
         return model.with_added_exposure([[self.mean_e]], [[1.0]])
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.3 e-."""
-        return (cls(mean_e=0.3),)

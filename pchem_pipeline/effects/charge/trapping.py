@@ -20,25 +20,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+from typing import ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.count_scores import charlier_information
+from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
+from pchem_pipeline.effects.estimators.regression import CERTAIN, SIGNIFICANT
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    BoolArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
-
-FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
-
-_WHICH = 0xFFFFFFFE  # draw that is no frame's
 # probability that the state of a trap goes back farther than the frames that are simulated for it
 _RARE = 1e-6
 # chances, and shares of the pixels, among which the estimator looks first
@@ -46,10 +48,8 @@ _CAPTURES = np.geomspace(0.002, 0.9, 12)
 _RELEASES = np.geomspace(0.02, 0.9, 9)
 _FRACTIONS = (0.03, 0.1, 0.3)
 _LIMITS = (0.02, 0.95)  # of a release, and the largest of a capture
-# standard deviations of the covariances in time, and of all, that are worth a hypothesis
-_SEEN, _CLEAR = 2.5, 3.5
-# standard deviations, as a likelihood ratio, by which only some pixels have a trap; the most that are some
-_CERTAIN, _MOST = 4.0, 0.8
+_CLEAR = 3.5  # standard deviations of all that pixels show that are worth a hypothesis
+_MOST = 0.8  # share of the pixels with a trap beyond which all have one
 # standard deviations from what is expected beyond which a pixel counts no more
 _CUT = 5.0
 _SMALL = 1e-3  # chance at which the law of a sample is looked at
@@ -97,13 +97,20 @@ class Trapping(Effect):
     )
     fraction: Ratio = Field(default=1.0, ge=0, le=1, description="share of the pixels with a trap, no unit")
 
+    #: in all pixels, fast and slow, and in a tenth of them
+    typical_values = (
+        {"capture": 0.03, "release": 0.4},
+        {"capture": 0.3, "release": 0.06},
+        {"capture": 0.3, "release": 0.3, "fraction": 0.1},
+    )
+
     def history(self) -> int:
         """Return how many frames ago a trap was last filled or emptied whatever its state was, at most."""
         # chances above one half also make it change places, which leaves its state open
         known = min(self.release, 1.0 - abs(1.0 - self.release - self.capture))
         return math.ceil(math.log(_RARE) / math.log1p(-known)) if self.capture > 0 else 0
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, as read: less what is caught, with what is released.
 
         A trap that was neither filled nor emptied for as long as :meth:`history` is taken for empty, so that
@@ -112,19 +119,10 @@ class Trapping(Effect):
         u = context.random.uniform(("frame", "y", "x"))
         filled = (u > 1.0 - self.capture) & (values > 0)
         if self.fraction < 1:
-            filled &= context.random.uniform(("y", "x"), _WHICH) < self.fraction
+            filled &= context.random.uniform(("y", "x"), OF_PIXEL[0]) < self.fraction
         emptied = u < self.release
         full = _states(filled, emptied, self.history())
         return values + full[:-1] - full[1:]
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it in all pixels, fast and slow, and in a tenth of them."""
-        return (
-            cls(capture=0.03, release=0.4),
-            cls(capture=0.3, release=0.06),
-            cls(capture=0.3, release=0.3, fraction=0.1),
-        )
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -143,7 +141,7 @@ class Trapping(Effect):
             other = _refined(pixels, alike.opposite(float(pixels.some.mean())))
             found = [_first_of(alike, other)]
         some = _refined(pixels, max((starts[f] for f in _FRACTIONS), key=lambda one: one.height))
-        clear = some.height - max(alike.height, 0.0) > _CERTAIN**2 / 2.0
+        clear = some.height - max(alike.height, 0.0) > CERTAIN**2 / 2.0
         if clear and some.seen and some.fraction < _MOST:
             found.insert(0, some)
         return [cls(capture=one.capture, release=one.release, fraction=one.fraction) for one in found]
@@ -168,7 +166,7 @@ def _chance(capture: float, release: float, some: FloatArray) -> FloatArray:
     return np.asarray(capture * release / (release + capture * some))
 
 
-def _states(filled: NDArray[np.bool_], emptied: NDArray[np.bool_], history: int) -> NDArray[np.int64]:
+def _states(filled: BoolArray, emptied: BoolArray, history: int) -> IntArray:
     """Return whether traps are full before and behind each frame, (frame + 1, y, x), 0 or 1.
 
     Args:
@@ -230,7 +228,7 @@ class _Trap(NamedTuple):
     @property
     def seen(self) -> bool:
         """Whether it is worth a hypothesis."""
-        return self.height > _CLEAR**2 / 2.0 and self.in_time > _SEEN**2 / 2.0
+        return self.height > _CLEAR**2 / 2.0 and self.in_time > SIGNIFICANT**2 / 2.0
 
     def opposite(self, some: float) -> _Trap:
         """Return the trap that catches as often as this one releases, and releases as this one catches."""

@@ -1,30 +1,30 @@
-"""Find a smooth bend, or a break, of the ADC's transfer curve in the counts per code.
+"""What the counts per code show of a bent or broken transfer curve, and of samples moved to other codes.
 
 A deviation ``delta(x)`` of the transfer curve moves the code edges by ``-delta``. The pixels' own fits take
 up what looks like a change of their H, g, mu or sigma; what they leave is computed here to first order, for
 a sample of pixels (the same projection as of an efficient score), summed over the codes and compared with
 the residuals for sines of many periods and for breaks at many places.
+
+If a share of the samples of some codes comes out as other codes, the counts change by the mass that leaves
+and arrives; what the fits take up of that is left out likewise.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.estimators.codes import usable_codes
+from pchem_pipeline.effects.estimators.regression import multiple_of
+from pchem_pipeline.effects.types import BoolArray, Evidence, FloatArray, IntArray, PixelMaps, SampleLaw
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-
-_PIXELS = 256
-_PERIODS = 48
-_MOST_CODES = 1500
-_SHORTEST = 8.0
+_PIXELS = 256  # that stand for all: their windows of codes overlap many times
+_PERIODS = 48  # sines that are tried, twice as many as are independent
+_MOST_CODES = 1500  # memory: a square of so many numbers
+_SHORTEST = 8.0  # DN; what changes faster is new from code to code
 # places of a break that are tried, and the share of the samples on either side that it needs
 _LEVELS = 80
 _END = 0.002
@@ -53,7 +53,7 @@ class Curve:
 
     first: float
     spacing: float
-    values: NDArray[np.float64]
+    values: FloatArray
 
 
 @dataclass(frozen=True)
@@ -67,10 +67,10 @@ class SampledPixels:
         tangents: change of the masses with H, mu, sigma, g, orthonormal under ``1 / mass``, (n, 4, cells).
     """
 
-    first: NDArray[np.int64]
-    density: NDArray[np.float64]
-    mass: NDArray[np.float64]
-    tangents: NDArray[np.float64]
+    first: IntArray
+    density: FloatArray
+    mass: FloatArray
+    tangents: FloatArray
 
 
 @dataclass(frozen=True)
@@ -93,10 +93,10 @@ class CurveResponse:
         expected: counts per code, (codes,).
     """
 
-    edges: NDArray[np.float64]
-    response: NDArray[np.float64]
-    residuals: NDArray[np.float64]
-    expected: NDArray[np.float64]
+    edges: FloatArray
+    response: FloatArray
+    residuals: FloatArray
+    expected: FloatArray
 
     @classmethod
     def of(cls, evidence: Evidence) -> CurveResponse | None:
@@ -109,14 +109,12 @@ class CurveResponse:
         response = _response(pixels, codes) * (samples / np.sqrt(expected))[:, None]
         return cls(np.append(codes, codes[-1] + 1) - 0.5, response, residuals * np.sqrt(expected), expected)
 
-    def fits(self, deviations: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def fits(self, deviations: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return by how much pairs of deviations (kinds, 2, codes + 1) lower chi2, and their factors."""
         found = [_fit(self.response @ pair.T, self.residuals) for pair in deviations]
         return np.array([gain for gain, _ in found]), np.array([factors for _, factors in found])
 
-    def worth(
-        self, gains: NDArray[np.float64], known: float = 0.0, least: float = _LEAST_GAIN
-    ) -> NDArray[np.bool_]:
+    def worth(self, gains: FloatArray, known: float = 0.0, least: float = _LEAST_GAIN) -> BoolArray:
         """Return which gains are more than a known one, and what chance and what else is amiss brings."""
         total = float((self.residuals**2).sum())
         left = np.maximum(1.0, (total - gains) / max(self.residuals.size - 6, 1))
@@ -165,13 +163,13 @@ def best_curve(evidence: Evidence) -> Curve | None:
     return best
 
 
-def _straight(response: CurveResponse, deviation: NDArray[np.float64]) -> np.polynomial.Polynomial:
+def _straight(response: CurveResponse, deviation: FloatArray) -> np.polynomial.Polynomial:
     """Return the straight line through a deviation (codes + 1,): bias and gain of the pixels take it up."""
     counts = np.append(response.expected, 0.0) + np.append(0.0, response.expected)
     return np.polynomial.Polynomial.fit(response.edges, deviation, 1, w=np.sqrt(counts))
 
 
-def _fit_knots(response: CurveResponse, basis: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+def _fit_knots(response: CurveResponse, basis: FloatArray) -> tuple[FloatArray, float]:
     """Return values at the knots of a basis (codes + 1, knots), LSB, and by how much they lower chi2.
 
     What hardly shows (a straight line, which bias and gain take up, above all) is left at nothing.
@@ -184,9 +182,7 @@ def _fit_knots(response: CurveResponse, basis: NDArray[np.float64]) -> tuple[NDA
     return values, float((seen**2 - (seen - kept) ** 2).sum())
 
 
-def through_knots(
-    knots: NDArray[np.float64], values: NDArray[np.float64], places: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def through_knots(knots: FloatArray, values: FloatArray, places: FloatArray) -> FloatArray:
     """Return natural cubic splines through values (knots, ...) at places; beyond the ends as at the ends."""
     from scipy.interpolate import CubicSpline
 
@@ -222,60 +218,41 @@ def best_stitch(evidence: Evidence) -> list[Stitch]:
 
 def sampled_tangents(maps: PixelMaps) -> SampledPixels | None:
     """Return masses and tangents of pixels spread over the sensor; None where none is usable."""
-    chosen = _sample(maps)
-    return None if chosen is None else _tangents(*chosen)
+    from pchem_pipeline.model.law.mass import sample_slopes
+
+    pixels = _sample(maps)
+    if pixels is None:
+        return None
+    exposure, gain, bias, noise = (each[:, None] for each in pixels.maps)
+    sigma = np.sqrt(np.maximum(noise**2 - QUANTISATION_VARIANCE, 0.01))
+    first = np.floor(bias - 5.0 * sigma).astype(np.int64)
+    cells = int(np.ceil((10.0 * sigma + (exposure + 5.0 * np.sqrt(exposure) + 2.0) / gain).max()))
+    mass, slopes = sample_slopes(SampleLaw(), pixels, first[:, 0], cells)
+    # a larger bias takes from each code what lies at its upper edge, and gives what lies at its lower one
+    density = np.pad(-np.cumsum(slopes[:, 2], axis=1), ((0, 0), (1, 0)))
+    mass = np.maximum(mass, 1e-12)
+    root = np.sqrt(mass)[:, :, None]
+    tangents = np.linalg.qr(slopes.transpose(0, 2, 1) / root)[0] * root
+    return SampledPixels(first, density, mass, tangents.transpose(0, 2, 1))
 
 
-def _in_use(expected: NDArray[np.float64]) -> float:
+def _in_use(expected: FloatArray) -> float:
     """Return over how many DN the middle 98 % of the samples spread."""
     share = np.cumsum(expected) / expected.sum()
     return float(np.searchsorted(share, 0.99) - np.searchsorted(share, 0.01) + 1)
 
 
-def _sample(maps: PixelMaps) -> tuple[NDArray[np.float64], ...] | None:
-    """Return H, g, mu, sigma of pixels spread over the sensor, each (n, 1), without the widest histograms."""
-    parts = np.stack([part[maps.usable] for part in maps.maps]).astype(np.float64)
-    parts = parts[:, np.isfinite(parts).all(axis=0)]
-    if not parts.shape[1]:
+def _sample(maps: PixelMaps) -> PixelMaps | None:
+    """Return pixels spread over the sensor, shape (n,), without the widest histograms."""
+    some = maps.of(maps.usable & np.isfinite(np.stack(maps.maps)).all(axis=0))
+    if not some.bias.size:
         return None
-    widths = (parts[0] + 6.0 * np.sqrt(parts[0])) / parts[1]
-    parts = parts[:, widths <= np.quantile(widths, 0.95)]
-    step = max(1, parts.shape[1] // _PIXELS)
-    return tuple(part[::step, None] for part in parts)
+    widths = (some.quanta_exposure + 6.0 * np.sqrt(some.quanta_exposure)) / some.conversion_gain
+    kept = np.flatnonzero(widths <= np.quantile(widths, 0.95))
+    return some.of(kept[:: max(1, kept.size // _PIXELS)])
 
 
-def _tangents(
-    exposure: NDArray[np.float64],
-    gain: NDArray[np.float64],
-    bias: NDArray[np.float64],
-    noise: NDArray[np.float64],
-) -> SampledPixels:
-    """Return masses and tangents of the pixels' PCDs (exact rounded mass and its derivatives)."""
-    from scipy.special import gammaln, ndtr
-
-    sigma = np.sqrt(np.maximum(noise**2 - QUANTISATION_VARIANCE, 0.01))
-    first = np.floor(bias - 5.0 * sigma).astype(np.int64)
-    most = int(np.ceil((exposure + 6.0 * np.sqrt(exposure) + 3.0).max()))
-    cells = int(np.ceil((10.0 * sigma + (exposure + 5.0 * np.sqrt(exposure) + 2.0) / gain).max()))
-    edges = first - 0.5 + np.arange(cells + 1)
-    cdf, density = np.zeros(edges.shape), np.zeros(edges.shape)
-    by_exposure, by_noise, by_gain = np.zeros(edges.shape), np.zeros(edges.shape), np.zeros(edges.shape)
-    for k in range(most + 1):
-        weight = np.exp(k * np.log(exposure) - exposure - gammaln(k + 1.0))
-        z = (edges - bias - k / gain) / sigma
-        below, bell = ndtr(z), np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
-        cdf += weight * below
-        density += weight * bell / sigma
-        by_exposure += weight * (k / exposure - 1.0) * below
-        by_noise -= weight * bell * z
-        by_gain += weight * bell * k
-    mass = np.maximum(np.diff(cdf, axis=1), 1e-12)
-    raw = np.stack([np.diff(part, axis=1) for part in (by_exposure, -density, by_noise, by_gain)], axis=2)
-    tangents = np.linalg.qr(raw / np.sqrt(mass)[:, :, None])[0] * np.sqrt(mass)[:, :, None]
-    return SampledPixels(first, density, mass, tangents.transpose(0, 2, 1))
-
-
-def _response(pixels: SampledPixels, codes: NDArray[np.int64]) -> NDArray[np.float64]:
+def _response(pixels: SampledPixels, codes: IntArray) -> FloatArray:
     """Return the change of the mass of the codes per DN of deviation at their edges, (codes, codes + 1).
 
     Summed over the sample of pixels, with what their fits take up projected out.
@@ -299,7 +276,62 @@ def _response(pixels: SampledPixels, codes: NDArray[np.int64]) -> NDArray[np.flo
     return total[n_cells:-n_cells, n_cells:-n_cells]
 
 
-def _fit(design: NDArray[np.float64], scaled: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+def _fit(design: FloatArray, scaled: FloatArray) -> tuple[float, FloatArray]:
     """Return by how much a sine and a cosine lower chi2 of the codes, and their factors."""
-    factors: NDArray[np.float64] = np.linalg.lstsq(design, scaled, rcond=None)[0].astype(np.float64)
+    factors: FloatArray = np.linalg.lstsq(design, scaled, rcond=None)[0].astype(np.float64)
     return float((scaled**2).sum() - ((scaled - design @ factors) ** 2).sum()), factors
+
+
+class MovedShare(NamedTuple):
+    """A share of moved samples, its standard error, and by how much it lowers chi2 of the codes."""
+
+    share: float
+    error: float
+    gain: float
+
+
+def moved_shares(evidence: Evidence, targets: IntArray) -> list[MovedShare]:
+    """Return for each of several kinds of moves the share of samples that explains the counts best.
+
+    Args:
+        evidence: of one split.
+        targets: where a sample of each code of ``evidence.code`` comes out, as places there, shape (kinds,
+            codes); its own place where it stays, -1 where it leaves them.
+    """
+    code, pixels = evidence.code, sampled_tangents(evidence.maps)
+    if pixels is None:
+        return []
+    n, cells = pixels.mass.shape
+    samples = evidence.n_frames * int(evidence.maps.usable.sum()) / n
+    places = pixels.first - code.first + np.arange(cells)
+    here = (places >= 0) & (places < code.expected.size)
+    residual = code.observed - code.expected
+    found = []
+    for target in targets:
+        to = np.where(here, target[np.where(here, places, 0)], -1)
+        leaves = here & (to != places)
+        change = np.where(leaves, -pixels.mass, 0.0)
+        inside = np.zeros(change.shape)
+        arrives = leaves & (to >= 0)
+        rows, columns = np.nonzero(arrives)
+        cell = to[arrives] - places[rows, 0]
+        mass = pixels.mass[rows, columns]
+        near = (cell >= 0) & (cell < cells)
+        np.add.at(inside, (rows[near], cell[near]), mass[near])
+        change += inside
+        taken_up = np.einsum("nic,nc->ni", pixels.tangents, change / pixels.mass)
+        change -= np.einsum("ni,nic->nc", taken_up, pixels.tangents)
+        pattern = np.bincount(places[here], change[here], code.expected.size)
+        pattern += np.bincount(to[arrives][~near], mass[~near], code.expected.size)
+        found.append(_regressed(samples * pattern, residual, code.expected))
+    return found
+
+
+def _regressed(pattern: FloatArray, residual: FloatArray, expected: FloatArray) -> MovedShare:
+    """Return the factor of a pattern in the residuals of Poisson counts, by two weighted least squares."""
+    share, error = 0.0, np.inf
+    for _ in range(2):
+        weight = 1.0 / np.maximum(expected + share * pattern, 1.0)
+        found, error = multiple_of(pattern, residual, weight)
+        share = max(found, 0.0)
+    return MovedShare(share, error, (share / error) ** 2)

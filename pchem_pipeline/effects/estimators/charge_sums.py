@@ -7,16 +7,12 @@ Var(k)``.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps, TimeSeries
-
-FloatArray = NDArray[np.float64]
-
+from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray, PixelMaps, TimeSeries
 
 _FAR = 7.5  # median deviations of the logarithm of a gain: five standard deviations
 
@@ -68,8 +64,8 @@ class BlockCharge(NamedTuple):
     length: FloatArray
     deviation: FloatArray
     variance: FloatArray
-    y: NDArray[np.int64]
-    x: NDArray[np.int64]
+    y: IntArray
+    x: IntArray
 
 
 def block_charge(evidence: Evidence) -> BlockCharge | None:

@@ -9,18 +9,11 @@ Both are normal with variances that the pixels' fits give, so f and the lines ha
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pchem_pipeline.effects.estimators.common_modes import mean_variance, responsivity
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.evidence import Evidence
-
-FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray
 
 _PARTS = np.concatenate([[0.0], np.geomspace(2e-3, 1.0, 300)])
 _LEAST_GAIN = 9.0  # of the log-likelihood, against a noise of frames: some 500 overlapping ranges are tried
@@ -54,7 +47,7 @@ class _Moments:
     own: FloatArray
     shared: FloatArray
     pixels: FloatArray
-    spans: NDArray[np.int64]
+    spans: IntArray
 
 
 def best_clamp(evidence: Evidence) -> Clamp | None:

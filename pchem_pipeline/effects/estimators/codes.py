@@ -7,16 +7,12 @@ d is taken for bias, gain and noise by the pixels' own fits, so only the rough p
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from pchem_pipeline.effects.framework.evidence import CodeResiduals
+from pchem_pipeline.effects.types import FloatArray, IntArray, PixelMaps
 
-    from pchem_pipeline.effects.framework.evidence import CodeResiduals, PixelMaps
-
-Residuals = tuple["NDArray[np.int64]", "NDArray[np.float64]", "NDArray[np.float64]"]
+Residuals = tuple["IntArray", "FloatArray", "FloatArray"]
 
 # fewest expected counts at which a relative residual is about normal
 _FEWEST = 100.0
@@ -49,7 +45,7 @@ def usable_codes(code: CodeResiduals, *, most: int = 1 << 12) -> Residuals:
     return codes, (code.observed[part] - expected) / expected, expected
 
 
-def few_shifts(residuals: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def few_shifts(residuals: FloatArray, expected: FloatArray) -> FloatArray | None:
     """Return shifts of the edges, DN, shape (codes + 1,), if a few of them explain all that is rough.
 
     One edge after the other, the one that lowers chi2 the most (matching pursuit); None if the residuals ask
@@ -77,7 +73,7 @@ def few_shifts(residuals: NDArray[np.float64], expected: NDArray[np.float64]) ->
     return shifts
 
 
-def roughness(residuals: NDArray[np.float64], expected: NDArray[np.float64]) -> tuple[float, float]:
+def roughness(residuals: FloatArray, expected: FloatArray) -> tuple[float, float]:
     """Return the variance of independent edge shifts, DN^2, and how many standard errors it is above 0.
 
     Second differences ``(2 w_c - w_{c-1} - w_{c+1}) / sqrt(6)`` of the widths see nothing smooth; each has
@@ -95,9 +91,7 @@ def roughness(residuals: NDArray[np.float64], expected: NDArray[np.float64]) -> 
     return max(excess, 0.0) * 0.3, excess / float(error)
 
 
-def edge_shifts(
-    residuals: NDArray[np.float64], expected: NDArray[np.float64], variance: float
-) -> NDArray[np.float64]:
+def edge_shifts(residuals: FloatArray, expected: FloatArray, variance: float) -> FloatArray:
     """Return the most probable shifts of the edges, DN, shape (codes + 1,), given that of each variance.
 
     Least squares of the widths with a penalty on the shifts (the posterior mean of independent normal

@@ -9,23 +9,16 @@ is the score's variance.
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.evidence import Evidence
-
-FloatArray = NDArray[np.float64]
+from pchem_pipeline.effects.estimators.regression import CUT, CUT_ROUNDS
+from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray
 
 # the information is smooth in both: nodes of its table, e-
 _EXPOSURES = np.geomspace(0.02, 60.0, 25)
 _NOISES = np.geomspace(0.08, 1.6, 14)
 _POINTS_PER_SIGMA = 4
-# standard deviations from what is expected beyond which a score is cut, and rounds of it
-_CUT = 4.0
-_ROUNDS = 4
 
 
 def count_excess(evidence: Evidence, power: float) -> tuple[float, float]:
@@ -50,9 +43,9 @@ def count_excess(evidence: Evidence, power: float) -> tuple[float, float]:
         return 0.0, np.inf
     seen = np.asarray(score[good], np.float64)
     excess = float(np.median(seen) / np.median(slope))
-    for _ in range(_ROUNDS):
+    for _ in range(CUT_ROUNDS):
         expected = excess * slope
-        excess = float(slope @ (expected + np.clip(seen - expected, -_CUT, _CUT))) / weight
+        excess = float(slope @ (expected + np.clip(seen - expected, -CUT, CUT))) / weight
     return excess, weight**-0.5
 
 
@@ -74,7 +67,7 @@ def charlier_information(exposure: FloatArray, noise: FloatArray) -> FloatArray:
     return information
 
 
-def _place(nodes: FloatArray, values: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+def _place(nodes: FloatArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
     index = np.clip(np.searchsorted(nodes, values) - 1, 0, nodes.size - 2)
     return index, np.clip((values - nodes[index]) / (nodes[index + 1] - nodes[index]), 0.0, 1.0)
 

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from pchem_pipeline.effects.types import FloatArray, IntArray
 
 _STEPS = np.array([[0, 1], [0, -1], [1, 0], [-1, 0]])
 # beyond this the mass at zero underflows and the recursion has no start

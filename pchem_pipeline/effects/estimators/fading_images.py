@@ -5,19 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from pchem_pipeline.effects.estimators.charge_sums import BlockCharge
+from pchem_pipeline.effects.estimators.regression import CUT, CUT_ROUNDS
+from pchem_pipeline.effects.types import FloatArray, IntArray
 
 # a cell must explain this chi-square to tell the time constant, and the differences of four cells that one
 _PRICE_OF_CELL = 6.0
 _PRICE_OF_DETAIL = 9.0
 # of the brightest cell: less than this is dark
 _DARK = 0.05
-# standard errors beyond which a pixel's amplitude is cut, around its cell's, and how often
-_CUT = 4.0
-_CUTS = 4
 
 
 @dataclass(frozen=True)
@@ -34,14 +32,14 @@ class FadingCells:
     """
 
     decay: float
-    amplitude: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    exposure: NDArray[np.float64]
+    amplitude: FloatArray
+    noise: FloatArray
+    exposure: FloatArray
     score: float
-    cell: NDArray[np.int64]
+    cell: IntArray
 
     @classmethod
-    def of(cls, blocks: BlockCharge, exposure: NDArray[np.float64], decay: float, grid: int) -> FadingCells:
+    def of(cls, blocks: BlockCharge, exposure: FloatArray, decay: float, grid: int) -> FadingCells:
         """Return the least squares amplitudes at a time constant, on a grid of so many rows and columns.
 
         Each is a power of two, smaller where the sensor is.
@@ -54,16 +52,16 @@ class FadingCells:
         cell = (blocks.y * rows // exposure.shape[0]) * columns + blocks.x * columns // exposure.shape[1]
         n = rows * columns
 
-        def mean_of(values: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
+        def mean_of(values: FloatArray, inverse: FloatArray) -> FloatArray:
             return np.bincount(cell, values * inverse, n) / np.maximum(np.bincount(cell, inverse, n), 1e-300)
 
         inverse = stderr**-2
         # from the middle of each cell: from 0 on a bright image would be cut at so many steps
         amplitude = np.nan_to_num(ndimage.median(found, cell, np.arange(n)))
-        for _ in range(_CUTS):
+        for _ in range(CUT_ROUNDS):
             # single pixels that jump are another effect
             middle = amplitude[cell]
-            amplitude = mean_of(np.clip(found, middle - _CUT * stderr, middle + _CUT * stderr), inverse)
+            amplitude = mean_of(np.clip(found, middle - CUT * stderr, middle + CUT * stderr), inverse)
         held = np.bincount(cell, inverse, n)
         noise = np.where(held > 0, np.maximum(held, 1e-300) ** -0.5, np.inf)
         freedom = max(int((held > 0).sum()) - 1, 1)
@@ -72,13 +70,13 @@ class FadingCells:
         size = (rows, columns)
         return cls(decay, amplitude.reshape(size), noise.reshape(size), bright.reshape(size), score, cell)
 
-    def above_background(self) -> NDArray[np.float64]:
+    def above_background(self) -> FloatArray:
         """Return the amplitudes with that part of H added which makes their median 0."""
         held = np.isfinite(self.noise) & (self.exposure > 0)
         background = float(np.median(self.amplitude[held] / self.exposure[held]))
         return np.where(held, self.amplitude - background * self.exposure, 0.0)
 
-    def image(self) -> NDArray[np.float64]:
+    def image(self) -> FloatArray:
         """Return the amplitudes above the background without their noise, >= 0.
 
         A group of two by two cells keeps its differences where they stand out, and has its mean otherwise; so
@@ -89,7 +87,7 @@ class FadingCells:
         return np.where(image > _DARK * image.max(), image, 0.0)
 
 
-def _denoised(values: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+def _denoised(values: FloatArray, weight: FloatArray) -> FloatArray:
     """Return values on a grid of powers of two, of given inverse variances, coarse where they may be."""
     rows, columns = values.shape
     if values.size == 1:
@@ -100,13 +98,13 @@ def _denoised(values: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArr
     mean = (held * groups).sum(axis=(1, 3)) / np.maximum(whole, 1e-300)
     details = groups - mean[:, None, :, None]
     stands_out = (held * details**2).sum(axis=(1, 3)) > _PRICE_OF_DETAIL
-    kept: NDArray[np.float64] = _denoised(mean, whole)[:, None, :, None] + np.where(
+    kept: FloatArray = _denoised(mean, whole)[:, None, :, None] + np.where(
         stands_out[:, None, :, None], details, 0.0
     )
     return kept.reshape(rows, columns)
 
 
-def _exponential(blocks: BlockCharge, decay: float) -> NDArray[np.float64]:
+def _exponential(blocks: BlockCharge, decay: float) -> FloatArray:
     """Return the block means of ``exp(-t / decay)``, less their mean."""
     mean = decay / blocks.length * np.exp(-blocks.start / decay) * -np.expm1(-blocks.length / decay)
     return mean - np.average(mean, weights=blocks.length)

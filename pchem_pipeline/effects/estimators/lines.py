@@ -8,12 +8,11 @@ averaged over frames (Bretthorst 1988: the periodogram is the likelihood of a si
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from pchem_pipeline.effects.types import AnyArray, FloatArray, IntArray
 
 # probability of any line where there is none
 _FALSE_ALARM = 0.02
@@ -47,7 +46,7 @@ class Line:
     excess: float
 
 
-def coherent_line(means: NDArray[Any], frames: NDArray[np.int64], n_run: int) -> Line | None:
+def coherent_line(means: AnyArray, frames: IntArray, n_run: int) -> Line | None:
     """Return the highest line over frames and lines, or None where none stands out.
 
     What is constant in time (part of the bias map), drifts (slower than three cycles per run) and alternation
@@ -78,7 +77,7 @@ def coherent_line(means: NDArray[Any], frames: NDArray[np.int64], n_run: int) ->
     return _refined(field, numbers, lines, start, (1.0 / length, 1.0 / n_lines), float(excess))
 
 
-def incoherent_line(means: NDArray[Any]) -> Line | None:
+def incoherent_line(means: AnyArray) -> Line | None:
     """Return the highest line within frames whose phase is new in every frame, or None.
 
     Args:
@@ -105,7 +104,7 @@ def incoherent_line(means: NDArray[Any]) -> Line | None:
     return Line(float(amplitude), float(fine[best]), 0.0, 0.0, excess)
 
 
-def _prepared(means: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _prepared(means: AnyArray) -> tuple[FloatArray, IntArray]:
     """Return the means of the lines that have pixels, constant pattern removed, and their numbers."""
     lines = np.flatnonzero(np.isfinite(means).all(axis=0))
     field = means[:, lines].astype(np.float64)
@@ -118,7 +117,7 @@ def _half_plane(grid: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.abs(spectrum) ** 2, np.float32)
 
 
-def _without_slow(field: NDArray[np.float64], frames: NDArray[np.int64]) -> NDArray[np.float64]:
+def _without_slow(field: FloatArray, frames: IntArray) -> FloatArray:
     """Return the field without what no pickup does: the mean, slow changes and alternation of each line.
 
     They are fitted and not only left out of the spectrum, where gaps between the frames spread them widely.
@@ -147,18 +146,16 @@ def _level(power: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.maximum(level, np.float32(0.5) * np.median(level)) / np.log(2.0), np.float32)
 
 
-def _mean_power(
-    field: NDArray[np.float64], lines: NDArray[np.int64], frequencies: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _mean_power(field: FloatArray, lines: IntArray, frequencies: FloatArray) -> FloatArray:
     """Return the power along the lines at these frequencies, averaged over frames, per line."""
     waves = np.exp(-2j * np.pi * np.outer(lines, frequencies))
     return np.asarray((np.abs(field @ waves) ** 2).mean(axis=0) / lines.size, np.float64)
 
 
 def _refined(
-    field: NDArray[np.float64],
-    frames: NDArray[np.int64],
-    lines: NDArray[np.int64],
+    field: FloatArray,
+    frames: IntArray,
+    lines: IntArray,
     start: tuple[float, float],
     width: tuple[float, float],
     excess: float,

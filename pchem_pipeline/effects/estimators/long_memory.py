@@ -10,17 +10,17 @@ each level.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from pchem_pipeline.effects.types import AnyArray, FloatArray, IntArray
 
 # frames apart by that many correlation times are independent but for 1e-7
 _FAR = 16.0
 _BITS = 29
 _FRAMES = (1 << _BITS) - 1
+#: Draws that are no frame's, for what a pixel has throughout the run.
+OF_PIXEL = (0xFFFFFFFE, 0xFFFFFFFF, 0xFFFFFFFD, 0xFFFFFFFC)
 
 
 def frame_key(frame: int, process: int = 0) -> int:
@@ -34,11 +34,11 @@ def frame_key(frame: int, process: int = 0) -> int:
 
 
 def between_grid_points(
-    frames: NDArray[np.int64],
+    frames: IntArray,
     longest: float,
-    independent: Callable[[int], NDArray[Any]],
-    midpoint: Callable[[int, NDArray[Any], NDArray[Any], int], NDArray[Any]],
-) -> list[NDArray[Any]]:
+    independent: Callable[[int], AnyArray],
+    midpoint: Callable[[int, AnyArray, AnyArray, int], AnyArray],
+) -> list[AnyArray]:
     """Return the states of a stationary Markov process at frames.
 
     Args:
@@ -65,12 +65,12 @@ def between_grid_points(
 
 
 def two_states(
-    frames: NDArray[np.int64],
-    correlation_frames: NDArray[np.float64] | float,
-    occupied: NDArray[np.float64] | float,
-    uniform: Callable[[int], NDArray[np.float64]],
+    frames: IntArray,
+    correlation_frames: FloatArray | float,
+    occupied: FloatArray | float,
+    uniform: Callable[[int], FloatArray],
     longest: float,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Return a Markov chain of two states for each of n traps: 1 where it is full and 0 where it is empty.
 
     Args:
@@ -85,15 +85,13 @@ def two_states(
         Shape (m, n).
     """
 
-    def full_after(state: NDArray[np.float64] | float, rho: NDArray[np.float64]) -> NDArray[np.float64]:
+    def full_after(state: FloatArray | float, rho: FloatArray) -> FloatArray:
         return np.asarray(occupied + (state - occupied) * rho, np.float64)
 
-    def independent(frame: int) -> NDArray[np.float64]:
+    def independent(frame: int) -> FloatArray:
         return (uniform(frame) < occupied).astype(np.float64)
 
-    def midpoint(
-        frame: int, before: NDArray[np.float64], after: NDArray[np.float64], half: int
-    ) -> NDArray[np.float64]:
+    def midpoint(frame: int, before: FloatArray, after: FloatArray, half: int) -> FloatArray:
         rho = np.exp(-half / np.asarray(correlation_frames))
         # Bayes: the way there by way of "full" and by way of "empty"
         up, from_full, from_empty = full_after(before, rho), full_after(1.0, rho), full_after(0.0, rho)

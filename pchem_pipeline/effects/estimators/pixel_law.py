@@ -11,20 +11,14 @@ This is for estimating an effect from a few pixels that stand for all, so clarit
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.types import FloatArray, PixelMaps, SampleLaw
 from pchem_pipeline.model.arithmetic.robust import chi_square
-from pchem_pipeline.model.law.sample_law import SampleLaw
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-
-FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 #: polynomials (a, b) that the four parameters of the PCD take up: bias, exposure, gain, read noise
 _PARAMETERS = ((1, 0), (0, 1), (1, 1), (2, 0))
 _SMALLEST_MASS = 1e-100

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pchem_pipeline.effects.estimators.common_modes import mean_variance, responsivity
-
-if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
-
-FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+from pchem_pipeline.effects.estimators.regression import multiple_of
+from pchem_pipeline.effects.types import Evidence, FloatArray, TimeSeries
 
 _TAPS = (1, 2, 4, 8)
 _LAGS = 8  # rows
@@ -102,9 +98,8 @@ def _fitted_beside(
 
 def _fitted(seen: FloatArray, shape: FloatArray, error: FloatArray) -> tuple[float, float]:
     """Return by how much a multiple of a shape lowers chi2 (0 if it is negative), and the multiple."""
-    information = float(((shape / error) ** 2).sum())
-    factor = float((shape * seen / error**2).sum()) / information if information > 0 else 0.0
-    return (factor**2 * information if factor > 0 else 0.0), factor
+    factor = multiple_of(shape, seen, error**-2.0)
+    return (factor.sigmas**2 if factor.value > 0 else 0.0), factor.value
 
 
 def _seen(evidence: Evidence, time: TimeSeries) -> tuple[FloatArray, FloatArray]:

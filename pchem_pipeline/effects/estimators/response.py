@@ -7,20 +7,16 @@ that the effect does to it (:mod:`pchem_pipeline.effects.estimators.pixel_law`),
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
-from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.estimators.regression import CUT, SIGNIFICANT, Multiple, multiple_of
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.types import Evidence, FloatArray, SampleLaw
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.effects.framework.evidence import Evidence
-
-FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 EffectType = TypeVar("EffectType", bound="Effect")
 
 
@@ -29,9 +25,9 @@ def strength_of(
     effect: EffectType,
     name: str,
     *,
-    sigmas: float = 2.5,
+    sigmas: float = SIGNIFICANT,
     signed: bool = False,
-    cut: float = 4.0,
+    cut: float = CUT,
 ) -> list[EffectType]:
     """Return the effect at the strength that the mean of a score shows; empty if it shows none.
 
@@ -61,35 +57,25 @@ def strength_of(
             for fit, mass in zip(fits, masses, strict=True)
         ]
     )
-    again, error = _regression(seen, shift, number)
+    again, error = multiple_of(shift, seen, number)
     # a fit that goes astray at this strength must not take the estimate along
     return [_times(first, float(np.clip(again, 0.1, 10.0)) if np.isfinite(error) else 1.0)]
 
 
-def first_order(evidence: Evidence, effect: Effect, name: str, cut: float = 4.0) -> tuple[float, float]:
-    """Return how many times an effect's influence on the mean of a score is seen, and the standard error.
+def first_order(evidence: Evidence, effect: Effect, name: str, cut: float = CUT) -> Multiple:
+    """Return how many times an effect's influence on the mean of a score is seen.
 
     Args:
         evidence: of one split.
         effect: the effect at some small strength.
         name: the score, such as "He2C1".
         cut: a pixel's score counts up to that many standard deviations away from the others.
-
-    Returns:
-        0 and infinity where it has no influence.
     """
     chosen, groups = typical_pixels(evidence.maps)
     laws = [PixelLaw(evidence.maps, int(pixel), evidence.n_frames) for pixel in chosen]
     shift = np.array([law.score_shift(name, law.change(_law(effect, law))) for law in laws])
     seen, number = _mean_scores(evidence, name, groups, cut)
-    return _regression(seen, np.sqrt(evidence.n_frames) * shift, number)
-
-
-def _regression(seen: FloatArray, shift: FloatArray, number: FloatArray) -> tuple[float, float]:
-    information = float((number * shift**2).sum())
-    if not information > 0:
-        return 0.0, np.inf
-    return float((number * shift * seen).sum()) / information, information**-0.5
+    return multiple_of(np.sqrt(evidence.n_frames) * shift, seen, number)
 
 
 def _law(effect: Effect, law: PixelLaw) -> SampleLaw:

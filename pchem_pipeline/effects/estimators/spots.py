@@ -4,19 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pchem_pipeline.effects.estimators.charge_sums import against_usual_gain
 from pchem_pipeline.effects.framework.spot import Falloff, spot_image
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.evidence import Evidence
-
-FloatArray = np.ndarray[Any, np.dtype[np.float64]]
+from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray
 
 _RADII = (0.04, 0.06, 0.09, 0.13, 0.19, 0.28, 0.4, 0.6)
 _CENTRES = 17  # along either side
@@ -210,7 +203,7 @@ def _lines(evidence: Evidence) -> _Lines | None:
     return _Lines(np.concatenate(charge, axis=1), y, x, cells(response), cells(variance))
 
 
-def _by_blocks(sums: FloatArray, frames: NDArray[np.int64], start: NDArray[np.int64]) -> FloatArray:
+def _by_blocks(sums: FloatArray, frames: IntArray, start: IntArray) -> FloatArray:
     """Return the mean over the block of each frame, (n, lines)."""
     first = np.searchsorted(frames, start)
     length = np.diff(np.append(first, len(sums)))

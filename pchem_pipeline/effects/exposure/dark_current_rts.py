@@ -8,26 +8,30 @@ al. 2009; Virmontois et al. 2013). The state is a Markov chain with exponential 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.charge_sums import BlockCharge, block_charge
+from pchem_pipeline.effects.estimators.regression import FEW_PIXELS
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Frames, Plane, Ratio, register_effect
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    BoolArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+)
 from pchem_pipeline.model.arithmetic.robust import chi_square
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.telegraph import Telegraph
+from pchem_pipeline.model.law.telegraph import Telegraph
 
 # a pixel stands out beyond this standard normal number: one in 150,000 by chance
 _STANDS_OUT = 4.35
-_MOST_OF_A_SENSOR = 0.3
 # share of the time in the upper level, and law of the steps
 _KINDS: tuple[tuple[float, Literal["equal", "exponential"]], ...] = (
     (0.5, "equal"),
@@ -57,7 +61,7 @@ class DarkCurrentRts(Effect):
         "shape.C2.cnt",
     )
     strength: ClassVar[str] = "fraction"
-    brightens_anew: ClassVar[bool] = True
+    resample_pixels: ClassVar[bool] = True
     separate: ClassVar[Mapping[str, str]] = {
         "rts_noise": "the exposure time: the jumps grow with it here, and not there",
         "flicker_noise": "the jumps are in the electron numbers here, in the readout residual there",
@@ -81,7 +85,13 @@ class DarkCurrentRts(Effect):
         default=200.0, ge=0.5, description="mean time in the upper level, frames"
     )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    #: in 1.1 % of the pixels, slow and fast
+    typical_values = (
+        {"fraction": 0.011},
+        {"fraction": 0.011, "dwell_low_frames": 20.0, "dwell_high_frames": 20.0},
+    )
+
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the blinking exposure (frame, y, x), e-; touches the pixels that blink only."""
         result = values.copy()
         u = context.random.uniform(("y", "x"))[0]
@@ -96,7 +106,7 @@ class DarkCurrentRts(Effect):
                 result[:, row, column] += self._added(context, random)
         return result
 
-    def _added(self, context: EffectContext, random: np.random.Generator) -> NDArray[np.float64]:
+    def _added(self, context: EffectContext, random: np.random.Generator) -> FloatArray:
         """Return the additional exposure of one pixel in each frame of the block, e-."""
         low, high = self.dwell_low_frames, self.dwell_high_frames
         step = self.step_e * (random.exponential() if self.steps == "exponential" else 1.0)
@@ -109,11 +119,11 @@ class DarkCurrentRts(Effect):
         changes = np.cumsum(dwell.reshape(-1))
         # frames before the run are as the first one
         passed = np.searchsorted(changes, np.maximum(context.frames, 0), side="right")
-        added: NDArray[np.float64] = step * ((passed % 2 == 0) == starts_high)
+        added: FloatArray = step * ((passed % 2 == 0) == starts_high)
         return added
 
     def added_exposure(
-        self, frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], maps: PixelMaps
+        self, frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps
     ) -> AddedExposure | None:
         """Return the levels above the lowest one, and the time spent there, of the pixels seen to blink.
 
@@ -133,7 +143,7 @@ class DarkCurrentRts(Effect):
                 if telegraph is not None:
                     found[int(y), int(x)] = telegraph
         # where most of them seem to blink, it is something else
-        if not 0 < len(found) <= _MOST_OF_A_SENSOR * good.size:
+        if not 0 < len(found) <= FEW_PIXELS * good.size:
             return None
         levels = max(telegraph.added.size for telegraph in found.values())
         exposure, weight = np.zeros((levels, *good.shape)), np.zeros((levels, *good.shape))
@@ -148,11 +158,6 @@ class DarkCurrentRts(Effect):
         return ("step_e", "dwell_low_frames", "dwell_high_frames") if self.step_e > 0.0 else ()
 
     @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it in 1.1 % of the pixels, slow and fast."""
-        return (cls(fraction=0.011), cls(fraction=0.011, dwell_low_frames=20.0, dwell_high_frames=20.0))
-
-    @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return it from the pixels that stand out by block means or by lagged correlations.
 
@@ -165,7 +170,7 @@ class DarkCurrentRts(Effect):
             return ()
         found = _outliers(evidence, blocks)
         n = int(found.sum())
-        if n < 3 or n > _MOST_OF_A_SENSOR * found.size:
+        if n < 3 or n > FEW_PIXELS * found.size:
             return ()
         variance, tau = _telegraph(evidence, blocks, found)
         if not variance > 0:
@@ -188,7 +193,7 @@ def _guess(
     }
 
 
-def _outliers(evidence: Evidence, blocks: BlockCharge) -> NDArray[np.bool_]:
+def _outliers(evidence: Evidence, blocks: BlockCharge) -> BoolArray:
     """Return which of the blocks' pixels wander by themselves, shape (n,)."""
     assert evidence.time is not None
     freedom = blocks.length.size - 1
@@ -196,7 +201,7 @@ def _outliers(evidence: Evidence, blocks: BlockCharge) -> NDArray[np.bool_]:
     wander = chi_square(chi2, freedom)
     lags = np.asarray(evidence.time.lag_charge, np.float64)[:, blocks.y, blocks.x]
     alike = lags.sum(axis=0) * np.sqrt(evidence.time.n_pairs / lags.shape[0])
-    outliers: NDArray[np.bool_] = np.fmax(wander, alike) > _STANDS_OUT
+    outliers: BoolArray = np.fmax(wander, alike) > _STANDS_OUT
     return outliers
 
 
@@ -207,7 +212,7 @@ class _Telegraph(NamedTuple):
     tau: float
 
 
-def _telegraph(evidence: Evidence, blocks: BlockCharge, found: NDArray[np.bool_]) -> _Telegraph:
+def _telegraph(evidence: Evidence, blocks: BlockCharge, found: BoolArray) -> _Telegraph:
     """Fit ``S exp(-lag / tau)`` to the autocovariances and to the variogram of the block means."""
     assert evidence.time is not None
     single = blocks.variance[found]
@@ -234,9 +239,7 @@ def _telegraph(evidence: Evidence, blocks: BlockCharge, found: NDArray[np.bool_]
     return _Telegraph(float(variance[best]), float(tau[best, 0]))
 
 
-def _variogram(
-    blocks: BlockCharge, found: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _variogram(blocks: BlockCharge, found: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Return distances in time, frames, and half the mean squared difference of block means so far apart."""
     deviation = blocks.deviation[:, found]
     products = deviation @ deviation.T / deviation.shape[1]
@@ -251,12 +254,12 @@ def _variogram(
     return distance, np.bincount(group, half)[kept] / held[kept]
 
 
-def _averaged(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _averaged(x: FloatArray) -> FloatArray:
     """Return the variance of the mean over x time constants of an exponential memory of variance 1."""
     return np.where(x > 1e-4, 2.0 * (x + np.expm1(-x)) / np.maximum(x, 1e-4) ** 2, 1.0)
 
 
-def _averaged_apart(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _averaged_apart(x: FloatArray) -> FloatArray:
     """Return the covariance of two such means over its value for points in their centres."""
     x = np.minimum(x, 50.0)
     return np.where(x > 1e-3, 2.0 * (np.cosh(x) - 1.0) / np.maximum(x, 1e-3) ** 2, 1.0)

@@ -9,26 +9,20 @@ drifts by 1 %.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+from typing import ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
-from pchem_pipeline.effects.estimators.time_profiles import along_path, settling, settling_time
+from pchem_pipeline.effects.estimators.regression import multiple_of
+from pchem_pipeline.effects.estimators.time_profiles import NODES, hats, profile_at, settling_time
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
 _T = TypeVar("_T", bound="ExposureDrift")
 
-# nodes of a free path, and the chi-square that each must explain
-_NODES = (5, 9, 17, 33)
+# chi-square that each node of a free path must explain
 _PRICE_OF_NODE = 2.5
 # chi-square that the choice of the time constant explains by chance
 _PRICE_OF_SETTLING = 3.0
@@ -80,6 +74,14 @@ class ExposureDrift(Effect):
         "unit (its mean and range are taken out); empty: a straight line",
     )
 
+    #: at 1.6 % end to end, rising and falling, straight and settling
+    typical_values = (
+        {"drift": 0.016},
+        {"drift": -0.016},
+        {"drift": 0.016, "settling_fraction": 0.2},
+        {"drift": -0.016, "settling_fraction": 0.2},
+    )
+
     @model_validator(mode="after")
     def _one_profile(self) -> Self:
         if self.path and self.settling_fraction is not None:
@@ -90,32 +92,19 @@ class ExposureDrift(Effect):
             raise ValueError("exposure_drift: path needs at least two different values; leave it empty")
         return self
 
-    def profile(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
+    def profile(self, position: FloatArray) -> FloatArray:
         """Return the profile s, of mean 0 and range 1 over the run, at times 0..1 (first to last frame)."""
-        if self.path:
-            return along_path(position, self.path) / float(np.ptp(self.path))
-        if self.settling_fraction is not None:
-            return settling(position, self.settling_fraction)
-        return position - 0.5
+        found = profile_at(position, self.settling_fraction, self.path)
+        return found / float(np.ptp(self.path)) if self.path else found
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the drifting exposure (frame, y, x), e-; draws nothing."""
         last = context.n_frames - 1
         # frames before the run are simulated only as memory of the first: as exposed as that one
         position = context.frames.clip(0, last) / last if last > 0 else np.full(context.frames.shape, 0.5)
         factor = np.maximum(1.0 + self.drift * self.profile(position), 0.0)
-        result: NDArray[Any] = values * factor[:, None, None]
+        result: AnyArray = values * factor[:, None, None]
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 1.6 % end to end, rising and falling, straight and settling."""
-        return (
-            cls(drift=0.016),
-            cls(drift=-0.016),
-            cls(drift=0.016, settling_fraction=0.2),
-            cls(drift=-0.016, settling_fraction=0.2),
-        )
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -148,26 +137,26 @@ class ExposureDrift(Effect):
         return model.with_exposures(*exposure_nodes(factors))
 
 
-def _fit(unit: _T, profile: ExposureProfile, position: NDArray[np.float64], noise: float) -> tuple[float, _T]:
+def _fit(unit: _T, profile: ExposureProfile, position: FloatArray, noise: float) -> tuple[float, _T]:
     """Return the chi-square that a time profile explains, and it at its fitted strength."""
     shape = unit.profile(position)
     shape = shape - shape.mean()
-    slope = float(shape @ profile.deviation) / float(shape @ shape)
-    return slope**2 * float(shape @ shape) / noise, unit.scaled(slope)
+    slope = multiple_of(shape, profile.deviation, 1.0 / noise)
+    return slope.sigmas**2, unit.scaled(slope.value)
 
 
 def _fit_path(
-    cls: type[_T], profile: ExposureProfile, position: NDArray[np.float64], noise: float
+    cls: type[_T], profile: ExposureProfile, position: FloatArray, noise: float
 ) -> tuple[float, _T]:
     """Return the same for a broken line with free nodes, as many as pay; the chi-square less their price."""
     deviation = profile.deviation - profile.deviation.mean()
     best = (0.0, cls(drift=0.0))
-    for n in _NODES:
-        hats = np.stack([np.interp(position, np.linspace(0.0, 1.0, n), row) for row in np.eye(n)], axis=1)
+    for n in NODES[1:]:
+        basis = hats(position, n)
         # a little stiffness, so that nodes without frames follow their neighbours
         stiff = 1e-3 * position.size / n * np.diff(np.eye(n), 2, axis=0)
-        nodes = np.linalg.solve(hats.T @ hats + stiff.T @ stiff, hats.T @ deviation)
-        left = deviation - hats @ nodes
+        nodes = np.linalg.solve(basis.T @ basis + stiff.T @ stiff, basis.T @ deviation)
+        left = deviation - basis @ nodes
         net = float(deviation @ deviation - left @ left) / noise - _PRICE_OF_NODE * (n - 1)
         spread = float(np.ptp(nodes))
         if net > best[0] and spread > 0:

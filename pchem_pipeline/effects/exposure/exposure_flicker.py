@@ -10,7 +10,7 @@ that misses a cycle or a laser that hops between modes takes a few values only (
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
+from typing import ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -18,14 +18,10 @@ from pydantic import Field, model_validator
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
 from pchem_pipeline.effects.estimators.common_modes import successive
 from pchem_pipeline.effects.estimators.levels.level_mixtures import Levels, few_levels
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
+from pchem_pipeline.effects.estimators.time_profiles import fitted, hats
 from pchem_pipeline.effects.framework.effect import Effect, Frames, Plane, Ratio, Turns, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
 # cycles in the run below which a change is a drift
 _SLOWEST = 20
@@ -57,7 +53,7 @@ class ExposureFlicker(Effect):
     )
     strength: ClassVar[str] = "rms"
     power: ClassVar[float] = 2.0
-    attained: ClassVar[tuple[str, ...]] = ("phase_cycles",)
+    may_be_at_bound: ClassVar[tuple[str, ...]] = ("phase_cycles",)
     separate: ClassVar[Mapping[str, str]] = {
         "glow": "a map of the bright frames: a flicker is bright where H is, a glow at its place",
         "exposure_drift": "a longer run: a flicker does not go on in one direction",
@@ -89,6 +85,13 @@ class ExposureFlicker(Effect):
         default=(), max_length=64, description="share of the frames at each of the levels; empty: equal"
     )
 
+    #: at 2 %: from frame to frame, slower, and on the mains (100 Hz at 30 frames/s)
+    typical_values = (
+        {"rms": 0.02},
+        {"rms": 0.02, "correlation_frames": 5.0},
+        {"rms": 0.02, "period_frames": 3.0},
+    )
+
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
         if self.period_frames is not None and (self.correlation_frames > 0 or self.levels):
@@ -112,7 +115,7 @@ class ExposureFlicker(Effect):
         centred = (values - law.shares @ values) / law.rms
         return Levels(np.maximum(1.0 + self.rms * centred, 0.0), law.shares)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the flickering exposure (frame, y, x), e-."""
         if self.rms == 0:
             return values.copy()
@@ -131,10 +134,10 @@ class ExposureFlicker(Effect):
             # log-normal: never negative, mean exactly 1
             width = np.sqrt(np.log1p(self.rms**2))
             factor = np.exp(width * self._fluctuation(context) - 0.5 * width**2)
-        result: NDArray[Any] = values * factor[:, None, None]
+        result: AnyArray = values * factor[:, None, None]
         return result
 
-    def _fluctuation(self, context: EffectContext) -> NDArray[np.float64]:
+    def _fluctuation(self, context: EffectContext) -> FloatArray:
         """Return a normal number of mean 0 and variance 1 for each frame, shape (n,)."""
         if self.correlation_frames == 0:
             return context.random.normal(("frame",))[:, 0, 0]
@@ -145,13 +148,8 @@ class ExposureFlicker(Effect):
         steps = context.random.generator().standard_normal(context.n_frames)
         steps[1:] *= np.sqrt(1.0 - kept**2)
         path = np.asarray(lfilter([1.0], [1.0, -kept], steps))
-        fluctuation: NDArray[np.float64] = path[context.frames.clip(0, context.n_frames - 1)]
+        fluctuation: FloatArray = path[context.frames.clip(0, context.n_frames - 1)]
         return fluctuation
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 2 %: from frame to frame, slower, and on the mains (100 Hz at 30 frames/s)."""
-        return (cls(rms=0.02), cls(rms=0.02, correlation_frames=5.0), cls(rms=0.02, period_frames=3.0))
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -193,7 +191,7 @@ def _random(cls: type[_T], profile: ExposureProfile) -> list[_T]:
         return []
     found: list[_T] = []
     levels = few_levels(profile.deviation, profile.variance)
-    if fast > 2.5 * fast_error:
+    if fast > SIGNIFICANT * fast_error:
         found.append(cls(rms=min(float(np.sqrt(fast)), 1.0)))
     # fast = s^2 (1 - rho): the lag-1 correlation of an exponential memory
     rho = 1.0 - fast / whole if whole > 3.0 * whole_error else 0.0
@@ -237,16 +235,13 @@ def _sine(cls: type[_T], profile: ExposureProfile) -> list[_T]:
     return [cls(rms=min(float(rms), 1.0), period_frames=float(1.0 / frequency), phase_cycles=float(cycles))]
 
 
-def _slow(position: NDArray[np.float64], deviation: NDArray[np.float64]) -> NDArray[np.float64]:
+def _slow(position: FloatArray, deviation: FloatArray) -> FloatArray:
     """Return the least squares broken line of ``_SLOWEST`` pieces: the gaps between blocks would alias it."""
-    hats = np.stack(
-        [np.interp(position, np.linspace(0, 1, _SLOWEST + 1), h) for h in np.eye(_SLOWEST + 1)], 1
-    )
-    slow: NDArray[np.float64] = hats @ np.linalg.lstsq(hats, deviation, rcond=1e-9)[0]
-    return slow
+    basis = hats(position, _SLOWEST + 1)
+    return np.asarray(basis @ fitted(deviation, basis).values)
 
 
-def _refined(series: NDArray[np.float64], frequency: float) -> float:
+def _refined(series: FloatArray, frequency: float) -> float:
     """Return the frequency (cycles per frame) of the highest power next to a peak of the spectrum."""
     t = np.arange(series.size)
     width = 0.5 / series.size

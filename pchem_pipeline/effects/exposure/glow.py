@@ -9,9 +9,10 @@ electronics warm up, is not.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.charge_sums import block_charge, exposure_nodes
@@ -21,13 +22,8 @@ from pchem_pipeline.effects.estimators.spots import Spot, best_bursts, best_spot
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.region import Span
-from pchem_pipeline.effects.framework.spot import Falloff, spot_found_in, spot_image, spot_seen_in
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.spot import Falloff, spot_image, spot_to_sensor, spot_to_window
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, IntArray, PixelMaps
 
 _GRID = 16  # cells along either side of the map of what grows
 _STRAIGHT = 50.0  # runs: a time constant so long is a straight line
@@ -57,7 +53,7 @@ class Glow(Effect):
         "time.block.charge.chi",
     )
     strength: ClassVar[str] = "peak_e"
-    attained: ClassVar[tuple[str, ...]] = ("centre_y", "centre_x")
+    may_be_at_bound: ClassVar[tuple[str, ...]] = ("centre_y", "centre_x")
     separate: ClassVar[Mapping[str, str]] = {
         "exposure_flicker": "a map of the bright frames: a flicker is bright where H is, a glow at its place",
         "exposure_drift": "a map of the change along the run: a drift goes with H, a glow has its place",
@@ -85,33 +81,36 @@ class Glow(Effect):
         description="exponential: to 1/e within the radius; gaussian: of that standard deviation",
     )
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    #: a corner that bursts in one frame of fifty, by 1 e-, and one that grows by 0.3 e-
+    typical_values = ({"peak_e": 1.0, "burst_share": 0.02}, {"peak_e": 0.3})
+
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its centre counted from these rows and columns, and the size that it has there."""
-        return self.model_copy(update=spot_seen_in(vars(self), self.falloff, rows, columns, shape))
+        return self.model_copy(update=spot_to_window(vars(self), self.falloff, rows, columns, shape))
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its centre counted on the sensor."""
-        return self.model_copy(update=spot_found_in(vars(self), rows, columns, shape))
+        return self.model_copy(update=spot_to_sensor(vars(self), rows, columns, shape))
 
-    def pattern(self, rows: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    def pattern(self, rows: IntArray, shape: tuple[int, ...]) -> FloatArray:
         """Return the spot in some rows relative to its brightest pixel, shape (rows, columns)."""
         centre = (self.centre_y, self.centre_x)
         return spot_image(rows, np.arange(shape[1]), shape, centre, self.radius, self.falloff)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the exposure with the glow (frame, y, x), e-."""
         if self.burst_share is None:
             size = run_position(context.frames, context.n_frames)
         else:
             size = (context.random.uniform(("frame",))[:, 0, 0] < self.burst_share).astype(np.float64)
-        result: NDArray[Any] = values.copy()
+        result: AnyArray = values.copy()
         bright = size > 0
         pattern = self.peak_e * self.pattern(context.rows, context.shape)
         result[bright] += size[bright, None, None] * pattern
         return result
 
     def added_exposure(
-        self, frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], maps: PixelMaps
+        self, frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps
     ) -> AddedExposure | None:
         """Return the glow's levels: with and without a burst, or three of its growth."""
         if self.peak_e == 0:
@@ -129,11 +128,6 @@ class Glow(Effect):
         )
 
     @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return a corner that bursts in one frame of fifty, by 1 e-, and one that grows by 0.3 e-."""
-        return cls(peak_e=1.0, burst_share=0.02), cls(peak_e=0.3)
-
-    @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return a spot that bursts, from rows and columns, and one that grows, from block means."""
         bursts = best_bursts(evidence)
@@ -147,12 +141,9 @@ class Glow(Effect):
             {"peak_e": spot.peak, "falloff": spot.falloff, "burst_share": burst_share, **spot.place}
         )
 
-    def representative(self, frames: NDArray[np.int64]) -> tuple[Self, float]:
+    def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return rare bursts more often than they are, and how much rarer they are."""
-        shown = min(_FEWEST_SHOWN / max(frames.size, 1), 1.0)
-        if self.burst_share is None or self.burst_share >= shown:
-            return self, 1.0
-        return self.model_copy(update={"burst_share": shown}), self.burst_share / shown
+        return self._shown_at_least("burst_share", _FEWEST_SHOWN / max(frames.size, 1), 1.0)
 
 
 def _growing(evidence: Evidence) -> Spot | None:

@@ -9,14 +9,16 @@ image on a coarse grid.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import block_charge, block_signal, exposure_nodes
 from pchem_pipeline.effects.estimators.fading_images import FadingCells, fading_of
 from pchem_pipeline.effects.estimators.spots import best_spot
+from pchem_pipeline.effects.estimators.time_profiles import SETTLING
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.effect import (
     Effect,
@@ -27,13 +29,8 @@ from pchem_pipeline.effects.framework.effect import (
     register_effect,
 )
 from pchem_pipeline.effects.framework.region import Span
-from pchem_pipeline.effects.framework.spot import spot_found_in, spot_image, spot_seen_in
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.spot import spot_image, spot_to_sensor, spot_to_window
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, IntArray, PixelMaps
 
 # rows and columns of the grids: to find something, and to describe it
 _GRIDS = (8, 32)
@@ -43,7 +40,7 @@ _MOST_CELLS = 48
 _MORE = 1.25
 _BRIGHTEST = 1e6  # e- per frame that an afterglow begins with
 # time constants tried, in lengths of the run
-_DECAYS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0)
+_DECAYS = (*SETTLING, 2.0)
 
 
 @register_effect
@@ -65,7 +62,7 @@ class Persistence(Effect):
         "frame.charge.slow",
     )
     strength: ClassVar[str] = "peak_e"
-    attained: ClassVar[tuple[str, ...]] = ("slow_share", "centre_y", "centre_x")
+    may_be_at_bound: ClassVar[tuple[str, ...]] = ("slow_share", "centre_y", "centre_x")
     separate: ClassVar[Mapping[str, str]] = {
         "glow": "a run after a longer time in the dark: persistence is gone, a glow is not",
         "exposure_drift": "a run after a longer time in the dark: the change, not proportional to H, is gone",
@@ -99,6 +96,9 @@ class Persistence(Effect):
         "whole sensor (rows of numbers >= 0, the largest counts as 1, linear in between); empty: the spot",
     )
 
+    #: a spot of 0.15 e- that fades within a quarter of a run of 4000 frames
+    typical_values = ({"peak_e": 0.15, "decay_frames": 1000.0},)
+
     @model_validator(mode="after")
     def _image_is_a_grid(self) -> Self:
         if not self.image:
@@ -110,17 +110,17 @@ class Persistence(Effect):
             raise ValueError("persistence: image needs numbers >= 0 and one above 0; correct it")
         return self
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its spot or image counted from these rows and columns."""
         if self.image:
             return self._seen_image(rows, columns, shape)
-        return self.model_copy(update=spot_seen_in(vars(self), "gaussian", rows, columns, shape))
+        return self.model_copy(update=spot_to_window(vars(self), "gaussian", rows, columns, shape))
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its spot or image counted on the sensor; an image is dark elsewhere."""
         if self.image:
             return self._found_image(rows, columns, shape)
-        return self.model_copy(update=spot_found_in(vars(self), rows, columns, shape))
+        return self.model_copy(update=spot_to_sensor(vars(self), rows, columns, shape))
 
     def _seen_image(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with the image as a grid over the window, as fine as that over the sensor."""
@@ -150,31 +150,29 @@ class Persistence(Effect):
             update={"image": _numbers(values / brightest), "peak_e": self.peak_e * brightest}
         )
 
-    def _image_at(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _image_at(self, y: FloatArray, x: FloatArray) -> FloatArray:
         """Return the image, relative to its largest value, at places 0..1 of the sensor."""
         grid = np.asarray(self.image)
-        values: NDArray[np.float64] = (
-            _hats(y, grid.shape[0]) @ (grid / grid.max()) @ _hats(x, grid.shape[1]).T
-        )
+        values: FloatArray = _hats(y, grid.shape[0]) @ (grid / grid.max()) @ _hats(x, grid.shape[1]).T
         return values
 
-    def pattern(self, rows: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.float64]:
+    def pattern(self, rows: IntArray, shape: tuple[int, int]) -> FloatArray:
         """Return the earlier image in some rows, relative to its largest value, shape (rows, columns)."""
         columns = np.arange(shape[1])
         if self.image:
             return self._image_at((rows + 0.5) / shape[0], (columns + 0.5) / shape[1])
         return spot_image(rows, columns, shape, (self.centre_y, self.centre_x), self.radius)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the exposure with what the earlier image left (frame, y, x), e-; draws nothing."""
         if self.peak_e == 0:
             return values.copy()
         left = self._left(context.frames)
-        result: NDArray[Any] = values + left[:, None, None] * self.pattern(context.rows, context.shape)
+        result: AnyArray = values + left[:, None, None] * self.pattern(context.rows, context.shape)
         return result
 
     def added_exposure(
-        self, frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], maps: PixelMaps
+        self, frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps
     ) -> AddedExposure | None:
         """Return the ghost, with three levels for its time profile."""
         left = self._left(numbers)
@@ -188,19 +186,14 @@ class Persistence(Effect):
             nodes[:, None, None] * image, np.broadcast_to(weights[:, None, None], (nodes.size, rows, columns))
         )
 
-    def _left(self, frames: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _left(self, frames: IntArray) -> FloatArray:
         """Return what is left of the largest value in each frame, e-."""
         # frames before the run are simulated only as memory of the first: as exposed as that one
         t = np.maximum(frames, 0)
-        left: NDArray[np.float64] = np.exp(-t / self.decay_frames)
+        left: FloatArray = np.exp(-t / self.decay_frames)
         if self.slow_decay_frames is not None:
             left = (1.0 - self.slow_share) * left + self.slow_share * np.exp(-t / self.slow_decay_frames)
         return self.peak_e * left
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return a spot of 0.15 e- that fades within a quarter of a run of 4000 frames."""
-        return (cls(peak_e=0.15, decay_frames=1000.0),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -244,12 +237,12 @@ class Persistence(Effect):
         return found
 
 
-def _numbers(image: NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:
+def _numbers(image: FloatArray) -> tuple[tuple[float, ...], ...]:
     """Return a grid for the YAML."""
     return tuple(tuple(float(round(v, 3)) for v in row) for row in image)
 
 
-def _hats(position: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+def _hats(position: FloatArray, n: int) -> FloatArray:
     """Return weights (positions, n) of linear interpolation between the centres of n cells in 0..1."""
     centres = (np.arange(n) + 0.5) / n
     return np.stack([np.interp(position, centres, row) for row in np.eye(n)], axis=1)

@@ -11,6 +11,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Dim = Literal["frame", "y", "x"]
+#: What the random numbers depend on that samples, or all samples of a row, column or frame, have.
+DIMS: Mapping[str, tuple[Dim, ...]] = {
+    "sample": ("frame", "y", "x"),
+    "row": ("frame", "y"),
+    "column": ("frame", "x"),
+    "frame": ("frame",),
+}
+
+#: As many rows as any sensor has: the halo of an effect that reaches across all of it.
+ALL_ROWS = 1 << 20
 
 
 class RandomSource(Protocol):

@@ -1,8 +1,10 @@
 """What an effect is, and the registry of our own.
 
 An effect is one file in the folder of its plane: a frozen settings class that is at once its YAML
-section, its documentation and its forward model. It is a function of a block of frames and of random
-numbers keyed on position, so that the simulated frames do not depend on how the work is divided:
+section, its documentation and its forward model. What several have in common is a base class of a family
+(:mod:`pchem_pipeline.effects.families`), and they only what differs. An effect is a function of a block of
+frames and of random numbers keyed on position, so that the simulated frames do not depend on how the work is
+divided:
 
 - **independent samples** need nothing: return a new array of the same shape;
 - **common modes** draw one number per frame, row, column or run: ``context.random.normal(("frame", "y"))``;
@@ -96,17 +98,20 @@ class Effect(Section):
         strength: the parameter that scales it; 0 is no effect (a clipping limit and its like have none: "").
         power: near zero the statistics grow like ``strength ** power``.
         separate: for each effect that it is confused with (tag), the measurement that tells them apart.
-        erratic: whether its time profile is drawn anew in every simulation, so that a fingerprint is one of
-            many and another effect outdoes it only by a clear margin.
-        brightens_anew: whether the pixels to which it adds exposure are drawn anew in every simulation.
+        random_realisation: whether its time profile is drawn anew in every simulation, so that a fingerprint
+            is one of many and another effect outdoes it only by a clear margin.
+        resample_pixels: whether the pixels to which it adds exposure are drawn anew in every simulation.
         untestable: why frames of one constant exposure cannot show it; empty for all that they can show.
         rough_law: whether :meth:`sample_law` is right for the pixels' parameters only, so that the histograms
             of a few pixels do not tell whether they have the effect.
-        measured_only: whether it is no hypothesis, but what is measured where all of those have failed.
+        empirical: whether it is no hypothesis, but what is measured where all of those have failed.
         far_reaching: whether samples depend on others anywhere in their frame, so that a part of the sensor
             by itself does not show it.
-        attained: parameters that may well be at a limit: a frequency at half a cycle, a missing code. A fit
-            that drives any other one there has taken another effect for this one.
+        typical_values: parameters as met in practice, one set for each of its kinds (signs, patterns).
+        may_be_at_bound: parameters that may well be at a limit, as half a cycle or a missing code. A
+            fit that drives any other one there has taken another effect for this one.
+        reach_rows, reach_frames: rows on either side, and frames before, that a sample depends on, where
+            that is so whatever the parameters.
     """
 
     tag: str
@@ -118,13 +123,16 @@ class Effect(Section):
     strength: ClassVar[str] = ""
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {}
-    erratic: ClassVar[bool] = False
-    brightens_anew: ClassVar[bool] = False
+    random_realisation: ClassVar[bool] = False
+    resample_pixels: ClassVar[bool] = False
     untestable: ClassVar[str] = ""
     rough_law: ClassVar[bool] = False
-    measured_only: ClassVar[bool] = False
+    empirical: ClassVar[bool] = False
     far_reaching: ClassVar[bool] = False
-    attained: ClassVar[tuple[str, ...]] = ()
+    typical_values: ClassVar[tuple[Mapping[str, Any], ...]] = ()
+    may_be_at_bound: ClassVar[tuple[str, ...]] = ()
+    reach_rows: ClassVar[int] = 0
+    reach_frames: ClassVar[int] = 0
     region: Region | None = Field(default=None, description="where on the sensor it acts; null: everywhere")
     when: When | None = Field(default=None, description="in which frames it acts; null: in all")
 
@@ -153,20 +161,20 @@ class Effect(Section):
         return next((m.name for m in marks if isinstance(m, Unit)), "")
 
     @property
-    def unlisted(self) -> bool:
+    def empirical_unnamed(self) -> bool:
         """Whether it is measured, and of a kind that no effect with a name makes."""
         return False
 
     @property
     def measured_parts(self) -> int:
         """How many things are told that were measured and have no explanation."""
-        return int(type(self).measured_only)
+        return int(type(self).empirical)
 
     def at_place(self, region: Region | None, when: When | None = None) -> Self:
         """Return a copy with another place and time."""
         return self.model_copy(update={"region": region, "when": when})
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it as it acts on some rows and columns that are taken for a sensor of their own.
 
         For effects with places among their parameters; a region is cut elsewhere.
@@ -178,8 +186,8 @@ class Effect(Section):
         """
         return self
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return as an effect on the sensor what was found in some of its rows and columns; see `seen_in`."""
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return as an effect on the sensor what acts on some of its rows and columns; see `to_window`."""
         return self
 
     @abstractmethod
@@ -196,11 +204,11 @@ class Effect(Section):
 
     @classmethod
     def typical(cls) -> Sequence[Self]:
-        """Return it at strengths met in practice, one for each of its kinds (signs, patterns).
+        """Return it with each of its :attr:`typical_values`.
 
         Used as guesses where :meth:`estimate` has nothing better, and for demonstrations.
         """
-        return ()
+        return tuple(cls.model_validate(values) for values in cls.typical_values)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -223,6 +231,13 @@ class Effect(Section):
             frames: numbers of the frames to be simulated, increasing, shape (n,).
         """
         return self, 1.0
+
+    def _shown_at_least(self, name: str, share: float, most: float) -> tuple[Self, float]:
+        """Return it with a chance of at least so much, and how much rarer what it makes then really is."""
+        now, shown = getattr(self, name), min(share, most)
+        if not now or now >= shown:
+            return self, 1.0
+        return self.model_copy(update={name: shown}), now / shown
 
     def details(self) -> tuple[str, ...]:
         """Return positive numbers beside the strength with which the statistics go smoothly.
@@ -255,12 +270,12 @@ class Effect(Section):
     def at_limits(self) -> dict[str, float]:
         """Return the parameters that stand at a limit of their field, by name.
 
-        Not those at their default, nor those of :attr:`attained`.
+        Not those at their default, nor those of :attr:`may_be_at_bound`.
         """
         found = {}
         for name, field in type(self).model_fields.items():
             value = getattr(self, name)
-            if not isinstance(value, float) or value == field.default or name in self.attained:
+            if not isinstance(value, float) or value == field.default or name in self.may_be_at_bound:
                 continue
             if any(
                 value in (getattr(limit, "ge", None), getattr(limit, "le", None)) for limit in field.metadata
@@ -268,8 +283,8 @@ class Effect(Section):
                 found[name] = value
         return found
 
-    def words(self) -> str:
-        """Return what is known of it, for people."""
+    def describe(self) -> str:
+        """Describe in a few words what is known of it."""
         return self.title or self.tag
 
     def by_law(self, shape: tuple[int, int]) -> Sequence[Effect]:
@@ -347,12 +362,12 @@ class Effect(Section):
         return None
 
     def halo(self) -> int:
-        """Return how many rows on either side a row depends on, px."""
-        return 0
+        """Return how many rows on either side a row depends on, px: :attr:`reach_rows`."""
+        return self.reach_rows
 
     def history(self) -> int:
-        """Return how many frames before it a frame depends on."""
-        return 0
+        """Return how many frames before it a frame depends on: :attr:`reach_frames`."""
+        return self.reach_frames
 
 
 def _within(effect: type[Effect], name: str, value: float) -> float:

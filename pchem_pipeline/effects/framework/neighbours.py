@@ -34,3 +34,10 @@ def neighbours(values: NDArray[Any], place: tuple[int, int, int]) -> tuple[NDArr
     found, known = values.copy(), np.zeros(values.shape, np.bool_)
     found[tuple(to)], known[tuple(to)] = values[tuple(source)], True
     return found, known
+
+
+def along_axis(values: NDArray[Any], step: NDArray[np.int64], axis: int) -> NDArray[Any]:
+    """Return the values so many places later along an axis, those at the ends instead of what is beyond."""
+    at = np.arange(values.shape[axis]).reshape([-1 if a == axis else 1 for a in range(3)])
+    index = np.clip(at + step, 0, values.shape[axis] - 1)
+    return np.take_along_axis(values, np.broadcast_to(index, values.shape), axis)

@@ -61,7 +61,7 @@ def _check(region: Region, shape: tuple[int, int]) -> None:
     for (name, beyond), size in zip(ends.items(), shape, strict=True):
         if beyond and max(beyond) > size:
             raise ConfigError(
-                f"region: {region.words()}: the sensor has {size} {name}, counted from 0; correct it"
+                f"region: {region.describe()}: the sensor has {size} {name}, counted from 0; correct it"
             )
 
 

@@ -114,7 +114,7 @@ class Taps(_Place):
             raise ValueError("groups of one column without a period; give width, or every")
         return self
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return them in words: ``columns of tap 3 (40 each)``, ``every 8th column from 5``."""
         which = _listed(self.which)
         if self.every is None:
@@ -199,10 +199,10 @@ class Region(_Place):
 
         return overlap(self.mask(shape), other.mask(shape))
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return it in words: ``rows 3 to 9, columns 120 to 159``."""
         parts = [_range_words("row", self.rows), _range_words("column", self.columns)]
-        parts += [self.taps.words()] if self.taps is not None else []
+        parts += [self.taps.describe()] if self.taps is not None else []
         parts += [f"the {self.quadrant} quadrant"] if self.quadrant is not None else []
         parts += [_pixel_words(self.pixels)] if self.pixels else []
         return ", ".join(part for part in parts if part)
@@ -282,7 +282,7 @@ class When(_Place):
         numbers = np.arange(n_frames)
         return overlap(self.frames(numbers), other.frames(numbers))
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return it in words: ``frames 200 to 399``, ``every 10th frame from 3``, ``frames 7 and 99``."""
         parts = [_range_words("frame", self.range)]
         if self.every is not None:

@@ -44,7 +44,7 @@ def spot_image(
     return np.asarray(np.exp(np.sqrt(least) - np.sqrt(away)))
 
 
-def spot_seen_in(
+def spot_to_window(
     spot: dict[str, Any], falloff: Falloff, rows: Span, columns: Span, shape: tuple[int, int]
 ) -> dict[str, float]:
     """Return a spot as it is on some rows and columns that are taken for a sensor of their own.
@@ -68,10 +68,10 @@ def spot_seen_in(
     return {"centre_y": y, "centre_x": x, "radius": radius, "peak_e": spot["peak_e"] * float(left[0, 0])}
 
 
-def spot_found_in(
+def spot_to_sensor(
     spot: dict[str, Any], rows: Span, columns: Span, shape: tuple[int, int]
 ) -> dict[str, float]:
-    """Return on the sensor a spot that was found in some of its rows and columns; see `spot_seen_in`."""
+    """Return on the sensor a spot that lies on some of its rows and columns; see `spot_to_window`."""
     centre, size = (spot["centre_y"], spot["centre_x"]), (rows[1] - rows[0], columns[1] - columns[0])
     y, x = ((c * m + low) / n for c, n, (low, _), m in zip(centre, shape, (rows, columns), size, strict=True))
     return {"centre_y": y, "centre_x": x, "radius": spot["radius"] * max(size) / max(shape)}

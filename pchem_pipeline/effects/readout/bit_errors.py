@@ -8,20 +8,22 @@ Eldred 1959). The sample is then off by the weight of that bit, 2^b DN.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.moved_codes import moved_shares
+from pchem_pipeline.effects.estimators.bends import moved_shares
 from pchem_pipeline.effects.framework.effect import Count, Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 Fault = Literal["zero", "one", "flip"]
 _FAULTS: tuple[Fault, ...] = ("zero", "one", "flip")
@@ -65,14 +67,14 @@ class BitErrors(Effect):
     bit: Count = Field(ge=0, lt=_MOST_BITS, description="which bit, 0 the least significant")
     fault: Fault = Field(default="zero", description="what it reads then: zero, one, or flip: its opposite")
 
-    def faulty(self, codes: NDArray[Any]) -> NDArray[Any]:
+    def faulty(self, codes: AnyArray) -> AnyArray:
         """Return what comes out instead of codes, DN."""
         weight = codes.dtype.type(1 << self.bit)
         if self.fault == "flip":
             return np.asarray(codes ^ weight)
         return np.asarray(codes | weight if self.fault == "one" else codes & ~weight)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN; a bit that the ADC does not have is never wrong."""
         if self.bit >= context.bit_depth:
             return values.copy()
@@ -120,7 +122,7 @@ class BitErrors(Effect):
         weights = np.concatenate([weights, 1.0 - weights.sum(axis=1, keepdims=True)], axis=1)
         return model.with_noise(weights, shift_dn=np.array([-weight, weight, 0.0]))
 
-    def _moving(self, maps: PixelMaps) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _moving(self, maps: PixelMaps) -> tuple[FloatArray, FloatArray]:
         """Return the shares of each pixel's samples whose bit is 0 and goes up, or 1 and goes down, (n,)."""
         from pchem_pipeline.effects.estimators.codes import code_range
         from pchem_pipeline.model.law.mass import sample_mass
@@ -134,9 +136,7 @@ class BitErrors(Effect):
         return (up * (self.fault != "zero"), down * (self.fault != "one"))
 
 
-def _never_seen(
-    codes: NDArray[np.int64], observed: NDArray[np.float64]
-) -> tuple[int, Literal["zero", "one"]] | None:
+def _never_seen(codes: IntArray, observed: FloatArray) -> tuple[int, Literal["zero", "one"]] | None:
     """Return the lowest bit that is the same in all samples although they span several of its periods."""
     used = codes[observed > 0]
     if not used.size:

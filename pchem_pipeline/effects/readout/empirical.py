@@ -9,8 +9,7 @@ about why.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -18,22 +17,22 @@ from pydantic import Field, model_validator
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.context import DIMS
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import Dim, EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.effects.framework.region import Span
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.framework.region import Span
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    BoolArray,
+    EffectContext,
+    FloatArray,
+    IntArray,
+    PixelMaps,
+    SampleLaw,
+)
 
 #: What is moved together.
 Together = Literal["sample", "row", "column", "frame"]
-_DIMS: dict[Together, tuple[Dim, ...]] = {
-    "sample": ("frame", "y", "x"), "row": ("frame", "y"), "column": ("frame", "x"), "frame": ("frame",),
-}  # fmt: skip
 _DEPTH = 4  # frames through which a move towards an earlier frame is followed
 _MOST_TOLD = 4
 
@@ -64,7 +63,7 @@ class Move(Section):
             raise ValueError("shift_dn: towards a neighbour it is not negative")
         return self
 
-    def of(self, own: NDArray[np.int64], other: NDArray[np.int64] | None) -> NDArray[np.int64]:
+    def of(self, own: IntArray, other: IntArray | None) -> IntArray:
         """Return samples moved, DN; ``other`` are their neighbours."""
         if other is None:
             return own + self.shift_dn
@@ -77,7 +76,7 @@ class Move(Section):
             step = np.where(abs(difference) <= self.within_dn, step, 0)
         return np.asarray(own + step)
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return it in words."""
         if self.towards is None:
             return f"by {self.shift_dn:+d} DN"
@@ -103,7 +102,7 @@ class Empirical(Effect):
     title: ClassVar[str] = "measured moves of samples, without an explanation"
     source: ClassVar[str] = "Laird 1978, Lindsay 1983 (mixing laws); Raftery 1985 (mixture transitions)"
     strength: ClassVar[str] = "share"
-    measured_only: ClassVar[bool] = True
+    empirical: ClassVar[bool] = True
     share: Ratio = Field(ge=0, le=1, description="share of the samples that are moved, no unit")
     moves: tuple[Move, ...] = Field(min_length=1, max_length=16, description="how; one of them each")
     together: Together = Field(
@@ -115,6 +114,9 @@ class Empirical(Effect):
         "columns of this parity on (0 even, 1 odd); null: none does",
     )
 
+    #: a hundredth of the samples 8 DN too low
+    typical_values = ({"share": 0.01, "moves": (Move(shift_dn=-8),)},)
+
     @model_validator(mode="after")
     def _has_moves(self) -> Self:
         if not sum(move.weight for move in self.moves) > 0:
@@ -125,24 +127,24 @@ class Empirical(Effect):
             )
         return self
 
-    def seen_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it as it acts on some rows and columns that are taken for a sensor of their own."""
         if not self.squares:
             return self
         squares = (self.squares[0] + rows[0]) % 2, (self.squares[1] + columns[0]) % 2
         return self.model_copy(update={"squares": squares})
 
-    def found_in(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return as an effect on the sensor what was found in some of its rows and columns."""
-        return self.seen_in(rows, columns, shape)  # of two parities each is the other of the other
+        return self.to_window(rows, columns, shape)  # of two parities each is the other of the other
 
-    def shares(self) -> NDArray[np.float64]:
+    def shares(self) -> FloatArray:
         """Return the share of the samples that each move has."""
         weight = np.array([move.weight for move in self.moves])
         return np.asarray(self.share * weight / weight.sum())
 
     @property
-    def unlisted(self) -> bool:
+    def empirical_unnamed(self) -> bool:
         """Whether squares come as their mean, or samples come nearer to those of an earlier frame."""
         of_earlier = any(move.towards[0] for move in self.moves if move.towards)
         return self.squares is not None or (self.together == "sample" and of_earlier)
@@ -156,9 +158,9 @@ class Empirical(Effect):
         """Return how many frames before it matter: those of the neighbours, and of theirs."""
         return _DEPTH * max(-move.towards[0] if move.towards else 0 for move in self.moves)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN, with some samples moved."""
-        drawn = context.random.uniform(_DIMS[self.together])
+        drawn = context.random.uniform(DIMS[self.together])
         which = np.searchsorted(np.cumsum(self.shares()), drawn.ravel(), side="right").reshape(drawn.shape)
         own = values.astype(np.int64)
         if self.squares:
@@ -170,7 +172,7 @@ class Empirical(Effect):
         for _ in range(_DEPTH if self.history() else 1):
             before, found = found, own
             for number, move in enumerate(self.moves):
-                here: NDArray[np.bool_] = which == number
+                here: BoolArray = which == number
                 if not here.any():
                     continue
                 other = None
@@ -179,16 +181,6 @@ class Empirical(Effect):
                     here = here & known
                 found = np.where(here, move.of(own, other), found)
         return found.clip(0, 2**context.bit_depth - 1).astype(values.dtype)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return a hundredth of the samples 8 DN too low."""
-        return (cls(share=0.01, moves=(Move(shift_dn=-8),)),)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return none: it is measured where all else has failed, and competes with nothing."""
-        return ()
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with satellites at the shifts: exact; what neighbours add to it is left out."""
@@ -201,7 +193,7 @@ class Empirical(Effect):
         weights = np.append(shares, max(1.0 - float(shares.sum()), 0.0))
         return model.with_noise(weights, shift_dn=np.append(shifts, 0.0))
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         what = {
@@ -215,12 +207,12 @@ class Empirical(Effect):
             )
         shares = self.shares()
         order = np.argsort(-shares)[:_MOST_TOLD]
-        told = [f"{per_cent(shares[i])} {self.moves[i].words()}" for i in order]
-        how = f" {self.moves[0].words()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
+        told = [f"{per_cent(shares[i])} {self.moves[i].describe()}" for i in order]
+        how = f" {self.moves[0].describe()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
         return f"{per_cent(self.share)} of the {what}{place} differ from the model as if they were moved{how}"
 
 
-def _averaged(values: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _averaged(values: IntArray, chosen: BoolArray) -> IntArray:
     """Return frames (frame, y, x) whose squares from chosen pixels on are their mean; none overlap."""
     result = values.copy()
     corners = [

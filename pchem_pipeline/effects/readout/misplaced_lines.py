@@ -8,19 +8,16 @@ cable of the end of a packet. Every sample is then a good one, of another pixel.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
+from pchem_pipeline.effects.framework.context import Dim
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.evidence import PLACES
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import Dim, EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence
+from pchem_pipeline.effects.framework.neighbours import along_axis
+from pchem_pipeline.effects.types import AnyArray, BoolArray, EffectContext, Evidence, FloatArray, IntArray
 
 Move = Literal["swapped", "early", "late", "sample_lost", "sample_twice", "line_lost", "line_twice"]
 
@@ -50,6 +47,7 @@ class MisplacedLines(Effect):
     source: ClassVar[str] = "GenICam / GigE Vision (packet resend); likelihood ratio of lines at other places"
     signature: ClassVar[tuple[str, ...]] = ("space.misplaced.rows", "space.misplaced.columns")
     strength: ClassVar[str] = "share"
+    reach_rows = 2  # whether a row changes places with the next depends on the two before
     separate: ClassVar[Mapping[str, str]] = {
         "repeated_lines": "equality of neighbouring lines: lines that change places differ from each other",
         "interpixel_capacitance": "a line's samples taken together: a coupling moves all lines a little",
@@ -68,15 +66,18 @@ class MisplacedLines(Effect):
     )
     lines: Literal["rows", "columns"] = Field(default="rows", description="which lines")
 
-    def halo(self) -> int:
-        """Return 2: whether a row changes places with the next depends on the two before."""
-        return 2
+    #: rows that change places, come late, and lose a sample, one in a hundred
+    typical_values = (
+        {"share": 1e-2},
+        {"share": 1e-2, "move": "late"},
+        {"share": 1e-2, "move": "sample_lost"},
+    )
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN; at the end of a line the last sample is repeated."""
         across, along = (_Y, _X) if self.lines == "rows" else (_X, _Y)
         if self.move == "swapped":
-            return _taken(values, self._exchanged(context, across), across)
+            return along_axis(values, self._exchanged(context, across), across)
         of_lines = self.move in ("line_lost", "line_twice")
         axis = across if of_lines else along
         drawn: tuple[Dim, ...] = ("frame",) if of_lines else ("frame", _DIMS[across])
@@ -85,16 +86,16 @@ class MisplacedLines(Effect):
             size, place = _places(context, axis)
             hit = hit & (place >= np.floor(context.random.uniform(drawn, _WHERE) * size))
         later = self.move in ("early", "sample_lost", "line_lost")
-        return _taken(values, np.where(hit, 1 if later else -1, 0), axis)
+        return along_axis(values, np.where(hit, 1 if later else -1, 0), axis)
 
-    def _exchanged(self, context: EffectContext, across: int) -> NDArray[np.int64]:
+    def _exchanged(self, context: EffectContext, across: int) -> IntArray:
         """Return from how many lines later each line comes; of overlapping pairs the first one counts."""
         size, place = _places(context, across)
         hit = (context.random.uniform(("frame", _DIMS[across])) < self.share) & (place < size - 1)
         first = hit & ~_before(hit, across)
         return np.where(first, 1, np.where(_before(first, across), -1, 0))
 
-    def displaced(self) -> Mapping[Literal["rows", "columns"], NDArray[np.float64]]:
+    def displaced(self) -> Mapping[Literal["rows", "columns"], FloatArray]:
         """Return the shares of lines that hold the samples of other pixels."""
         some = self.share / 2.0  # of the lines of a frame those after a random one
         found = {
@@ -107,11 +108,6 @@ class MisplacedLines(Effect):
             "line_twice": {"before": some},
         }[self.move]
         return {self.lines: np.array([found.get(place, 0.0) for place in PLACES])}
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return rows that change places, come late, and lose a sample, one in a hundred."""
-        return cls(share=1e-2), cls(share=1e-2, move="late"), cls(share=1e-2, move="sample_lost")
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -139,22 +135,15 @@ class MisplacedLines(Effect):
         ]
 
 
-def _places(context: EffectContext, axis: int) -> tuple[int, NDArray[np.int64]]:
+def _places(context: EffectContext, axis: int) -> tuple[int, IntArray]:
     """Return how many rows (columns) the sensor has, and which those here are, (1, y, 1) or (1, 1, x)."""
     if axis == _Y:
         return context.shape[0], context.rows[None, :, None]
     return context.shape[1], np.arange(context.shape[1])[None, None, :]
 
 
-def _before(lines: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
+def _before(lines: BoolArray, axis: int) -> BoolArray:
     """Return for each line whether the one before it is marked; the first one has none."""
     moved = np.roll(lines, 1, axis)
     moved[(slice(None),) * axis + (0,)] = False
     return moved
-
-
-def _taken(values: NDArray[Any], step: NDArray[np.int64], axis: int) -> NDArray[Any]:
-    """Return the values so many places later along an axis, those at the ends instead of what is beyond."""
-    at = np.arange(values.shape[axis]).reshape([-1 if a == axis else 1 for a in range(3)])
-    index = np.clip(at + step, 0, values.shape[axis] - 1)
-    return np.take_along_axis(values, np.broadcast_to(index, values.shape), axis)

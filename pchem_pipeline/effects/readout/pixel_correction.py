@@ -9,20 +9,16 @@ exceeds the median of its eight neighbours by more than so many DN comes out as 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.prediction import PREDICTORS, Predictor, predicted
 from pchem_pipeline.effects.framework.effect import Code, Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.framework.evidence import PredictedSamples
 from pchem_pipeline.effects.framework.replacement import Replacement
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PredictedSamples
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray
 
 # standard deviations by which samples must equal their prediction too often, and exceed it too seldom
 _EQUAL, _ABOVE = 4.0, 3.0
@@ -48,6 +44,7 @@ class PixelCorrection(Effect):
     source: ClassVar[str] = "Hamamatsu DCAM-API (HOTPIXELCORRECT_LEVEL); Andor SDK3 (SpuriousNoiseFilter)"
     signature: ClassVar[tuple[str, ...]] = ("space.predicted.equal", "space.predicted.above", "shape.C3.mean")
     strength: ClassVar[str] = "share"
+    reach_rows = 1
     separate: ClassVar[Mapping[str, str]] = {
         "row_noise": "the camera's corrections switched off; noise of rows makes no sample equal its median",
         "frame_noise": "the camera's corrections switched off; a frame's noise moves all of its samples",
@@ -65,11 +62,10 @@ class PixelCorrection(Effect):
         description="median or mean: of the eight neighbours; row: mean of the left and the right one",
     )
 
-    def halo(self) -> int:
-        """Return 1: the rows beside."""
-        return 1
+    #: at 60 DN above the median
+    typical_values = ({"threshold_dn": 60},)
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN, corrected; those at the border stay as they are."""
         rule = self.replacement(values)
         replaced = (values - rule.value > rule.excess) & rule.inside
@@ -77,18 +73,13 @@ class PixelCorrection(Effect):
             replaced &= context.random.uniform(("frame", "y", "x")) < self.share
         return np.where(replaced, rule.value, values).astype(values.dtype)
 
-    def replacement(self, frames: NDArray[Any]) -> Replacement:
+    def replacement(self, frames: AnyArray) -> Replacement:
         """Return the rule: what the neighbours predict, inside the border."""
         value, inside = frames.astype(np.int32), np.zeros(frames.shape[1:], np.bool_)
         if min(inside.shape) >= 3:
             value[:, 1:-1, 1:-1] = predicted(frames, self.predictor)
             inside[1:-1, 1:-1] = True
         return Replacement(value, inside, self.threshold_dn, self.share)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 60 DN above the median."""
-        return (cls(threshold_dn=60),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -128,7 +119,7 @@ def _threshold(seen: PredictedSamples) -> tuple[int, float] | None:
     return int(seen.thresholds[place]), share
 
 
-def _replaced_share(own: float, moments: NDArray[np.float64]) -> float:
+def _replaced_share(own: float, moments: FloatArray) -> float:
     """Return the share s of replaced samples from how many are above their own and others' predictions.
 
     A sample x exceeds the prediction of a chance frame with probability q(x). Of the samples before the

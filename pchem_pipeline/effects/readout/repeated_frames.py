@@ -9,19 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator
 
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, IntArray
 
 # longer runs of repeats are left out of the simulation if they are rarer than this
 _RARE = 1e-12
@@ -70,6 +64,9 @@ class RepeatedFrames(Effect):
         default=None, description="first row and the row after the last that are repeated; null: all rows"
     )
 
+    #: at one frame in a thousand
+    typical_values = ({"probability": 1e-3},)
+
     @field_validator("rows")
     @classmethod
     def _some_rows(cls, rows: tuple[int, int] | None) -> tuple[int, int] | None:
@@ -96,7 +93,7 @@ class RepeatedFrames(Effect):
         breaks = np.flatnonzero(np.diff(self.frames) != 1) + 1
         return int(np.diff(np.concatenate([[0], breaks, [len(self.frames)]])).max())
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN, with repeats in place of their frames."""
         frames = context.frames
         repeats = np.isin(frames, np.array(self.frames, np.int64))
@@ -112,14 +109,9 @@ class RepeatedFrames(Effect):
         if self.rows is None:
             return np.asarray(values[source])
         chosen = np.flatnonzero((context.rows >= self.rows[0]) & (context.rows < self.rows[1]))
-        result: NDArray[Any] = values.copy()
+        result: AnyArray = values.copy()
         result[:, chosen] = values[source][:, chosen]
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at one frame in a thousand."""
-        return (cls(probability=1e-3),)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -139,7 +131,7 @@ class RepeatedFrames(Effect):
             found.append(cls(probability=min(time.repeated_rows / part / pairs, 0.5), rows=(0, part)))
         return found
 
-    def representative(self, frames: NDArray[np.int64]) -> tuple[Self, float]:
+    def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return repeats spread evenly over the frames, and how many more or fewer there are in the mean."""
         second = frames[1:][np.diff(frames) == 1]
         if self.frames or not self.probability * second.size > 0:
@@ -149,7 +141,3 @@ class RepeatedFrames(Effect):
         places = (np.arange(shown) * second.size) // shown
         listed = tuple(int(frame) for frame in second[places])
         return type(self)(frames=listed, rows=self.rows), mean / shown
-
-    def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the same law: a repeat is one more sample of it, though not a new one."""
-        return model

@@ -7,18 +7,15 @@ one before. In analog data two lines are never equal by chance, so a single case
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
+from pchem_pipeline.effects.framework.context import DIMS
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.evidence import Evidence
+from pchem_pipeline.effects.framework.neighbours import along_axis
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, IntArray
 
 _FEWEST_SHOWN = 8.0  # repeats of each line in a simulation that shows what they do
 
@@ -47,25 +44,18 @@ class RepeatedLines(Effect):
     share: Ratio = Field(ge=0, le=0.5, description="probability that a line repeats the one before, no unit")
     lines: Literal["rows", "columns"] = Field(default="rows", description="which lines")
 
+    #: one row, and one column, in a thousand
+    typical_values = ({"share": 1e-3}, {"share": 1e-3, "lines": "columns"})
+
     def halo(self) -> int:
         """Return 1 for rows: the one above."""
         return 1 if self.lines == "rows" else 0
 
-    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+    def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN, with repeats; the first line has none before it."""
-        result: NDArray[Any] = values.copy()
-        if self.lines == "rows":
-            repeats = context.random.uniform(("frame", "y"))[:, 1:] < self.share
-            result[:, 1:] = np.where(repeats, values[:, :-1], values[:, 1:])
-        else:
-            repeats = context.random.uniform(("frame", "x"))[:, :, 1:] < self.share
-            result[:, :, 1:] = np.where(repeats, values[:, :, :-1], values[:, :, 1:])
-        return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return one row, and one column, in a thousand."""
-        return cls(share=1e-3), cls(share=1e-3, lines="columns")
+        axis, along = (1, "row") if self.lines == "rows" else (2, "column")
+        repeats = context.random.uniform(DIMS[along]) < self.share
+        return along_axis(values, np.where(repeats, -1, 0), axis)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -81,9 +71,6 @@ class RepeatedLines(Effect):
                 found.append(cls.model_validate({"share": min(share, 0.5), "lines": lines}))
         return sorted(found, key=lambda one: -one.share)
 
-    def representative(self, frames: NDArray[np.int64]) -> tuple[Self, float]:
+    def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return rare repeats more often than they are, and how much rarer they are."""
-        shown = min(_FEWEST_SHOWN / max(frames.size, 1), 0.5)
-        if not 0.0 < self.share < shown:
-            return self, 1.0
-        return self.model_copy(update={"share": shown}), self.share / shown
+        return self._shown_at_least("share", _FEWEST_SHOWN / max(frames.size, 1), 0.5)

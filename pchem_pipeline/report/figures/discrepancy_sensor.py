@@ -92,7 +92,7 @@ def sensor_figures(data: DiscrepancyData) -> list[Figure]:
         words.append(
             f"{each.title}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} (by chance 0 "
             f"and 1), {count(each.outliers, 'pixel')} beyond 5"
-            + (f", most in {each.region.words()}" if each.region is not None else "")
+            + (f", most in {each.region.describe()}" if each.region is not None else "")
         )
     columns = {each.title: each.z for each in maps}
     table = DataTable(columns, dict.fromkeys(columns, "standard deviations"), origin=origin)

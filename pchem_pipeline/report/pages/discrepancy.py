@@ -233,7 +233,7 @@ def _unfitted_text(found: Verdict) -> str:
 
 
 def _words_of(region: dict[str, Any]) -> str:
-    return Region.model_validate(region).words()
+    return Region.model_validate(region).describe()
 
 
 def verdict_level(found: Verdict) -> tuple[Level, str]:

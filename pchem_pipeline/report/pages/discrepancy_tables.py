@@ -350,7 +350,7 @@ def _examined(data: DiscrepancyData) -> Table:
         rows.append(("share that was looked at for places", percent(examined.surveyed, 1.0)))
         rows += [(f"share: {kind}", percent(share, 1.0)) for kind, share in examined.surveyed_by.items()]
     for place in examined.places:
-        words = Region.model_validate(place.region).words()
+        words = Region.model_validate(place.region).describe()
         rows.append(
             (f"whole sensor: {_surveyed(place.map, data)}", f"{words} (p {probability_text(place.p)})")
         )

@@ -80,7 +80,7 @@ def candidate_classes(settings: DiscrepancySettings) -> dict[str, type[Effect]]:
     return {
         tag: known[tag]
         for tag in wanted
-        if tag not in settings.exclude and not known[tag].untestable and not known[tag].measured_only
+        if tag not in settings.exclude and not known[tag].untestable and not known[tag].empirical
     }
 
 

@@ -67,7 +67,7 @@ class Measurement(NamedTuple):
     @property
     def unlisted(self) -> bool:
         """Whether it may be of a kind that no effect with a name makes."""
-        return any(effect.unlisted for effect in (self.effect, *self.others))
+        return any(effect.empirical_unnamed for effect in (self.effect, *self.others))
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ class Unexplained:
             clear = likely.measured.gain > _WORTHWHILE * self._of_all[0].measured.gain
             if clear and likely.measured.unlisted:
                 found = self._alone(number)
-                if found is None or not found.effects[0].unlisted or not self._leaves_little(found):
+                if found is None or not found.effects[0].empirical_unnamed or not self._leaves_little(found):
                     continue
                 if best is None or found.score > best.score:
                     best = found
@@ -139,7 +139,7 @@ class Unexplained:
         if not self._of_all or not self._of_all[0].measured.unlisted:
             return False
         found = self._alone(0)
-        return found is not None and found.effects[0].unlisted and self.leaves_nothing(found)
+        return found is not None and found.effects[0].empirical_unnamed and self.leaves_nothing(found)
 
     def clearest(self, unlisted: bool = False) -> Refitted | None:
         """Return the clearest by itself, or another that is as clear; None where they leave more than little.

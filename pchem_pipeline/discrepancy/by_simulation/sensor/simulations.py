@@ -91,7 +91,7 @@ class Simulations:
             return Refit(plain.maps, {}, plain.covariance)
         own, numbers = self.frames.effects(model), self.frames.seen_numbers
         # where the pixels are drawn anew in every replicate, what they have in the data stays part of H
-        steady = [e for e in own if not e.brightens_anew]
+        steady = [e for e in own if not e.resample_pixels]
         added = added_exposures(steady, frames, numbers, plain.maps)
         fit = refit_maps(frames, plain.maps, own, plain.covariance, added, numbers)
         tags = (effect.tag for effect in model)

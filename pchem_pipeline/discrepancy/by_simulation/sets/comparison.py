@@ -336,7 +336,7 @@ def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesi
     chosen = firsts(choice.best.hypotheses)
     for hypothesis in firsts(hypotheses):
         same = sum(h.tag == hypothesis.tag for h in chosen)
-        most = 1 if type(hypothesis.effect).erratic else _MOST_OF_ONE
+        most = 1 if type(hypothesis.effect).random_realisation else _MOST_OF_ONE
         if same < most and len(chosen) < _MOST_SINGLES and all(hypothesis is not h for h in chosen):
             chosen.append(hypothesis)
     return chosen

@@ -306,7 +306,7 @@ def _has_law(effect: Effect) -> bool:
 def is_told(effect: Effect) -> bool:
     """Tell whether the law of a sample holds all numbers of an effect that its histograms show first."""
     kind = type(effect)
-    if not effect.everywhere or kind.rough_law or kind.erratic:
+    if not effect.everywhere or kind.rough_law or kind.random_realisation:
         return False
     if not kind.signature or not leads_in_histograms(kind):
         return False

@@ -384,7 +384,7 @@ class Refitter:
 
 def is_dear(effects: Iterable[Effect]) -> bool:
     """Tell whether a refit with effects takes long: those look for levels or a path in every pixel."""
-    return any(type(effect).erratic for effect in effects)
+    return any(type(effect).random_realisation for effect in effects)
 
 
 def _moved(hypotheses: Sequence[Hypothesis], step: FloatArray) -> tuple[Hypothesis, ...] | None:

@@ -14,13 +14,10 @@ against its error is taken out again.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+from pchem_pipeline.effects.types import FloatArray, IntArray
 
 # cosines of the common mode, where it wanders, and the errors that a jump must be large
 _WAVES = (0, 12)
@@ -36,11 +33,11 @@ class Steps:
         levels: shape (s,), with mean 0 over the series.
     """
 
-    starts: NDArray[np.int64]
-    levels: NDArray[np.float64]
+    starts: IntArray
+    levels: FloatArray
 
 
-def noise_variance(series: NDArray[np.float64]) -> float:
+def noise_variance(series: FloatArray) -> float:
     """Return the variance of the white part: half the mean squared difference of successive values.
 
     Sudden steps are so few that leaving out the largest twentieth of the differences takes care of them
@@ -51,9 +48,7 @@ def noise_variance(series: NDArray[np.float64]) -> float:
     return float(kept.mean() / 2.0 / 0.774)
 
 
-def find_steps(
-    series: NDArray[np.float64], gaps: NDArray[np.float64] | None = None, *, largest: int = 100
-) -> list[Steps]:
+def find_steps(series: FloatArray, gaps: FloatArray | None = None, *, largest: int = 100) -> list[Steps]:
     """Return the levels of each series and where they begin.
 
     A cut must lower the sum of squares by ``4 log(n m) + 6`` times the variance of the noise (twice what the
@@ -100,8 +95,8 @@ def find_steps(
 
 
 def _with_common(
-    series: NDArray[np.float64], starts: list[list[int]], variance: float, n_waves: int
-) -> tuple[float, list[list[int]], list[NDArray[np.float64]]]:
+    series: FloatArray, starts: list[list[int]], variance: float, n_waves: int
+) -> tuple[float, list[list[int]], list[FloatArray]]:
     """Return which series jump at the cuts, and the levels of all, the common mode included.
 
     Least squares in which the common mode counts less, by as much as it is noisier than a mean of ``m`` white
@@ -155,21 +150,19 @@ def _together(cuts: list[int]) -> list[int]:
     return [group[len(group) // 2] for group in groups]
 
 
-def _indicators(begins: list[int], n: int, row: NDArray[np.float64]) -> NDArray[np.float64]:
+def _indicators(begins: list[int], n: int, row: FloatArray) -> FloatArray:
     """Return the columns of a design that one series' levels have, (n * m, levels)."""
     inside = np.repeat(np.eye(len(begins)), np.diff([*begins, n]), axis=0)
     return (inside[:, None, :] * row[:, None]).reshape(n * row.size, len(begins))
 
 
-def centred(levels: NDArray[np.float64], starts: list[int], n: int) -> NDArray[np.float64]:
+def centred(levels: FloatArray, starts: list[int], n: int) -> FloatArray:
     """Return levels less their mean over n values, each from its start on."""
     lengths = np.diff([*starts, n])
     return np.asarray(levels - (levels * lengths).sum() / n)
 
 
-def _fitted(
-    contrast: NDArray[np.float64], starts: list[list[int]]
-) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
+def _fitted(contrast: FloatArray, starts: list[list[int]]) -> tuple[list[FloatArray], FloatArray]:
     """Return the least-squares levels of all series, and their contrast at each time, (n, m).
 
     Normal equations of the contrasts: the length of a segment on the diagonal, less its overlap in time with
@@ -188,9 +181,7 @@ def _fitted(
     return found, profile - profile.mean(axis=1, keepdims=True)
 
 
-def _best_cut(
-    series: NDArray[np.float64], first: int, last: int, bonus: NDArray[np.float64]
-) -> tuple[float, int]:
+def _best_cut(series: FloatArray, first: int, last: int, bonus: FloatArray) -> tuple[float, int]:
     """Return by how much the best cut of a part lowers the sum of squares, and its place."""
     n = last - first
     if n < 2:
@@ -203,9 +194,7 @@ def _best_cut(
     return float(gains[best]), first + 1 + best
 
 
-def _refine(
-    contrast: NDArray[np.float64], starts: list[list[int]], bonus: NDArray[np.float64], least: float
-) -> None:
+def _refine(contrast: FloatArray, starts: list[list[int]], bonus: FloatArray, least: float) -> None:
     """Move each cut to its best place between its neighbours; take out those that do not pay."""
     n, m = contrast.shape
     for q in range(m):

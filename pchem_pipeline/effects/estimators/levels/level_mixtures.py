@@ -6,9 +6,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pchem_pipeline.effects.types import FloatArray
 
 _MOST_LEVELS = 6
 _STEPS = 200  # of EM; levels that are as far apart as the noise is wide take some fifty

@@ -11,14 +11,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from pchem_pipeline.effects.estimators.levels.change_points import Steps, centred, find_steps, noise_variance
-
-FloatArray = np.ndarray[Any, np.dtype[np.float64]]
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
+from pchem_pipeline.effects.types import FloatArray, IntArray
 
 Layout = TypeVar("Layout", bound=str)
 

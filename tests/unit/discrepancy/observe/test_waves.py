@@ -97,8 +97,8 @@ def test_pickup_sample_by_sample_is_estimated_as_it_is() -> None:
     # of 288,000 samples, whose noise is 8 times as large: 1.7 % per standard error
     assert pickup.amplitude_dn == pytest.approx(0.3, rel=0.09)
     assert np.cos(pickup.phase - 0.4) > 0.99
-    moved = pickup.found_in((5, 29), (3, 23), (40, 40))
-    seen_again = moved.seen_in((5, 29), (3, 23), (40, 40))
+    moved = pickup.to_sensor((5, 29), (3, 23), (40, 40))
+    seen_again = moved.to_window((5, 29), (3, 23), (40, 40))
     assert np.exp(1j * seen_again.phase) == pytest.approx(np.exp(1j * pickup.phase))
     turned = pickup.phase - 2.0 * np.pi * (pickup.cycles_per_row * 5 + pickup.cycles_per_column * 3)
     assert np.exp(1j * moved.phase) == pytest.approx(np.exp(1j * turned))
@@ -120,7 +120,7 @@ def test_what_takes_turns_is_measured_and_no_pickup() -> None:
     measured = measured_wave(found(values), found(frames(8)), seen, EVERYWHERE)
     assert measured is not None
     assert isinstance(measured.effect, EmpiricalNoise)
-    assert measured.effect.unlisted
+    assert measured.effect.empirical_unnamed
     assert measured.effect.noise_dn == pytest.approx(0.3, rel=0.09)
     assert measured_wave(found(values), found(values), seen, EVERYWHERE) is None
 

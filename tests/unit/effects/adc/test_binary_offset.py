@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
-from pydantic import ValidationError
 
-from pchem_pipeline.discrepancy.observe.digital.previous_bits import BITS, bit_statistics, previous_bits
+from pchem_pipeline.discrepancy.observe.digital.previous_bits import BITS, previous_bits
 from pchem_pipeline.effects.adc.binary_offset import BinaryOffset
-from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
-from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -29,11 +24,6 @@ def test_the_code_before_moves_a_sample_one_after_the_other():
     np.testing.assert_allclose(effect.apply(values, context_of((4, 9), 3)), expected, atol=1e-12)
     same = BinaryOffset(offset_dn=0.0).apply(values, context_of((4, 9), 3))
     np.testing.assert_array_equal(same, values)
-
-
-def test_bits_that_are_all_0_are_refused():
-    with pytest.raises(ValidationError, match="all 0"):
-        BinaryOffset(offset_dn=1.0, bits=(0.0, 0.0))
 
 
 def test_the_law_has_the_variance_of_all_bits():
@@ -92,14 +82,3 @@ def test_the_bits_and_their_offsets_are_found(effect, shape, seed):
     assert (np.abs(offsets - wanted)[~small] < 4 * errors[~small]).all()
     assert (errors[~small] < 0.35 * np.abs(wanted[~small])).all()
     assert evidence.z["space.x.bits"] > 5.0
-
-
-def test_relatives_follow_no_bit():
-    truth = drawn_truth((24, 24))
-    effects = ((), (InterpixelCapacitance(coupling=0.01),), (RowNoise(row_noise_dn=1.0),))
-    for number, hidden in enumerate(effects):
-        evidence = seen(taken(truth, *hidden, n_frames=1600, seed=5 + number))
-        assert list(BinaryOffset.estimate(evidence)) == []
-        assert abs(evidence.z["space.x.bits"]) < 4.0
-    assert BinaryOffset.estimate(replace(evidence, time=None)) == ()
-    assert bit_statistics(None) == {}

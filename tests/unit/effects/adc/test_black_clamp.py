@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import drawn_truth, seen, taken
 from hidden.chain import hide
-from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.effects.adc.black_clamp import BlackClamp
-from pchem_pipeline.effects.analog.frame_noise import FrameNoise
-from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.simulate.chain import simulate_block
-from pchem_pipeline.simulate.settings import SimulateSettings
 
 
 @pytest.mark.parametrize("place", [{}, {"columns": (0, 3)}, {"rows": (9, 12)}])
@@ -33,23 +26,13 @@ def test_frames_move_against_the_clamp_s_pixels(place):
     assert moved.std() > 1.0
 
 
-def test_bands_are_parts_of_the_whole():
-    truth = drawn_truth((12, 8))
-    settings = SimulateSettings(
-        shape=truth.shape, n_frames=20, seed=1, effects=(BlackClamp(follow=1.0, rows=(0, 2)),)
-    )
-    whole = simulate_block(truth, settings, (0, 20), electron_frames=0)[0]
-    band = simulate_block(truth, settings, (5, 15), (7, 12), electron_frames=0)[0]
-    np.testing.assert_array_equal(band, whole[5:15, 7:12])
-
-
 def test_a_window_has_its_part_of_the_clamp():
     shape, window = (40, 60), ((10, 30), (0, 20))
-    found = BlackClamp(follow=0.3, columns=(0, 4)).found_in(*window, shape)
+    found = BlackClamp(follow=0.3, columns=(0, 4)).to_sensor(*window, shape)
     assert (found.rows, found.columns) == ((10, 30), (0, 4))
-    seen_again = found.seen_in(*window, shape)
+    seen_again = found.to_window(*window, shape)
     assert (seen_again.rows, seen_again.columns, seen_again.follow) == ((0, 20), (0, 4), 0.3)
-    assert found.seen_in((10, 30), (20, 40), shape).follow == 0.0
+    assert found.to_window((10, 30), (20, 40), shape).follow == 0.0
     part = Part(Region(rows=((5, 15),)))
     looked_at = SensorWindow(*window, shape)
     placed = looked_at.found(BlackClamp(follow=0.3, rows=(0, 4)), Part(looked_at.on_sensor(part.region)))
@@ -57,12 +40,7 @@ def test_a_window_has_its_part_of_the_clamp():
     [acting] = looked_at.effects([placed])
     assert (acting.rows, acting.columns) == ((5, 9), (0, 20))
     whole = BlackClamp(follow=0.3, rows=(0, 4))
-    assert whole.found_in((0, 40), (0, 60), shape) == whole
-
-
-def test_ranges_without_lines_are_refused():
-    with pytest.raises(ValidationError, match="holds no line"):
-        BlackClamp(follow=0.1, rows=(3, 3))
+    assert whole.to_sensor((0, 40), (0, 60), shape) == whole
 
 
 def test_the_law_has_the_variance_of_the_clamp():
@@ -91,18 +69,3 @@ def test_an_independent_camera_s_clamp_is_found(seed, level):
         assert 70 <= found.pixels <= 72  # without a pixel that has no fit
     if where == "all":
         assert found.pixels > 400
-
-
-def test_relatives_are_no_clamp():
-    truth = drawn_truth((24, 24))
-    for number, hidden in enumerate(
-        (
-            (),
-            (FrameNoise(frame_noise_dn=0.5),),
-            (ExposureFlicker(rms=0.05),),
-            (FrameNoise(frame_noise_dn=2.0),),
-        )
-    ):
-        evidence = seen(taken(truth, *hidden, n_frames=1500, seed=11 + number))
-        assert BlackClamp.estimate(evidence) == ()
-    assert BlackClamp.estimate(replace(evidence, time=None)) == ()

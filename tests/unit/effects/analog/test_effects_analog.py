@@ -6,45 +6,19 @@ from types import MappingProxyType
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from pchem_pipeline.effects.analog.analog_memory import AnalogMemory
 from pchem_pipeline.effects.analog.flicker_noise import FlickerNoise
 from pchem_pipeline.effects.analog.gain_drift import GainDrift
-from pchem_pipeline.effects.analog.heavy_tailed_noise import HeavyTailedNoise
 from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
-from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
-from pchem_pipeline.effects.analog.nonlinearity import Nonlinearity
 from pchem_pipeline.effects.analog.rts_noise import RtsNoise
-from pchem_pipeline.effects.analog.signal_dependent_noise import SignalDependentNoise
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.simulate.chain import simulate_block
-from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.streams import KeyedStreams
-from pchem_pipeline.simulate.truth import TruthMaps
 
 BOW = (-0.5, 0.5, -0.5)
-
-
-def names(effect: Effect) -> str:
-    return effect.tag
-
-
-def make_truth(shape: tuple[int, int], seed: int | None = 5) -> TruthMaps:
-    """Maps of a sensor; all pixels alike without a seed."""
-    spread = 0.0 if seed is None else 1.0
-    rng = np.random.default_rng(seed)
-    return TruthMaps(
-        quanta_exposure=1.5 + spread * rng.uniform(-1.0, 1.0, shape),
-        conversion_gain=0.1 + spread * rng.uniform(-0.02, 0.02, shape),
-        bias=100.0 + spread * rng.uniform(-3.0, 3.0, shape),
-        analog_read_noise_e=0.3 + spread * rng.uniform(-0.05, 0.05, shape),
-        defect=np.zeros(shape, np.uint8),
-    )
 
 
 def analog(effect: Effect, shape=(500, 20, 30), *, charge=None, first=0, n_run=None, noise=0.3, seed=1):
@@ -72,96 +46,7 @@ def within(seen, expected, stderr, widths: float = 5.0) -> None:
     assert abs(seen - expected) <= widths * stderr, (seen, expected, stderr)
 
 
-# -- what is refused ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("effect", "values"),
-    [
-        (AnalogMemory, {"memory": 0.6}),
-        (AnalogMemory, {}),
-        (FlickerNoise, {"share": 1.1}),
-        (FlickerNoise, {"share": 0.1, "correlation_frames": 0.0}),
-        (FlickerNoise, {"share": 0.1, "spectrum": "white"}),
-        (GainDrift, {"drift": 0.6}),
-        (GainDrift, {"drift": 0.1, "shape": "path"}),
-        (GainDrift, {"drift": 0.1, "path": (0.0, 1.0)}),
-        (GainDrift, {"drift": 0.5, "shape": "path", "path": (0.0, 0.0, 10.0)}),
-        (HeavyTailedNoise, {"share": -0.1}),
-        (HeavyTailedNoise, {"share": 0.1, "factor": 0.5}),
-        (InterpixelCapacitance, {"coupling": -0.01}),
-        (InterpixelCapacitance, {"coupling": 0.3}),
-        (InterpixelCapacitance, {"coupling": 0.1, "anisotropy": 2.0}),
-        (NoiseSkew, {"share": 1.5}),
-        (NoiseSkew, {"share": float("nan")}),
-        (Nonlinearity, {"step_change": 1.0}),
-        (RtsNoise, {"fraction": 1.5, "amplitude_e": 1.0}),
-        (RtsNoise, {"fraction": 0.5, "amplitude_e": -1.0}),
-        (RtsNoise, {"fraction": 0.5, "amplitude_e": 1.0, "samples": 0}),
-        (RtsNoise, {"fraction": 0.5, "amplitude_e": 1.0, "probability": 2.0}),
-        (SignalDependentNoise, {"noise_e": -0.1}),
-        (SignalDependentNoise, {"noise_e": 0.1, "growth": "square"}),
-    ],
-)
-def test_impossible_parameters_are_refused_by_name(effect, values):
-    with pytest.raises(ValidationError) as error:
-        effect(**values)
-    assert any(name in str(error.value) for name in effect.model_fields)
-
-
 # -- moments ------------------------------------------------------------------------------------------------
-
-
-def test_heavy_tails_have_the_variance_and_the_fourth_moment_of_the_mixture():
-    after, before, k, _ = analog(HeavyTailedNoise(share=0.05, factor=3.0))
-    z = (after - k) / 0.3
-    n = z.size
-    within((after != before).mean(), 0.05, np.sqrt(0.05 * 0.95 / n))
-    fourth, eighth = 3 * (0.95 + 0.05 * 81), 105 * (0.95 + 0.05 * 6561)
-    within((z**2).mean(), 1.4, np.sqrt((fourth - 1.4**2) / n))
-    within((z**4).mean(), fourth, np.sqrt((eighth - fourth**2) / n))
-    assert abs((z**2).mean() - 1.0) > 20 * np.sqrt(2 / n)
-
-
-@pytest.mark.parametrize("share", [0.8, -0.5])
-def test_skewed_noise_keeps_mean_and_variance(share):
-    after, _, k, _ = analog(NoiseSkew(share=share))
-    z = (after - k) / 0.3
-    n = z.size
-    fourth = 3 + 6 * share**4
-    within(z.mean(), 0.0, 1 / np.sqrt(n))
-    within((z**2).mean(), 1.0, np.sqrt((fourth - 1) / n))
-    # sixth cumulant of the exponential: 120; the sixth moment follows from the cumulants
-    sixth = 15 + 15 * 6 * share**4 + 10 * (2 * share**3) ** 2 + 120 * share**6
-    within((z**3).mean(), 2 * share**3, np.sqrt(sixth / n))
-    assert abs((z**3).mean()) > 20 * np.sqrt(15 / n)
-
-
-@pytest.mark.parametrize("growth", ["root", "linear"])
-def test_noise_of_electrons_grows_as_stated(growth):
-    after, before, k, r = analog(SignalDependentNoise(noise_e=0.2, growth=growth))
-    added = after - before
-    for number in range(5):
-        of = added[k == number]
-        variance = 0.04 * (number if growth == "root" else number**2)
-        within((of**2).mean(), variance, variance * np.sqrt(2 / of.size))
-        within((of * r[k == number]).mean(), 0.0, 0.3 * np.sqrt(variance / of.size))
-
-
-def test_the_comb_bends():
-    after, before, k, _ = analog(Nonlinearity(step_change=-0.02), (4, 3, 5), charge=np.arange(5))
-    levels = (after - before + k)[0, 0]
-    np.testing.assert_allclose(np.diff(levels), 1 - 0.02 * np.arange(4), atol=1e-12)
-
-
-def test_noise_that_comes_before_the_bend_is_as_large_as_the_steps():
-    for noise, slope in (("bent", 1 - 0.02 * (np.arange(5) - 0.5)), ("kept", np.ones(5))):
-        effect = Nonlinearity(step_change=-0.02, noise=noise)
-        after, _, _, r = analog(effect, (400, 30, 5), charge=np.arange(5))
-        levels = np.arange(5) * (1 - 0.02 * (np.arange(5) - 1) / 2)
-        # its mean moves by b sigma^2 / 2, a thousandth of an electron
-        seen = ((after - levels) * r).mean(axis=(0, 1)) / (r * r).mean(axis=(0, 1))
-        np.testing.assert_allclose(seen, slope, atol=5 * 0.01 * 0.3 * np.sqrt(15 / 400 / 30))
 
 
 def test_capacitance_moves_charge_without_losing_any():
@@ -341,49 +226,9 @@ def test_exponential_steps_have_the_mean_that_is_stated():
 
 # -- the law of a pixel -------------------------------------------------------------------------------------
 
-ALIKE = make_truth((32, 32), seed=None)
 MAPS = PixelMaps(
     np.array([1.5]), np.array([0.1]), np.array([100.0]), np.array([np.sqrt(9 + 1 / 12)]), np.array([True])
 )
-CODES = np.arange(60, 240)
-
-
-@pytest.mark.parametrize(
-    "effect",
-    [
-        AnalogMemory(memory=0.05),
-        AnalogMemory(memory=0.2, saturation_e=1.5),
-        FlickerNoise(share=0.5, correlation_frames=1.0),
-        HeavyTailedNoise(share=0.05, factor=3.0),
-        NoiseSkew(share=0.5),
-        NoiseSkew(share=-0.7),
-        Nonlinearity(step_change=0.02),
-        Nonlinearity(step_change=-0.02, noise="bent"),
-        SignalDependentNoise(noise_e=0.1),
-        SignalDependentNoise(noise_e=0.05, growth="linear"),
-        InterpixelCapacitance(coupling=0.01, anisotropy=0.5),
-        GainDrift(drift=0.12, shape="path", path=(0.5, -0.5, 0.5)),
-    ],
-    ids=names,
-)
-def test_the_marginal_is_the_law_of_the_samples(effect):
-    n_frames = 400
-    settings = SimulateSettings(shape=(32, 32), n_frames=n_frames, seed=8, bit_depth=12, effects=(effect,))
-    dn = simulate_block(ALIKE, settings, (0, n_frames))[0]
-    inside = dn[:, 1:-1, 1:-1]  # pixels at the edge have fewer neighbours
-    seen = np.bincount(inside.ravel(), minlength=CODES[-1] + 1)[CODES]
-    assert seen.sum() == inside.size
-
-    def misfit(model: SampleLaw) -> float:
-        expected = sample_mass(model, MAPS, CODES)[0] * inside.size
-        some = expected > 10
-        chi = ((seen - expected)[some] ** 2 / expected[some]).sum()
-        return float((chi - some.sum()) / np.sqrt(2 * some.sum()))
-
-    model = effect.sample_law(SampleLaw(), MAPS)
-    assert abs(misfit(model)) < 5
-    if not model.neutral:
-        assert misfit(SampleLaw()) > 20
 
 
 def test_telegraph_noise_leaves_the_levels_to_the_pixels():

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, offsets
-from pydantic import ValidationError
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
@@ -33,17 +32,6 @@ N_FRAMES, SHAPE = 14, (6, 5)
 def frames_of(*effects: Effect) -> Any:
     sensor = SimulateSettings(shape=SHAPE, n_frames=N_FRAMES, seed=8, effects=effects)
     return simulate_block(drawn_truth(SHAPE), sensor, (0, N_FRAMES))[0]
-
-
-def test_a_repeat_that_forgets_history_would_be_noticed():
-    class Forgetful(RepeatedFrames):
-        def history(self):
-            return 1
-
-    effect = Forgetful(frames=(4, 5, 6))
-    sensor = SimulateSettings(shape=SHAPE, n_frames=N_FRAMES, seed=8, effects=(effect,))
-    part = simulate_block(drawn_truth(SHAPE), sensor, (5, 9))[0]
-    assert (part != frames_of(RepeatedFrames(frames=(4, 5, 6)))[5:9]).any()
 
 
 # -- moments and shapes ---------------------------------------------------------------------------
@@ -275,41 +263,6 @@ def test_random_repeats_come_as_often_as_they_should():
 # -- what is refused ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("effect", "fields", "words"),
-    [
-        (BiasDrift, {"drift_dn": 1, "shape": "path"}, "needs `path` with 2 values"),
-        (BiasDrift, {"drift_dn": 1, "path": [1, 2]}, "leave one of them out"),
-        (BiasDrift, {"drift_dn": float("nan")}, "finite"),
-        (BiasJumps, {"amplitude_dn": -1}, "greater than or equal to 0"),
-        (BiasJumps, {"amplitude_dn": 1, "rate": 0.9}, "less than or equal to 0.5"),
-        (BiasJumps, {"amplitude_dn": 1, "path": [[[0, 1]]]}, "each of 4 quadrants, got 1"),
-        (BiasJumps, {"amplitude_dn": 1, "path": [[[5, 1], [2, 0]], [], [], []]}, "must increase"),
-        (BiasJumps, {"amplitude_dn": 1, "parts": "top_bottom", "path": [[]] * 4}, "of 2 top_bottom, got 4"),
-        (FrameNoise, {}, "frame_noise_dn"),
-        (RowNoise, {"row_noise_dn": -0.1}, "greater than or equal to 0"),
-        (ColumnNoise, {"column_noise_dn": "much"}, "valid number"),
-        (PeriodicPickup, {"amplitude_dn": 1, "cycles_per_row": 0.7}, "less than or equal to 0.5"),
-        (ReadoutAlternation, {"alternation_dn": float("inf")}, "finite"),
-        (AdcDnl, {"dnl_lsb": 1.5}, "less than or equal to 1"),
-        (AdcDnl, {"dnl_lsb": 0.1, "pattern": "edges"}, "belong together"),
-        (AdcDnl, {"dnl_lsb": 0.1, "edges": [0.1]}, "belong together"),
-        (AdcDnl, {"dnl_lsb": 0.1, "pattern": "bit", "per_column": True}, "per_column is for pattern random"),
-        (AdcInl, {"inl_lsb": 20, "period_dn": 50}, "turns the curve back"),
-        (AdcInl, {"inl_lsb": 20, "form": "curve", "curve": [0, 1, 0, -1]}, "turns the curve back"),
-        (AdcInl, {"inl_lsb": 1, "form": "curve"}, "belong together"),
-        (AdcInl, {"inl_lsb": 1, "curve": [0, 1, 0, -1]}, "belong together"),
-        (AdcInl, {"inl_lsb": 1, "form": "curve", "curve": [0, 1]}, "at least 4 values, got 2"),
-        (RepeatedFrames, {"frames": [0]}, "frame 0 is the first"),
-        (RepeatedFrames, {"rows": [3, 3]}, "hold none"),
-        (RepeatedFrames, {"probability": 0.9}, "less than or equal to 0.5"),
-    ],
-)
-def test_impossible_parameters_are_refused(effect, fields, words):
-    with pytest.raises(ValidationError, match=words):
-        effect(**fields)
-
-
 def test_scaling_stops_where_the_parameters_end():
     assert AdcDnl(dnl_lsb=0.4).scaled(10).dnl_lsb == 1.0
     bent = AdcInl(inl_lsb=1, period_dn=50).scaled(100)
@@ -317,7 +270,3 @@ def test_scaling_stops_where_the_parameters_end():
     assert RepeatedFrames(probability=0.3).scaled(4).probability == 0.5
     with pytest.raises(ConfigError, match="no strength"):
         Clipping(low=3).scaled(2)
-
-
-def test_clipping_guesses_nothing_without_evidence():
-    assert Clipping.typical() == ()

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, offsets, seen, taken
 from hidden.chain import hide
 
-from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
 from pchem_pipeline.effects.analog.read_order_noise import ReadOrderNoise
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
@@ -33,13 +30,6 @@ def test_its_spectrum_falls_along_the_samples_of_a_tap(taps):
     if taps > 1:
         other = noise[:, :, width : 2 * width].reshape(600, -1)
         assert abs(np.mean(first * other)) < 5 * 4.0 / np.sqrt(600)
-
-
-def test_bands_and_blocks_are_parts_of_the_whole():
-    effect = ReadOrderNoise(noise_dn=1.0, taps=2)
-    whole = offsets(effect, context_of(SHAPE, 20))
-    part = offsets(effect, context_of(SHAPE, 20, frames=range(5, 9), rows=np.arange(3, 7)))
-    np.testing.assert_array_equal(part, whole[5:9, 3:7])
 
 
 # one tap, one tap, four
@@ -71,12 +61,3 @@ def test_neighbours_that_are_coupled_besides_are_not_taken_for_taps(probability)
     assert alone.taps > 1
     assert beside.taps == 1
     assert beside.noise_dn == pytest.approx(2.0, rel=0.2)
-
-
-def test_relatives_have_another_order():
-    truth = drawn_truth((24, 24))
-    effects = ((), (RowNoise(row_noise_dn=0.8),), (InterpixelCapacitance(coupling=0.01),))
-    for number, hidden in enumerate(effects):
-        evidence = seen(taken(truth, *hidden, n_frames=1200, seed=41 + number))
-        assert ReadOrderNoise.estimate(evidence) == []
-    assert ReadOrderNoise.estimate(replace(evidence, time=None)) == []

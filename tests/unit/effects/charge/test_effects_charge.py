@@ -8,7 +8,6 @@ import dataclasses
 import numpy as np
 import pytest
 from helpers.charge_material import a_sensor, electrons, exposures, simulated
-from pydantic import ValidationError
 from scipy import stats
 
 from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
@@ -20,10 +19,7 @@ from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCoun
 from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
 from pchem_pipeline.effects.estimators.charge_sums import exposure_nodes
 from pchem_pipeline.effects.estimators.electrons import binomial_upper, further_uniform, regrouped
-from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
-from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
-from pchem_pipeline.effects.exposure.persistence import Persistence
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -41,47 +37,12 @@ def goodness(k, mass):
     return (chi2 - enough.sum()) / np.sqrt(2.0 * enough.sum())
 
 
-def borel_mass(h, branching, n=60):
-    k = np.arange(n)
-    q = h * (1 - branching)
-    return np.exp(
-        np.log(q)
-        + (k - 1) * np.log(q + branching * k)
-        - q
-        - branching * k
-        - [np.sum(np.log(np.arange(1, i + 1))) for i in k]
-    )
-
-
-@pytest.mark.parametrize("h", [0.4, 3.0])
-@pytest.mark.parametrize("strength", [0.02, 0.4])
-def test_overdispersed_counts_are_negative_binomial(h, strength):
-    k = electrons(h, (40, 40), 500, OverdispersedCounts(relative_variance=strength))
-    mass = stats.nbinom.pmf(np.arange(60), 1 / strength, 1 / (1 + strength * h))
-    assert abs(goodness(k, mass)) < 5
-    if strength * h > 0.05:
-        assert goodness(electrons(h, (40, 40), 500), mass) > 20
-    if strength * h > 1:
-        # nor is it the other law of the same variance
-        assert goodness(k, borel_mass(h, 1 - (1 + strength * h) ** -0.5)) > 20
-
-
 def lognormal_mass(h, variance, n=60, nodes=60):
     """Return the masses of Poisson numbers of log-normal exposures, by many nodes."""
     z, w = np.polynomial.hermite_e.hermegauss(nodes)
     width = np.sqrt(np.log1p(variance))
     means = h * np.exp(width * z - 0.5 * width**2)
     return (w / w.sum()) @ stats.poisson.pmf(np.arange(n), means[:, None])
-
-
-@pytest.mark.parametrize("h", [0.4, 3.0])
-@pytest.mark.parametrize("strength", [0.02, 0.4])
-def test_counts_of_lognormal_exposures(h, strength):
-    k = electrons(h, (40, 40), 500, OverdispersedCounts(relative_variance=strength, exposures="lognormal"))
-    assert abs(goodness(k, lognormal_mass(h, strength))) < 5
-    if strength * h > 1:
-        # more skewed than those of Gamma-distributed exposures of the same variance
-        assert goodness(k, stats.nbinom.pmf(np.arange(60), 1 / strength, 1 / (1 + strength * h))) > 20
 
 
 @pytest.mark.parametrize("h", [0.4, 3.0, 12.0])
@@ -94,16 +55,6 @@ def test_the_law_of_lognormal_exposures_has_nodes_enough(h, strength):
     true = lognormal_mass(h, strength)
     # what two million samples do not tell from the truth
     assert 2e6 * np.sum((mass - true) ** 2 / np.maximum(true, 1e-9)) < 20
-
-
-@pytest.mark.parametrize("h", [0.4, 3.0])
-@pytest.mark.parametrize("strength", [0.02, 0.4])
-def test_branching_counts_are_generalised_poisson_of_the_same_mean(h, strength):
-    k = electrons(h, (40, 40), 500, BranchingCounts(branching=strength))
-    assert abs(goodness(k, borel_mass(h, strength))) < 5
-    assert abs(k.mean() - h) < 5 * np.sqrt(h / (1 - strength) ** 2 / k.size)
-    if strength > 0.1:
-        assert goodness(electrons(h, (40, 40), 500), borel_mass(h, strength)) > 20
 
 
 def test_overdispersed_counts_follow_an_exposure_that_changes():
@@ -261,38 +212,6 @@ def test_exposures_of_a_run_are_a_mixture_with_its_moments():
     assert np.allclose(two[0], 0.5)
 
 
-@pytest.mark.parametrize(
-    ("effect", "variance"),
-    [
-        (ExposureDrift(drift=0.6), 0.03),
-        (ExposureFlicker(rms=0.1), 0.01),
-        (ExposureFlicker(rms=0.1, period_frames=5.0), 0.01),
-    ],
-)
-def test_the_law_is_mixed_over_the_exposures_of_the_run(effect, variance):
-    model = effect.sample_law(SampleLaw(), None)
-    w, f = model.exposure_weights, model.exposure_factors
-    assert w.sum() == pytest.approx(1.0)
-    assert w @ f == pytest.approx(1.0)
-    assert w @ (f - 1) ** 2 == pytest.approx(variance, rel=0.01)
-
-
-def test_the_law_of_the_electron_number_and_what_leaves_it_alone():
-    plain = SampleLaw()
-    law = OverdispersedCounts(relative_variance=0.1).sample_law(plain, None)
-    assert (law.law, law.dispersion) == ("negative_binomial", 0.1)
-    law = BranchingCounts(branching=0.2).sample_law(plain, None)
-    assert (law.law, law.dispersion) == ("borel", 0.2)
-    law = OpticalCrosstalk(probability=0.2).sample_law(plain, None)
-    assert law.exposure_factors.tolist() == [1.2]
-    assert 0 < CosmicRays(tracks_per_frame=0.1).sample_law(plain, None).outlier_share < 1e-5
-    for cls in (Persistence, DarkCurrentRts, ChargeLag, ChargeDiffusion):
-        assert cls.typical()[0].sample_law(plain, None) is plain
-    # H is then the exposure without it
-    law = SpuriousCharge(mean_e=0.3).sample_law(plain, None)
-    assert (law.added_exposure.tolist(), law.added_weights.tolist()) == ([[0.3]], [[1.0]])
-
-
 # -- tools -------------------------------------------------------------------------------------------
 
 
@@ -318,41 +237,6 @@ def test_further_numbers_are_uniform_and_unrelated():
 
 
 # -- bad input ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("cls", "fields", "words"),
-    [
-        (ExposureDrift, {"drift": 3.0}, "less than or equal to 2"),
-        (ExposureDrift, {"drift": 0.1, "path": (1.0, 1.0)}, "two different values"),
-        (ExposureDrift, {"drift": 0.1, "path": (1.0, 2.0), "settling_fraction": 0.1}, "give one of them"),
-        (ExposureDrift, {"drift": 0.1, "path": (1.0, np.nan)}, "finite"),
-        (ExposureFlicker, {"rms": -0.1}, "greater than or equal"),
-        (ExposureFlicker, {"rms": 0.1, "period_frames": 1.0}, "greater than 1"),
-        (ExposureFlicker, {"rms": 0.1, "period_frames": 5.0, "correlation_frames": 2.0}, "leave one"),
-        (Persistence, {"peak_e": 1.0}, "decay_frames"),
-        (Persistence, {"peak_e": 1.0, "decay_frames": 0.0}, "greater than 0"),
-        (
-            Persistence,
-            {"peak_e": 1.0, "decay_frames": 1.0, "image": ((1.0,), (1.0, 2.0))},
-            "different lengths",
-        ),
-        (Persistence, {"peak_e": 1.0, "decay_frames": 1.0, "image": ((-1.0, 1.0),)}, "numbers >= 0"),
-        (DarkCurrentRts, {"fraction": 1.5}, "less than or equal"),
-        (DarkCurrentRts, {"fraction": 0.1, "dwell_low_frames": 0.0}, "greater than or equal"),
-        (OverdispersedCounts, {"relative_variance": -1e-9}, "greater than or equal"),
-        (BranchingCounts, {"branching": 0.9}, "less than or equal"),
-        (OpticalCrosstalk, {"probability": 0.6}, "less than or equal"),
-        (CosmicRays, {"tracks_per_frame": 1e9}, "less than or equal"),
-        (CosmicRays, {"tracks_per_frame": 1.0, "length_um": 0.0}, "greater than 0"),
-        (ChargeLag, {"fraction": 1.0}, "less than or equal"),
-        (ChargeDiffusion, {"fraction": -0.1}, "greater than or equal"),
-        (SpuriousCharge, {"mean_e": np.inf}, "finite"),
-    ],
-)
-def test_impossible_parameters_are_refused(cls, fields, words):
-    with pytest.raises(ValidationError, match=words):
-        cls(**fields)
 
 
 def test_of_very_many_electrons_of_which_nearly_all_are_lost_the_few_are_left():

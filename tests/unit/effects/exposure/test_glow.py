@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
 from hidden.chain import hide
 
-from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
 from pchem_pipeline.effects.estimators.spots import best_spot
-from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
 from pchem_pipeline.effects.exposure.glow import Glow
 from pchem_pipeline.effects.exposure.persistence import Persistence
 from pchem_pipeline.effects.framework.spot import spot_image
@@ -54,11 +50,11 @@ def test_a_spot_is_1_in_its_brightest_pixel_and_falls_with_the_distance():
 def test_a_window_sees_its_part_of_the_glow(effect):
     image = effect.peak_e * effect.pattern(np.arange(40), (40, 60))
     for rows, columns in (((0, 20), (20, 50)), ((16, 40), (0, 30)), ((0, 40), (0, 60))):
-        part = effect.seen_in(rows, columns, (40, 60))
+        part = effect.to_window(rows, columns, (40, 60))
         size = (rows[1] - rows[0], columns[1] - columns[0])
         own = part.peak_e * part.pattern(np.arange(size[0]), size)
         np.testing.assert_allclose(own, image[slice(*rows), slice(*columns)], rtol=1e-9)
-    part = effect.seen_in((0, 20), (20, 50), (40, 60)).found_in((0, 20), (20, 50), (40, 60))
+    part = effect.to_window((0, 20), (20, 50), (40, 60)).to_sensor((0, 20), (20, 50), (40, 60))
     np.testing.assert_allclose(
         [getattr(part, n) for n in ("peak_e", "centre_y", "centre_x", "radius")], [2.0, 0.1, 0.6, 0.3]
     )
@@ -100,16 +96,6 @@ def test_bursts_so_bright_that_they_mislead_the_fits_keep_their_form(seed):
     assert found.falloff == "exponential"
     assert found.peak_e == pytest.approx(10.0, rel=0.15)
     assert found.radius == pytest.approx(0.2, rel=0.1)
-
-
-def test_relatives_glow_nowhere():
-    truth = drawn_truth((24, 24))
-    for number, hidden in enumerate(
-        ((), (ExposureFlicker(rms=0.05),), (OpticalCrosstalk(probability=0.02),))
-    ):
-        evidence = seen(taken(truth, *hidden, n_frames=1500, seed=31 + number))
-        assert Glow.estimate(evidence) == []
-    assert Glow.estimate(replace(evidence, time=None)) == []
 
 
 def test_a_spot_that_no_cell_shows_is_no_guess() -> None:

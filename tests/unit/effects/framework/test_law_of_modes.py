@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, offsets, taken
+from helpers.sensor_of_modes import context_of, offsets
 from scipy.special import ndtri
 
 from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
-from pchem_pipeline.effects.adc.adc_inl import AdcInl
 from pchem_pipeline.effects.adc.clipping import Clipping
 from pchem_pipeline.effects.analog.bias_drift import BiasDrift
 from pchem_pipeline.effects.analog.bias_jumps import BiasJumps
@@ -21,7 +20,6 @@ from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.simulate.truth import TruthMaps
 
 H, STEP, MU, NOISE_E = 1.4, 12.0, 100.3, 0.25
 SIGMA = float(np.sqrt((NOISE_E * STEP) ** 2 + 1 / 12))
@@ -76,38 +74,6 @@ def test_gaussian_offsets_widen_the_law(effect, size):
     quantiles = NORMAL / NORMAL.std() * size
     change = np.abs(smeared(quantiles) - smeared(np.zeros(1))).max()
     assert np.abs(law_of(effect.scaled(size)) - smeared(quantiles)).max() < 0.06 * change
-
-
-def chi2(observed: np.ndarray, mass: np.ndarray) -> tuple[float, int]:
-    expected = mass * observed.sum()
-    good = expected > 5
-    return float(((observed - expected)[good] ** 2 / expected[good]).sum()), int(good.sum()) - 1
-
-
-@pytest.mark.parametrize(
-    "effect",
-    [
-        AdcDnl(dnl_lsb=0.2, pattern="bit", bit=1),
-        AdcDnl(dnl_lsb=0.3, pattern="edges", first_code=100, edges=(0.5, -1.0, 0.8, 0.3)),
-        AdcDnl(dnl_lsb=1.0, pattern="edges", first_code=108, edges=(1.0, 0.0, 0.5, -0.5)),
-        AdcInl(inl_lsb=1.0, period_dn=37.0, phase=1.0),
-        AdcInl(
-            inl_lsb=1.0, form="curve", first_dn=90.0, spacing_dn=9.0, curve=(0.0, 1.0, -0.5, 0.2, 0.8, 0.0)
-        ),
-        Clipping(low=98, high=141),
-    ],
-    ids=lambda e: e.tag,
-)
-def test_the_law_of_the_adc_is_that_of_simulated_samples(effect):
-    truth = TruthMaps(
-        *(np.full((20, 20), v) for v in (H, 1 / STEP, MU, NOISE_E)), np.zeros((20, 20), np.uint8)
-    )
-    frames = taken(truth, effect, n_frames=1500)
-    observed = np.bincount(frames.ravel(), minlength=CODES[-1] + 1)[CODES]
-    value, degrees = chi2(observed, law_of(effect))
-    assert value < degrees + 5 * np.sqrt(2 * degrees)
-    plain, degrees = chi2(observed, law_of(RepeatedFrames(probability=0.1)))
-    assert plain > degrees + 50 * np.sqrt(2 * degrees)
 
 
 def test_random_widths_and_repeats_leave_the_law_as_it_is():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.sensor_of_modes import make
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
@@ -31,10 +32,6 @@ def places():
 def mass(effects, at=None):
     law = sample_law(effects, maps(), places=at if at is not None else places())
     return sample_mass(law, maps(), CODES)
-
-
-def make(tag, **fields):
-    return effect_class(tag).model_validate({"tag": tag, **fields})
 
 
 #: One of each way in which effects change the law: noise, levels, counts, exposures, edges, outliers.

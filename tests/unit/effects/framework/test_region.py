@@ -61,7 +61,7 @@ def test_region_holds_the_pixels_that_it_says(given, condition, words):
     np.testing.assert_array_equal(region.mask(SHAPE), expected)
     band = np.arange(2, 9)
     np.testing.assert_array_equal(region.mask(SHAPE, band), expected[2:9])
-    assert region.words() == words
+    assert region.describe() == words
     again = Region.model_validate(json.loads(json.dumps(region.numbers())))
     assert again == region
     if not region.text().startswith("{"):
@@ -85,7 +85,7 @@ def test_when_holds_the_frames_that_it_says(given, expected, words):
     when = When.model_validate(given)
     numbers = np.arange(-3, 10)
     np.testing.assert_array_equal(numbers[when.frames(numbers)], expected)
-    assert when.words() == words
+    assert when.describe() == words
     assert When.model_validate(when.numbers()) == when
     assert when.share(np.arange(10)) == pytest.approx(len(expected) / 10)
 

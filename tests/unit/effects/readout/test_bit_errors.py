@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
@@ -112,11 +110,3 @@ def test_a_bit_that_never_changes_is_stuck(bit, fault):
     effect = BitErrors(share=1.0, bit=bit, fault=fault)
     truth = drawn_truth((16, 16))
     assert BitErrors.estimate(seen(taken(truth, effect, n_frames=800))) == (effect,)
-
-
-def test_nothing_is_guessed_where_nothing_is():
-    truth = drawn_truth((24, 24))
-    found = [BitErrors.estimate(seen(taken(truth, n_frames=1200, seed=seed))) for seed in range(5)]
-    assert not any(found)
-    evidence = seen(taken(truth, BitErrors(share=1.0, bit=0), n_frames=800))
-    assert BitErrors.estimate(replace(evidence, time=None)) == ()

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
 
 from pchem_pipeline.discrepancy.observe.digital.misplaced import misplaced_lines, own_lines
-from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.readout.misplaced_lines import MisplacedLines
 from pchem_pipeline.effects.readout.repeated_lines import RepeatedLines
@@ -65,17 +62,6 @@ def test_every_sample_comes_from_where_the_move_says(move, lines):
     shown = {"swapped": 1 - 1 / n - share, "line_lost": 1 - 1 / n, "sample_lost": 1 - 1 / m}.get(move, 1.0)
     expected = trials * share * shown
     assert abs(hits - expected) < 5 * np.sqrt(expected)
-
-
-@pytest.mark.parametrize("lines", ["rows", "columns"])
-@pytest.mark.parametrize("move", MOVES)
-def test_a_band_of_rows_is_as_in_the_whole(move, lines):
-    frames, effect = origins(SHAPE, FRAMES), MisplacedLines(share=0.3, move=move, lines=lines)
-    whole = effect.apply(frames, context_of(SHAPE, FRAMES))
-    first, last, halo = 4, 7, effect.halo()
-    rows = np.arange(first - halo, min(last + halo, SHAPE[0]))
-    band = effect.apply(frames[:, rows], context_of(SHAPE, FRAMES, rows=rows))
-    np.testing.assert_array_equal(band[:, halo : halo + last - first], whole[:, first:last])
 
 
 def test_the_ratios_are_those_of_the_likelihoods():
@@ -147,15 +133,6 @@ def test_pixels_are_fitted_without_the_lines_that_were_moved(move, lines):
     assert replaced[moved].mean() > (0.5 if "sample" in move else 0.8)
     assert replaced[~moved].mean() < 0.01
     assert own_lines(frames, np.ones(shape, np.bool_), [RowNoise(row_noise_dn=1.0)]) is frames
-
-
-def test_nothing_else_misplaces_lines():
-    truth = drawn_truth((18, 26))
-    for effects in ((), (RowNoise(row_noise_dn=4.0),), (InterpixelCapacitance(coupling=0.02),)):
-        evidence = seen(taken(truth, *effects, n_frames=1200, seed=4))
-        assert all(abs(evidence.z[f"space.misplaced.{lines}"]) < 4 for lines in ("rows", "columns"))
-        assert list(MisplacedLines.estimate(evidence)) == []
-    assert MisplacedLines.estimate(replace(evidence, time=None)) == ()
 
 
 def test_a_line_in_two_places_is_misplaced_too_and_its_equality_tells():

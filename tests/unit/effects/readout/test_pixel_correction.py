@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
@@ -83,17 +81,6 @@ def test_threshold_and_share_are_found(effect, shape, n_frames, seed):
     # a hundredth by chance; replaced neighbours lower the predictions of some of the samples beside
     assert found.share == pytest.approx(effect.share, rel=0.1)
     assert evidence.z["space.predicted.equal"] > 20.0
-
-
-def test_nothing_is_found_where_there_is_nothing_or_a_relative():
-    from pchem_pipeline.effects.analog.frame_noise import FrameNoise
-    from pchem_pipeline.effects.analog.row_noise import RowNoise
-
-    truth = drawn_truth((24, 24))
-    for effects in ((), (RowNoise(row_noise_dn=3.0),), (FrameNoise(frame_noise_dn=2.0),)):
-        evidence = seen(taken(truth, *effects, n_frames=1200, seed=6))
-        assert PixelCorrection.estimate(evidence) == ()
-    assert PixelCorrection.estimate(replace(evidence, time=None)) == ()
 
 
 def test_exchanged_predictions_count_the_same_as_a_loop():

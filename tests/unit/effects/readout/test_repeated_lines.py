@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
 
-from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
-from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.readout.repeated_lines import RepeatedLines
 
 SHAPE, FRAMES = (9, 11), 300
@@ -44,14 +40,6 @@ def test_the_share_is_found(lines, share):
     assert found.lines == lines
     assert abs(found.share - share) < 3.5 * np.sqrt(share / n)
     assert evidence.z[f"space.repeated.{lines}"] == 10.0 * round(found.share * n)
-
-
-def test_no_line_repeats_by_chance_or_by_a_relative():
-    truth = drawn_truth((18, 26))
-    for effects in ((), (RowNoise(row_noise_dn=4.0),), (InterpixelCapacitance(coupling=0.02),)):
-        evidence = seen(taken(truth, *effects, n_frames=1200, seed=4))
-        assert list(RepeatedLines.estimate(evidence)) == []
-    assert RepeatedLines.estimate(replace(evidence, time=None)) == ()
 
 
 def test_lines_so_short_that_chance_repeats_them_say_nothing():

@@ -128,7 +128,7 @@ def test_what_depends_on_a_neighbour_is_measured(move: Any, share: float, wanted
     assert found.together == "sample"
     # a few samples are taken for other moves
     assert found.share == pytest.approx(share, rel=0.25)
-    assert neighbour_words(wanted.towards) in found.words()
+    assert neighbour_words(wanted.towards) in found.describe()
 
 
 def test_squares_that_come_as_their_mean_are_measured_where_they_begin() -> None:
@@ -136,10 +136,10 @@ def test_squares_that_come_as_their_mean_are_measured_where_they_begin() -> None
     assert found is not None
     assert found.squares == (1, 0)
     assert found.share == pytest.approx(0.05, rel=0.1)
-    assert "from odd rows and even columns on" in found.words()
+    assert "from odd rows and even columns on" in found.describe()
     # in a window that begins at an odd row they begin at even ones
-    assert found.seen_in((3, 9), (2, 12), SHAPE).squares == (0, 0)
-    assert found.found_in((3, 9), (2, 12), SHAPE).squares == (0, 0)
+    assert found.to_window((3, 9), (2, 12), SHAPE).squares == (0, 0)
+    assert found.to_sensor((3, 9), (2, 12), SHAPE).squares == (0, 0)
 
 
 def test_simulated_squares_are_the_mean_of_their_samples() -> None:

@@ -220,7 +220,7 @@ def test_its_words_say_what_happens_to_electrons() -> None:
         ElectronMode(fate="followed", place=(1, 0, 0)),
         ElectronMode(fate="lost", weight=0.5),
     )
-    assert EmpiricalElectrons(chance=0.04, modes=modes).words() == (
+    assert EmpiricalElectrons(chance=0.04, modes=modes).describe() == (
         "electron numbers that are not independent (for each one the sample one frame later has 0.04 more on "
         "average; a sample of k has 0.02 k (k - 1) fewer than independent ones would be)"
     )

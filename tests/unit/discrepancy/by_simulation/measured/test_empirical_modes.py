@@ -69,7 +69,7 @@ def test_a_gain_that_moves_is_told_by_what_shares_it(of: str, shape: tuple[int, 
     error = 0.02 * SIGNAL * np.sqrt(0.5 / np.prod(shape))
     assert abs(found.noise_dn - 0.02 * SIGNAL) < 5 * error + 0.15 * 0.02 * SIGNAL
     words = f"% of the gain, {found.noise_dn:.2g} DN at a signal of 21 DN, the same in a whole {of})"
-    assert words in found.words()
+    assert words in found.describe()
 
 
 def test_light_in_bursts_in_a_corner_is_told_with_its_place() -> None:
@@ -85,7 +85,7 @@ def test_light_in_bursts_in_a_corner_is_told_with_its_place() -> None:
     blocks = np.array(mode.shape)
     assert blocks.shape == (4, 5)
     assert blocks[0, 0] > 5 * abs(blocks).ravel()[2:].max()
-    assert "strongest in the rows from 0 to 25 %" in found.words()
+    assert "strongest in the rows from 0 to 25 %" in found.describe()
 
 
 def test_frames_that_are_noisier_are_told_with_how_many_they_are() -> None:
@@ -98,10 +98,10 @@ def test_frames_that_are_noisier_are_told_with_how_many_they_are() -> None:
     assert mode.burst == pytest.approx(some.mean(), rel=0.1)
     # too small, since loud samples scatter more than the scores should: where a fit to all statistics begins
     assert 0.5 < found.noise_dn / (0.5 * np.sqrt(some.mean()) * 0.25 * STEP) < 1.2
-    assert found.unlisted
+    assert found.empirical_unnamed
     # of bursts their size in the frames that have them
     size = r"\(\+[34]\d % of the read noise, 1\.\d DN of 3.51 DN, the same in"
-    assert re.search(f"a change of the read noise that samples share {size}", found.words())
+    assert re.search(f"a change of the read noise that samples share {size}", found.describe())
 
 
 @pytest.mark.parametrize("size", [0.3, 1.0, 2.5])
@@ -181,7 +181,7 @@ def test_a_wave_of_gain_or_light_is_told_by_its_frequencies(
     stack = frames(11, gain=1.0 + sine) if changes == "gain" else frames(11, light=1.0 + sine)
     found = measured(stack)
     assert found is not None
-    assert found.unlisted
+    assert found.empirical_unnamed
     (mode,) = found.modes
     assert (mode.of, mode.changes, mode.lags, mode.burst) == (of, changes, (), None)
     assert mode.wave is not None
@@ -194,7 +194,7 @@ def test_a_wave_of_gain_or_light_is_told_by_its_frequencies(
     assert abs(known[1] - per_line) < 4.0 * error / max(sums.information.size, 2)
     # the scores see a little less where the peaks overlap
     assert found.noise_dn / SIGNAL == pytest.approx(amplitude / np.sqrt(2.0), rel=0.15)
-    assert "a wave of" in found.words()
+    assert "a wave of" in found.describe()
 
 
 def test_a_wave_that_a_model_makes_is_not_measured_again() -> None:
@@ -239,10 +239,10 @@ def test_a_wave_is_below_half_a_cycle_along_its_own_axes_and_nothing_else(wrong:
 def test_an_offset_that_takes_turns_is_told_as_that() -> None:
     mode = NoiseMode(of="sample", share=1.0, wave=(0.5, 0.5, -0.5))
     assert mode.takes_turns
-    assert mode.words(0.3) == (
+    assert mode.describe(0.3) == (
         "0.3 DN, changing its sign from frame to frame, from row to row, from column to column"
     )
-    assert NoiseMode(of="column", share=1.0, wave=(0.1, 0.0, 0.25)).words(0.3) == (
+    assert NoiseMode(of="column", share=1.0, wave=(0.1, 0.0, 0.25)).describe(0.3) == (
         "0.3 DN, the same in a whole column, a wave of 0.1 cycles per frame and 0.25 per column"
     )
 
@@ -261,7 +261,7 @@ def test_an_offset_in_bursts_is_told_with_how_often_and_how_large() -> None:
     assert mode.burst == pytest.approx(some.mean(), rel=0.05)  # a frame of 320 samples tells it
     # the scores see a little less where the peaks overlap
     assert found.noise_dn == pytest.approx(1.5 * np.sqrt(some.mean()), rel=0.15)
-    assert "of the frames only" in found.words()
+    assert "of the frames only" in found.describe()
 
 
 def test_what_a_model_makes_is_taken_off() -> None:
@@ -333,9 +333,9 @@ def test_a_shape_that_was_found_in_a_window_is_there_on_the_sensor_and_nowhere_e
         {"shape": ((0.5, 1.0), (1.5, 0.2))} if of == "frame" else {"profile": (1.0, -0.5, 2.0)}
     )
     found = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of=of, share=1.0, **form),))
-    of_sensor = found.found_in(*window, sensor)
+    of_sensor = found.to_sensor(*window, sensor)
     size = (16, 20)
-    assert of_sensor.seen_in(*window, sensor) == found
+    assert of_sensor.to_window(*window, sensor) == found
 
     def relative(effect: EmpiricalNoise, shape: tuple[int, int]) -> np.ndarray:
         rows, columns = np.arange(shape[0]), np.arange(shape[1])
@@ -349,15 +349,15 @@ def test_a_shape_that_was_found_in_a_window_is_there_on_the_sensor_and_nowhere_e
         slice(10, 26) if of != "row" else slice(None), slice(20, 40) if of != "column" else slice(None)
     ] = False
     assert not whole[beyond].any()
-    other = relative(of_sensor.seen_in((0, 20), (30, 60), sensor), (20, 30))
+    other = relative(of_sensor.to_window((0, 20), (30, 60), sensor), (20, 30))
     np.testing.assert_allclose(other, whole[:20, 30:])
     if of == "frame":
-        assert "strongest in rows 10 to 25 and columns 20 to 39" in of_sensor.words()
+        assert "strongest in rows 10 to 25 and columns 20 to 39" in of_sensor.describe()
 
 
 def test_an_effect_without_a_shape_is_the_same_in_every_window() -> None:
     effect = EmpiricalNoise.typical()[0]
-    assert effect.seen_in((3, 9), (2, 8), (20, 20)) == effect == effect.found_in((3, 9), (2, 8), (20, 20))
+    assert effect.to_window((3, 9), (2, 8), (20, 20)) == effect == effect.to_sensor((3, 9), (2, 8), (20, 20))
 
 
 def test_an_extent_without_pixels_is_refused() -> None:

@@ -103,7 +103,7 @@ def test_what_samples_share_is_measured_by_distance(noise, of, lag, covariance):
     else:
         # the least with which a covariance at one distance is possible is twice as much
         assert abs(mode.correlation[0]) == pytest.approx(0.5 / 1.15, abs=1e-4)
-    assert "share" in found.words()
+    assert "share" in found.describe()
 
 
 def test_nothing_is_measured_where_there_is_nothing():
@@ -252,7 +252,7 @@ model:
         - {of: row, share: 1.0, lags: [[0, 1, 0]], correlation: [0.48]}
 """
     (effect,) = parse_config(text).model.effects
-    assert effect.words() == (
+    assert effect.describe() == (
         "noise of 0.7 DN that samples share (the same in a whole row, correlated by 0.48 (1 row apart))"
     )
 

@@ -136,7 +136,7 @@ def test_what_only_large_charge_does_is_told_with_how_large() -> None:
     (term,) = found.effect.terms
     assert (term.of, term.place, term.above) == ("sample", (-1, 0, 0), 3.0)
     assert found.effect.response * term.weight == pytest.approx(-0.05, rel=0.3)
-    assert "what exceeds 3 e- in the sample one frame earlier" in found.effect.words()
+    assert "what exceeds 3 e- in the sample one frame earlier" in found.effect.describe()
 
 
 def test_what_follows_its_mirror_image_is_told_in_one() -> None:
@@ -148,7 +148,7 @@ def test_what_follows_its_mirror_image_is_told_in_one() -> None:
     assert term.columns == (SHAPE[1] // 2, SHAPE[1])
     assert found.effect.response == pytest.approx(0.05, rel=0.3)
     assert found.unlisted
-    assert "% in columns 9 to 17 of its mirror image along the rows)" in found.effect.words()
+    assert "% in columns 9 to 17 of its mirror image along the rows)" in found.effect.describe()
 
 
 @pytest.mark.parametrize("along", [("rows",), ("columns",), ("rows", "columns")])
@@ -156,8 +156,8 @@ def test_a_mirror_image_in_a_window_is_where_it_is_on_the_sensor(along: Any) -> 
     charge = np.random.default_rng(5).poisson(2.0, (3, 20, 24)).astype(float)
     exposure, window = np.full((20, 24), 2.0), ((3, 15), (2, 18))
     here = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(0, 1, -2), mirrored=along),))
-    there = here.found_in(*window, (20, 24))
-    assert there.seen_in(*window, (20, 24)) == here
+    there = here.to_sensor(*window, (20, 24))
+    assert there.to_window(*window, (20, 24)) == here
     box = np.s_[:, 3:15, 2:18]
     seen = here.terms[0].seen(charge[box], exposure[box[1:]])
     on_sensor = there.terms[0].seen(charge, exposure)[box]
@@ -311,23 +311,23 @@ def test_its_size_in_a_place_is_that_of_the_place() -> None:
 def test_it_is_no_candidate_and_says_what_follows() -> None:
     assert "empirical_response" not in candidate_classes(DiscrepancySettings())
     terms = ResponseTerm(place=(0, 0, -16)), ResponseTerm(of="row", weight=-0.5, number=32)
-    assert EmpiricalResponse(response=0.004, terms=terms).words() == (
+    assert EmpiricalResponse(response=0.004, terms=terms).describe() == (
         "samples that correlate with the charge of others (+0.4 % of the sample 16 columns to the left, "
         "-0.2 % of each other sample of the row)"
     )
     terms = tuple(ResponseTerm(place=(0, 0, 1), columns=each) for each in ((0, 1), (2, 5)))
-    assert EmpiricalResponse(response=0.01, terms=terms).words() == (
+    assert EmpiricalResponse(response=0.01, terms=terms).describe() == (
         "samples that correlate with the charge of others (+1 % in column 0, +1 % in columns 2 to 4 of "
         "the sample one column to the right)"
     )
     near = EmpiricalResponse(response=0.004, terms=(ResponseTerm(place=(0, 0, -1)),))
-    assert not near.unlisted
+    assert not near.empirical_unnamed
 
 
 def test_columns_that_follow_one_across_the_rows_are_told_together() -> None:
     """The last sample of a row is the one read before the first of the next."""
     terms = tuple(ResponseTerm(place=(0, -1, 63 - n), columns=(n, n + 1), weight=0.5**n) for n in range(6))
-    assert EmpiricalResponse(response=0.16, terms=terms).words() == (
+    assert EmpiricalResponse(response=0.16, terms=terms).describe() == (
         "samples that correlate with the charge of others (+16 % in column 0, +8 % in column 1, "
         "+4 % in column 2, +2 % in column 3 and 2 more of the sample one row above in column 63)"
     )
@@ -335,9 +335,9 @@ def test_columns_that_follow_one_across_the_rows_are_told_together() -> None:
 
 def test_columns_of_a_window_are_told_on_the_sensor() -> None:
     effect = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(0, 0, 3), columns=(2, 5)),))
-    there = effect.found_in((0, 8), (10, 20), (32, 32))
+    there = effect.to_sensor((0, 8), (10, 20), (32, 32))
     assert there.terms[0].columns == (12, 15)
-    assert there.seen_in((0, 8), (10, 20), (32, 32)) == effect
+    assert there.to_window((0, 8), (10, 20), (32, 32)) == effect
 
 
 @pytest.mark.parametrize("how", [{}, {"place": (1, 0, 0)}, {"of": "row", "place": (0, 0, 2)}])

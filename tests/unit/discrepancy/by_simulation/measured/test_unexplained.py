@@ -121,7 +121,7 @@ def test_the_clearest_stands_by_itself_where_it_leaves_little(
 
 def test_what_is_measured_is_fitted_where_it_is_on_the_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
     nothing: Any = None
-    frames: Any = SimpleNamespace(on_sensor=lambda effect: effect.found_in((8, 16), (4, 12), (32, 32)))
+    frames: Any = SimpleNamespace(on_sensor=lambda effect: effect.to_sensor((8, 16), (4, 12), (32, 32)))
     refitter: Any = SimpleNamespace(model=lambda effects: effects)
     unexplained = Unexplained(SimpleNamespace(frames=frames), refitter, nothing, 0)  # type: ignore[arg-type]
     effect = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(0, 0, -1), columns=(0, 2)),))
@@ -207,12 +207,12 @@ def test_what_an_effect_with_a_name_makes_is_told_from_what_none_does(effect: An
         ElectronMode: lambda: EmpiricalElectrons(chance=0.01, modes=(effect,)),
         Move: lambda: Empirical(share=0.1, moves=(effect,)),
     }
-    assert made[type(effect)]().unlisted is unlisted
+    assert made[type(effect)]().empirical_unnamed is unlisted
 
 
 def test_rows_that_come_from_elsewhere_have_a_name() -> None:
     for place in ((0, 0, 1), (0, 1, 0)):
-        assert not Empirical(share=0.1, moves=(Move(towards=place),), together="row").unlisted
+        assert not Empirical(share=0.1, moves=(Move(towards=place),), together="row").empirical_unnamed
 
 
 def explainer(judge: Any, put: Callable[[Any], Any]) -> FrameExplainer:

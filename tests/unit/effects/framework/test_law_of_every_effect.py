@@ -1,0 +1,80 @@
+"""The law of a pixel's samples with an effect, against samples that its forward model makes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.sensor_of_modes import make, taken
+
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.simulate.truth import TruthMaps
+
+EXPOSURE, GAIN, BIAS, NOISE_E = 1.5, 0.1, 100.3, 0.3
+SHAPE, N_FRAMES = (34, 34), 400
+CODES = np.arange(50, 700)
+
+EFFECTS = [
+    make("analog_memory", memory=0.05),
+    make("analog_memory", memory=0.2, saturation_e=1.5),
+    make("flicker_noise", share=0.5, correlation_frames=1.0),
+    make("heavy_tailed_noise", share=0.05, factor=3.0),
+    make("noise_skew", share=0.5),
+    make("noise_skew", share=-0.7),
+    make("nonlinearity", step_change=0.02),
+    make("nonlinearity", step_change=-0.02, noise="bent"),
+    make("signal_dependent_noise", noise_e=0.1),
+    make("signal_dependent_noise", noise_e=0.05, growth="linear"),
+    make("interpixel_capacitance", coupling=0.01, anisotropy=0.5),
+    make("gain_drift", drift=0.12, shape="path", path=(0.5, -0.5, 0.5)),
+    make("adc_dnl", dnl_lsb=0.2, pattern="bit", bit=1),
+    make("adc_dnl", dnl_lsb=0.3, pattern="edges", first_code=100, edges=(0.5, -1.0, 0.8, 0.3)),
+    make("adc_dnl", dnl_lsb=1.0, pattern="edges", first_code=108, edges=(1.0, 0.0, 0.5, -0.5)),
+    make("adc_inl", inl_lsb=1.0, period_dn=37.0, phase=1.0),
+    make(
+        "adc_inl",
+        inl_lsb=1.0,
+        form="curve",
+        first_dn=90.0,
+        spacing_dn=9.0,
+        curve=(0.0, 1.0, -0.5, 0.2, 0.8, 0.0),
+    ),
+    make("clipping", low=98, high=141),
+    make("gain_stitch", gain_change=0.05, level_dn=121.3),
+    make("gain_stitch", gain_change=-0.05, level_dn=118.0, origin_dn=115.0),
+    make("overdispersed_counts", relative_variance=0.1),
+    make("overdispersed_counts", relative_variance=0.4),
+    make("overdispersed_counts", relative_variance=0.4, exposures="lognormal"),
+    make("branching_counts", branching=0.05),
+    make("branching_counts", branching=0.4),
+    make("optical_crosstalk", probability=0.1),
+    make("spurious_charge", mean_e=0.3),
+    make("charge_lag", fraction=0.3),
+    make("charge_diffusion", fraction=0.3),
+    make("exposure_drift", drift=0.6),
+    make("exposure_drift", drift=0.6, settling_fraction=0.3),
+    make("exposure_flicker", rms=0.3, period_frames=5.3),
+    make("exposure_flicker", rms=0.3, levels=(1.0, 2.0)),
+]
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=repr)
+def test_the_law_is_that_of_the_samples(effect):
+    parameters = (np.full(SHAPE, value) for value in (EXPOSURE, GAIN, BIAS, NOISE_E))
+    truth = TruthMaps(*parameters, np.zeros(SHAPE, np.uint8))
+    inside = taken(truth, effect, n_frames=N_FRAMES, seed=8)[:, 1:-1, 1:-1]  # fewer neighbours at the edge
+    seen = np.bincount(inside.ravel(), minlength=CODES[-1] + 1)[CODES]
+    assert seen.sum() == inside.size
+    sigma = np.sqrt((NOISE_E / GAIN) ** 2 + 1 / 12)
+    maps = PixelMaps.known([np.array([v]) for v in (EXPOSURE, GAIN, BIAS, sigma)], np.ones(1, bool))
+
+    def misfit(model: SampleLaw) -> float:
+        expected = sample_mass(model, maps, CODES)[0] * inside.size
+        some = expected > 10
+        chi2 = ((seen - expected)[some] ** 2 / expected[some]).sum()
+        return float((chi2 - some.sum()) / np.sqrt(2 * some.sum()))
+
+    model = effect.sample_law(SampleLaw(), maps)
+    assert abs(misfit(model)) < 5
+    assert model.neutral or misfit(SampleLaw()) > 20
