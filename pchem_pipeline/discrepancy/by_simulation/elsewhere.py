@@ -38,7 +38,7 @@ def deviation(by: Simulations, model: Sequence[Effect]) -> str:
     try:
         _, vectors = by.drawn(tuple(model), _REPLICATES)
     except NotFittedError:
-        return "hardly a pixel can be fitted with it"
+        return "almost no pixel can be fitted with it"
     names = by.observed.names([*own, *vectors])
     if not names:
         return ""
