@@ -1,10 +1,11 @@
-"""The way of a search for missing effects: from the split of the samples to the verdict.
+"""The steps of a search for missing effects, from the split of the samples to the verdict.
 
 Split, null, gap, disagree, explain, add, describe, close, verdict.
 
-It is the same for frames and for ready-made histograms; what differs is how effects are told apart. With
-frames, effects are simulated and compared by what they do to many statistics (:mod:`.by_simulation`); with
-histograms they enter the exact likelihood (:mod:`.by_likelihood`). Each way is an :class:`Explainer`.
+They are the same for frames and for ready-made histograms; only the comparison of effects differs. With
+frames, effects are simulated and compared by their shift of many statistics (:mod:`.by_simulation`); with
+histograms they are parameters of the exact likelihood (:mod:`.by_likelihood`). Either is an
+:class:`Explainer`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The effects that the likelihood of histograms added: each with its gap and its rivals, and what is left."""
+"""Effects added by likelihood, with gap and rivals of each, and the remaining discrepancy."""
 
 from __future__ import annotations
 

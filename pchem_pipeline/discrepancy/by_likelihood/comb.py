@@ -1,4 +1,4 @@
-"""Codes by their place on the comb of peaks: which to compare, and where data and model disagree.
+"""Codes by their position (x - bias) * gain: which to compare, and where data and model disagree.
 
 Where no known effect brings the model to the data, something unknown is in them, and likely in one place: a
 peak that was cut by a trigger, samples between the peaks. A fit to all codes bends every parameter towards

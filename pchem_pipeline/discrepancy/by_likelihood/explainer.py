@@ -1,4 +1,4 @@
-"""Effects are told apart in ready-made histograms by their likelihood: the law of the samples alone.
+"""Comparison of effects in ready-made histograms by likelihood.
 
 There is no order in time and there are no neighbours. The samples of every pixel are split at random into
 three parts: one to fit, one to score, one for the final gap. Effects enter the exact likelihood of the

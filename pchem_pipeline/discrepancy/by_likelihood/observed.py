@@ -1,4 +1,4 @@
-"""What a search sees of ready-made histograms before it asks anything: the rows that it looks at, split."""
+"""The examined histograms, split into train, test and final samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The effects that rounds of simulation added: each with its gap, its rivals, and whether it stands."""
+"""Effects added by simulation, with gap, rivals and acceptance of each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a model that explains one window of the sensor holds in another one.
+"""Test of the final model in another window of the sensor.
 
 A search compares a window of a large sensor with simulations. What is larger than that window may look there
 like something else: of a slope along each row one end is like noise of the rows.
