@@ -35,6 +35,7 @@ from pchem_pipeline.discrepancy.verdict import (
     families_words,
     form_of,
     parameters_of,
+    share_text,
     sigma_text,
 )
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
@@ -503,14 +504,8 @@ def _closed(found: Findings) -> str:
     before, after = found.before, found.added.after
     if before.at_floor or after.value >= before.value:
         return f"does not reduce the discrepancy in unseen {found.samples}"
-    share = _share(closed_share(before.value, after.value))
+    share = share_text(closed_share(before.value, after.value))
     return f"explains {share} of the discrepancy in unseen {found.samples}"
-
-
-def _share(share: float) -> str:
-    """Format a share in per cent; 100 % only if it is all."""
-    percent = 100.0 * share
-    return f"{percent:.0f} %" if percent < 99.0 or share >= 1.0 else f"{min(percent, 99.99):.4g} %"
 
 
 def _rest(found: Findings) -> str:
@@ -520,7 +515,7 @@ def _rest(found: Findings) -> str:
         return ""
     if after.value <= after.floor:
         return f"; a significant discrepancy remains in {families_words(after.standing_out)}"
-    return f"; {_share(1.0 - closed_share(found.before.value, after.value))} of the discrepancy remains"
+    return f"; {share_text(1.0 - closed_share(found.before.value, after.value))} of the discrepancy remains"
 
 
 def _broken(found: Findings) -> str:
@@ -555,7 +550,7 @@ def _doubts(added: Added) -> str:
             if share > CONVINCING_PLACEBO:
                 words += (
                     f"; an unrelated control ({_title(each.placebo.effect)}) explains "
-                    f"{_share(min(share, 1.0))} of that, too: the name {_title(each.effect.tag)} is doubtful"
+                    f"{share_text(min(share, 1.0))} of that, too: {_title(each.effect.tag)} is doubtful"
                 )
     return words
 

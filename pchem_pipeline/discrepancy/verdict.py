@@ -609,6 +609,12 @@ def micronats(gap: float) -> str:
     return "not known" if not math.isfinite(gap) else f"{value:,.0f}" if value >= 100.0 else f"{value:.2g}"
 
 
+def share_text(share: float) -> str:
+    """Format a share in per cent; 100 % only if it is all."""
+    percent = 100.0 * share
+    return f"{percent:.0f} %" if percent < 99.0 or share >= 1.0 else f"{min(percent, 99.99):.4g} %"
+
+
 def sigma_text(z: float) -> str:
     """Format the size of a deviation in standard deviations; its direction is in the sentence beside it."""
     return f"{abs(z):.{1 if abs(z) < 9.95 else 0}f} sigma" if math.isfinite(z) else "sigma not known"

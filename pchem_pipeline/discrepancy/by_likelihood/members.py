@@ -1,4 +1,4 @@
-"""Effects as parameters of a likelihood: which of them change a pixel's histogram, and their free parameters."""
+"""Effects as parameters of a likelihood: which change a pixel's histogram, and their free parameters."""
 
 from __future__ import annotations
 
