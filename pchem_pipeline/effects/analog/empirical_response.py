@@ -86,7 +86,7 @@ class ResponseTerm(Section):
         return self.columns[0] + self.place[2] if any(self.place[:2]) and self.place[2] else None
 
     def words(self) -> str:
-        """Return in words what is followed."""
+        """Describe the other samples."""
         if self.of == "sample":
             what = f"what exceeds {self.above:g} e- in " if self.above else ""
             if self.mirrored:
@@ -148,7 +148,7 @@ class EmpiricalResponse(Effect):
 
     tag: Literal["empirical_response"] = Field(default="empirical_response", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "measured response to the charge of other samples, without an explanation"
+    title: ClassVar[str] = "empirical response to the charge of other samples"
     source: ClassVar[str] = "Volterra 1930, Priestley 1981 (linear responses)"
     strength: ClassVar[str] = "response"
     measured_only: ClassVar[bool] = True
@@ -156,7 +156,7 @@ class EmpiricalResponse(Effect):
     response: Ratio = Field(
         ge=0,
         le=1,
-        description="part of the charge of another sample that a sample gets, for weight 1, no unit",
+        description="share of the charge of another sample that is added, for weight 1, no unit",
     )
     terms: tuple[ResponseTerm, ...] = Field(
         min_length=1,
@@ -263,7 +263,7 @@ class EmpiricalResponse(Effect):
         return model.with_variance(e2=self.response**2 * power)
 
     def words(self) -> str:
-        """Return what is known of it."""
+        """Describe the response as a clause."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         followed: dict[str, list[str]] = {}
         for term in sorted(self.terms, key=lambda term: -abs(term.weight)):
@@ -273,7 +273,7 @@ class EmpiricalResponse(Effect):
             )
         told = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:_FEW]]
         more = f", and {len(followed) - _FEW} more" if len(followed) > _FEW else ""
-        return f"samples{place} that correlate with the charge of others ({', '.join(told)}{more})"
+        return f"samples{place} depend on the charge of other samples ({', '.join(told)}{more})"
 
 
 def _few(parts: Sequence[str]) -> str:

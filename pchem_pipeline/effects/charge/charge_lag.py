@@ -36,11 +36,11 @@ class ChargeLag(Effect):
     source: ClassVar[str] = "Fossum and Hondongwa 2014, IEEE J. Electron Devices Soc. 2, 33; Mirasol 1963"
     strength: ClassVar[str] = "fraction"
     untestable: ClassVar[str] = (
-        "Poisson electrons that are each delayed by chance stay independent Poisson electrons; a bright "
-        "frame followed by dark ones would show it"
+        "randomly delayed Poisson electrons remain independent and Poisson; a bright frame followed by dark "
+        "ones would show it"
     )
     fraction: Ratio = Field(
-        ge=0, le=0.9, description="probability that an electron is one frame late, no unit"
+        ge=0, le=0.9, description="probability that an electron is delayed by one frame, no unit"
     )
 
     def history(self) -> int:

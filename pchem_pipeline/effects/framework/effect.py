@@ -125,8 +125,8 @@ class Effect(Section):
     measured_only: ClassVar[bool] = False
     far_reaching: ClassVar[bool] = False
     attained: ClassVar[tuple[str, ...]] = ()
-    region: Region | None = Field(default=None, description="where on the sensor it acts; null: everywhere")
-    when: When | None = Field(default=None, description="in which frames it acts; null: in all")
+    region: Region | None = Field(default=None, description="region of the sensor; null: everywhere")
+    when: When | None = Field(default=None, description="frames concerned; null: all")
 
     @model_serializer(mode="wrap")
     def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -249,11 +249,11 @@ class Effect(Section):
         return type(self).model_validate(values)
 
     def stuck_words(self) -> str:
-        """Return in words which parameters stand at a limit; empty: none."""
-        return " and ".join(f"its {name} stands at its limit, {v:g}" for name, v in self.at_limits().items())
+        """State which parameters are at a limit; empty if none."""
+        return " and ".join(f"its {name} is at the limit of {v:g}" for name, v in self.at_limits().items())
 
     def at_limits(self) -> dict[str, float]:
-        """Return the parameters that stand at a limit of their field, by name.
+        """Return the parameters at a limit of their field, by name.
 
         Not those at their default, nor those of :attr:`attained`.
         """
@@ -269,7 +269,7 @@ class Effect(Section):
         return found
 
     def words(self) -> str:
-        """Return what is known of it, for people."""
+        """Describe the effect: its title, or a clause for an empirical one."""
         return self.title or self.tag
 
     def by_law(self, shape: tuple[int, int]) -> Sequence[Effect]:
