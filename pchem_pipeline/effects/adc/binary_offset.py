@@ -44,7 +44,7 @@ class BinaryOffset(Effect):
     strength: ClassVar[str] = "offset_dn"
     separate: ClassVar[Mapping[str, str]] = {
         "interpixel_capacitance": "pixels above and below: ADC memory acts along the row only",
-        "optical_crosstalk": "a bright spot: crosstalk depends on the charge beside it, an offset on the code",
+        "optical_crosstalk": "a bright spot: crosstalk depends on nearby charge, a binary offset on the code",
         "adc_dnl": "a dark neighbour: DNL stays, an offset by the previous code vanishes",
     }
     offset_dn: Dn = Field(

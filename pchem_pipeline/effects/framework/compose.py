@@ -148,7 +148,7 @@ def _with_effect(
     if effect.everywhere:
         return [(pixels, effect.sample_law(law, _some(maps, pixels)))]
     if places is None:
-        raise ValueError("pixels and frames of these samples are unknown")
+        raise ValueError("pixels and frames of these samples are not known")
     inside = places.inside(effect)[pixels]
     share = places.share(effect)
     if share == 0.0 or not inside.any():
