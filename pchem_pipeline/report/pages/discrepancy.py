@@ -71,7 +71,7 @@ PARTS: tuple[tuple[str, str, str], ...] = (
     ),
     (
         "evidence",
-        "Which effect it is",
+        "Identification of the effect",
         "Log-likelihood of each fitted candidate on test frames, relative to the best; larger is better. A "
         "difference below three standard errors is not decisive.",
     ),
@@ -397,14 +397,14 @@ def _compared(step: Step, data: DiscrepancyData) -> list[Flag]:
         return []
     if runner_up is not None:
         share = percent(step.closed_by(runner_up), 1.0)
-        why = f"; {runner_up.why}" if runner_up.why else ""
-        rival = f"The next best effect instead of {name}, {_short(data, runner_up.effect)}"
-        flags.append(Flag("note", f"{rival}, closes {share} of the gap{why}."))
+        why = f" and is rejected: {runner_up.why}" if runner_up.why else ""
+        rival = f"{_short(data, runner_up.effect)} instead of {name} (next best effect)"
+        flags.append(Flag("note", f"{rival} closes {share} of the gap{why}."))
     if placebo is None:
         return [*flags, Flag("good", f"No unrelated control instead of {name} closes any of the gap.")]
     of_that = min(step.closed_by(placebo) / own, 1.0)
     doubtful = of_that > CONVINCING_PLACEBO
     end = f": {name} is doubtful" if doubtful else ""
-    text = f"An unrelated control instead of {name} ({_short(data, placebo.effect)}) closes"
-    words = f"{text} {percent(of_that, 1.0)} as much of the gap{end}."
+    text = f"An unrelated control ({_short(data, placebo.effect)}) reduces the gap"
+    words = f"{text} {percent(of_that, 1.0)} as much as {name}{end}."
     return [*flags, Flag("caution" if doubtful else "good", words)]

@@ -46,11 +46,11 @@ def probability_text(p: float) -> str:
 
 
 def parameter_texts(candidate: Candidate) -> list[tuple[str, str]]:
-    """Return the fields of a candidate as text, numbers to four digits."""
+    """Format the given fields of a candidate, numbers to three digits."""
     return [
-        (name, f"{value:.4g}" if isinstance(value, int | float) else str(value or ""))
+        (name, f"{value:.3g}" if isinstance(value, int | float) else str(value))
         for name, value in candidate.parameters.items()
-        if not isinstance(value, list | dict)
+        if value is not None and not isinstance(value, list | dict)
     ]
 
 
@@ -270,7 +270,7 @@ def _moved(found: Verdict) -> Table:
                 (
                     f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
                     f"{step.likeliest}{_how(step, found)}",
-                    short(each.median) if math.isfinite(each.median) else "not known",
+                    short(each.median, 2) if math.isfinite(each.median) else "not known",
                     signed(each.in_stderr),
                 )
             )
@@ -361,4 +361,4 @@ def _examined(data: DiscrepancyData) -> Table:
     if math.isfinite(found.work):
         rows.append(("counted work of the search, CPU s of a core of about 2020", f"{found.work:,.0f}"))
     rows += [(f"version: {name}", str(version)) for name, version in found.versions.items()]
-    return Table("discrepancy-examined", "What was examined", "", ("item", "value"), tuple(rows))
+    return Table("discrepancy-examined", "Samples examined", "", ("item", "value"), tuple(rows))

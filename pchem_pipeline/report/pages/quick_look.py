@@ -52,7 +52,8 @@ def nothing_found(look: QuickLook) -> str:
     rows = next((check for check in look.checks if check.name == "row_noise"), None)
     if rows is None:
         return "Quick look: the codes agree with the model within sampling noise."
-    text = "Quick look: frames, rows, columns, neighbours, pickup and codes agree with the model"
+    codes = "" if "codes" in look.missing else ", codes"
+    text = f"Quick look: frames, rows, columns, neighbours{codes} and pickup agree with the model"
     if math.isfinite(rows.limit):
         text += f"; row noise above {short(rows.limit, 2)} DN is excluded (95 %)"
     return f"{text}."

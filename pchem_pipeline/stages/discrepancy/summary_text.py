@@ -104,9 +104,7 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
     """Format the named effect of a step and its rejected rivals, or the table of an ambiguous step."""
     lines = []
     title = f"step {number}" if number else "candidate"
-    if step.effect:
-        lines += [line for rival in step.rivals for line in _rejected(rival)]
-    elif len(step.candidates) > 1 and found.verdict == "ambiguous":
+    if not step.effect and len(step.candidates) > 1 and found.verdict == "ambiguous":
         lines.append(f"{title:<28}{'score':>10}{'stderr':>9}{'probability':>13}")
         for each in step.candidates[:_MOST_CANDIDATES]:
             row = f"  {each.effect:<26}{_number(each.score):>10}{_number(each.stderr):>9}"
@@ -120,7 +118,9 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
         ]
         values += [f"{name} = {word}" for name, word in step.form.items()]
         lines += _listed(f"{step.likeliest} in {step.place}" if step.place else step.likeliest, values, 0)
-    if not step.effect and found.verdict == "ambiguous":
+    if step.effect:
+        lines += [line for rival in step.rivals for line in _rejected(rival)]
+    elif found.verdict == "ambiguous":
         lines += [
             line
             for rival, text in step.separate.items()
@@ -155,12 +155,10 @@ def _gap(found: Verdict) -> list[str]:
         words += f", {share_text(gap.closed_fraction)} closed{nearest}"
     words += ")"
     for step in found.steps:
-        if step.within_chance:
+        if step.within_chance or not step.effect:
             continue  # reductions of sampling noise mean nothing
-        for role, rival in (("next best effect", step.runner_up), ("unrelated control", step.placebo)):
-            if rival is not None and step.effect:
-                left = f"{micronats(rival.gap_after)} remain"
-                words += f"; with the {role} {rival.effect} instead of {step.effect}, {left}"
-        if step.effect and step.placebo is None:
-            words += f"; no unrelated control instead of {step.effect} reduces it"
+        rivals = (step.runner_up, "next best effect"), (step.placebo, "unrelated control")
+        left = [f"{micronats(r.gap_after)} with {r.effect} ({role})" for r, role in rivals if r is not None]
+        left += ["no unrelated control reduces it"] if step.placebo is None else []
+        words += f"; instead of {step.effect}: {', '.join(left)}"
     return _wrapped(words)
