@@ -66,7 +66,7 @@ def test_nothing_hidden_is_consistent():
     assert found.effects == ()
     assert found.gap.before < 3 * found.gap.floor
     assert "row_noise" in found.untestable
-    assert "no order in time and no neighbours" in found.untestable["row_noise"]
+    assert "no frame order and no neighbours" in found.untestable["row_noise"]
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tri
     found = find_in_histograms([sample], short).verdict
     assert found.verdict == "unexplained"
     assert found.effects == ()
-    assert "ended at its limit" in found.limit
+    assert "used its budget" in found.limit
     assert "branching_counts" in found.limit
     assert find_in_histograms([sample], short).verdict == found
 
