@@ -463,7 +463,7 @@ def _sized(effect: Effect, sizes: Mapping[Effect, Size | None]) -> str:
 def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Size | None]) -> str:
     """Describe the data empirically where no known effect explains them."""
     known = [(effect.words(), sizes.get(effect)) for effect in found.described]
-    words = "; and ".join(text if size is None else f"{text}, {size.words()}" for text, size in known)
+    words = "; and ".join(text if size is None else f"{text}, size {size.words()}" for text, size in known)
     lead = f"The model was missing {_and(titles)}; {_none(found)} explains the rest"
     if not titles:
         lead = f"{_none(found).capitalize()} explains the discrepancy"
@@ -489,7 +489,7 @@ def _nearest(found: Findings) -> str:
     words = ""
     for why in dict.fromkeys(doubtful.values()):
         alike = [_title(tag) for tag, against in doubtful.items() if against == why]
-        words += f"; {_and(alike)} comes closest and is rejected: {why}"
+        words += f"; {_and(alike)} {'comes' if len(alike) == 1 else 'come'} closest, but {why}"
     return words + (f"; closest known: {_and(nearest)}" if nearest else "")
 
 
@@ -549,7 +549,7 @@ def _doubts(added: Added) -> str:
             share = (each.before.value - max(each.placebo.gap_after, 0.0)) / closed
             if share > CONVINCING_PLACEBO:
                 words += (
-                    f"; an unrelated control ({_title(each.placebo.effect)}) explains "
+                    f"; an unrelated control, {_title(each.placebo.effect)}, explains "
                     f"{share_text(min(share, 1.0))} of that, too: {_title(each.effect.tag)} is doubtful"
                 )
     return words
