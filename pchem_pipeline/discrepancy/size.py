@@ -24,7 +24,7 @@ from pchem_pipeline.simulate.settings import SimulateSettings
 
 _MOST_ROWS = 12  # and columns: what all pixels of a frame share has one draw a frame
 _BLOCKS, _BLOCK_FRAMES = 100, 40  # spread over the run
-#: Frames that are drawn at least, in several stacks of a short run: a size is told to two digits.
+#: Smallest number of simulated frames, in several stacks of a short run: a size has two digits.
 _FEWEST_FRAMES = 20_000
 _FEWEST_BLOCKS = 4  # of the whole sensor
 _BITS = 24

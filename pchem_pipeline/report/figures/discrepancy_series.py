@@ -277,7 +277,7 @@ def frames_chart(
     Args:
         frames: of :func:`frame_tables`.
         stretches: likewise.
-        sds: standard deviation of a frame by chance, in the stored unit, by what is shown.
+        sds: sampling noise of a frame mean, in the stored unit, by panel.
         marked: places whose frames are shaded.
     """
     panels = []

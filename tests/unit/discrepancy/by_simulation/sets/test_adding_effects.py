@@ -728,7 +728,7 @@ def test_effects_that_meet_in_one_part_are_one_cause_without_a_name(second: str)
 @pytest.mark.parametrize(
     ("left", "words"),
     [
-        ({"frame.covariance": 6.0}, "with it in the model"),
+        ({"frame.covariance": 6.0}, "it leaves a misfit"),
         ({"frame.covariance": 3.0}, ""),
         ({"shape.He4.mean": 6.0}, ""),
     ],
