@@ -139,7 +139,7 @@ def test_a_peak_that_was_cut_is_set_aside_and_bends_nothing():
 
 
 def test_too_few_samples_are_refused_in_one_line():
-    with pytest.raises(InputError, match="fewer than 900"):
+    with pytest.raises(InputError, match="900 needed"):
         find_in_histograms([SampleHistograms(np.ones((4, 50), np.uint32), np.zeros(4, np.int64))], SETTINGS)
 
 
