@@ -392,13 +392,14 @@ def _compared(step: Step, data: DiscrepancyData) -> list[Flag]:
     if step.within_chance:  # reductions of sampling noise mean nothing
         if runner_up is None or not runner_up.why:
             return []
-        return [Flag("note", f"{_short(data, runner_up.effect)} is rejected: {runner_up.why}.")]
+        rival = f"The next best effect, {_short(data, runner_up.effect)}"
+        return [Flag("note", f"{rival}, is rejected, since {runner_up.why}.")]
     if not own > 0.0:
         return []
     if runner_up is not None:
         share = percent(step.closed_by(runner_up), 1.0)
-        why = f" and is rejected: {runner_up.why}" if runner_up.why else ""
-        rival = f"{_short(data, runner_up.effect)} instead of {name} (next best effect)"
+        why = f" and is rejected, since {runner_up.why}" if runner_up.why else ""
+        rival = f"Instead of {name}, {_short(data, runner_up.effect)} (next best effect)"
         flags.append(Flag("note", f"{rival} closes {share} of the gap{why}."))
     if placebo is None:
         return [*flags, Flag("good", f"No unrelated control instead of {name} closes any of the gap.")]

@@ -489,7 +489,7 @@ def test_a_gap_that_chance_makes_is_not_said_to_be_closed() -> None:
     data = discrepancy_data("named", steps=[weak], gap=gap)
     told = [flag.text for flag in remarks(data)]
     assert not any("closes" in text or "control" in text for text in told)
-    assert any(text.startswith("Periodic pickup is rejected: it leaves a misfit") for text in told)
+    assert any("Periodic pickup, is rejected, since it leaves a misfit" in text for text in told)
     facts = {fact.label: fact for fact in key_facts(data)}
     assert "of the gap closed" not in facts
     assert facts["gap between data and model"].value == "0.6 → 0"
