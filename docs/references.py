@@ -186,16 +186,17 @@ def effects() -> str:
     lines = [
         "# Effects",
         "",
-        "Effects of real sensors beyond the PCD. Each may be in `model.effects` (fit) and in",
-        "`simulate.effects` (simulation), and is a candidate of `pchem discrepancy` unless it is not",
-        "testable with one constant exposure, or an empirical description. The statistics that it",
-        "affects first identify it.",
+        "What the plain model lacks and real sensors have. Each may stand in `model.effects` (it is",
+        "fitted with) and in `simulate.effects` (it is simulated), and is a candidate of `pchem discrepancy`",
+        "unless its own text says that frames of one constant exposure cannot show it, or that it is",
+        "measured where all others have failed. Each is told by the",
+        "statistics that it moves first.",
         "",
-        "Each may be restricted to a region and to frames (`region`, `when`). Readout taps or groups of",
-        "columns that differ are described by several entries of `frame_noise`, `bias_drift`,",
-        "`gain_drift`, `exposure_flicker` or another effect, each with its own strength and `region`,",
-        "for example `taps=64/1`.",
-        "Constant differences of bias, gain and read noise between taps are in the maps already.",
+        "Each may have a place and a time (`region`, `when`). What differs by readout tap or group of",
+        "columns is so described, without effects of its own: several entries of `frame_noise`,",
+        "`bias_drift`, `gain_drift`, `exposure_flicker` or another, each with its own strength and",
+        "`region`, for example `taps=64/1`.",
+        "Bias, gain and read noise that differ by tap and stay are in the maps of the pixels already.",
     ]
     for plane in Plane:
         members = [c for c in own if c.plane is plane]
@@ -222,7 +223,7 @@ def _effect(effect: type[Any]) -> Iterator[str]:
         yield f"Not testable with one constant exposure: {_escaped(effect.untestable)}."
         yield ""
     if effect.signature:
-        yield "Statistics affected first: " + ", ".join(f"`{s}`" for s in effect.signature) + "."
+        yield "Moves first: " + ", ".join(f"`{s}`" for s in effect.signature) + "."
         yield ""
     yield "| setting | default | meaning |"
     yield "|---|---|---|"
@@ -231,7 +232,7 @@ def _effect(effect: type[Any]) -> Iterator[str]:
         yield f"| `{name}` | {_default(field)} | {_cell(field.description or '')}{_limits(field)} |"
     if effect.separate:
         yield ""
-        yield "| similar effect | measurement: difference |"
+        yield "| rival | what tells them apart |"
         yield "|---|---|"
         for rival, words in effect.separate.items():
             yield f"| `{rival}` | {_cell(words)} |"

@@ -162,21 +162,22 @@ def discrepancy(
         bool,
         typer.Option(
             "--refit/--no-refit",
-            help="add named effects to the model, and redo fit, maps, ensemble and report with it",
+            help="add what is named to the model, and do fit, maps, ensemble and report with it",
         ),
     ] = True,
     roi: Annotated[
-        str | None, typer.Option(help="search the pixels y0:y1,x0:x1 only [default: all, or a window]")
+        str | None, typer.Option(help="look at the pixels y0:y1,x0:x1 only [default: all, or a window]")
     ] = None,
     effort: Annotated[
-        float | None, typer.Option(help="factor on the search budget [default: discrepancy.effort]")
+        float | None,
+        typer.Option(help="times the usual limit of the search's work [default: discrepancy.effort]"),
     ] = None,
     *,
     command: Command,
 ) -> None:
-    """Search for effects that the model is missing, and add them to it.
+    """Find what the model is missing, name it, and add it to the model.
 
-    Compares the frames with simulations of the fitted model. Named effects make a new version of the model.
+    Simulates the fitted model many times and compares. What is named makes a new version of the model.
     """
     from pchem_pipeline.commands.discrepancy import find_and_add
     from pchem_pipeline.run.target import find_run
@@ -236,12 +237,12 @@ def status(
 @app.command()
 def model(
     target: Target,
-    use: Annotated[int | None, typer.Option(min=1, help="use this version, in store and YAML")] = None,
+    use: Annotated[int | None, typer.Option(min=1, help="put this version in force, in the YAML too")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one line of JSON, for machines")] = False,
 ) -> None:
-    """List the versions of the model and the results of each; switch to one.
+    """List the versions of the model and what rests on each; go back to one.
 
-    A version is made from the section model of the YAML, or by pchem discrepancy.
+    A version is made from the section model of the YAML, or by a verdict of discrepancy.
     """
     from pchem_pipeline.commands.model import list_models, model_lines, models_json, use_model
     from pchem_pipeline.run.target import find_run
@@ -381,7 +382,7 @@ def demo(
     hidden: Annotated[
         str | None,
         typer.Option(
-            help="simulate this effect and search for it: a tag; in a part of the sensor or run with "
+            help="hide this effect and search for it: a tag; in a part of the sensor or of the run with "
             "row_noise@columns=40:50"
         ),
     ] = None,

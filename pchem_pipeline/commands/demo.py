@@ -1,6 +1,7 @@
 """``pchem demo``: a simulated sensor through the whole pipeline, beside its truth.
 
-With ``--hidden`` the simulated frames contain an effect that the fitted model lacks, and that a search finds.
+With ``--hidden`` the simulated frames contain an effect that the fitted model lacks, and the search for a
+discrepancy has to find it.
 """
 
 from __future__ import annotations
@@ -43,8 +44,9 @@ def run_demo(
         size: rows and columns.
         n_frames: number of frames.
         seed: root of the random numbers.
-        hidden: tag of an effect in the frames, to be found by the search; after ``@`` its region or frames.
-        quiet: print warnings only.
+        hidden: tag of an effect in the frames, to be found by the search; with ``@`` and a place or a time:
+            it acts only there.
+        quiet: say warnings only.
 
     Raises:
         ConfigError: the folder holds something else, or the effect is unknown or has no typical strength.
@@ -97,7 +99,7 @@ def hidden_effect(asked: str, size: int, n_frames: int) -> Effect:
         known = ", ".join(effect_classes())
         raise ConfigError(
             f"--hidden {tag!r}: there is no such effect; choose one of: {known}; "
-            f"in a part of the sensor or run, add @ and {GRAMMAR}"
+            f"behind it @ and a place, if any: {GRAMMAR}"
         )
     typical = effect_class(tag).typical()
     if not typical:
@@ -124,11 +126,11 @@ def _search(target: Target, effect: Effect, command: Command, plain: str) -> str
     numbers = {n: v for n, v in effect.model_dump().items() if isinstance(v, int | float)}
     reason = type(effect).untestable
     return (
-        f"{verdict_text(found)}\n\nhidden effect: {effect_words(effect)}"
+        f"{verdict_text(found)}\n\nhidden was: {effect_words(effect)}"
         f"{''.join(f', {name} = {value:.4g}' for name, value in numbers.items())}"
-        f"{f' (not testable with such frames: {reason})' if reason else ''}\n\n"
-        f"fit of the plain model:\n{plain}\n\n"
-        f"fit of the model found:\n{comparison_table(RunStore.open(target.store))}\n\n"
+        f"{f' (such frames cannot show it: {reason})' if reason else ''}\n\n"
+        f"with the plain model:\n{plain}\n\n"
+        f"with the model of the verdict:\n{comparison_table(RunStore.open(target.store))}\n\n"
         f"verdict: {target.store / 'discrepancy.html'}"
     )
 

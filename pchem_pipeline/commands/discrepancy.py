@@ -1,4 +1,4 @@
-"""``pchem discrepancy``: search for missing effects, then redo the rest of the run with the new model."""
+"""``pchem discrepancy``: search for what is missing, then bring the rest of the run up to the model found."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _AFTERWARDS = ("fit", "maps", "ensemble", "report")
 
 
 def find_and_add(target: Target, command: Command, *, refit: bool, effort: float | None = None) -> str:
-    """Search for effects, add the named ones to the model, and refit; return the verdict as text.
+    """Search for effects, add those named to the model, and fit with it; return the verdict as text.
 
     Args:
         target: the run.
-        command: options of the command line.
-        refit: make the verdict's model a version, unless ``discrepancy.add`` is off, and redo existing fit,
-            maps, ensemble and report; False: model and YAML stay.
-        effort: replaces ``discrepancy.effort``; None: not.
+        command: from the command line.
+        refit: make the verdict's model a version, unless ``discrepancy.add`` is off, and bring fit, maps,
+            ensemble and report up to date where they were done before; else model and YAML stay.
+        effort: in place of the configuration's ``discrepancy.effort``; None: as that has it.
 
     Raises:
         PchEmError: a stage cannot be done.
@@ -47,7 +47,7 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
     if add:
         target, words = adopt_verdict(target)
         if words:
-            written = "" if path is None else f" (written to {path})"
+            written = "" if path is None else f" (it is in {path} now)"
             Reporter(command.progress, quiet=command.quiet, log=command.log_json).info(words + written)
     if refit:
         done = {s.stage for s in run_status(target) if s.state != "missing"}
@@ -61,7 +61,7 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
 
 
 def _of_histograms(target: Target) -> bool:
-    """Return whether the search uses histograms instead of frames: ready-made ones, or several exposures."""
+    """Tell whether the search looks at histograms, not at frames: ready-made ones, or several samples'."""
     if not target.store.exists():
         return False
     store = target.stored()
@@ -69,5 +69,5 @@ def _of_histograms(target: Target) -> bool:
 
 
 def without_choice(command: Command) -> Command:
-    """Return the command without --force and --roi, which apply to the search only."""
+    """Return the command without --force and --roi, which were meant for the search alone."""
     return replace(command, options=replace(command.options, force=False, roi=None))

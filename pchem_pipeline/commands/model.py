@@ -1,4 +1,4 @@
-"""``pchem model``: the versions of a run's model, the one in use, and the results of each."""
+"""``pchem model``: the versions of a run's model, which of them is in force, and what rests on each."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class ListedModel:
     """A version of the model as it is listed.
 
     Attributes:
-        version: the version.
-        current: whether it is in use.
-        results: stages with results of this version.
+        version: of the model.
+        current: whether it is in force.
+        results: stages whose results rest on it.
     """
 
     version: ModelVersion
@@ -48,7 +48,7 @@ class ListedModel:
     results: tuple[str, ...]
 
     def to_json(self) -> dict[str, object]:
-        """Return JSON data."""
+        """Return it as JSON data."""
         version = self.version
         return {
             "number": version.number,
@@ -64,7 +64,7 @@ class ListedModel:
 
 
 def list_models(target: Target) -> list[ListedModel]:
-    """Return the versions of the model of a run; one that is only in the YAML comes last.
+    """Return the versions of the model of a run; one that is in the YAML but not in the run yet comes last.
 
     Raises:
         StoreError: there is no run, or it is damaged.
@@ -96,13 +96,12 @@ def model_lines(models: Sequence[ListedModel]) -> list[str]:
 
 
 def _words(version: ModelVersion) -> str:
-    """Describe the model, with the strengths of its effects."""
+    """Return the model in words, with the strengths of its effects."""
     try:
         effects = version.effects
     except ConfigError:
         return ", ".join(str(effect.get("tag")) for effect in version.model["effects"])
-    n = len(version.settings.set_aside_e)
-    aside = [f"without {n} interval{'s' if n > 1 else ''} of codes"] if n else []
+    aside = [f"without {len(version.settings.set_aside_e)} intervals"] if version.settings.set_aside_e else []
     return " + ".join(["PCD", *map(_effect_words, effects), *aside])
 
 
@@ -115,11 +114,11 @@ def _effect_words(effect: Effect) -> str:
 
 
 def use_model(target: Target, number: int) -> str:
-    """Switch to a version of the model, in store and YAML; return a text that lists stale results.
+    """Put a version of the model in force, in store and YAML; return in words what is stale thereby.
 
     Args:
         target: the run.
-        number: number of the version.
+        number: of the version.
 
     Raises:
         ConfigError: there is no such version, or the YAML cannot be edited.
@@ -132,31 +131,31 @@ def use_model(target: Target, number: int) -> str:
         version = version_with(store, number)
         changed = _put_in_force(store, target, version)
     if before.number == number:
-        words = f"model {number} is in use already: {_words(version)}"
+        words = f"model {number} was in force already: {_words(version)}"
     else:
         words = _change_words(changed, before, version)
     return "\n".join([words, *_stale_lines(changed)])
 
 
 def _change_words(target: Target, before: ModelVersion, version: ModelVersion) -> str:
-    """State the version in use, and how to go back to the previous one."""
+    """Say which version is in force now, and how to go back to the one before."""
     place = quoted(yaml_of(target) or target.store)
     back = f"to go back: pchem model {place} --use {before.number}"
-    return f"model {version.number} is in use: {_words(version)}; {back}"
+    return f"model {version.number} is in force: {_words(version)}; {back}"
 
 
 def _stale_lines(target: Target) -> list[str]:
-    """List stale results, and the command that updates them."""
+    """Say which results are stale, and what does them again."""
     stale = [state.stage for state in run_status(target) if state.state == "stale"]
     place = quoted(yaml_of(target) or target.store)
     usual = [name for name in stale if not STAGES[name].on_demand]
-    lines = [f"stale: {', '.join(usual)}; update: pchem run {place}"] if usual else []
-    lines += [f"stale: {name}; update: pchem {name} {place}" for name in stale if name not in usual]
+    lines = [f"stale: {', '.join(usual)}; to do them again: pchem run {place}"] if usual else []
+    lines += [f"stale: {name}; to do it again: pchem {name} {place}" for name in stale if name not in usual]
     return lines or ["nothing is stale"]
 
 
 def yaml_of(target: Target) -> Path | None:
-    """Return the YAML of a run; None if it is missing or names another store (in a copy of a run).
+    """Return the YAML of a run, where it is there and is of this run: that of a copy names the first one's.
 
     Raises:
         ConfigError: it is no configuration.
@@ -169,7 +168,7 @@ def yaml_of(target: Target) -> Path | None:
 
 
 def _kept(store: RunStore, target: Target) -> ModelVersion:
-    """Return the version in use; an edited section in the YAML becomes a version first."""
+    """Return the version in force; what stands in the YAML and no command has seen yet becomes one, too."""
     path = yaml_of(target)
     if path is not None:
         keep_in_force(store, model_in_force(store, load_config(path).model))
@@ -177,7 +176,7 @@ def _kept(store: RunStore, target: Target) -> ModelVersion:
 
 
 def _put_in_force(store: RunStore, target: Target, version: ModelVersion) -> Target:
-    """Switch to a version; the YAML first, since writing it may fail."""
+    """Put a version in force; the YAML first, which may be refused."""
     settings, path = version.settings, yaml_of(target)
     if path is not None:
         write_model(path, settings)
@@ -188,13 +187,13 @@ def _put_in_force(store: RunStore, target: Target, version: ModelVersion) -> Tar
 
 
 def adopt_verdict(target: Target) -> tuple[Target, str]:
-    """Make the model of a run's verdict a version, and switch to it, in store and YAML.
+    """Make the model of a run's verdict a version, and put it in force, in the store and in the YAML.
 
     Args:
-        target: a run with a complete search.
+        target: a run whose search is complete.
 
     Returns:
-        The run with that model; the change and how to undo it, empty if the verdict changes nothing.
+        The run with that model; what changed and how to go back, empty where the verdict changes nothing.
 
     Raises:
         ConfigError: the YAML cannot be edited.

@@ -282,12 +282,12 @@ class Run:
     def discrepancy(
         self, *, refit: bool = False, effort: float | None = None, progress: ProgressMode = "off"
     ) -> Verdict:
-        """Search for missing effects, and return the verdict; the evidence is in the report.
+        """Search for what the model is missing, and return the verdict; the evidence is in the report.
 
         Args:
-            refit: add named effects to the model and refit, as ``pchem discrepancy`` does; open the run again
-                afterwards.
-            effort: factor on the search budget; None: ``discrepancy.effort``.
+            refit: add what is named to the model and fit with it, as ``pchem discrepancy`` does; open the run
+                again afterwards.
+            effort: times the usual limit of the search's work; None: as the run's settings say.
             progress: auto, on or off.
 
         Raises:

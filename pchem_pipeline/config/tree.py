@@ -54,12 +54,12 @@ class RunConfig(Section):
     )
     input: InputSettings = Field(default_factory=InputSettings, description="camera files")
     histogram: HistogramSettings = Field(default_factory=HistogramSettings, description="counting")
-    model: ModelSettings = Field(default_factory=ModelSettings, description="effects beyond the PCD")
+    model: ModelSettings = Field(default_factory=ModelSettings, description="what is added to the PCD")
     fit: FitSettings = Field(default_factory=FitSettings, description="PCH-EM")
     maps: MapsSettings = Field(default_factory=MapsSettings, description="parameter maps")
     ensemble: EnsembleSettings = Field(default_factory=EnsembleSettings, description="ensemble distributions")
     discrepancy: DiscrepancySettings = Field(
-        default_factory=DiscrepancySettings, description="search for missing effects"
+        default_factory=DiscrepancySettings, description="search for what the model is missing"
     )
     methods: MethodsSettings = Field(
         default_factory=MethodsSettings, description="other methods beside PCH-EM (pchem methods)"

@@ -1,4 +1,4 @@
-"""Effects added by simulation, with gap, rivals and acceptance of each."""
+"""The effects that rounds of simulation added: each with its gap, its rivals, and whether it stands."""
 
 from __future__ import annotations
 

@@ -212,7 +212,9 @@ def _compared(
     laws = pixel_laws(counts, seen.origin, outside, parameters, usable)
     good = laws.good
     if not good.any():
-        raise PchEmError(f"none of the {good.size} pixels has a reliable fit; see the flags of the fit")
+        raise PchEmError(
+            f"none of the {good.size} pixels has a fit that can be relied upon; see the flags of the fit"
+        )
     masked = np.where(good[:, None], parameters, np.nan)
     moments = np.where(good[:, None], laws.moments, np.nan)
     residuals = CodeResiduals(

@@ -138,7 +138,7 @@ class NoiseMode(Section):
         return self.of == "sample" and self.wave is not None and root_mean_square(self.wave) == 1.0
 
     def words(self, rms: float | None) -> str:
-        """Describe size (omitted if ``rms`` is None), sharing and correlation of this part of the noise."""
+        """Return in words what varies by so many DN (None: that is said elsewhere), and who shares it."""
         own = self.of == "sample" and (self.lags or self.wave is not None)
         whole = "" if own else f"common to each {self.of}"
         order = np.argsort(-np.abs(self.correlation))[:_FEW]
@@ -391,7 +391,7 @@ class EmpiricalNoise(Effect):
         return model
 
     def words(self) -> str:
-        """Describe the noise as a clause."""
+        """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         of_all = len(self.modes) == 1 and self.modes[0].changes == "offset" and self.modes[0].burst is None
         parts = "; ".join(mode.words(None if of_all else self.share_of(mode)) for mode in self.modes)

@@ -86,7 +86,7 @@ class ResponseTerm(Section):
         return self.columns[0] + self.place[2] if any(self.place[:2]) and self.place[2] else None
 
     def words(self) -> str:
-        """Describe the other samples."""
+        """Return in words what is followed."""
         if self.of == "sample":
             what = f"what exceeds {self.above:g} e- in " if self.above else ""
             if self.mirrored:
@@ -263,7 +263,7 @@ class EmpiricalResponse(Effect):
         return model.with_variance(e2=self.response**2 * power)
 
     def words(self) -> str:
-        """Describe the response as a clause."""
+        """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         followed: dict[str, list[str]] = {}
         for term in sorted(self.terms, key=lambda term: -abs(term.weight)):

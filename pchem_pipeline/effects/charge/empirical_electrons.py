@@ -61,7 +61,7 @@ class ElectronMode(Section):
         return self
 
     def words(self, chance: float) -> str:
-        """Describe the dependence, with its probability or mean number."""
+        """Return in words how the numbers vary together, with a chance (or a mean number)."""
         if self.fate == "emptied":
             return f"{per_cent(chance)} of the samples have no electrons"
         where = neighbour_words(self.place) if any(self.place) else "the same sample"
@@ -166,7 +166,7 @@ class EmpiricalElectrons(Effect):
         return ()
 
     def words(self) -> str:
-        """Describe the dependence as a clause."""
+        """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         told = [mode.words(chance) for mode, chance in zip(self.modes, self._chances(), strict=True)]
         return f"electron numbers{place} are not independent ({'; '.join(told)})"

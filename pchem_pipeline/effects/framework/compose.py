@@ -171,7 +171,7 @@ def _some(maps: PixelMaps, pixels: NDArray[np.intp]) -> PixelMaps:
 
 
 def place_words(effect: Effect) -> str:
-    """Describe region and frames of an effect; empty if unrestricted."""
+    """Return in words where and when an effect acts; nothing where that is everywhere and always."""
     return ", ".join(place.words() for place in (effect.region, effect.when) if place is not None)
 
 

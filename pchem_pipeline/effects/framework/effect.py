@@ -269,7 +269,7 @@ class Effect(Section):
         return found
 
     def words(self) -> str:
-        """Describe the effect: its title, or a clause for an empirical one."""
+        """Return what is known of it, for people."""
         return self.title or self.tag
 
     def by_law(self, shape: tuple[int, int]) -> Sequence[Effect]:

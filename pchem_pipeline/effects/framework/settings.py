@@ -13,12 +13,12 @@ class ModelSettings(Section):
 
     effects: EffectList = Field(
         default=(),
-        description="effects beyond the PCD in fit and ensemble; pchem discrepancy adds named effects "
-        "(a simulated camera has its own list, simulate.effects)",
+        description="effects beyond the PCD with which pixels are fitted and ensembles predicted; "
+        "pchem discrepancy adds those that it names; a simulated camera has its own list, simulate.effects",
     )
     set_aside_e: tuple[tuple[float | None, float | None], ...] = Field(
         default=(),
         description="codes that the fit leaves out, since the model does not describe them: intervals of "
-        "(x - bias) * gain of the plain fit, e-; null: no limit ([[null, 0.5]] leaves the 0-electron peak "
-        "out)",
+        "their place on the comb of the plain fit, (x - bias) * gain, null for no limit ([[null, 0.5]] sets "
+        "the 0-electron peak aside), e-",
     )

@@ -202,7 +202,7 @@ class Empirical(Effect):
         return model.with_noise(weights, shift_dn=np.append(shifts, 0.0))
 
     def words(self) -> str:
-        """Describe the shifts as a clause."""
+        """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         what = {
             "sample": "samples", "row": "rows", "column": "columns", "frame": "frames",

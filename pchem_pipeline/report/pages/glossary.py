@@ -67,9 +67,9 @@ GLOSSARY: tuple[Term, ...] = (
     ),
     Term(
         "gap",
-        "Kullback-Leibler divergence per sample from the model to the data, on held-out frames. It does not "
-        "depend on the number of frames; its floor, the 95 % limit of sampling noise, falls with it.",
-        ("floor", "discrepancy"),
+        "How far the law of the data is from that of the model (Kullback-Leibler divergence), on frames "
+        "that no fit has seen. More data do not change it; they lower its floor, which chance alone makes.",
+        ("floor",),
     ),
     Term(
         "hot pixels",
@@ -79,8 +79,8 @@ GLOSSARY: tuple[Term, ...] = (
     ),
     Term(
         "micronat",
-        "10⁻⁶ nat, the unit of the gap. A gap of G nats per sample makes N samples less likely by a factor "
-        "of exp(N G): e for 1 micronat and a million samples.",
+        "10⁻⁶ nat, the unit of the gap. N samples with a gap of G nats each are exp(N G) times as likely "
+        "under the law of the data as under the model: 1 micronat, a million samples: a factor e.",
         ("micronats",),
     ),
     Term(
@@ -105,6 +105,11 @@ GLOSSARY: tuple[Term, ...] = (
         ("photon counting distribution",),
     ),
     Term(
+        "placebo",
+        "The best fit of an effect that has nothing to do with the named one. What it closes of the gap, any "
+        "wrong effect could.",
+    ),
+    Term(
         "PRNU",
         "Photo response non-uniformity: spread between pixels of the response to light, over its mean. "
         "Here the spread of H under light stands for it; EMVA 1288 measures at half saturation.",
@@ -118,14 +123,13 @@ GLOSSARY: tuple[Term, ...] = (
     ),
     Term(
         "readout and charge",
-        "Each sample is split by its pixel's fit into the expected number of electrons (charge) and the "
-        "residual (readout). Effects of light show in the first, effects of the electronics in the second.",
+        "Each sample is split by its pixel's fit into the expected number of electrons (charge) and what is "
+        "left (readout). Effects of light show in the first, those of the electronics in the second.",
         ("readout residuals", "readout channel", "charge channel"),
     ),
     Term(
         "replicate",
-        "A stack simulated from the fitted model and analysed like the data; replicates give the "
-        "distribution of each statistic under the model.",
+        "A stack simulated from the fitted model and treated like the data: what chance makes of it.",
         ("replicates",),
     ),
     Term(
@@ -134,9 +138,10 @@ GLOSSARY: tuple[Term, ...] = (
         "sampling noise alone leaves some.",
     ),
     Term(
-        "sigma",
-        "Standard deviation of a statistic under the model (between replicates). The largest of a hundred "
-        "statistics is near 3 sigma by sampling noise.",
+        "sd of chance",
+        "Standard deviation of a statistic between stacks simulated from the fitted model. Of a hundred "
+        "statistics the largest lies near 3 by chance.",
+        ("standard deviations of chance", "sd"),
     ),
     Term(
         "standard error",
@@ -148,11 +153,6 @@ GLOSSARY: tuple[Term, ...] = (
         "temporal dark noise",
         "Standard deviation of a pixel's dark signal from frame to frame (EMVA 1288: σ_d, σ_y.dark), shot "
         "noise of the dark current included.",
-    ),
-    Term(
-        "unrelated control",
-        "Negative control: the best fit of an effect that is unrelated to the named one. Any wrong effect "
-        "could reduce the gap as much.",
     ),
 )  # fmt: skip
 

@@ -96,8 +96,8 @@ def _run_frames(
     elsewhere = search.elsewhere(settings, "elsewhere-", window, found)
     if elsewhere is not None and elsewhere.deviates and whole != settings:
         context.note(
-            f"the model found does not hold in {elsewhere.words()}, where {elsewhere.deviates}: searching "
-            "again with discrepancy.max_samples"
+            f"what was found does not hold in {elsewhere.words()}, where {elsewhere.deviates}: as many "
+            "samples are compared as discrepancy.max_samples allows"
         )
         window, found = search.found(whole, "whole-")
         elsewhere = search.elsewhere(whole, "whole-elsewhere-", window, found)
@@ -155,7 +155,7 @@ class _Search:
         other = other_window(window, self.source.shape, self.roi)
         if other is None or found.verdict.verdict != "named":
             return None
-        self.tell("testing the model in another window")
+        self.tell("looking whether that holds elsewhere")
         frames = FrameStack.of(
             read_window(self.source, other), other.numbers, settings.block_frames, **self._taken(other)
         )
@@ -167,7 +167,7 @@ class _Search:
             by = Simulations(observed, _Mapper(self.context, prefix), settings.seed, effort)
             return there.model_copy(update={"deviates": deviation(by, found.model)})
         except Exception as error:
-            self.context.note(f"not tested again in {there.words()}: {error_words(error)}")
+            self.context.note(f"not looked at again in {there.words()}: {error_words(error)}")
             return None
         finally:
             self.work += effort.spent
@@ -212,19 +212,19 @@ def _surveyed(
             less = within_memory(settings, source.shape, roi, codes, limit << 20)
             if less != settings:
                 context.note(
-                    f"compute.max_memory (--max-memory) limits the comparison with simulations to "
-                    f"{less.max_pixels} pixels instead of {settings.max_pixels}"
+                    f"compute.max_memory (--max-memory) allows {less.max_pixels} pixels in the comparison "
+                    f"with simulations, {settings.max_pixels} without a limit"
                 )
             settings = less
-        tell("surveying all pixels and frames")
+        tell("looking at every pixel and every frame")
         seen = _survey(context, source, settings)
         if seen.left_out:
-            context.note(f"left out (empty or outlying): {frame_words(np.array(seen.left_out))}")
+            context.note(f"left out, empty or far from the others: {frame_words(np.array(seen.left_out))}")
         most, few = settings, fewer_samples(source, settings, roi, seen) if not before else settings
         if few != settings:
             context.note(
-                f"{few.max_samples:,} samples show a clear disagreement and are compared; raise "
-                "discrepancy.clear_samples for smaller errors and weaker effects"
+                f"the disagreement is clear in {few.max_samples:,} samples; raise discrepancy.clear_samples "
+                "to compare more: smaller errors, and weaker effects beside it"
             )
             settings, seen = few, _survey(context, source, few)
         known = {"window": _taken_of(settings), "whole": _taken_of(most), **seen.numbers()}
@@ -354,4 +354,4 @@ def _write(context: StageContext, found: Discrepancy) -> None:
         context.store.write_array(f"{_STAGE}/{name}", array)
     context.store.write_file(VERDICT_FILE, found.verdict.to_json().encode())
     for tag, reason in found.verdict.defects.items():
-        context.note(f"defect: candidate {tag} failed and was not compared: {reason}")
+        context.note(f"defect in the candidate {tag}, which was not compared: {reason}")

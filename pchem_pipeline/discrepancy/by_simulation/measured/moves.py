@@ -1,4 +1,4 @@
-"""Empirical component: shifts of samples (a mixture), fitted to the data.
+"""The empirical component: what no known effect explains, measured as moves of the samples.
 
 The samples are taken for a mixture of their law and of what moves would make of it: shifts on a grid, and,
 given the sample beside or before, moves towards that one. The shares of the moves are those of maximum

@@ -1,4 +1,4 @@
-"""Empirical component: a periodic offset across rows, columns and frames."""
+"""The empirical component: an offset that runs as a wave across rows, columns and frames."""
 
 from __future__ import annotations
 
