@@ -1,1 +1,1 @@
-"""Where model and data disagree: statistics, their null distribution, the naming of effects, the gap."""
+"""Disagreement of model and data: statistics, their null distribution, identification of effects, the gap."""

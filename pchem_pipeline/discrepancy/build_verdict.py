@@ -1,4 +1,4 @@
-"""From what a search measured to its verdict: the state, one sentence, and a step for each added effect."""
+"""Build the verdict from the results of a search: its state, its sentence, and a step per added effect."""
 
 from __future__ import annotations
 
@@ -35,6 +35,8 @@ from pchem_pipeline.discrepancy.verdict import (
     families_words,
     form_of,
     parameters_of,
+    share_text,
+    sigma_text,
 )
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.compose import place_words, title_words
@@ -45,18 +47,19 @@ from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 
 FloatArray = NDArray[np.float64]
 
-#: Share of the gap that effects may leave, where it is above its floor, and still explain it.
+#: Largest share of a gap above its floor that may remain with effects that explain it.
 LARGEST_REST = 0.2
 _MOST_UNEXPLAINED = 8
 _MOST_RESIDUALS = 3
-_DECIDED = 3.0  # standard errors of a difference of scores that tells two effects apart
-_MOST_LONGER = 30.0  # times the samples that anyone will take
-_NO_CHANCE = 0.05  # of any statistic as far from the model, below which one is told beside the farthest
-_NO_CHANCE = 1e-6  # of any statistic, with which nothing is called consistent
-_RARE = 0.02  # a chance that is worth telling though it is no disagreement
+_DECIDED = 3.0  # standard errors of a difference of log-likelihoods that decides between two effects
+_MOST_LONGER = 30.0  # largest factor on the number of samples that is recommended
+_NO_CHANCE = 1e-6  # global p-value below which nothing is consistent, and further statistics are listed
+_RARE = 0.02  # global p-value below which a statistic is mentioned as borderline
 # nats per sample from which on a plain fit may be far off: six of seven hidden effects that left so much had
 # moved the gain of 19 to 100 % of the pixels by a fifth or more
 _BEYOND_A_FIT = 0.1
+#: Reason of a rejection.
+LEAVES_TOO_MUCH = "it leaves too much of the discrepancy"
 
 
 @dataclass(frozen=True)
@@ -66,16 +69,16 @@ class Addition:
     Attributes:
         effect: with its fitted parameters.
         alone: whether all others are excluded.
-        against: why it is not what the data hold, and the candidates are only the nearest known; else empty.
-        candidates: those compared, the likeliest first.
+        against: reason of its rejection, starting with "it"; empty if it is accepted.
+        candidates: effects compared, the likeliest first.
         strength_stderr: standard error of its strength.
         before, after: gap on the final samples without and with it.
-        rivals: the next best candidates, fitted the same way, the best first.
-        placebo: the best of those that have nothing to do with it, or None.
-        pulls: the statistics that moved most.
-        moved: change of each parameter map by its refit with the effect.
-        described: whether it is measured where no known effect explains the data, and not understood.
-        certain: whether its strength is beyond doubt.
+        rivals: the next best effects, fitted the same way, the best first.
+        placebo: best unrelated control, or None.
+        pulls: the statistics that changed most.
+        moved: change of each parameter map by the refit with the effect.
+        described: whether it is an empirical description without a cause.
+        certain: whether its strength is significant.
     """
 
     effect: Effect
@@ -94,12 +97,12 @@ class Addition:
 
     @property
     def fits(self) -> bool:
-        """Whether nothing speaks against it."""
+        """Whether it is not rejected."""
         return not self.against
 
     @property
     def confirmed(self) -> bool:
-        """Whether it is certain, and the final samples show what it is for or come nearer with it."""
+        """Whether it is significant, and the gap on the final samples shows or confirms it."""
         return self.certain and (not self.before.at_floor or self.after.value < self.before.value)
 
     @property
@@ -109,7 +112,7 @@ class Addition:
 
     @property
     def verdict(self) -> State:
-        """The verdict of it alone."""
+        """The verdict on this effect alone."""
         if self.described:
             return "described"
         if not self.fits:
@@ -117,11 +120,11 @@ class Addition:
         return "named" if self.alone and self.confirmed else "ambiguous"
 
     def step(self, size: Size | None) -> Step:
-        """Return it as ``discrepancy.json`` holds it."""
+        """Make its entry in ``discrepancy.json``."""
         return Step(
             effect=self.effect.tag if self.named else None,
             verdict=self.verdict,
-            # one that is not confirmed is not confused with those that it beats
+            # an unconfirmed effect without a competitor is listed alone
             candidates=self.candidates[:1] if self.alone and not self.confirmed else self.candidates,
             parameters=parameters_of(self.effect, self.strength_stderr),
             form=form_of(self.effect),
@@ -140,7 +143,7 @@ class Addition:
         )
 
     def _separate(self) -> dict[str, str]:
-        """Return by effect what would tell it from this one: of those known, or of the candidates."""
+        """Return, by effect, the measurement that would distinguish it from this one."""
         known = dict(type(self.effect).separate)
         if self.named:
             return known
@@ -156,16 +159,16 @@ class Addition:
 
 @dataclass(frozen=True)
 class Added:
-    """All that was added to the model, and what is left.
+    """All effects added to the model, and the remaining discrepancy.
 
     Attributes:
-        additions: the effects, the weightiest of a round first.
+        additions: the effects, the largest of a round first.
         after: gap on the final samples with all of them.
-        unfinished: whether too much of the gap is left to call the model complete.
-        nearest: tags of effects that come nearest where none explains the data.
-        stand_ins: tags of effects that describe a part, but not on all codes alike.
-        residuals: codes that the final model does not account for.
-        set_aside: codes that its fit leaves out, by their place on a pixel's comb: intervals, e-.
+        unfinished: whether the remaining gap is too large for a complete model.
+        nearest: tags of the closest effects if none explains the data.
+        stand_ins: tags of effects that explain some codes, but not all.
+        residuals: codes that the final model does not explain.
+        set_aside: intervals of (x - bias) * gain, e-, whose codes the fit leaves out.
     """
 
     additions: tuple[Addition, ...]
@@ -192,18 +195,18 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Findings:
-    """What a search measured.
+    """The results of a search.
 
     Attributes:
-        samples: what the data are ("frames", "histograms").
+        samples: kind of data ("frames", "histograms").
         z: statistics of the data.
-        first, last: replicates of the model before and after.
-        before: gap on the final samples with no new effect.
-        places: where the data disagree with the model as it was.
-        still: whether they disagree with the final model.
-        added: effects, and what is left.
-        doubt: why the pixels are not identified, and what would help; empty where they are.
-        limit: where the search ended at its limit, and what was not tried; empty where it did not.
+        first, last: null distribution of the model before and after.
+        before: gap on the final samples without new effects.
+        places: disagreements of the data with the model before.
+        still: whether the data disagree with the final model.
+        added: added effects, and the remaining discrepancy.
+        doubt: why the pixels' parameters are not identified, and the cure; empty if they are.
+        limit: what was not tried when the search had used its budget; empty if it finished.
     """
 
     samples: str
@@ -219,10 +222,10 @@ class Findings:
 
     @property
     def state(self) -> State:
-        """The verdict in a word."""
+        """The kind of verdict."""
         additions = self.added.additions
         if not additions:
-            # no families of statistics, and no gap, excuse a single one that chance does not make
+            # a single highly significant statistic counts even if gap and families are within sampling noise
             if self.still or self.first.global_p(self.z.both, 2) < _NO_CHANCE:
                 return "unexplained"
             return "cannot_tell" if self.doubt else "consistent"
@@ -232,30 +235,30 @@ class Findings:
             return "named_in_part" if self.named else "unexplained"
         if any(not each.named for each in additions):
             return "ambiguous"
-        # what was not tried may be missing as well, and so is what shows in a single statistic
+        # effects that were not tried may be missing too, and so may one that shows in a single statistic
         whole = self.added.after.at_floor and not self.limit and not self.still
         return "named" if whole else "named_in_part"
 
     @property
     def named(self) -> tuple[Effect, ...]:
-        """The named effects, the weightiest first."""
+        """The named effects, the largest first."""
         return tuple(each.effect for each in self.added.additions if each.named)
 
     @property
     def described(self) -> tuple[Effect, ...]:
-        """What was measured and is not understood."""
+        """The empirical descriptions without a cause."""
         return tuple(each.effect for each in self.added.additions if each.described)
 
     @property
     def proposed(self) -> tuple[Effect, ...]:
-        """Descriptions that leave something: the pixels fitted with them may be farther off than without."""
+        """Incomplete descriptions: parameters fitted with them may be worse than without."""
         return () if self.added.after.at_floor else self.described
 
     def model(self, present: Sequence[Effect], extended: Sequence[Effect]) -> tuple[Effect, ...]:
-        """Return the model with those effects that were added and are named, or describe all that is left.
+        """Return the model with the named effects and complete descriptions.
 
         Args:
-            present: effects that it had before the search.
+            present: effects before the search.
             extended: the same, and all that were added.
         """
         kept = self.named if self.proposed else (*self.named, *self.described)
@@ -274,19 +277,19 @@ def build_verdict(
     n_replicates: int,
     work: float,
 ) -> Discrepancy:
-    """Put the verdict together.
+    """Build the verdict.
 
     Args:
-        found: what was measured.
-        model: effects that the model has now.
+        found: results of the search.
+        model: effects of the final model.
         fitted: the pixels under it.
-        looked_at: evidence of the train samples, and what was examined.
+        looked_at: evidence of the train samples, and the samples examined.
         untestable: effects that such data cannot show, and why.
         defects: candidates that failed, and why.
-        n_replicates: drawn in all.
-        work: CPU seconds by count.
+        n_replicates: number of simulated stacks or histograms.
+        work: counted work, CPU seconds.
     """
-    # e-, and the share of the read noise, of pixels whose gain and read noise are open would be made up
+    # unidentified gain and read noise give no size in e-
     sizes = {
         each.effect: None
         if found.doubt
@@ -328,7 +331,7 @@ def build_verdict(
 
 
 def _still(found: Findings, pulls: FloatArray) -> list[Place]:
-    """Return what disagrees with the final model: the farthest statistic, and others beyond chance."""
+    """Return the largest disagreement with the final model, and other significant ones."""
     if not found.still:
         return []
     tests = found.last.effective_tests
@@ -341,7 +344,7 @@ def _still(found: Findings, pulls: FloatArray) -> list[Place]:
 def largest_pulls(
     names: Sequence[str], weight: FloatArray, before: FloatArray, after: FloatArray
 ) -> tuple[Pull, ...]:
-    """Return the statistics of largest weight with their pulls, shape (m,) each."""
+    """Return the statistics of largest weight with their pulls; all arguments have shape (m,)."""
     return tuple(
         Pull(
             statistic=names[i],
@@ -367,87 +370,89 @@ def _gap_change(before: Gap, added: Added) -> GapChange:
 
 
 def _more_samples(other: Candidate) -> str:
-    """Return the run that tells a candidate from the best: scores grow with it, their errors as its root."""
+    """Return the data that decide between a candidate and the best.
+
+    A difference of log-likelihoods grows with the number of samples, its standard error with the root.
+    """
     lead = abs(other.score)
     longer = (_DECIDED * other.stderr / lead) ** 2 if lead > 0.0 else math.inf
     if not longer <= _MOST_LONGER:
-        return (
-            "another exposure, or frames without any, as a second stack (pchem joint); hardly more of these"
-        )
-    return f"{max(longer, 1.5):.2g} times as many samples, if their scores go on to differ as they do"
+        return "fit a second exposure, or dark frames, jointly (pchem joint); more of the same will not do"
+    return f"about {max(longer, 1.5):.2g} times as many samples"
 
 
 def _nearly(found: Findings) -> str:
-    """Return what comes near to a disagreement without being one; empty where nothing does."""
+    """Describe borderline deviations; empty if there are none."""
     words = []
     p = found.first.global_p(found.z.both, 2)
     if p < _RARE:
         least = int(np.argmin(found.first.p_values(found.z.both, 2)))
         says = STATISTICS[found.first.names[least]].says(float(found.first.pulls(found.z.both, 2)[least]))
-        words.append(f"{says}, by chance in one of {1.0 / p:,.0f} such runs")
+        words.append(f"{says} (p = {p:.1g})")
     if not found.before.at_floor:
-        words.append(f"taken together the {found.samples} are farther from it than in 19 of 20 such runs")
-    return f"; near the limit: {'; '.join(words)}; more frames would tell" if words else ""
+        words.append("all statistics together exceed the 95 % limit of sampling noise")
+    return f"; borderline: {'; '.join(words)}; take more frames to decide" if words else ""
 
 
-#: What histograms show, and what they do not.
-_OF_PIXELS = ", of the histograms of single pixels; frames, rows, columns and neighbours were not looked at"
+_OF_PIXELS = " (histograms of single pixels only; frames, rows, columns and neighbours were not tested)"
 
 
 def _sentence(found: Findings, sizes: Mapping[Effect, Size | None]) -> str:
-    """Return the verdict in one sentence: what, how large, and what it closes beside its rivals."""
+    """Return the verdict in one sentence: the effect, its size, and the remaining discrepancy."""
     state, data, added = found.state, found.samples, found.added
     titles = [_sized(effect, sizes) for effect in found.named]
     if state == "consistent":
         seen = _OF_PIXELS if data == "histograms" else ""
-        return f"The {data} agree with the model in every statistic tested{seen}{_nearly(found)}."
+        return f"Data and model agree in every statistic tested{seen}{_nearly(found)}."
     if state == "cannot_tell":
         return (
-            f"Nothing in the order of the {data}, between pixels or in the codes disagrees with the model; "
-            f"of what shows only in the shape of the histograms nothing can be told: {found.doubt}."
+            "Frame order, neighbours and codes agree with the model; the shape of the histograms cannot be "
+            f"tested: {found.doubt}."
         )
     if state == "unexplained":
         first = found.places[0] if found.places else None
         lead = f": {first.sentence or first.statistic}" if first is not None else ""
-        none = "no known effect explains it" if not found.limit else "none that was tried explains it"
-        words = f"{lead}; {none}{_nearest(found)}{_left(added)}{_broken(found)}"
-        return f"The {data} disagree with the model{words}."
+        words = f"{lead}; {_none(found)} explains it{_nearest(found)}{_left(added)}{_broken(found)}"
+        return f"Data and model disagree{words}."
     if state == "described":
         return _described(found, titles, sizes)
     if state == "ambiguous":
         return _ambiguous(found, titles, sizes)
     if found.before.at_floor:
-        return f"The model was missing {_and(titles)}, too little for the final {data} alone to show."
+        return f"The model was missing {_and(titles)}, too small to show in the final {data} alone."
     if state == "named_in_part":
         words = f"{_rest(found)}{_shown(found)}{_nearest(found)}{_left(added)}{_doubts(added)}"
-        words += _broken(found)
-        return f"A part of what the model was missing is {_and(titles)}{words}."
-    them = "them" if len(titles) > 1 else "it"
-    words = f"with {them}, no more of the gap is left than chance makes{_left(added)}{_doubts(added)}"
+        return f"The model was missing {_and(titles)}{words}{_broken(found)}."
+    words = f"with {'them' if len(titles) > 1 else 'it'}, {_AGREE}{_left(added)}{_doubts(added)}"
     return f"The model was missing {_and(titles)}; {words}."
 
 
+_AGREE = "data and model agree within sampling noise"
+
+
+def _none(found: Findings) -> str:
+    """Return the subject of "explains it" where nothing does."""
+    return "no effect tried" if found.limit else "no known effect"
+
+
 def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Size | None]) -> str:
-    """Return what the model may lack: effects not told apart, and what the final samples do not confirm."""
+    """Describe effects between which the data do not decide, and unconfirmed ones."""
     data, additions = found.samples, found.added.additions
     unknown = [" or ".join(_title(c.effect) for c in each.candidates) for each in additions if not each.alone]
     doubtful = [each for each in additions if each.alone and each.fits and not each.confirmed]
     weak = _and([_sized(each.effect, sizes) for each in doubtful])
-    why = f"which the final {data} do not confirm"
-    if not all(each.certain for each in doubtful):
-        why = f"too weak in these {data} to be certain"
-    also = f"{_and(titles)} is missing, and " if titles else ""
+    certain = all(each.certain for each in doubtful)
+    why = f"not confirmed by the final {data}" if certain else f"too weak in these {data} to be certain"
+    also = f"The model was missing {_and(titles)}; it also" if titles else "The model"
+    rest = f"{_rest(found)}{_left(found.added)}"
     if not unknown:
-        also = f"The model was missing {_and(titles)}, and it may" if titles else "The model may"
-        left = f"{_rest(found)}{_left(found.added)}"
-        return f"{also} lack {weak}, {why}: more samples would tell{left}."
-    weak = f"; it may lack {weak}, {why}" if weak else ""
-    lacks = f"{also}{_and(unknown)}{weak}{_rest(found)}{_left(found.added)}"
-    return f"The model lacks something that these {data} cannot tell apart: {lacks}."
+        return f"{also} may lack {weak}: {why}; take more samples{rest}."
+    weak = f"; it may lack {weak}: {why}" if weak else ""
+    return f"{also} lacks {_and(unknown)}: these {data} do not decide which{weak}{rest}."
 
 
 def _sized(effect: Effect, sizes: Mapping[Effect, Size | None]) -> str:
-    """Return what an effect is called, with its size, and then its place."""
+    """Describe an effect by name, size and region."""
     size = sizes.get(effect)
     if size is None:
         return title_words(effect)
@@ -456,29 +461,27 @@ def _sized(effect: Effect, sizes: Mapping[Effect, Size | None]) -> str:
 
 
 def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Size | None]) -> str:
-    """Return what is known of a disagreement that was measured and is not understood."""
+    """Describe the data empirically where no known effect explains them."""
     known = [(effect.describe(), sizes.get(effect)) for effect in found.described]
-    told = [text if size is None else f"{text}, in all {size.words()}" for text, size in known]
-    words, them = "; and ".join(told), "it" if len(told) == 1 else "them"
-    besides = f" besides {_and(titles)}" if titles else ""
-    none = "No known effect explains" if not found.limit else "No effect that was tried explains"
+    words = "; and ".join(text if size is None else f"{text}, size {size.words()}" for text, size in known)
+    lead = f"The model was missing {_and(titles)}; {_none(found)} explains the rest"
+    if not titles:
+        lead = f"{_none(found).capitalize()} explains the discrepancy"
     return (
-        f"{none} the {found.samples}{besides}; a description of them, which names no cause: {words}; "
-        f"with {them} {_closed(found)}; {_alike(found)}{_broken(found)}."
+        f"{lead}; empirically, {words}; this {_closed(found)}, and is a description, not a cause"
+        f"{_remains(found)}{_broken(found)}."
     )
 
 
-def _alike(found: Findings) -> str:
-    """Return in words whether a measured component is alike in all that it is said of, and in the model."""
+def _remains(found: Findings) -> str:
+    """State whether an empirical description is complete, and in the model."""
     if found.proposed:
-        return "the rest is more than chance, so that the description is proposed and not in the model"
-    if found.still:
-        return "whether it is like that throughout is not known"
-    return "as far as these statistics show, it is like that throughout"
+        return "; more than sampling noise remains, so it is proposed, not added to the model"
+    return "; single statistics still disagree" if found.still else ""
 
 
 def _nearest(found: Findings) -> str:
-    """Return in words which known effects come nearest to what none explains."""
+    """Name the effects that come closest to an unexplained discrepancy."""
     named = {effect.tag for effect in found.named}
     doubtful = {e.candidates[0].effect: e.against for e in found.added.additions if not e.fits}
     doubtful = {tag: against for tag, against in doubtful.items() if tag not in named}
@@ -486,66 +489,59 @@ def _nearest(found: Findings) -> str:
     words = ""
     for why in dict.fromkeys(doubtful.values()):
         alike = [_title(tag) for tag, against in doubtful.items() if against == why]
-        words += f"; most like {_and(alike)}, which {'does' if len(alike) == 1 else 'do'} not fit: {why}"
-    return words + (f"; nearest known: {_and(nearest)}" if nearest else "")
+        words += f"; {_and(alike)} {'comes' if len(alike) == 1 else 'come'} closest, but {why}"
+    return words + (f"; closest known: {_and(nearest)}" if nearest else "")
 
 
 def _title(tag: str) -> str:
-    """Return what an effect is called."""
+    """Return the title of an effect."""
     effect = effect_classes().get(tag)
     return tag if effect is None else effect.title or tag
 
 
 def _closed(found: Findings) -> str:
-    """Return the share of the gap that is closed, in words."""
+    """State the share of the gap that an empirical description explains."""
     before, after = found.before, found.added.after
     if before.at_floor or after.value >= before.value:
-        return f"the gap on unseen {found.samples} is no smaller"
-    return f"{_share(closed_share(before.value, after.value))} of the gap on unseen {found.samples} is closed"
-
-
-def _share(share: float) -> str:
-    """Return a share in words; what is not all is never said to be all."""
-    percent = 100.0 * share
-    return f"{percent:.0f} %" if percent < 99.0 or share >= 1.0 else f"{min(percent, 99.99):.4g} %"
+        return f"does not reduce the discrepancy in unseen {found.samples}"
+    share = share_text(closed_share(before.value, after.value))
+    return f"explains {share} of the discrepancy in unseen {found.samples}"
 
 
 def _rest(found: Findings) -> str:
-    """Return how much of the gap is left above its floor, in words; nothing where it is at it."""
+    """State the remaining share of the gap; empty if it is within sampling noise."""
     after = found.added.after
     if after.at_floor or found.before.value <= 0.0:
         return ""
     if after.value <= after.floor:
-        return f"; in {families_words(after.standing_out)} more is left than chance makes"
-    left = 1.0 - closed_share(found.before.value, after.value)
-    return f"; {_share(left)} of the gap is left unexplained"
+        return f"; a significant discrepancy remains in {families_words(after.standing_out)}"
+    return f"; {share_text(1.0 - closed_share(found.before.value, after.value))} of the discrepancy remains"
 
 
 def _broken(found: Findings) -> str:
-    """Return a caution where what is left is so much that the pixels' own parameters are in doubt."""
+    """Warn if the remaining gap is so large that the pixels' parameters are unreliable."""
     left = found.added.after.interval[0]
     if left < _BEYOND_A_FIT:
         return ""
     return (
-        f"; what is left, {left:.2g} nats per sample at least, is so much that the fit itself breaks down: "
-        "gain, bias, read noise and exposure of the pixels may be far off, and with them what is said of "
-        "electrons"
+        f"; the rest, at least {left:.2g} nats per sample, is too large for the fit: gain, bias, read noise, "
+        "exposure and all numbers in electrons can be far off"
     )
 
 
 def _shown(found: Findings) -> str:
-    """Return what one statistic shows still though the whole gap is at its floor, in words."""
+    """Name the statistic that still deviates though the gap is at its floor."""
     if not found.still or not found.added.after.at_floor:
         return ""
     pulls = found.last.pulls(found.z.both, splits=2)
     worst = int(np.argmax(np.abs(pulls)))
     name = found.last.names[worst]
-    beside = "it" if len(found.named) == 1 else "them"
-    return f"; beside {beside} {STATISTICS[name].says(float(pulls[worst]))} ({pulls[worst]:+.1f} sd)"
+    says = STATISTICS[name].says(float(pulls[worst]))
+    return f"; one statistic still disagrees: {says} ({sigma_text(pulls[worst])})"
 
 
 def _doubts(added: Added) -> str:
-    """Return a caution where a placebo closes much of what a named effect does."""
+    """Warn if an unrelated control closes much of the gap that a named effect closes."""
     words = ""
     for each in added.additions:
         closed = each.before.value - each.after.value
@@ -553,19 +549,19 @@ def _doubts(added: Added) -> str:
             share = (each.before.value - max(each.placebo.gap_after, 0.0)) / closed
             if share > CONVINCING_PLACEBO:
                 words += (
-                    f"; {_title(each.placebo.effect)}, unrelated to {_title(each.effect.tag)}, would close "
-                    f"{_share(min(share, 1.0))} of what that closes: take the name with caution"
+                    f"; an unrelated control, {_title(each.placebo.effect)}, explains "
+                    f"{share_text(min(share, 1.0))} of that, too: {_title(each.effect.tag)} is doubtful"
                 )
     return words
 
 
 def _left(added: Added) -> str:
-    """Return in words which codes are not accounted for, and what stands in for it."""
+    """Name the codes that are not explained, and the effects that explain some codes only."""
     first = "; ".join(place.sentence for place in added.residuals[:_MOST_RESIDUALS])
-    words = f"; what is left: {first}" if first else ""
+    words = f"; not explained: {first}" if first else ""
     if added.stand_ins:
         names = _and([_title(tag) for tag in added.stand_ins])
-        words += f"; {names} would describe a part of it, but not on all codes alike, and is not named"
+        words += f"; {names} explains some codes, but not all, and is not named"
     return words
 
 

@@ -1,8 +1,7 @@
-"""The covariance of many statistics, known from few replicates: of each by itself, and of common modes.
+"""Covariance of many statistics from few replicates: a diagonal plus a matrix of low rank.
 
-Statistics are many hundred, replicates a few dozen. A covariance that is estimated from these and drawn
-towards its diagonal is that diagonal and a matrix of low rank, and so is all that is added to it; to whiten
-with it costs in proportion to the statistics, and not to their cube.
+There are hundreds of statistics and some dozen replicates. The sample covariance shrunk towards its diagonal
+has this form, and so have all sums with it; whitening is linear in the number of statistics, not cubic.
 """
 
 from __future__ import annotations

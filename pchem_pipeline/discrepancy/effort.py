@@ -1,6 +1,6 @@
-"""What a search for missing effects may cost, in work that is counted and not timed.
+"""The budget of a search for missing effects, in counted work instead of time.
 
-The same search ends at the same place on any machine, whatever else that does.
+The same search therefore ends at the same point on any machine.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _FOR_FITS = 0.4
 
 
 class EffortSpentError(Exception):
-    """The search has reached its limit.
+    """The search has used its budget.
 
     Attributes:
-        doing: what would have been next.
-        untried: effects that were to be fitted and were not.
+        doing: the next step.
+        untried: effects that were not fitted.
     """
 
     def __init__(self, doing: str, untried: Iterable[str] = ()) -> None:
@@ -44,9 +44,9 @@ class EffortSpentError(Exception):
         self.doing, self.untried = doing, tuple(untried)
 
     def words(self) -> str:
-        """Return where the search ended, what was not tried, and how to go on."""
+        """State where the search ended, what was not tried, and how to continue."""
         rest = f"; not tried: {', '.join(self.untried)}" if self.untried else ""
-        return f"the search ended at its limit before {self.doing}{rest}; --effort raises it"
+        return f"the search used its budget before {self.doing}{rest}; go on with a larger --effort"
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""The strength that an effect's estimator finds in simulated frames: a test of effects, others' too."""
+"""Test of the estimator of an effect, own or third-party, on simulated frames."""
 
 from __future__ import annotations
 

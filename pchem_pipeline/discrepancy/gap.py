@@ -1,12 +1,11 @@
 """The gap between data and model in nats per sample, its floor, and its interval.
 
-A gap is a distance of the final samples from the model, less what replicates of the model have of it by
-chance, over the number of samples: an estimate of a Kullback-Leibler divergence per sample. It does not grow
-with the data; more data only lowers the floor, the 95 % quantile of what the model has against itself.
+``gap = (D - E[D]) / N`` with the distance D of the final samples from the model, nats, its mean over
+replicates of the model E[D], and the number of samples N: an estimate of the Kullback-Leibler divergence per
+sample, independent of N. The floor is the 95 % quantile of the gap of replicates and falls with N.
 
-Replicates are compared among themselves before they judge the data: one whose distance no other one has says
-how a fit goes astray, not what chance makes. And what one family of statistics shows is not lost in the
-chance of the others: a gap is at its floor where the sum and each family are within chance.
+Outlying replicates (failed fits) are left out. A gap is at its floor if the sum and each family of statistics
+are within sampling noise.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere, r
 
 FloatArray = NDArray[np.float64]
 
-_REST_OF_NAMED = 0.1  # of the gap that an effect closes, the most that may be left where it gets a name
+_REST_OF_NAMED = 0.1  # largest remaining gap beside a named effect, over the gap that the effect closes
 _FLOOR_QUANTILE = 0.95
 _INTERVAL = 1.96
-# robust standard deviations from the middle beyond which the distance of a replicate is no chance: of data
-# without effects, and with some, that may come in a few replicates only
+# robust standard deviations from the median beyond which a replicate is an outlier: without effects, and with
+# effects, which may occur in a few replicates only
 _APART, _APART_WITH_EFFECTS = 8.0, 30.0
-_BEYOND_CHANCE = 1e-3  # probability of any family, below which it stands out by itself
+_BEYOND_CHANCE = 1e-3  # p-value below which a family is significant by itself
 
 
 @dataclass(frozen=True)
@@ -39,11 +38,11 @@ class Gap:
     """A gap, nats per sample.
 
     Attributes:
-        value: the gap; negative values are chance.
-        floor: what a right model stays below in 19 of 20 data sets.
+        value: the gap; negative by sampling noise only.
+        floor: 95 % quantile under the model.
         interval: 95 % interval.
-        families: the contribution of each family of statistics.
-        standing_out: families that are farther from the model than chance takes them.
+        families: contribution of each family of statistics.
+        standing_out: families that are significant by themselves.
     """
 
     value: float
@@ -64,53 +63,51 @@ class Gap:
         families: Mapping[str, float] | None = None,
         standing_out: tuple[str, ...] = (),
     ) -> Gap:
-        """Return the gap of a distance.
+        """Compute gap, floor and interval from a distance.
 
         Args:
-            distance: of the data from the model, nats.
-            chance: distances that replicates of the model have, nats, shape (b,).
-            n_samples: behind the distance.
-            variance: of the distance beyond that by chance, nats^2.
-            carried: part of the gap that the distance does not hold, nats.
-            families: contributions, nats per sample; None: all is of the shape of the histograms.
-            standing_out: families beyond chance.
+            distance: distance of the data from the model, nats.
+            chance: distances of replicates of the model, nats, shape (b,).
+            n_samples: number of samples of the distance.
+            variance: additional variance of the distance, nats^2.
+            carried: additional part of the gap, nats.
+            families: contributions, nats per sample; None: all of family "shape".
+            standing_out: significant families.
         """
         expected = float(chance.mean())
         spread = float(np.sqrt(chance.var(ddof=1) + variance))
         total = distance - expected + carried
         value = total / n_samples
         ends = (total - _INTERVAL * spread) / n_samples, (total + _INTERVAL * spread) / n_samples
-        # of few replicates the quantile that one more exceeds in as many cases as it says
+        # unbiased for few replicates: one more exceeds it with probability 0.05
         floor = float(np.quantile(chance, _FLOOR_QUANTILE, method="weibull") - expected) / n_samples
         return cls(value, floor, ends, {"shape": value} if families is None else families, standing_out)
 
     @property
     def at_floor(self) -> bool:
-        """Whether nothing more can be seen in these samples, in all families together and in each."""
+        """Whether all families together and each by itself are within sampling noise."""
         return self.value <= self.floor and not self.standing_out
 
     def too_wide(self, closed: float) -> bool:
-        """Tell whether so much is left that an effect which closed some gets no name.
+        """Test whether the remaining gap is too large to name an effect that closed ``closed``.
 
-        What counts is what the samples prove to be left: few of them tell the gap of a weak effect from none
-        badly.
+        The lower end of the interval counts, since few samples measure a small gap poorly.
         """
         return max(self.interval[0], 0.0) >= _REST_OF_NAMED * closed
 
 
 @dataclass(frozen=True)
 class StatisticsGap:
-    """Measures gaps by statistics: ``sum_f (D_f - E_f) / (2 N)`` over their families.
+    """Computes gaps from statistics: ``sum_f (D_f - E_f) / (2 N)`` over their families.
 
-    D_f is the squared distance of the statistics of a family from what the model gives, in their covariance,
-    E_f the distance that replicates of the model itself have. One covariance, that of the model before
-    anything was added, measures all models of a comparison: otherwise an effect that makes the statistics
-    scatter would shrink the gap by widening the noise. Only exact counts scatter as the Poisson counts that
-    the model says they are: without an effect that predicts some there is none.
+    D_f is the squared Mahalanobis distance of the statistics of a family from their expectation, E_f its mean
+    over replicates of the model. All models are compared with one covariance, that of the model before
+    anything was added: otherwise an effect could reduce the gap by widening the distribution. Exact counts
+    have the Poisson variance of their expectation in addition.
 
     Attributes:
-        null: of the model before anything was added.
-        n_samples: samples behind each statistic (frames x usable pixels).
+        null: null distribution before anything was added.
+        n_samples: samples per statistic (frames x usable pixels).
     """
 
     null: NullModel
@@ -126,14 +123,14 @@ class StatisticsGap:
         replicates: FloatArray,
         strengths: FloatArray | None = None,
     ) -> Gap:
-        """Return the gap of a model.
+        """Compute the gap of a model.
 
         Args:
-            z: measured statistics, shape (m,).
-            mean: what the model gives, shape (m,).
-            replicates: vectors drawn from a model with that mean or another, for the floor, shape (b, m).
-            strengths: by how much a standard error of the strength of each effect moves the statistics, shape
-                (e, m); they were fitted to other samples, so that a right model, too, is off by that.
+            z: statistics of the data, shape (m,).
+            mean: expectation under the model, shape (m,).
+            replicates: vectors of a model with that mean or another, for the floor, shape (b, m).
+            strengths: shift of the statistics by one standard error of the strength of each effect, shape
+                (e, m), since strengths were fitted to other samples.
         """
         own, covariance = self._own_distances(replicates, strengths), self._covariance(mean)
         distances = {
@@ -155,22 +152,21 @@ class StatisticsGap:
         )
 
     def _covariance(self, mean: FloatArray) -> Covariance:
-        """Return the covariance that measures a model that gives ``mean``."""
+        """Compute the covariance for a model of expectation ``mean``."""
         counts = self.null.events * np.maximum(mean - self.null.mean, 0.0)
         return self.null.covariance.plus(counts)
 
     def _members(self) -> dict[str, list[int]]:
-        """Return the places of the statistics of each family that has any."""
+        """Return the indices of the statistics of each family."""
         families = [STATISTICS[name].family for name in self.null.names]
         found = {family: [i for i, f in enumerate(families) if f == family] for family in FAMILIES}
         return {family: index for family, index in found.items() if index}
 
     def _own_distances(self, replicates: FloatArray, strengths: FloatArray | None) -> dict[str, FloatArray]:
-        """Return for each family half the squared distances of data of the model, (b,) or (2 b,) each.
+        """Compute half the squared distances of the replicates, (b,) or (2 b,) for each family.
 
-        Each replicate is measured against the others, as the data are against all: in the covariance too,
-        where that was estimated from it. Its strengths are off to one side and to the other. Those that are
-        farther off than the others allow are left out.
+        Each replicate is compared with mean and covariance of the others (leave-one-out), with random errors
+        of the strengths of either sign. Outliers are left out.
         """
         key = id(replicates), id(strengths)
         if key in self._known:
@@ -199,20 +195,20 @@ class StatisticsGap:
 
 
 def among_themselves(distances: FloatArray, apart: float = _APART) -> NDArray[np.bool_]:
-    """Tell which replicates are no farther from the model than the others allow, (b,).
+    """Return which replicates are no outliers, (b,).
 
     Args:
         distances: half a chi-square each, nats, shape (b,).
-        apart: standard deviations, by the others or at least by the law of a chi-square.
+        apart: limit, robust standard deviations, at least those of a chi-square distribution.
     """
     middle = float(np.median(distances))
     return np.asarray(distances <= middle + apart * max(robust_sd(distances), np.sqrt(max(middle, 0.5))))
 
 
 def _stands_out(distance: float, chance: FloatArray, families: int) -> bool:
-    """Tell whether chance hardly takes any of so many families as far from the model as one is.
+    """Test whether a family is significant, corrected for the number of families.
 
-    Student's t, since replicates are few, of the cube root of what is nearly a chi-square.
+    Student's t-test of the cube root (Wilson and Hilferty 1931), since the distance is nearly chi-square.
     """
     mean, variance = float(chance.mean()), float(chance.var(ddof=1)) * (1.0 + 1.0 / chance.size)
     if not (mean > 0.0 and variance > 0.0):

@@ -1,12 +1,12 @@
-"""The statistics where the model is right, from replicates of it, and whether the data deviate from them.
+"""Null distribution of the statistics from replicates of the model, and tests of the data against it.
 
-Replicates are simulated from the fitted model and refitted (parametric bootstrap), so whatever the fit
-absorbs is absorbed in them too. Data disagree with the model where a statistic deviates beyond chance, among
-all that were looked at, and alike in two parts of the samples.
+Replicates are simulated from the fitted model and refitted (parametric bootstrap, Efron 1979), so that data
+and replicates lose the same degrees of freedom to the fit. Data and model disagree if a statistic is
+significant after correction for the number of statistics, with the same sign in two parts of the samples.
 
-Tails are not those of the normal law: sums of squares over the pixels are skewed by the few pixels whose law
-has rare samples, and a number of pixels or samples is a count of hardly any. The skewness comes from the
-replicates, statistics of a kind together; counts have the tail that they are made to have.
+The distributions are not normal: sums of squares over pixels are skewed by rare samples of a few pixels, and
+numbers of pixels or samples are small counts. The skewness is estimated from the replicates, pooled over
+statistics of a kind; counts are normal quantiles by construction.
 """
 
 from __future__ import annotations
@@ -27,45 +27,44 @@ from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 FloatArray = NDArray[np.float64]
 
 _OF_ORDER = ("time", "frame", "space")
-# statistics of neighbouring codes, and the period that they look at, DN
+# statistics of neighbouring codes, and their period, DN
 _OF_CODES = {"code.alternating": 2, "code.period2": 2, "code.largest": 2, "code.rough": 3, "code.period4": 4}
-_SHORTER = 1.5  # than the comb of the electrons such a period must be
+_SHORTER = 1.5  # smallest peak distance over such a period at which the fit cannot absorb it
 
-# of the correlations between statistics; their estimates from few replicates are noise, so pull them to 0
+# shrinkage of correlations between statistics towards 0, since few replicates estimate them poorly
 _SHRINKAGE = 0.6
-# standard deviations of statistics are 1 by construction up to a few tenths; the replicates count for that
-# many fewer than this number of earlier ones
+# weight of the prior that standard deviations are 1 (they are within a few tenths), in replicates
 _PRIOR_WEIGHT = 10.0
 _SMALLEST_STD = 0.6
 # last words of the names of statistics that are normal quantiles of a count: of few events their scatter is
-# far below 1, but their tail is that of the normal law all the same
+# far below 1, but their tail is normal all the same
 _COUNTS = ("cnt", "count", "pixels", "clusters")
-# errors of its mean by which a statistic must move to count as moved, and the chance of as much more scatter
+# standard errors of the mean from which a statistic has moved, and the p-value below which it has widened
 _MOVED = 4.0
 _WIDER = 0.01
-_REPLICATION = 0.02  # in each split by itself, and in the same direction
-#: Nats on held-out frames that an explanation must be worth where no statistic deviates by itself.
+_REPLICATION = 0.02  # p-value required in each split, with the same sign
+#: Held-out log-likelihood ratio, nats, required where no statistic is significant by itself.
 CONVINCING = 6.0
-_SUSPICION = 0.1  # chance of a deviation for which it is worth to ask the candidates
-# robust standard deviations beyond which a value of a replicate is a single pixel's: with effects, that may
-# move a few replicates only, and without
+_SUSPICION = 0.1  # global p-value below which candidates are compared
+# robust standard deviations at which replicates are winsorised: with effects, which may change a few
+# replicates only, and without
 _STRAY, _STRAY_ALONE = 30.0, 10.0
-_SIGNATURE = 3.0  # standard deviations by which an effect moves the statistics of its signature
+_SIGNATURE = 3.0  # standard deviations by which an effect shifts the statistics of its signature
 
 
 @dataclass(frozen=True)
 class NullModel:
-    """Mean and covariance of the statistics of one split under a model.
+    """Mean, covariance and skewness of the statistics of one split under a model.
 
     Attributes:
-        names: of the statistics, shape (m,).
+        names: names of the statistics, shape (m,).
         mean: shape (m,).
         std: standard deviations, shape (m,).
         covariance: shrunk towards its diagonal.
         replicates: the vectors, shape (b, m).
-        skewness: of the statistics of one split, shape (m,).
-        effective_tests: number of independent statistics that the largest of them is worth.
-        strengths: by how much a standard error of the strength of each effect moves the statistics, (e, m).
+        skewness: skewness of the statistics of one split, shape (m,).
+        effective_tests: equivalent number of independent statistics.
+        strengths: shift of the statistics by one standard error of the strength of each effect, (e, m).
     """
 
     names: tuple[str, ...]
@@ -86,13 +85,13 @@ class NullModel:
         *,
         effects: bool = False,
     ) -> NullModel:
-        """Estimate from replicates, shape (b, m).
+        """Estimate the null distribution from replicates.
 
         Args:
-            names: of the statistics.
-            vectors: the replicates.
-            before: null of the model to which effects were added: statistics that they leave where they were,
-                and do not widen, scatter as they did, which few new replicates need not show again.
+            names: names of the statistics.
+            vectors: the replicates, shape (b, m).
+            before: null of the model to which effects were added; standard deviations of statistics that they
+                neither shift nor widen are pooled with it.
             effects: whether the model has effects, as one with a model before it has.
         """
         vectors = without_strays(vectors, _STRAY if effects or before is not None else _STRAY_ALONE)
@@ -107,9 +106,12 @@ class NullModel:
         return cls(names, mean, std, covariance, vectors, skewness, tests)
 
     def moved_by(self, vectors: FloatArray) -> NDArray[np.bool_]:
-        """Tell which statistics effects move or widen, shape (m,), from replicates with them, shape (b, m).
+        """Test which statistics effects shift (t-test) or widen (F-test), shape (m,).
 
-        A common mode scatters trends and correlations in time without moving them.
+        A common mode widens trends and correlations in time without shifting them.
+
+        Args:
+            vectors: replicates with the effects, shape (b, m).
         """
         n = len(vectors)
         moved = np.abs(vectors.mean(axis=0) - self.mean) > _MOVED * self.std / np.sqrt(n)
@@ -117,7 +119,7 @@ class NullModel:
         return np.asarray(moved | (wider < _WIDER))
 
     def shifted(self, shift: FloatArray) -> NullModel:
-        """Return the null of a model that gives ``shift`` more, shape (m,)."""
+        """Return the null with all means shifted by ``shift``, shape (m,)."""
         return replace(self, mean=self.mean + shift, replicates=self.replicates + shift)
 
     @property
@@ -127,7 +129,7 @@ class NullModel:
 
     @property
     def events(self) -> FloatArray:
-        """By how much an event raises each exact count; 0 for all other statistics, shape (m,)."""
+        """Increase of each exact count by one event, 0 for all other statistics, shape (m,)."""
         return np.array([EXACT.get(name.partition("@")[0], 0.0) for name in self.names])
 
     @property
@@ -141,50 +143,49 @@ class NullModel:
         return self.n_replicates - 1 + _PRIOR_WEIGHT
 
     def pulls(self, z: FloatArray, splits: int = 1) -> FloatArray:
-        """Return (z - mean) / std for the mean of ``splits`` vectors, with the error of the mean."""
+        """Compute (z - mean) / (std sqrt(1/splits + 1/b)) for the mean of ``splits`` vectors."""
         scale = np.sqrt(1.0 / splits + 1.0 / self.n_replicates)
         return np.asarray((z - self.mean) / (self.std * scale))
 
     def p_values(self, z: FloatArray, splits: int = 1) -> FloatArray:
-        """Return two-sided p-values of the mean of ``splits`` vectors."""
+        """Compute two-sided p-values of the mean of ``splits`` vectors."""
         return self.p_of(self.pulls(z, splits), splits)
 
     def p_of(self, pulls: FloatArray, splits: int = 1) -> FloatArray:
-        """Return two-sided p-values of pulls of the mean of ``splits`` vectors.
+        """Compute two-sided p-values of pulls of the mean of ``splits`` vectors.
 
-        Student's t, since the standard deviation comes from few replicates, of the pulls without their skew
-        (Wilson and Hilferty 1931).
+        Student's t-distribution, since the standard deviation is from few replicates, of the pulls after the
+        transformation of Wilson and Hilferty 1931 for their skewness.
         """
         straight = _straight(self.names, pulls, self.std, self.skewness / np.sqrt(splits))
         return two_sided(straight, self.freedom)
 
     def global_p(self, z: FloatArray, splits: int = 1) -> float:
-        """Return the probability that any statistic deviates as much as the most deviating one."""
+        """Compute the smallest p-value, corrected for the effective number of statistics (Sidak)."""
         return look_elsewhere(float(self.p_values(z, splits).min()), self.effective_tests)
 
 
 def moments(vectors: FloatArray) -> tuple[FloatArray, FloatArray, Covariance]:
-    """Return mean, standard deviation and shrunk covariance of replicates, shape (b, m)."""
+    """Compute mean, standard deviation and shrunk covariance of replicates, shape (b, m)."""
     mean = vectors.mean(axis=0)
     off = vectors - mean
     std, length = _std(off), np.linalg.norm(off, axis=0)
-    # deviations of length 1, whose products are the correlations; one that is always the same has none
+    # deviations of length 1, whose products are the correlations; a constant has none
     common = np.sqrt(1.0 - _SHRINKAGE) * off / np.where(length > 0.0, length, 1.0)
     own = np.where(length > 0.0, _SHRINKAGE, 1.0)
     return mean, std, Covariance(own, common).scaled(std)
 
 
 def two_sided(pulls: FloatArray, freedom: float) -> FloatArray:
-    """Return two-sided p-values of Student's t, at least 1e-300."""
+    """Compute two-sided p-values of Student's t, at least 1e-300."""
     return np.asarray(np.maximum(2.0 * special.stdtr(freedom, -np.abs(pulls)), 1e-300))
 
 
 def without_strays(vectors: FloatArray, apart: float = _STRAY) -> FloatArray:
-    """Return replicates, (b, m), in which no value is farther from the others than any scatter takes it.
+    """Winsorise replicates, (b, m), at ``apart`` robust standard deviations from the median.
 
-    A single pixel that no fit holds makes a sum of squares of one replicate thousands of times as large as in
-    all others; its mean and scatter would be those of that pixel. What is farther than ``apart`` robust
-    standard deviations from the median is taken to be as far.
+    A single badly fitted pixel makes a sum of squares of one replicate thousands of times as large as in all
+    others, and would dominate mean and standard deviation.
     """
     middle = np.median(vectors, axis=0)
     # statistics scatter by about 1 without effects
@@ -195,18 +196,18 @@ def without_strays(vectors: FloatArray, apart: float = _STRAY) -> FloatArray:
 def as_matrix(
     names: Sequence[str], vectors: Sequence[Mapping[str, float]], usual: FloatArray | None = None
 ) -> FloatArray:
-    """Return statistics as rows in the order of the names.
+    """Arrange statistics as a matrix (vector, m) in the order of the names.
 
-    One that a vector lacks, since too few of its pixels or pairs could be used, says nothing: it is the mean
-    of the others, or the usual value where none has it.
+    A missing value (too few usable pixels or pairs) is replaced by the mean of the other vectors, or by
+    ``usual`` if all lack it.
 
     Args:
-        names: of the statistics, shape (m,).
-        vectors: by name.
-        usual: value of each, shape (m,); None: at least one vector has it.
+        names: names of the statistics, shape (m,).
+        vectors: statistics by name.
+        usual: default of each, shape (m,); None: at least one vector has it.
 
     Raises:
-        KeyError: no vector has a statistic, and nothing is usual.
+        KeyError: no vector has a statistic, and there is no default.
     """
     found = np.array([[vector.get(name, np.nan) for name in names] for vector in vectors], np.float64)
     lacking = np.array([[name not in vector for name in names] for vector in vectors], np.bool_)
@@ -227,17 +228,14 @@ def _std(deviations: FloatArray) -> FloatArray:
 
 
 def _std_of(squares: FloatArray, freedom: float) -> FloatArray:
-    """Return standard deviations of sums of squares; 1 is what is known beforehand.
-
-    That may not make a statistic that scatters more look quieter than it is.
-    """
+    """Compute standard deviations from sums of squares with the prior 1, which only raises small ones."""
     own = np.maximum(squares, 0.0)
     variance = np.maximum((own + _PRIOR_WEIGHT) / (freedom + _PRIOR_WEIGHT), own / freedom)
     return np.asarray(np.maximum(np.sqrt(variance), _SMALLEST_STD))
 
 
 def _kind(name: str) -> str:
-    """Return the last word of the name of a statistic, without the part that it is of."""
+    """Return the last word of the name of a statistic, without its part of the sensor."""
     return name.partition("@")[0].rpartition(".")[2]
 
 
@@ -246,10 +244,9 @@ def _are_counts(names: Sequence[str]) -> NDArray[np.bool_]:
 
 
 def _skewness(names: Sequence[str], vectors: FloatArray) -> FloatArray:
-    """Return the skewness of statistics, shape (m,).
+    """Compute the skewness of statistics, shape (m,), shrunk to the mean of their kind (empirical Bayes).
 
-    From few replicates it is noise, or misses what is rare: each is drawn to the mean of its kind as far as
-    those of a kind do not differ by more than chance (empirical Bayes).
+    The sampling variance of a skewness from n replicates is 6/n.
     """
     n = vectors.shape[0]
     off = vectors - vectors.mean(axis=0)
@@ -258,7 +255,7 @@ def _skewness(names: Sequence[str], vectors: FloatArray) -> FloatArray:
     kinds, found = np.array([_kind(name) for name in names]), np.zeros(own.size)
     for kind in np.unique(kinds):
         some = kinds == kind
-        # one more that has none, so that a kind of one is not believed
+        # one more without skewness, so that a kind of one is shrunk to 0
         usual = own[some].sum() / (some.sum() + 1.0)
         real = max(float(np.mean((own[some] - usual) ** 2)) - chance, 0.0)
         found[some] = usual + real / (real + chance) * (own[some] - usual)
@@ -266,9 +263,9 @@ def _skewness(names: Sequence[str], vectors: FloatArray) -> FloatArray:
 
 
 def _straight(names: Sequence[str], pulls: FloatArray, std: FloatArray, skewness: FloatArray) -> FloatArray:
-    """Return pulls as normal quantiles: counts at no less than their own scale, the others without skew.
+    """Transform pulls to normal quantiles: counts with a standard deviation >= 1, others without skew.
 
-    Not on their short side: a skewness by rare samples does not say that it ends.
+    Only the long tail is transformed: skewness by rare samples does not shorten the other tail.
     """
     scaled = pulls * np.where(_are_counts(names), np.minimum(std, 1.0), 1.0)
     straight = without_skew(scaled, skewness)
@@ -276,10 +273,10 @@ def _straight(names: Sequence[str], pulls: FloatArray, std: FloatArray, skewness
 
 
 def _effective_tests(names: Sequence[str], vectors: FloatArray, skewness: FloatArray) -> float:
-    """Return the m for which the smallest of m independent p-values is spread like that of the replicates.
+    """Compute the effective number of independent tests from the smallest p-value of each replicate.
 
-    Each replicate is standardised by the others. The maximum-likelihood m of ``P(p_min < p) = 1 - (1 -
-    p)^m`` is -1 / mean(log(1 - p_min)).
+    Each replicate is standardised by the others. The maximum-likelihood m of ``P(p_min < p) = 1 - (1 - p)^m``
+    is ``-1 / mean(log(1 - p_min))``.
     """
     n, m = vectors.shape
     total, squares = vectors.sum(axis=0), (vectors**2).sum(axis=0)
@@ -295,8 +292,8 @@ class Measured:
     """The statistics of the data, shape (m,) each.
 
     Attributes:
-        train, test: of the parts that effects are found on.
-        final: of the part that only the gap is measured on.
+        train, test: statistics of the parts used to find effects.
+        final: statistics of the part used only to measure the gap.
     """
 
     train: FloatArray
@@ -305,20 +302,19 @@ class Measured:
 
     @property
     def both(self) -> FloatArray:
-        """Mean of the train and test splits."""
+        """Mean of train and test."""
         return (self.train + self.test) / 2.0
 
 
 def free_of_parameters(names: Sequence[str], maps: PixelMaps) -> NDArray[np.bool_]:
-    """Tell of statistics whether they are what they are whatever the pixels' fitted parameters, shape (m,).
+    """Return which statistics do not depend on the pixels' fitted parameters (are ancillary), shape (m,).
 
-    Given the histograms, frames without an effect are in random order: all along time, between pixels and
-    frames follows from that alone. So do codes that differ from their neighbours, if electrons are farther
-    apart than that; the smooth rest of the histograms' shape is what the parameters bend.
+    Given the histograms, frames without an effect are in random order, which fixes all statistics of time,
+    frame and space. Differences of adjacent codes are ancillary if electron peaks are farther apart.
 
     Args:
-        names: of the statistics.
-        maps: fitted parameters, of which the gain tells how far apart electrons are.
+        names: names of the statistics.
+        maps: fitted parameters; the gain gives the distance of electron peaks.
     """
     step = float(np.nanmedian(1.0 / maps.conversion_gain[maps.usable])) if maps.usable.any() else 0.0
     free = {name for name, period in _OF_CODES.items() if _SHORTER * period <= step}
@@ -332,14 +328,14 @@ def disagrees(
     significance: float,
     tolerance: FloatArray | float = 0.0,
 ) -> bool:
-    """Tell whether some statistic deviates more than chance allows, and does so in both splits.
+    """Test whether any statistic deviates significantly, with the same sign in both splits.
 
     Args:
-        null: of the model.
+        null: null distribution of the model.
         z: the data.
-        significance: allowed probability of a chance, anywhere among the statistics.
-        tolerance: deviation that is not held against the model, shape (m,): effects that it has are never
-            known in every detail.
+        significance: probability of a false alarm by any statistic.
+        tolerance: model error of each statistic, shape (m,), added in quadrature: effects in the model are
+            never known exactly.
     """
     p = _p_values(null, z, tolerance)
     limit = 1.0 - (1.0 - significance) ** (1.0 / null.effective_tests)
@@ -351,10 +347,9 @@ def disagrees(
 
 
 def suspicious(null: NullModel, z: Measured) -> bool:
-    """Tell whether some statistic deviates so far that a candidate may explain it together with others.
+    """Test at a low significance whether candidates should be compared.
 
-    An effect moves many statistics a little: where none is beyond chance by itself, all in the direction that
-    the effect asks for may be.
+    An effect shifts many statistics a little: together they can be significant though none is by itself.
     """
     p = null.p_values(z.both, 2)
     same = (z.train - null.mean) * (z.test - null.mean) > 0
@@ -364,13 +359,13 @@ def suspicious(null: NullModel, z: Measured) -> bool:
 def misfits(
     null: NullModel, z: Measured, shift: FloatArray, significance: float, tolerance: FloatArray
 ) -> bool:
-    """Tell whether an effect of the model fails in what it moves itself: then it is not the right one.
+    """Test whether the statistics that an effect shifts most still deviate with it in the model.
 
     Args:
-        null: of the model with the effect.
+        null: null distribution of the model with the effect.
         z: the data.
-        shift: by how much the effect moves the statistics, shape (m,).
-        significance: allowed probability of a chance.
+        shift: shift of the statistics by the effect, shape (m,).
+        significance: probability of a false alarm.
         tolerance: see :func:`disagrees`.
     """
     signature = np.abs(shift) > _SIGNATURE * null.std

@@ -1,7 +1,7 @@
-"""The size of an effect in the units of the samples: e-, DN, and as a share of the read noise.
+"""The size of an effect in e-, in DN and relative to the read noise.
 
-An effect changes the values of its own plane of the signal chain. Their difference with and without it, on
-the same random numbers, is taken before anything is rounded; what is alike in all frames is a bias.
+It is the rms difference of simulated values with and without the effect, on the same random numbers, before
+rounding and around the mean of each pixel.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pchem_pipeline.simulate.settings import SimulateSettings
 
 _MOST_ROWS = 12  # and columns: what all pixels of a frame share has one draw a frame
 _BLOCKS, _BLOCK_FRAMES = 100, 40  # spread over the run
-#: Frames that are drawn at least, in several stacks of a short run: a size is told to two digits.
+#: Smallest number of simulated frames, in several stacks of a short run: a size has two digits.
 _FEWEST_FRAMES = 20_000
 _FEWEST_BLOCKS = 4  # of the whole sensor
 _BITS = 24
@@ -34,12 +34,12 @@ _IN_DN = (Plane.ADC, Plane.READOUT)
 
 
 def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
-    """Return the size of an effect where and when it acts; None where its samples cannot be simulated.
+    """Compute the size of an effect in its region and frames; None if it cannot be simulated.
 
     Args:
-        effect: with its strength, as it acts on these pixels, for themselves a sensor.
+        effect: with its strength, in coordinates of these pixels.
         maps: fitted parameters, (y, x) each.
-        n_frames: of the run.
+        n_frames: frames of the run.
     """
     if not maps.usable.any():
         return None

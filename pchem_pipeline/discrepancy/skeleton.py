@@ -1,10 +1,11 @@
-"""The way of a search for missing effects: from the split of the samples to the verdict.
+"""The steps of a search for missing effects, from the split of the samples to the verdict.
 
 Split, null, gap, disagree, explain, add, describe, close, verdict.
 
-It is the same for frames and for ready-made histograms; what differs is how effects are told apart. With
-frames, effects are simulated and compared by what they do to many statistics (:mod:`.by_simulation`); with
-histograms they enter the exact likelihood (:mod:`.by_likelihood`). Each way is an :class:`Explainer`.
+They are the same for frames and for ready-made histograms; only the comparison of effects differs. With
+frames, effects are simulated and compared by their shift of many statistics (:mod:`.by_simulation`); with
+histograms they are parameters of the exact likelihood (:mod:`.by_likelihood`). Either is an
+:class:`Explainer`.
 """
 
 from __future__ import annotations
@@ -176,7 +177,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
             null, still = instead, disagrees(instead, z, significance, by.tolerance())
             break
     if instead is None and (still or (rounds > 0 and by.unfinished(before, null))):
-        tell("measuring what no effect explains")
+        tell("describing what no effect explains")
         try:
             described = by.describe(before, null)
         except EffortSpentError as spent:
@@ -184,7 +185,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
         described = described or by.probable()
         if described is not None:
             null, still = described, disagrees(described, z, significance, by.tolerance())
-    tell("measuring the gap that is left, with effects and with rivals")
+    tell("measuring the remaining gap")
     added = by.close(before, null, still)
     if not disagreed and before.at_floor and not any(each.named for each in added.additions):
         # data that agree with the model are not made doubtful by what they do not confirm
@@ -226,5 +227,5 @@ def _round(
     explanation = by.explain(null, still)
     if explanation is None:
         return None
-    tell("fitting the pixels with the likeliest effects")
+    tell("refitting the pixels with the likeliest effects")
     return by.add(explanation, null)

@@ -1,4 +1,4 @@
-"""The frames in three parts that never mix: one to fit, one to score, one for the last word."""
+"""Disjoint parts of the frames: one to fit, one to score, one to measure the final gap."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def block_length(n_frames: int, wanted: int | None = None) -> int:
     needed = max(MINIMUM_FRAMES, 9 * length)
     if n_frames < needed:
         raise InputError(
-            f"{n_frames} frames are too few to look for a discrepancy: blocks of {length} in three parts "
-            f"need {needed}; take more frames"
+            f"{n_frames} frames are too few to look for a discrepancy; three parts in blocks of {length} "
+            f"need {needed}: take more frames"
             + ("" if wanted is None or n_frames < MINIMUM_FRAMES else ", or lower discrepancy.block_frames")
         )
     return length

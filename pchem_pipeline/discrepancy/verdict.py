@@ -1,8 +1,7 @@
 """The verdict of a search for missing effects: the content of ``discrepancy.json``, written and read here.
 
-The keys of the JSON are the names of the fields; a number that is not known is ``null`` there and NaN here.
-Whoever adds a key adds it here, and nowhere else; one that older files lack has a default, or raises
-:data:`SCHEMA_VERSION`, and files of another schema are refused.
+The keys of the JSON are the names of the fields; an unknown number is ``null`` there and NaN here. A new key
+either has a default for older files or raises :data:`SCHEMA_VERSION`; files of another schema are refused.
 """
 
 from __future__ import annotations
@@ -27,14 +26,14 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.region import Region, When
 
-#: As the field ``schema_version`` of :class:`Verdict` has it.
+#: Value of the field ``schema_version`` of :class:`Verdict`.
 SCHEMA_VERSION = 3
-#: Share of the samples below which the size of an effect is that of the samples that it changes.
+#: Share of changed samples below which the size of an effect is its rms over the changed samples only.
 RARE = 0.5
-_TIMES = 2.0  # the read noise, from which on a size is no longer told in per cent
-#: Share of what an effect closes, from which on an unrelated one that closes as much weakens its name.
+_TIMES = 2.0  # read noises from which a size is given as a multiple instead of in per cent
+#: Share of the reduction of the gap above which an unrelated control casts doubt on a name.
 CONVINCING_PLACEBO = 0.25
-#: Statistics whose pulls before and after are told and drawn.
+#: Largest number of statistics whose pulls before and after are stored and drawn.
 MOST_PULLS = 12
 #: File of the verdict in the folder of a run.
 VERDICT_FILE = "discrepancy.json"
@@ -55,7 +54,7 @@ def _finite(value: float) -> float | None:
 
 
 def _two_digits(value: float) -> str:
-    """Return a number to two digits, in full: 0.035, 21, 2,000."""
+    """Format a number to two significant digits without an exponent: 0.035, 21, 2,000."""
     return f"{value:.2g}" if abs(value) < 99.5 else f"{float(f'{value:.2g}'):,.0f}"
 
 
@@ -70,7 +69,7 @@ class _Part(BaseModel):
 
 
 class Measured(_Part):
-    """A number of an effect with its standard error; NaN for one that was not fitted."""
+    """A parameter of an effect with its standard error, NaN if it was not fitted."""
 
     value: Number
     stderr: Number = _NAN
@@ -78,13 +77,13 @@ class Measured(_Part):
 
 
 class Candidate(_Part):
-    """An effect that was compared, and how well it explains samples that it was not fitted to.
+    """An effect that was compared, with its log-likelihood of held-out samples.
 
     Attributes:
         effect: its tag.
-        score: held-out log score against the chosen one, nats (0 for the chosen one).
-        stderr: of that difference, nats.
-        probability: among all candidates.
+        score: held-out log-likelihood minus that of the best effect, nats (0 for the best).
+        stderr: standard error of ``score``, nats.
+        probability: posterior probability among all candidates.
         parameters: the fields of the effect.
     """
 
@@ -96,7 +95,7 @@ class Candidate(_Part):
 
     @classmethod
     def of(cls, effect: Effect, score: float, stderr: float, probability: float) -> Candidate:
-        """Return an effect with its score."""
+        """Make the entry of an effect from its score."""
         return cls(
             effect=effect.tag,
             score=score,
@@ -107,13 +106,15 @@ class Candidate(_Part):
 
 
 class Size(_Part):
-    """By how much an effect changes the samples, about a pixel's mean change; a rare one those that it does.
+    """Root mean square change of the samples by an effect, around each pixel's mean change.
+
+    The average is over the changed samples only if these are fewer than :data:`RARE`.
 
     Attributes:
-        electrons: e-.
-        dn: DN.
-        of_read_noise: share of the median read noise.
-        samples: share of the samples that it changes, where and when it acts.
+        electrons: the size, e-.
+        dn: the size, DN.
+        of_read_noise: the size over the median read noise.
+        samples: share of the samples that are changed, within the effect's region and frames.
     """
 
     electrons: Number
@@ -122,25 +123,25 @@ class Size(_Part):
     samples: Number = 1.0
 
     def words(self) -> str:
-        """Return it for people."""
-        most = f"{_two_digits(self.dn)} DN rms ({_two_digits(self.electrons)} e-, {self.beside_noise()})"
-        return most if self.samples >= RARE else f"{most} in {per_cent(self.samples)} of the samples"
+        """Describe the size: ``0.5 DN rms (1.1 e-, 22 % of the read noise)``."""
+        size = f"{_two_digits(self.dn)} DN rms ({_two_digits(self.electrons)} e-, {self.beside_noise()})"
+        return size if self.samples >= RARE else f"{size} in {per_cent(self.samples)} of the samples"
 
     def beside_noise(self) -> str:
-        """Return it as a share of the read noise, or how many times as large it is."""
+        """Describe the size relative to the read noise, in per cent or as a multiple."""
         share = self.of_read_noise
         times = f"{per_cent(share)} of" if share < _TIMES else f"{_two_digits(share)} times"
         return f"{times} the read noise"
 
 
 class Rival(_Part):
-    """Another effect added in the place of the named one, fitted in the same way.
+    """Another effect fitted instead of the named one, in the same way.
 
     Attributes:
         effect: its tag.
-        gap_after: the gap that it leaves, nats per sample.
-        behind: log score behind the chosen one, nats; NaN where it was not scored.
-        why: what it leaves of the data, or why it could not decide.
+        gap_after: the remaining gap, nats per sample.
+        behind: log-likelihood minus that of the named one, nats; NaN if it was not scored.
+        why: reason of the rejection.
     """
 
     effect: str
@@ -150,7 +151,7 @@ class Rival(_Part):
 
 
 class Moved(_Part):
-    """Change of the median of a delivered parameter, in its unit and in standard errors of a pixel."""
+    """Change of the median of a parameter map, in its unit and in standard errors per pixel."""
 
     median: Number
     in_stderr: Number
@@ -158,7 +159,7 @@ class Moved(_Part):
 
 
 class Pull(_Part):
-    """A statistic before and after effects were added, in standard deviations of chance."""
+    """A statistic before and after effects were added, in standard deviations under the model (sigma)."""
 
     statistic: str
     sentence: str
@@ -167,26 +168,26 @@ class Pull(_Part):
 
 
 class Place(_Part):
-    """A disagreement of data and model: a statistic, and the pixels, codes or frames that carry it.
+    """A disagreement of data and model: a statistic, and its pixels, codes or frames.
 
     Attributes:
         statistic: its name in the catalogue.
-        sentence: what it says.
+        sentence: the statistic in words.
         channel: charge, readout, ...
         direction: "+" or "-".
-        z: deviation from what the model gives, standard deviations.
-        p: probability of any statistic deviating so much by chance.
-        pixels: (y, x) on the sensor, where it is a matter of few pixels.
-        dn: first and last code, where it is a matter of codes.
-        frames: frame numbers, where it is a matter of few frames.
-        seen, expected: samples in these codes, where they were counted.
-        share_of_gap: share of the gap that is left, where it was measured.
-        region: where on the sensor its map stands out from the rest, as ``model.effects`` takes a region;
-            None: everywhere alike, or it has no map.
-        region_p: probability of such a place by chance, anywhere.
-        region_share: share of the region's pixels that deviate, at least (at 95 %).
-        when: frames in which its series stands out, as ``model.effects`` takes them; None: always alike.
-        when_p: probability of such frames by chance.
+        z: deviation from the expectation under the model, standard deviations.
+        p: p-value, corrected for the number of statistics.
+        pixels: (y, x) on the sensor, if few pixels deviate.
+        dn: first and last code, if codes deviate.
+        frames: frame numbers, if few frames deviate.
+        seen, expected: number of samples in these codes, if counted.
+        share_of_gap: share of the remaining gap, if measured.
+        region: part of the sensor in which the map of the statistic deviates, as in ``model.effects``; None:
+            uniform, or no map.
+        region_p: p-value of the region, corrected for the number of regions searched.
+        region_share: lower 95 % limit of the share of deviating pixels in the region.
+        when: frames in which the time series deviates, as in ``model.effects``; None: uniform.
+        when_p: p-value of these frames, corrected in the same way.
     """
 
     statistic: str
@@ -209,24 +210,24 @@ class Place(_Part):
 
     @classmethod
     def of(cls, statistic: str, z: float, **more: Any) -> Place:
-        """Return a place with the sentence and the channel that the catalogue has for its statistic."""
+        """Make a place with the sentence and channel of its statistic in the catalogue."""
         known = STATISTICS[statistic]
         words = {"sentence": known.says(z), "channel": known.channel, "direction": "+" if z > 0 else "-"}
         return cls(statistic=statistic, z=z, **{**words, **more})
 
     def spot(self) -> str:
-        """Return region and frames in words; empty where it is everywhere and always alike."""
-        # pixels that are listed one by one are told by :attr:`pixels`
+        """Describe region and frames; empty if uniform."""
+        # pixels listed one by one are in :attr:`pixels`
         listed = self.region is None or ("pixels" in self.region and self.pixels)
         parts = [] if listed else [Region.model_validate(self.region).describe()]
         parts += [] if self.when is None else [When.model_validate(self.when).describe()]
-        # a statistic of a part has only that; another one may be there elsewhere, too, and weaker
-        most = "most in " if parts and "@" not in self.statistic else ""
+        # other statistics than those of a part may deviate elsewhere, too, and less
+        most = "mainly in " if parts and "@" not in self.statistic else ""
         return f"{most}{', '.join(parts)}"
 
     def shifted(self, shape: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int]) -> Place:
-        """Return it with its region counted from the corner of a sensor of some shape."""
-        # a statistic of a part is told on the sensor
+        """Return a copy with its region in coordinates of the sensor."""
+        # statistics of a part have sensor coordinates already
         if self.region is None or "@" in self.statistic or (rows, columns) == ((0, shape[0]), (0, shape[1])):
             return self
         mask = np.zeros(shape, np.bool_)
@@ -236,13 +237,13 @@ class Place(_Part):
 
 
 class Families(_Part):
-    """The contribution of each family of statistics to the gap before and after, nats per sample."""
+    """Contribution of each family of statistics to the gap before and after, nats per sample."""
 
     before: dict[str, Number] = {}
     after: dict[str, Number] = {}
 
 
-#: What the families of statistics are of.
+#: Families of statistics in words.
 _FAMILIES = {
     "shape": "the shape of the histograms",
     "code": "the codes",
@@ -254,25 +255,25 @@ _FAMILIES = {
 
 
 def closed_share(before: float, after: float) -> float:
-    """Return the share of a gap that is closed, 0 to 1; 0 where there is none or it grew."""
+    """Compute ``1 - after / before``, limited to 0 ... 1; 0 without a gap before."""
     return min(max(1.0 - max(after, 0.0) / before, 0.0), 1.0) if before > 0.0 else 0.0
 
 
 def families_words(families: Sequence[str]) -> str:
-    """Return in words what families of statistics are of."""
+    """Describe families of statistics."""
     return " and ".join(_FAMILIES.get(family, family) for family in families)
 
 
 class GapChange(_Part):
-    """The gap of the model on samples that no fit has seen, before and after effects were added.
+    """The gap on held-out samples, before and after effects were added; see :mod:`.gap`.
 
     Attributes:
-        unit: of all but the share.
+        unit: unit of all numbers except ``closed_fraction``.
         before, after: without and with the effects.
-        floor: what chance makes at most in 19 of 20 cases.
-        closed_fraction: share that is closed, 0 to 1.
+        floor: 95 % quantile of sampling noise under the model.
+        closed_fraction: :func:`closed_share`.
         interval_before, interval_after: 95 % intervals.
-        standing_out: families of statistics that are beyond chance by themselves with the effects.
+        standing_out: families of statistics that are significant by themselves with the effects.
     """
 
     unit: str = "nats/sample"
@@ -286,27 +287,26 @@ class GapChange(_Part):
 
     @property
     def within_chance(self) -> bool:
-        """Whether chance alone makes as much before anything is added: no share of that is closed."""
+        """Whether the gap is within sampling noise before anything is added."""
         return self.before <= self.floor
 
 
 class Change(_Part):
-    """A number before and after effects were added."""
+    """A p-value before and after effects were added."""
 
     before: Number
     after: Number
 
 
 class Surveyed(_Part):
-    """A part of the sensor where a map of all pixels, from all frames, stands out.
+    """A part of the sensor in which a map of all pixels, from all frames, deviates.
 
     Attributes:
-        map: next_x or next_y (covariance with the next pixel), lag (with the frame before), spread (means
-            over blocks of frames scatter), score.* and goodness (shape of the histograms), pairs.row.readout
-            and so on (pixels that share a row, a column or a frame move together), unfitted (pixels without
-            a fit to be relied upon).
-        region: as ``model.effects`` takes a region.
-        p: probability of such a place by chance, anywhere.
+        map: next_x or next_y (covariance with the next pixel), lag (covariance with the frame before), spread
+            (scatter of block means), score.* and goodness (shape of the histograms), pairs.row.readout and so
+            on (covariance of pixels in a row, column or frame), unfitted (pixels without a reliable fit).
+        region: as in ``model.effects``.
+        p: p-value, corrected for the number of regions searched.
     """
 
     map: str
@@ -315,11 +315,11 @@ class Surveyed(_Part):
 
 
 class Elsewhere(_Part):
-    """Whether the model that was found holds in another window of the sensor.
+    """Test of the final model in another window of the sensor.
 
     Attributes:
-        rows, columns: of that, first and end.
-        deviates: what does not agree with it there, beyond doubt; empty: nothing.
+        rows, columns: the window, first and end.
+        deviates: statistic that disagrees there, in words; empty: none.
     """
 
     rows: tuple[int, int]
@@ -327,33 +327,33 @@ class Elsewhere(_Part):
     deviates: str = ""
 
     def words(self) -> str:
-        """Return where that is."""
+        """Describe the window."""
         return (
             f"rows {self.rows[0]} to {self.rows[1] - 1}, columns {self.columns[0]} to {self.columns[1] - 1}"
         )
 
     def says(self) -> str:
-        """Return where the model was looked at again, and what came of it."""
-        found = f"it does not hold: {self.deviates}" if self.deviates else "it holds"
-        return f"looked at again in {self.words()}: {found}"
+        """Describe the window and the result."""
+        found = f"the model does not hold: {self.deviates}" if self.deviates else "the model holds"
+        return f"tested again in {self.words()}: {found}"
 
 
 class Examined(_Part):
-    """What was looked at.
+    """The samples that were examined.
 
     Attributes:
-        frames: number of them; of histograms the samples of the fullest.
-        rows, columns: first, and end, on the sensor.
-        train, test, final: frames (of histograms: samples) to find with, to score on, and for the last gap.
-        histograms: number of those compared, where frames are not known; of several samples all count.
-        share: of the run's samples that were compared with simulations.
-        surveyed: of the run's samples that were looked at in every way of ``surveyed_by``, or compared.
-        surveyed_by: share of the run's samples by what was looked at, over the whole sensor: neighbours and
-            successive frames, shapes of the histograms, pairs of pixels in rows, columns and frames.
-        places: where those stand out.
-        unfitted: pixels that are not compared, since they have no fit to be relied upon.
-        elsewhere: where the model that was found was looked at again; None: nowhere.
-        left_out: frames that are empty or far from the others.
+        frames: number of frames; of histograms the largest number of samples.
+        rows, columns: first and end on the sensor.
+        train, test, final: frames (of histograms: samples) to fit, to score, and to measure the final gap.
+        histograms: number of histograms, if frames are unknown; those of all exposures count.
+        share: share of the run's samples compared with simulations.
+        surveyed: share of the run's samples in every survey of ``surveyed_by``, or compared.
+        surveyed_by: share of the run's samples by survey of the whole sensor: neighbours and successive
+            frames, shapes of the histograms, pairs of pixels in rows, columns and frames.
+        places: deviating parts of the sensor in these surveys.
+        unfitted: number of pixels left out for lack of a reliable fit.
+        elsewhere: test of the model in another window; None: not done.
+        left_out: empty and outlying frames.
     """
 
     frames: int
@@ -378,25 +378,24 @@ class Examined(_Part):
 
 
 class Step(_Part):
-    """An effect added to the model, or several that could not be told apart.
+    """An effect added to the model, or several between which the data do not decide.
 
     Attributes:
-        effect: tag of the named effect; None where it is ambiguous or does not fit.
-        verdict: of this step alone.
-        candidates: those compared, the likeliest first.
-        parameters: numbers of the named or the likeliest effect.
-        form: what else its fields say that is not their default, in words.
-        place: where and when it acts, in words; empty: everywhere, always.
-        gap_before, gap_after, gap_floor: on the final samples without and with it, nats per sample.
+        effect: tag of the named effect; None if ambiguous or rejected.
+        verdict: verdict of this step alone.
+        candidates: effects compared, the likeliest first.
+        parameters: parameters of the named or the likeliest effect.
+        form: its text fields that differ from their default.
+        place: region and frames in words; empty: everywhere, always.
+        gap_before, gap_after, gap_floor: gap on the final samples without and with it, nats per sample.
         gap_interval_after: 95 % interval of the gap with it.
-        size: by how much it changes the samples; None where that is not known.
+        size: size of the effect; None if unknown.
         families: the gap by family of statistics.
-        rivals: the next best candidates, the best first, each fitted in its place.
-        placebo: the best of those that have nothing to do with it, fitted in its place; None where none of
-            them would close anything.
-        moved: change of each parameter map by its refit with the effect.
-        separate: by effect, the measurement that would tell it apart.
-        pulls: the statistics that it moves most.
+        rivals: the next best effects, the best first, each fitted instead of it.
+        placebo: best unrelated control, fitted instead of it; None if none reduces the gap.
+        moved: change of each parameter map by the refit with the effect.
+        separate: by effect, the measurement that would distinguish it.
+        pulls: the statistics that change most.
     """
 
     effect: str | None
@@ -419,26 +418,26 @@ class Step(_Part):
 
     @property
     def within_chance(self) -> bool:
-        """Whether chance alone makes as much of a gap without it: no share of that is closed."""
+        """Whether the gap is within sampling noise without it."""
         return self.gap_before <= self.gap_floor
 
     @property
     def closed(self) -> float:
-        """Share of the gap before this step that it closes."""
+        """Relative reduction of the gap by this step."""
         return closed_share(self.gap_before, self.gap_after)
 
     @property
     def runner_up(self) -> Rival | None:
-        """The best of the rivals."""
+        """The next best effect."""
         return self.rivals[0] if self.rivals else None
 
     def closed_by(self, rival: Rival) -> float:
-        """Return the share of the gap before this step that a rival closes in its place."""
+        """Compute the relative reduction of the gap by a rival instead."""
         return closed_share(self.gap_before, rival.gap_after)
 
     @property
     def likeliest(self) -> str:
-        """Tag of the named effect, else of the likeliest candidate; empty without any."""
+        """Tag of the named effect, else of the likeliest candidate; empty if there is none."""
         return self.effect or next((c.effect for c in self.candidates), "")
 
 
@@ -446,28 +445,28 @@ class Verdict(_Part):
     """The content of ``discrepancy.json``.
 
     Attributes:
-        verdict: named (the gap that is left is at its floor), named_in_part (``gap.closed_fraction`` of it is
-            closed), ambiguous, described (measured, not understood), unexplained, consistent, or cannot_tell:
-            nothing is found that does not rest on the pixels' parameters, and those are not identified.
-        doubt: why the pixels are not identified, and what would help; empty where they are.
-        limit: where the search ended at its limit of work, and what was not tried; empty where it did not.
-        sentence: the same for people.
+        verdict: named (the remaining gap is within sampling noise), named_in_part (reduced by
+            ``gap.closed_fraction``), ambiguous, described (an empirical description without a cause),
+            unexplained, consistent, or cannot_tell (the pixels' parameters are not identified, and no
+            statistic that is independent of them deviates).
+        doubt: why the pixels' parameters are not identified, and the cure; empty if they are.
+        limit: what was not tried when the search had used its budget; empty if it finished.
+        sentence: the verdict in one sentence.
         effects: tags of the named effects.
-        model_effects: all effects that the model has afterwards, as the YAML holds them.
-        proposed: effects that describe what none explains but leave something; they are not in the model.
-        steps: what was added, in order of weight.
-        gap: with no new effect, and with all.
-        where: the disagreements with the model as it was.
-        unexplained: those that are left.
-        set_aside: codes that the fit leaves out, by their place on a pixel's comb: intervals, e-; None: no
-            limit.
+        model_effects: all effects of the model afterwards, as in the YAML.
+        proposed: empirical effects that do not explain everything; not in the model.
+        steps: added effects, the largest first.
+        gap: without new effects and with all.
+        where: disagreements with the model before the search.
+        unexplained: remaining disagreements.
+        set_aside: intervals of (x - bias) * gain, e-, whose codes the fit leaves out; None: no limit.
         untestable: effects that such data cannot show, and why.
-        defects: candidates that could not be compared because of an error in them, and which.
-        examined: what was looked at.
-        p_global: chance of the largest deviation.
-        replicates: simulated stacks or histograms in all.
-        work: CPU seconds by count, on a core of about 2020: the same on any machine.
-        versions: of what a verdict depends on.
+        defects: candidates that failed, and their errors.
+        examined: the samples that were examined.
+        p_global: p-value of the largest deviation.
+        replicates: number of simulated stacks or histograms.
+        work: counted work, CPU seconds of a core of about 2020: the same on any machine.
+        versions: versions on which the verdict depends.
     """
 
     schema_version: Literal[3] = 3
@@ -492,7 +491,7 @@ class Verdict(_Part):
     versions: dict[str, int | str]
 
     def to_json(self) -> str:
-        """Return the content of ``discrepancy.json``."""
+        """Write the content of ``discrepancy.json``."""
         return self.model_dump_json(indent=1)
 
     @classmethod
@@ -501,7 +500,7 @@ class Verdict(_Part):
 
         Args:
             text: the content.
-            source: where it comes from, for the message.
+            source: its origin, for the message.
 
         Raises:
             StoreError: it is damaged, or of another schema.
@@ -528,28 +527,28 @@ class Verdict(_Part):
 
     @property
     def closed_in_model(self) -> float:
-        """Share of the gap that the effects close which the model has afterwards."""
+        """Relative reduction of the gap by the effects in the final model."""
         named = [step for step in self.steps if step.verdict != "described"]
         if not self.proposed:
             return self.gap.closed_fraction
         return closed_share(self.gap.before, named[-1].gap_after) if named else 0.0
 
     def part_of_model(self, step: Step) -> bool:
-        """Tell whether the effect of a step is in the model: named, or a description of all that was left."""
+        """Return whether the effect of a step is in the final model: named, or a complete description."""
         return step.effect is not None or (step.verdict == "described" and not self.proposed)
 
     @property
     def word(self) -> str:
-        """The verdict in a word or three."""
+        """The verdict with spaces."""
         return self.verdict.replace("_", " ")
 
     def __repr__(self) -> str:
         return f"<Verdict {self.word}: {self.sentence}>"
 
     def _repr_html_(self) -> str:
-        """Return verdict and disagreements, for a notebook."""
+        """Return verdict and disagreements as HTML for a notebook."""
         rows = [
-            f"<li>{escape(place.sentence or place.statistic)} ({place.z:+.1f} sd)</li>"
+            f"<li>{escape(place.sentence or place.statistic)} ({sigma_text(place.z)})</li>"
             for place in self.where
         ]
         return (
@@ -557,7 +556,7 @@ class Verdict(_Part):
         )
 
     def added(self, step: Step) -> str:
-        """Return what a step added to the model for its gap: an effect, or the likeliest of several."""
+        """Return the effect that a step added, or the likeliest of several."""
         if step.effect:
             return step.effect
         rivals = list(dict.fromkeys(c.effect for c in step.candidates))[:3]
@@ -566,11 +565,11 @@ class Verdict(_Part):
         return f"nearest: {rivals[0]}" if step.verdict == "unexplained" else " or ".join(rivals)
 
     def costing(self, work: float) -> Verdict:
-        """Return it with the CPU seconds, by count, of all that led to it."""
+        """Return a copy with the counted work of the whole search, CPU seconds."""
         return self.model_copy(update={"work": round(work, 1)})
 
     def checked(self, elsewhere: Elsewhere) -> Verdict:
-        """Return it with what another window of the sensor says of the model that was found."""
+        """Return a copy with the test of the model in another window of the sensor."""
         changes: dict[str, Any] = {"examined": self.examined.model_copy(update={"elsewhere": elsewhere})}
         if elsewhere.deviates:
             not_there = f"; it does not hold in {elsewhere.words()}, where {elsewhere.deviates}."
@@ -586,13 +585,13 @@ class Verdict(_Part):
         columns: tuple[int, int],
         pixel: Callable[[int, int], tuple[int, int]],
     ) -> Verdict:
-        """Return it with pixels counted from the corner of the sensor.
+        """Return a copy in coordinates of the sensor.
 
         Args:
-            shape: of the sensor.
-            rows: that were looked at, first and end.
-            columns: likewise.
-            pixel: from the place (y, x) of a pixel among those looked at to that on the sensor.
+            shape: rows and columns of the sensor.
+            rows: examined rows, first and end.
+            columns: examined columns, first and end.
+            pixel: map from (y, x) in the examined window to (y, x) on the sensor.
         """
 
         def moved(place: Place) -> Place:
@@ -605,13 +604,24 @@ class Verdict(_Part):
 
 
 def micronats(gap: float) -> str:
-    """Return a gap, nats per sample, in millionths; less than nothing is chance, and shown as nothing."""
+    """Format a gap, nats per sample, in micronats; negative estimates as 0."""
     value = 1e6 * max(gap, 0.0)
-    return "not known" if not math.isfinite(gap) else f"{value:,.0f}" if value >= 100.0 else f"{value:.3g}"
+    return "not known" if not math.isfinite(gap) else f"{value:,.0f}" if value >= 100.0 else f"{value:.2g}"
+
+
+def share_text(share: float) -> str:
+    """Format a share in per cent; 100 % only if it is all."""
+    percent = 100.0 * share
+    return f"{percent:.0f} %" if percent < 99.0 or share >= 1.0 else f"{min(percent, 99.99):.4g} %"
+
+
+def sigma_text(z: float) -> str:
+    """Format the size of a deviation in standard deviations; its direction is in the sentence beside it."""
+    return f"{abs(z):.{1 if abs(z) < 9.95 else 0}f} sigma" if math.isfinite(z) else "sigma not known"
 
 
 def read_verdict(folder: Path) -> Verdict | None:
-    """Read the verdict of a run, or return None where there is none.
+    """Read the verdict of a run, or return None if there is none.
 
     Raises:
         StoreError: it cannot be read.
@@ -627,11 +637,11 @@ def read_verdict(folder: Path) -> Verdict | None:
 
 
 def parameters_of(effect: Effect, stderr: float) -> dict[str, Measured]:
-    """Return the numbers of an effect; only its strength was fitted and has a standard error.
+    """Return the parameters of an effect; only the strength has a standard error.
 
     Args:
         effect: with its fitted parameters.
-        stderr: of its strength; NaN where there is none.
+        stderr: standard error of the strength; NaN if it has none.
     """
     errors = {effect.strength: stderr}
     return {
@@ -644,7 +654,7 @@ def parameters_of(effect: Effect, stderr: float) -> dict[str, Measured]:
 
 
 def form_of(effect: Effect) -> dict[str, str]:
-    """Return the words in an effect's fields, such as the shape of a drift, that are not the default."""
+    """Return the text fields of an effect, such as the shape of a drift, that differ from their default."""
     fields = type(effect).model_fields
     return {
         name: value
@@ -655,17 +665,17 @@ def form_of(effect: Effect) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """A verdict with what it rests on.
+    """A verdict with its evidence.
 
     Attributes:
-        verdict: what ``discrepancy.json`` holds.
-        model: effects that the model has now, those it had before included.
-        maps: parameters of the pixels examined, under the final model.
-        evidence: of the train samples.
-        statistics: names, and deviations before and after, for pictures.
-        code_extended: samples expected at each code of ``evidence.code`` from the final model; None where
-            nothing was added or the model gives no law.
-        added: exposure that the effects add to single pixels on top of the H of ``maps``; None: nothing.
+        verdict: the content of ``discrepancy.json``.
+        model: effects of the final model, earlier ones included.
+        maps: parameters of the examined pixels under the final model.
+        evidence: statistics of the train samples.
+        statistics: names, and deviations before and after, for figures.
+        code_extended: samples expected at each code of ``evidence.code`` under the final model; None if
+            nothing was added or the model has no pmf.
+        added: exposure that effects add to single pixels on top of the H of ``maps``; None: nothing.
     """
 
     verdict: Verdict

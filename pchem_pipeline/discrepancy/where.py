@@ -1,4 +1,4 @@
-"""Where data and model disagree: statistics that deviate, and the pixels, DN and frames that carry them."""
+"""Locations of a disagreement: deviating statistics with their pixels, DN and frames."""
 
 from __future__ import annotations
 

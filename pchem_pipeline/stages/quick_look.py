@@ -48,9 +48,9 @@ def run_quick_look(store: RunStore, run: StoredRun, sums: StackSums | None) -> Q
         missing["rows, columns, frames, neighbours and lags"] = str(why)
     codes = None
     if run.model.effects:
-        missing["codes"] = "the model has effects; pchem discrepancy compares the codes with it"
+        missing["codes"] = "the model has effects; pchem discrepancy tests the codes"
     elif maps.usable.sum() < _FEWEST:
-        missing["codes"] = f"fewer than {_FEWEST} pixels with a fit that can be relied upon"
+        missing["codes"] = f"fewer than {_FEWEST} pixels have a reliable fit"
     else:
         codes = _codes(store, maps, joint=bool(run.sensor.samples))
     command = f"pchem discrepancy {quoted(Path(run.name))}"

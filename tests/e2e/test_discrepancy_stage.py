@@ -139,8 +139,8 @@ def test_a_search_ends_at_its_limit_and_goes_further_with_a_higher_one(fitted, t
     assert found["effects"] == []
     assert "row_noise" in found["limit"]
     words = " ".join(result.stdout.split())
-    assert "the search ended at its limit before row_noise was fitted" in words
-    assert "--effort raises it" in words
+    assert "the search used its budget before row_noise was fitted" in words
+    assert "go on with a larger --effort" in words
 
 
 def test_an_effect_that_the_model_has_is_not_added_twice(searched, fitted, tmp_path):
@@ -214,7 +214,7 @@ def test_effects_beside_one_that_is_no_candidate_are_named_in_part_and_a_killed_
     [
         ("[row_noise, frame_noise]", "[row_nois]", "unknown effects row_nois"),
         ("n_frames: 1800", "n_frames: 250", "take more frames"),
-        ("shape: [16, 16]", "shape: [4, 4]", "fewer than 32"),
+        ("shape: [16, 16]", "shape: [4, 4]", "32 are needed"),
     ],
 )
 def test_what_cannot_be_searched_is_one_clear_line(kernels, tmp_path, old, new, message):

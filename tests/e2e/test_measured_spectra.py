@@ -78,10 +78,10 @@ def test_the_search_names_what_physics_says_and_describes_the_rest(measured):
     assert gap["interval_after"][1] < gap["interval_before"][0]
     # the library holds neither the trigger that cuts the 0-electron peak nor afterpulses in the valleys
     left = [place["sentence"] for place in found["unexplained"]]
-    assert left[0].startswith("fewer samples than the model has at the 0-electron peak")
-    assert any("more samples than the model has between the 1- and the 2-electron peak" in s for s in left)
+    assert left[0].startswith("fewer samples than expected at the 0-electron peak")
+    assert any("more samples than expected between the 1- and the 2-electron peak" in s for s in left)
     assert {"row_noise", "interpixel_capacitance", "bias_drift"} <= set(found["untestable"])
-    assert "left unexplained:" in result.stdout
+    assert "unexplained:" in result.stdout
     # the picture shows both: the tail, which the plain model lacks, is there with branching
     arrays = {n: store.read(f"discrepancy/code_{n}") for n in ("dn", "observed", "expected", "extended")}
     far = arrays["dn"] >= 300

@@ -66,7 +66,7 @@ def test_nothing_hidden_is_consistent():
     assert found.effects == ()
     assert found.gap.before < 3 * found.gap.floor
     assert "row_noise" in found.untestable
-    assert "no order in time and no neighbours" in found.untestable["row_noise"]
+    assert "no frame order and no neighbours" in found.untestable["row_noise"]
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tri
     found = find_in_histograms([sample], short).verdict
     assert found.verdict == "unexplained"
     assert found.effects == ()
-    assert "ended at its limit" in found.limit
+    assert "used its budget" in found.limit
     assert "branching_counts" in found.limit
     assert find_in_histograms([sample], short).verdict == found
 
@@ -139,7 +139,7 @@ def test_a_peak_that_was_cut_is_set_aside_and_bends_nothing():
 
 
 def test_too_few_samples_are_refused_in_one_line():
-    with pytest.raises(InputError, match="fewer than 900"):
+    with pytest.raises(InputError, match="900 needed"):
         find_in_histograms([SampleHistograms(np.ones((4, 50), np.uint32), np.zeros(4, np.int64))], SETTINGS)
 
 

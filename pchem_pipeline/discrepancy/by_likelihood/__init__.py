@@ -1,1 +1,1 @@
-"""Effects named on ready-made histograms, by likelihood."""
+"""Identification of effects in ready-made histograms by likelihood."""

@@ -1,4 +1,4 @@
-"""The effects that the likelihood of histograms added: each with its gap and its rivals, and what is left."""
+"""Effects added by likelihood, with gap and rivals of each, and the remaining discrepancy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.build_verdict import LARGEST_REST, Added, Addition, largest_pulls
+from pchem_pipeline.discrepancy.build_verdict import (
+    LARGEST_REST,
+    LEAVES_TOO_MUCH,
+    Added,
+    Addition,
+    largest_pulls,
+)
 from pchem_pipeline.discrepancy.by_likelihood.comb import electrons_of, find_residuals, set_aside_residual
 from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap, carried_over
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
@@ -78,9 +84,7 @@ class AddedSets:
             addition = self._addition(named, members, (gap, after), (fitted, extended))
             additions.append(replace(addition, pulls=moved))
             gap, fitted = after, extended
-        left = (
-            "" if self.found.rest <= LARGEST_REST or gap.at_floor else "too much of the gap is left beside it"
-        )
+        left = "" if self.found.rest <= LARGEST_REST or gap.at_floor else LEAVES_TOO_MUCH
         added = Added(
             additions=tuple(replace(each, against=left or each.against) for each in additions),
             after=gap,
@@ -198,9 +202,9 @@ class AddedSets:
                 continue
             behind, error = self.found.sets.difference(set_with, judged)
             gap = self.gaps.value(self.sets.problem(fitted.members), fitted.fit, chance)
-            why = f"predicts samples that it was not fitted to worse, by {-behind:.3g} +- {error:.2g} nats"
+            why = f"it predicts unseen samples worse, by {-behind:.3g} +- {error:.2g}"
             if other.tag in named.equals:
-                why = "predicts as well: these histograms do not tell them apart"
+                why = "it predicts unseen samples as well: these histograms do not decide"
             found.append(Rival(effect=other.tag, gap_after=gap, behind=behind, why=why))
         return tuple(sorted(found, key=lambda rival: -rival.behind))
 

@@ -1,4 +1,4 @@
-"""Codes by their place on the comb of peaks: which to compare, and where data and model disagree.
+"""Codes by their position (x - bias) * gain: which to compare, and where data and model disagree.
 
 Where no known effect brings the model to the data, something unknown is in them, and likely in one place: a
 peak that was cut by a trigger, samples between the peaks. A fit to all codes bends every parameter towards
@@ -101,7 +101,7 @@ def _last(electrons: FloatArray) -> int:
 
 
 def place_words(low: float, high: float) -> str:
-    """Return the words for an interval on the comb, e-."""
+    """Describe an interval of (x - bias) * gain, e-."""
     centre = 0.5 * (low + high)
     k = round(centre)
     if centre < -_HALF_PEAK:
@@ -195,7 +195,7 @@ def _residual(
 ) -> Place:
     more = "more" if z > 0 else "fewer"
     words = (
-        f"{more} samples than the model has {place_words(low, high)} (DN {dn[0]} to {dn[1]}: "
+        f"{more} samples than expected {place_words(low, high)} (DN {dn[0]} to {dn[1]}: "
         f"{seen:.3g} seen, {expected:.3g} expected)"
     )
     return Place.of(

@@ -1,4 +1,4 @@
-"""Effects are told apart in ready-made histograms by their likelihood: the law of the samples alone.
+"""Comparison of effects in ready-made histograms by likelihood.
 
 There is no order in time and there are no neighbours. The samples of every pixel are split at random into
 three parts: one to fit, one to score, one for the final gap. Effects enter the exact likelihood of the
@@ -75,10 +75,10 @@ def find_in_histograms(
     settings = settings or DiscrepancySettings()
     classes = candidate_classes(settings)
     rng = np.random.default_rng(settings.seed)
-    tell("splitting the samples and looking at each part")
+    tell("computing the statistics of each part")
     observed = ObservedHistograms.of(samples, rng)
     times = [sample.integration_time for sample in samples]
-    tell("drawing the fitted model")
+    tell("simulating the fitted model")
     found = search(HistogramExplainer.begin(observed, settings, classes, tuple(model), times, rng), tell)
     n, n_lit = samples[0].counts.shape[0], sum(not sample.bias for sample in samples)
     row = width or n

@@ -1,4 +1,4 @@
-"""Effects as parameters of a likelihood: which change a pixel's own histogram, and what of them is fitted."""
+"""Effects as parameters of a likelihood: which change a pixel's histogram, and their free parameters."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 FloatArray = NDArray[np.float64]
 
 #: Why effects in time and space cannot be looked for.
-NO_ORDER = "ready-made histograms hold no order in time and no neighbours"
-_SAME_LAW = "it leaves the law of a single pixel's samples as it is, or only widens its read noise"
-_FEW_PIXELS = "it is told from the peaks of a histogram only by many pixels of different bias"
+NO_ORDER = "ready-made histograms have no frame order and no neighbours"
+_SAME_LAW = "it changes at most the width of the read noise in a pixel's histogram"
+_FEW_PIXELS = "only many pixels of different bias distinguish it from the peaks of a histogram"
 _FAMILIES = ("shape", "code", "tail")  # of statistics that histograms have
 _MOST_EXTRA = 2
 _MOST_STARTS = 6  # of one effect

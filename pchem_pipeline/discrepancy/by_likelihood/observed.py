@@ -1,4 +1,4 @@
-"""What a search sees of ready-made histograms before it asks anything: the rows that it looks at, split."""
+"""The examined histograms, split into train, test and final samples."""
 
 from __future__ import annotations
 
@@ -127,16 +127,15 @@ class ObservedHistograms:
 
 def _check(samples: Sequence[SampleHistograms]) -> None:
     if len({sample.counts.shape[0] for sample in samples}) != 1 or all(sample.bias for sample in samples):
-        raise InputError("the samples hold different numbers of pixels, or no electrons; give one exposure")
+        raise InputError("the exposures have different numbers of pixels, or no electrons; give one exposure")
     for sample in samples:
         most = int(sample.counts.sum(axis=1).max()) if sample.counts.size else 0
         if most < 3 * _FEWEST_SAMPLES:
             raise InputError(
-                f"the fullest histogram holds {most} samples, fewer than {3 * _FEWEST_SAMPLES}: nothing can "
-                "be compared; take more frames"
+                f"the largest histogram has {most} samples; {3 * _FEWEST_SAMPLES} needed: take more frames"
             )
         if most > _LARGEST_TOTAL:
-            raise InputError(f"a histogram holds {most} samples; at most {_LARGEST_TOTAL} can be split")
+            raise InputError(f"a histogram has {most} samples; at most {_LARGEST_TOTAL} can be split")
 
 
 def _fitted_together(counts: IntArray, origin: IntArray, layout: Samples) -> FloatArray:

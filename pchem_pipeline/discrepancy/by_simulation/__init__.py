@@ -1,1 +1,1 @@
-"""Effects named by simulating them: fingerprints, replicates, rounds."""
+"""Identification of effects in frames by simulation: fingerprints, replicates, rounds."""

@@ -1,4 +1,4 @@
-"""What the frames say of a set at its best fit: which effects are certain, and how wide a gap stays."""
+"""Acceptance of a fitted set of effects: significance of each, and the remaining gap."""
 
 from __future__ import annotations
 

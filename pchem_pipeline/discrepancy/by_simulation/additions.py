@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.build_verdict import Added, Addition, largest_pulls
+from pchem_pipeline.discrepancy.build_verdict import LEAVES_TOO_MUCH, Added, Addition, largest_pulls
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Contender,
     Hypothesis,
@@ -24,7 +24,7 @@ from pchem_pipeline.discrepancy.null import Measured, NullModel, misfits
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.discrepancy.verdict import Candidate, Rival
+from pchem_pipeline.discrepancy.verdict import Candidate, Rival, sigma_text
 from pchem_pipeline.effects.framework.effect import Effect
 
 FloatArray = NDArray[np.float64]
@@ -115,7 +115,7 @@ class AddedRounds:
                     "" if rest is None else unexplained_of_its_kind(effect, parts[member], rest, this.null)
                 )
                 if rest is not None and after.too_wide(gap.value - now.value):
-                    against = "too much of the gap is left beside it"
+                    against = LEAVES_TOO_MUCH
                 against = against or self._against(this, int(member), still)
                 later = parts[order[place + 1 :]].sum(axis=0)
                 of_round.append(self._addition(this, int(member), (gap, now), against, later))
@@ -138,7 +138,9 @@ class AddedRounds:
         added, parts = this.added.hypotheses[member], this.added.parts
         allowed = tolerance(parts, self.allowed, this.null.events)
         wrong = still and misfits(this.extended, self.z, parts[member], self.settings.significance, allowed)
-        return added.effect.stuck_words() or ("it does not account for what it moves itself" if wrong else "")
+        return added.effect.stuck_words() or (
+            "it does not fit the statistics that it changes most" if wrong else ""
+        )
 
     def _addition(
         self, this: Round, member: int, gaps: tuple[Gap, Gap], against: str, later: FloatArray
@@ -215,15 +217,16 @@ class AddedRounds:
         gap = self.gaps.gap(self.z.final, other.mean - later, this.null.replicates)
         worst = int(np.argmax(np.abs(other.rest)))
         if not other.closes:
-            why = "at no strength does it explain anything"
+            why = "it explains nothing at any strength"
         elif abs(other.rest[worst]) > _LEFT:
-            # in the unit in which the statistic is told elsewhere
+            # in the unit of all other pulls
             left = this.null.shifted(other.mean - this.null.mean).pulls(self.z.both, 2)[worst]
-            why = f"with it in the model {STATISTICS[this.null.names[worst]].says(left)} ({left:+.1f} sd)"
+            says = STATISTICS[this.null.names[worst]].says(left)
+            why = f"it leaves a misfit of {sigma_text(left)}: {says}"
         elif other.error is not None:
-            why = f"fits the histograms of the pixels worse, by {-other.behind:.1f} +- {other.error:.1f} nats"
+            why = f"it fits the pixel histograms worse, by {-other.behind:.1f} +- {other.error:.1f}"
         else:
-            why = f"fits all statistics together worse, by {-other.behind:.1f} nats of likelihood"
+            why = "it fits all statistics together worse"
         return Rival(effect=other.effect.tag, gap_after=gap.value, behind=other.behind, why=why)
 
 
@@ -259,7 +262,7 @@ def without_better_reason(addition: Addition) -> Addition:
     share = (addition.before.value - max(placebo.gap_after, 0.0)) / closed
     if share <= _AS_GOOD:
         return addition
-    return replace(addition, against="what has nothing to do with it closes the gap nearly as far")
+    return replace(addition, against="an unrelated control explains nearly as much")
 
 
 def without_company(additions: Sequence[Addition]) -> list[Addition]:
@@ -271,7 +274,7 @@ def without_company(additions: Sequence[Addition]) -> list[Addition]:
     mimics = [i for i, each in enumerate(additions) if each.against]
     first = mimics[0] if mimics else len(additions)
     return [
-        replace(each, against="it was found beside an effect that moves more and does not fit")
+        replace(each, against="it was fitted together with a larger effect that is rejected")
         if i > first and each.fits and not each.described
         else each
         for i, each in enumerate(additions)
@@ -322,7 +325,7 @@ def _worst_words(looked_at: NDArray[np.bool_], rest: FloatArray, null: NullModel
     worst = int(np.argmax(left))
     if left[worst] <= _LEFT:
         return ""
-    return f"with it in the model {STATISTICS[null.names[worst]].says(float(rest[worst]))}"
+    return f"it leaves a misfit: {STATISTICS[null.names[worst]].says(float(rest[worst]))}"
 
 
 def _weight(part: FloatArray, null: NullModel) -> float:

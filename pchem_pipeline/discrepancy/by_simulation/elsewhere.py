@@ -1,4 +1,4 @@
-"""Whether a model that explains one window of the sensor holds in another one.
+"""Test of the final model in another window of the sensor.
 
 A search compares a window of a large sensor with simulations. What is larger than that window may look there
 like something else: of a slope along each row one end is like noise of the rows.
@@ -38,7 +38,7 @@ def deviation(by: Simulations, model: Sequence[Effect]) -> str:
     try:
         _, vectors = by.drawn(tuple(model), _REPLICATES)
     except NotFittedError:
-        return "hardly a pixel can be fitted with it"
+        return "almost no pixel can be fitted with it"
     names = by.observed.names([*own, *vectors])
     if not names:
         return ""

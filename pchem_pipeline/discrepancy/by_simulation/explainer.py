@@ -111,9 +111,9 @@ def find_discrepancies(
         window=window,
     )
     classes = candidate_classes(settings)
-    tell("splitting the samples and looking at each part")
+    tell("computing the statistics of each part")
     observed = ObservedFrames.of(frames)
-    tell("drawing the fitted model")
+    tell("simulating the fitted model")
     return search(FrameExplainer.begin(observed, settings, classes, tuple(model), mapper), tell)
 
 

@@ -1,1 +1,1 @@
-"""A quick look at what the model leaves out, from the summaries that every run has."""
+"""Quick look: tests of the model from the summaries that every run has."""

@@ -1,8 +1,7 @@
-"""The outcome of a quick look: one check for each way in which samples may fail to be independent.
+"""The results of a quick look: one check for each way in which samples may fail to be independent.
 
-A check has a size in DN, in electrons and as a share of the read noise, its probability by chance among all
-checks, and the size that would have been found for sure: without that a check that finds nothing says
-nothing.
+A check has a size in DN, in electrons and as a share of the read noise, its p-value among all checks, and its
+detection limit.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ if TYPE_CHECKING:
 
 Level = Literal["good", "note", "caution", "serious"]
 
-#: A check counts as failed when chance does as much, in any of the checks, with a smaller probability.
+#: A check has failed if its p-value, corrected for the number of checks, is below this.
 SIGNIFICANCE = 1e-3
-#: Share of the read noise from which something is no mere remark, and from which it is serious: added in
-#: quadrature a tenth is half a per cent of the read noise, a half is an eighth.
+#: Share of the read noise from which a size deserves caution, and from which it is serious: in quadrature a
+#: tenth adds half a per cent to the read noise, a half adds an eighth.
 _SOME, _MUCH = 0.1, 0.5
 
 
@@ -30,19 +29,19 @@ class Check:
 
     Attributes:
         name: row_noise, lag, ...
-        title: what was looked for, as the subject of a sentence.
-        p: probability of as much by chance, in this check alone.
-        size: estimate; the root of a variance has no sign, and is 0 where the variance comes out negative.
-        unit: of the size: DN, LSB, or 1 for correlations and shares.
-        limit: size that is found in 19 of 20 runs like this one; NaN where that is not known.
-        where: rows, columns, frames or codes that carry it, in words; empty for all.
-        region: part of the sensor that it is in, as ``model.effects`` takes a region; None: everywhere alike.
-        advice: what it does to the results, in words.
-        level: how grave it is; "good" where it is not beyond chance.
-        p_global: probability of as much by chance in any of the checks.
-        in_model: whether the fitted model has an effect like it.
-        size_e: the size in electrons, where it is in DN.
-        share: of the read noise, where the size is in DN.
+        title: the disturbance, a noun.
+        p: p-value of this check alone.
+        size: estimate; the root of a variance is 0 if the variance is negative.
+        unit: unit of the size: DN, LSB, or 1 for correlations and shares.
+        limit: size found in 19 of 20 runs like this one; NaN if unknown.
+        where: rows, columns, frames or codes concerned, in words; empty for all.
+        region: part of the sensor, as in ``model.effects``; None: uniform.
+        advice: consequence for the results, and the cure.
+        level: severity; "good" if not significant.
+        p_global: p-value corrected for the number of checks.
+        in_model: whether the fitted model has such an effect.
+        size_e: the size in electrons, if it is in DN.
+        share: the size over the read noise, if it is in DN.
     """
 
     name: str
@@ -62,53 +61,50 @@ class Check:
 
     @property
     def found(self) -> bool:
-        """Whether it is beyond chance."""
+        """Whether it is significant."""
         return self.p_global < SIGNIFICANCE
 
 
-_IN_NOISE = "it is in the noise of each pixel and does not average out over pixels"
-_GAIN = "the gain, e⁻/DN, reads {} by about"
-_COUPLE = f"if neighbours couple, {_GAIN} twice the correlation"
-#: Of each check the unit of its size, what was looked for, and what it does to the results.
+_IN_NOISE = "included in each pixel's read noise, not reduced by averaging along a"
+_GAIN = "gain (e⁻/DN) is too {} by about"
+_COUPLE = f"if neighbours share charge, {_GAIN} twice this share"
+#: Unit of the size, title and advice of each check.
 _WORDS: dict[str, tuple[str, str, str]] = {
-    "levels": ("DN", "the frames are of several exposures", "make a run of each, from its own files or by "
-               "input.frame_range, and fit them together with pchem joint"),
-    "odd_frames": ("1", "frames stand out", "the fit has them: leave them out {}"),
-    "empty_frames": ("1", "frames are empty", "they are not counted"),
-    "repeated_frames": ("1", "frames equal an earlier one",
-                        "there are fewer samples than frames, and standard errors are too small"),
-    "frame_noise": ("DN", "the pixels of a frame move together", _IN_NOISE),
-    "row_noise": ("DN", "the pixels of a row move together", _IN_NOISE),
-    "column_noise": ("DN", "the pixels of a column move together", _IN_NOISE),
-    "drift": ("DN", "the mean of the frames drifts", "it widens the read noise, and what is taken for one "
-              "exposure changes along the run"),
-    "period": ("DN", "the mean of the frames has a period", "it widens the read noise"),
-    "frame_lag": ("1", "the mean of a frame resembles that of the frame before",
-                  "noise that the frames share has a memory"),
-    "lag": ("1", "samples resemble those of the frame before",
-            f"charge or signal is carried over: {_GAIN} as much"),
-    "neighbours_x": ("1", "neighbours in a row resemble each other", _COUPLE),
-    "neighbours_y": ("1", "neighbours in a column resemble each other", _COUPLE),
-    "wandering_pixels": ("1", "pixels change their level along the run",
-                         "their exposure and read noise are of several levels: a region that was moved, "
+    "levels": ("DN", "frames of several exposures", "make one run per exposure (own files, or "
+               "input.frame_range) and fit them jointly (pchem joint)"),
+    "odd_frames": ("1", "outlying frames", "included in the fit; leave them out {}"),
+    "empty_frames": ("1", "empty frames", "left out"),
+    "repeated_frames": ("1", "repeated frames",
+                        "standard errors are too small, since fewer frames are independent"),
+    "frame_noise": ("DN", "frame noise", f"{_IN_NOISE} frame"),
+    "row_noise": ("DN", "row noise", f"{_IN_NOISE} row"),
+    "column_noise": ("DN", "column noise", f"{_IN_NOISE} column"),
+    "drift": ("DN", "drift of the frame mean", "adds to the read noise; the exposure may drift"),
+    "period": ("DN", "periodic frame mean", "adds to the read noise"),
+    "frame_lag": ("1", "correlation of successive frame means", "frame noise is not white"),
+    "lag": ("1", "correlation of successive samples",
+            f"charge or signal is carried over: {_GAIN} this share"),
+    "neighbours_x": ("1", "correlation of neighbours in a row", _COUPLE),
+    "neighbours_y": ("1", "correlation of neighbours in a column", _COUPLE),
+    "wandering_pixels": ("1", "pixels with a changing level",
+                         "exposure and read noise are averages over these levels; check for a moved sensor, "
                          "a drift, or blinking pixels"),
-    "local_drift": ("DN", "a part of the sensor drifts apart from the rest",
-                    "it widens the read noise there"),
-    "wave": ("DN", "a wave runs across the samples in the order of reading",
-             "pickup: it widens the read noise; pchem discrepancy finds its frequency"),
-    "codes": ("LSB", "codes have different widths",
+    "local_drift": ("DN", "drift of a part of the sensor", "adds to the read noise there"),
+    "wave": ("DN", "pickup in readout order",
+             "adds to the read noise; pchem discrepancy finds its frequency"),
+    "codes": ("LSB", "unequal code widths (DNL)",
               "the histograms of all pixels deviate from the model at the same DN"),
-    "top_code": ("1", "samples pile up at the highest code",
-                 "larger signals are cut off there: exposures of bright pixels come out too low"),
-    "bottom_code": ("1", "samples pile up at the lowest code", "the black level is too low: raise it, or set "
+    "top_code": ("1", "saturation",
+                 "larger signals are cut off there: the exposure of bright pixels is too low"),
+    "bottom_code": ("1", "clipping at the lowest code", "the black level is too low: raise it, or set "
                     "input.bit_depth"),
-    "zero_code": ("1", "samples pile up at 0 DN", "the black level is too low: raise it. The fit counts "
-                  "them as 0 DN or less, so values hold, with larger errors"),
+    "zero_code": ("1", "clipping at 0 DN", "the black level is too low: raise it. The fit treats them as "
+                  "0 DN or less, so values are right, with larger errors"),
 }  # fmt: skip
 
 
 def check_of(name: str, p: float, size: float, *, how: str = "", **rest: Any) -> Check:
-    """Return a check with its words; ``how`` is what its advice leaves open."""
+    """Make a check with its title and advice; ``how`` fills the gap in the advice."""
     unit, title, advice = _WORDS[name]
     return Check(name, title, p, size, unit, advice=advice.format(how), **rest)
 
@@ -119,9 +115,9 @@ class QuickLook:
 
     Attributes:
         checks: in the order in which they were made.
-        missing: parts that were not looked at, and why.
-        samples: frames x pixels that the checks rest on.
-        command: what looks closer.
+        missing: checks that were not made, and why.
+        samples: frames x pixels of the checks.
+        command: command for a full search.
     """
 
     checks: tuple[Check, ...]
@@ -131,13 +127,13 @@ class QuickLook:
 
     @property
     def found(self) -> tuple[Check, ...]:
-        """Return the checks that are beyond chance, the gravest first."""
+        """Return the significant checks, the most severe first."""
         order = ("serious", "caution", "note", "good")
         beyond = [check for check in self.checks if check.found]
         return tuple(sorted(beyond, key=lambda check: (order.index(check.level), check.p)))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as plain data for JSON; what is not known is NaN."""
+        """Return plain data for JSON; unknown numbers are NaN."""
         return {
             "checks": [{**asdict(check), "found": check.found} for check in self.checks],
             "missing": dict(self.missing),
@@ -147,8 +143,8 @@ class QuickLook:
         }
 
 
-#: The statistics of a closer look (names of its catalogue) that show what a check finds: an effect of the
-#: model in whose signature one of them is explains it.
+#: Statistics of the catalogue that show the same as a check: an effect with one of them in its signature
+#: explains the check.
 _SIGNS: dict[str, tuple[str, ...]] = {
     "frame_noise": (
         "frame.readout.variance", "frame.readout.slow", "frame.readout.trend",
@@ -192,13 +188,13 @@ _SIGNS: dict[str, tuple[str, ...]] = {
 
 
 def graded(checks: list[Check], gain: float, read_noise: float, model: Sequence[Effect]) -> tuple[Check, ...]:
-    """Return checks with their probability among all, their size in other units, and their level.
+    """Compute p-values corrected for the number of checks (Sidak), sizes in e- and read noises, and levels.
 
     Args:
-        checks: those made.
-        gain: of the median pixel, e-/DN.
-        read_noise: of the median pixel, DN.
-        model: the effects that the pixels were fitted with.
+        checks: the checks.
+        gain: median gain, e-/DN.
+        read_noise: median read noise, DN.
+        model: effects of the fitted model.
     """
     shown = {name for effect in model for name in effect.signature}
     found = []
@@ -216,7 +212,7 @@ def graded(checks: list[Check], gain: float, read_noise: float, model: Sequence[
     return tuple(found)
 
 
-#: Sizes from which a check is no mere remark, and from which it is serious, by its unit and name.
+#: Sizes from which a check deserves caution, and from which it is serious, by its name.
 _LIMITS: dict[str, tuple[float, float]] = {
     "lag": (0.005, 0.05),
     "frame_lag": (math.inf, math.inf),

@@ -1,8 +1,8 @@
-"""Checks of the codes of the ADC: widths that differ, and samples that pile up at the lowest or highest code.
+"""Checks of the ADC codes: differential nonlinearity, and saturation or clipping at the end codes.
 
-The histograms of some pixels are compared with the exact mass of each code at the maximum of the exact
-likelihood: the density at whole DN, with which the run may have been fitted, differs from the mass by more
-than the widths that show here.
+Histograms of some pixels are compared with the exact probability of each code at the maximum of the exact
+likelihood: the density at integer DN, with which the run may have been fitted, is less exact than the widths
+detected here.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from pchem_pipeline.model.fit.settings import FitSettings
 
 FloatArray = NDArray[np.float64]
 
-#: Statistics of the codes, and what they say.
+#: Statistics of the codes in words.
 _WORDS = {
     "code.alternating": "even and odd codes differ",
     "code.period4": "with a period of 4 DN",
     "code.period8": "with a period of 8 DN",
     "code.period16": "with a period of 16 DN",
     "code.rough": "from code to code",
-    "code.largest": "most at {code} DN",
+    "code.largest": "mainly at {code} DN",
 }
 #: Samples expected at a code that is judged by itself.
 _ENOUGH = 100.0

@@ -1,7 +1,7 @@
-"""Whether the frames of a stack are of several exposures, as where dark and light frames lie in one folder.
+"""Check for frames of several exposures, such as dark and light frames in one folder.
 
-Their means then lie at levels with nothing between, and the variance over their pixels grows with the mean
-as shot noise does. A jump of the offset parts the means alone.
+Their means form separate levels, and the variance over their pixels grows with the mean like shot noise. A
+jump of the offset separates the means only.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ _SHOWN = 3
 
 
 def levels_check(mean: FloatArray, variance: FloatArray, gain: float) -> Check:
-    """Return whether frames are of several exposures.
+    """Test whether the frames are of several exposures.
 
     Args:
-        mean: of each frame over its pixels, DN, (n,).
-        variance: likewise, DN^2.
-        gain: of the median pixel, e-/DN.
+        mean: mean of each frame over its pixels, DN, (n,).
+        variance: variance of each frame over its pixels, DN^2, (n,).
+        gain: median gain, e-/DN.
     """
     levels, p = _parted(mean, variance, gain)
     levels.sort(key=lambda frames: float(mean[frames].mean()))
     several = len(levels) > 1
     centres = [float(mean[frames].mean()) for frames in levels]
-    more = f" and {len(levels) - _SHOWN} levels more" if len(levels) > _SHOWN else ""
+    more = f" and {len(levels) - _SHOWN} more levels" if len(levels) > _SHOWN else ""
     shown = zip(levels[:_SHOWN], centres, strict=False)
     where = "; ".join(f"{frame_words(frames, 1)} at {centre:.4g} DN" for frames, centre in shown) + more
     return check_of("levels", p, centres[-1] - centres[0], where=where if several else "")

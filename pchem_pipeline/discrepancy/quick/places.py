@@ -1,4 +1,4 @@
-"""Where on the sensor a quick look finds something: maps of all pixels from all frames, and their scan."""
+"""Regions of the sensor in a quick look: maps of all pixels from all frames, and their scan."""
 
 from __future__ import annotations
 

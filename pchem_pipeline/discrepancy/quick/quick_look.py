@@ -1,14 +1,14 @@
-"""A quick look at a run: do rows, columns, frames, neighbours and successive samples behave as independent?
+"""A quick look at a run: tests of independence of rows, columns, frames, neighbours and successive samples.
 
-It rests on sums that the run has anyway, so it costs a second, and looks at every pixel and every frame.
-Given the histograms, samples without any effect are in random order and independent of those of other
-pixels. The expectation and the variance of all sums of products of different samples follow from that alone:
-a poor fit of a pixel, a hot pixel or a heavy tail imitates nothing here. What is common to a frame, a row, a
-column or to neighbours adds to the mean covariance of the pairs that share it; the shares are taken apart as
-in an analysis of variance.
+It uses sums that the run has anyway, takes a second, and covers every pixel and every frame. Given the
+histograms, samples without any effect are in random order and independent of other pixels. This alone fixes
+expectation and variance of all sums of products of different samples (permutation argument), so that a poor
+fit, a hot pixel or a heavy tail gives no false alarm. Noise common to a frame, row, column or to neighbours
+adds to the mean covariance of the pairs that share it; its components are separated as in an analysis of
+variance.
 
-What is found here has a size, not a name: to say which effect it is, ``pchem discrepancy`` compares many more
-statistics with simulations.
+A quick look gives a size, not a cause: for that, ``pchem discrepancy`` compares many more statistics with
+simulations.
 """
 
 from __future__ import annotations
@@ -89,16 +89,16 @@ def quick_look(
     made = {check.name for check in found}
     unseen |= {} if sums is None else {part: why for name, (part, why) in _NEEDS.items() if name not in made}
     if found and found[0].name == "levels" and found[0].level == "serious":
-        found, unseen = found[:1], {**unseen, "all else": "the frames are of several exposures"}
+        found, unseen = found[:1], {**unseen, "all else": "frames of several exposures"}
     return QuickLook(found, unseen, samples, command)
 
 
-#: Checks that a stack can be too small for: what they look at, and why it was not.
+#: Checks that need a minimum size of the stack: what they test, and the size.
 _NEEDS = {
-    "wandering_pixels": ("pixels along the run", "frames are fewer than four blocks, of 32 or more each"),
-    "drift": ("the mean of the frames along the run", "frames are fewer than 64"),
-    "wave": ("pickup along the reading order", "rows or columns are fewer than 8"),
-    "frame_noise": ("what all pixels of a frame share", "rows or columns are fewer than 4"),
+    "wandering_pixels": ("pixels along the run", "fewer than four blocks of 32 or more frames"),
+    "drift": ("frame means along the run", "fewer than 64 frames"),
+    "wave": ("pickup in readout order", "fewer than 8 rows or columns"),
+    "frame_noise": ("noise common to a frame", "fewer than 4 rows or columns"),
 }
 
 
@@ -209,12 +209,12 @@ def _located(checks: list[Check], sums: StackSums) -> list[Check]:
 
 
 def _told_once(checks: list[Check], noise: str, neighbours: str) -> list[Check]:
-    """Return checks in which neighbours that noise of their line makes alike say so: one place, one cause."""
+    """Attribute the correlation of neighbours to the noise of their line where both have the same region."""
     first = next((check for check in checks if check.name == noise), None)
     if first is None or first.region is None or first.p > SIGNIFICANCE / len(checks):
         return checks
     return [
-        replace(check, advice="as the noise that they share there makes them")
+        replace(check, advice="explained by the noise common to their line")
         if check.name == neighbours and check.region == first.region
         else check
         for check in checks
@@ -331,7 +331,7 @@ def _single_lines(lines: Lines, line: str, width: int) -> tuple[float, str]:
         out = np.unique(out % width)
     shown = ", ".join(str(i) for i in out[:_SHOWN])
     more = f" and {out.size - _SHOWN} more" if out.size > _SHOWN else ""
-    words = f"most in {line}{'s' if out.size > 1 else ''} {shown}{more}" if out.size else ""
+    words = f"mainly in {line}{'s' if out.size > 1 else ''} {shown}{more}" if out.size else ""
     return of_many(float(p.min()), p.size), words
 
 
@@ -471,6 +471,6 @@ def _wandering(sums: StackSums, maps: PixelMaps, third: FloatArray) -> list[Chec
     out = np.flatnonzero(p < SIGNIFICANCE / p.size)
     places = np.argwhere(some)[out[np.argsort(-chi2[out])][:3]]
     shown = ", ".join(f"({y}, {x})" for y, x in places)
-    where = f"{out.size:,} pixels, most at (y, x) {shown}" if out.size else ""
+    where = f"{out.size:,} pixels, mainly (y, x) {shown}" if out.size else ""
     p_any, share = of_many(float(p.min()), p.size), out.size / p.size
     return [check_of("wandering_pixels", p_any, share, limit=2.0 / p.size, where=where)]

@@ -1,4 +1,4 @@
-"""Checks of the mean of the frames as a series in time: drift, periods, memory."""
+"""Checks of the frame means as a time series: drift, periods, autocorrelation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def of_many(p: float, n: float) -> float:
 def series_checks(mean: FloatArray) -> list[Check]:
     """Return the checks of the frames' means over the same pixels, DN, (n,).
 
-    They compare the series with itself in another order, so that noise of frame to frame is none of them.
+    White frame noise passes all of them.
     """
     n = mean.size
     if n < _FEWEST_FRAMES:
@@ -52,7 +52,7 @@ def series_checks(mean: FloatArray) -> list[Check]:
 
 
 def _drift(series: FloatArray, noise: float) -> tuple[FloatArray, Check]:
-    """Return the slow part of a series, and whether it is more than chance (Neyman's test; Fan 1996)."""
+    """Compute the slow part of a series and test it (Neyman's smooth test, adaptive: Fan 1996)."""
     n = series.size
     cuts = [k for k in _SLOWEST if k <= n // 16]
     time = np.pi * (np.arange(n) + 0.5) / n
@@ -66,13 +66,13 @@ def _drift(series: FloatArray, noise: float) -> tuple[FloatArray, Check]:
     p = normal_p(best(*z, independent=0.5 * (1 + len(z))))
     excess = max(float(energy[chosen - 1]) - chosen, 0.0) * noise / n
     peak = float(np.ptp(smooth))
-    where = f"{peak:.2g} DN from its lowest to its highest"
+    where = f"{peak:.2g} DN peak to peak"
     check = check_of("drift", p, math.sqrt(excess), limit=math.sqrt(16.0 * noise / n), where=where)
     return (smooth if p < 1e-3 else np.zeros(n)), check
 
 
 def _period(series: FloatArray) -> Check:
-    """Return whether one frequency stands out of those around it; the last is that of even and odd frames."""
+    """Test the highest peak of the periodogram against its surroundings (F-test); the last one is at 1/2."""
     n = series.size
     power = np.abs(np.fft.rfft(series)[1:]) ** 2
     freedom = np.full(power.size, 2.0)
@@ -101,7 +101,7 @@ def _around(power: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _memory(series: FloatArray) -> Check:
-    """Return whether the mean of a frame resembles that of the frame before."""
+    """Test the lag-1 autocorrelation of the frame means."""
     n = series.size
     total = float(series @ series)
     correlation = float(series[1:] @ series[:-1]) / max(total, 1e-300) + 1.0 / n

@@ -1,4 +1,4 @@
-"""What a quick look needs of the summaries of a stack, and the variances and covariances that they give."""
+"""Summaries of a stack for a quick look, and the variances and covariances computed from them."""
 
 from __future__ import annotations
 

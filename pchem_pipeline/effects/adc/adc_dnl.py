@@ -69,9 +69,9 @@ class AdcDnl(Effect):
     power: ClassVar[float] = 2.0
     may_be_at_bound: ClassVar[tuple[str, ...]] = ("dnl_lsb",)
     separate: ClassVar[Mapping[str, str]] = {
-        "gain_stitch": "a ramp over many codes: a stitch moves all codes above it, DNL single ones",
-        "clipping": "a shifted bias: unequal widths are at all codes, a limit at the extreme one",
-        "adc_inl": "a ramp or a shifted bias over many codes: DNL is new from code to code, INL smooth",
+        "gain_stitch": "a ramp over many codes: a stitch shifts all codes above it, DNL single codes",
+        "clipping": "a shifted bias: DNL affects all codes, clipping the extreme one",
+        "adc_inl": "a ramp or a shifted bias: DNL varies from code to code, INL smoothly",
     }
     dnl_lsb: Lsb = Field(
         ge=-1,
@@ -83,7 +83,7 @@ class AdcDnl(Effect):
         default="random", description="random: by code; bit: one binary weight; edges: as listed"
     )
     per_column: bool = Field(
-        default=False, description="random pattern: an ADC of its own for each column, with its own shifts"
+        default=False, description="random pattern: one ADC per column, with its own shifts"
     )
     bit: Count = Field(default=0, ge=0, le=23, description="bit pattern: which bit, 0 the least significant")
     first_code: Code = Field(default=0, ge=0, description="edges pattern: code of the first of `edges`, DN")

@@ -48,10 +48,10 @@ class AdcInl(Effect):
     )
     strength: ClassVar[str] = "inl_lsb"
     separate: ClassVar[Mapping[str, str]] = {
-        "gain_stitch": "a ramp of light over all codes: INL bends everywhere, a stitch is one kink",
-        "nonlinearity": "a shifted bias (pedestal): INL stays at its DN, nonlinearity at its charge",
-        "adc_dnl": "a ramp over many codes: INL is smooth along DN, DNL new from code to code",
-        "signal_dependent_noise": "a shifted bias: INL moves peaks to and fro in DN, noise only widens them",
+        "gain_stitch": "a ramp of light over all codes: INL is curved everywhere, a stitch is one kink",
+        "nonlinearity": "a shifted bias (pedestal): INL is fixed in DN, nonlinearity in charge",
+        "adc_dnl": "a ramp over many codes: INL varies smoothly along DN, DNL from code to code",
+        "signal_dependent_noise": "a shifted bias: INL shifts peaks, noise only widens them",
     }
     inl_lsb: Lsb = Field(
         ge=0, le=1e4, description="amplitude of the sine, or scale of `curve` (its largest value is 1), LSB"

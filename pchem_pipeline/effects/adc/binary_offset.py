@@ -33,14 +33,14 @@ class BinaryOffset(Effect):
     tag: Literal["binary_offset"] = Field(default="binary_offset", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ADC
     along: ClassVar[int] = 2
-    title: ClassVar[str] = "binary offset (memory of the converter for bits)"
+    title: ClassVar[str] = "binary offset (bit-dependent ADC memory)"
     source: ClassVar[str] = "Boone et al. 2018, PASP 130, 064504"
     signature: ClassVar[tuple[str, ...]] = ("space.x.bits", "space.x.rk", "space.x.rr")
     strength: ClassVar[str] = "offset_dn"
     separate: ClassVar[Mapping[str, str]] = {
-        "interpixel_capacitance": "pixels above and below: a converter's memory is along the row only",
-        "optical_crosstalk": "a bright spot: crosstalk follows the charge beside it, an offset the code",
-        "adc_dnl": "a dark neighbour: widths of codes stay, an offset by the code before does not",
+        "interpixel_capacitance": "pixels above and below: ADC memory acts along the row only",
+        "optical_crosstalk": "a bright spot: crosstalk depends on nearby charge, a binary offset on the code",
+        "adc_dnl": "a dark neighbour: DNL stays, an offset by the previous code vanishes",
     }
     offset_dn: Dn = Field(
         ge=-1e4, le=1e4, description="difference between a bit of 1 and of 0, in units of `bits`, DN"

@@ -30,7 +30,7 @@ class BlackClamp(Effect):
 
     tag: Literal["black_clamp"] = Field(default="black_clamp", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ADC
-    title: ClassVar[str] = "black-level clamp that follows the frame"
+    title: ClassVar[str] = "frame-dependent black-level clamp"
     source: ClassVar[str] = "Andor iXon manual (baseline clamp); Janesick 2001 (optically black pixels)"
     signature: ClassVar[tuple[str, ...]] = (
         "frame.covariance",
@@ -42,21 +42,19 @@ class BlackClamp(Effect):
     reach_rows = ALL_ROWS  # the clamp may be anywhere
     may_be_at_bound: ClassVar[tuple[str, ...]] = ("follow",)
     separate: ClassVar[Mapping[str, str]] = {
-        "frame_noise": "the camera's clamp switched off; noise of frames does not follow their charge",
-        "exposure_flicker": "the camera's clamp switched off, or covered pixels: they follow the light",
-        "interpixel_capacitance": "pixels far apart: a clamp couples all of the frame alike",
+        "frame_noise": "clamp switched off: frame noise stays and is independent of charge",
+        "exposure_flicker": "clamp switched off, or covered pixels: flicker is proportional to the light",
+        "interpixel_capacitance": "distant pixels: a clamp couples the whole frame, capacitance neighbours",
     }
     follow: Ratio = Field(
-        ge=0, le=1, description="part of the clamp's deviation that is taken off, no unit; 1: all of it"
+        ge=0, le=1, description="share of the clamp's deviation that is subtracted, no unit; 1: all of it"
     )
-    rows: Span | None = Field(
-        default=None, description="rows of the clamp: first, and behind the last; null: all"
-    )
+    rows: Span | None = Field(default=None, description="rows of the clamp: first and last + 1; null: all")
     columns: Span | None = Field(
-        default=None, description="columns of the clamp: first, and behind the last; null: all"
+        default=None, description="columns of the clamp: first and last + 1; null: all"
     )
     pixels: Count | None = Field(
-        default=None, ge=1, description="number of these pixels, for the law of a sample; null: left as it is"
+        default=None, ge=1, description="number of these pixels, for the read noise it adds; null: none"
     )
 
     #: clamps that take off a tenth of the mean of the frame, and of eight columns and rows
@@ -66,7 +64,7 @@ class BlackClamp(Effect):
     @classmethod
     def _some(cls, span: Span | None) -> Span | None:
         if span is not None and not 0 <= span[0] < span[1]:
-            raise ValueError(f"black_clamp: {list(span)} holds no line; give [first, behind the last]")
+            raise ValueError(f"black_clamp: {list(span)} holds no line; give [first, last + 1]")
         return span
 
     def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:

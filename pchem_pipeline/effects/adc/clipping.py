@@ -43,15 +43,11 @@ class Clipping(Effect):
         "shape.goodness.cnt",
     )
     separate: ClassVar[Mapping[str, str]] = {
-        "adc_dnl": "a shifted bias: a limit stays where it is, and nothing comes from beyond it",
-        "adc_inl": "a shifted bias or more light: a limit is one code, a bent curve all of them",
+        "adc_dnl": "a shifted bias: a limit is fixed in DN, with no samples beyond",
+        "adc_inl": "a shifted bias or more light: clipping affects one code, INL all",
     }
-    low: Code | None = Field(
-        default=None, ge=0, description="smallest DN that comes out; null: that of the ADC"
-    )
-    high: Code | None = Field(
-        default=None, ge=0, description="largest DN that comes out; null: that of the ADC"
-    )
+    low: Code | None = Field(default=None, ge=0, description="smallest DN; null: that of the ADC")
+    high: Code | None = Field(default=None, ge=0, description="largest DN; null: that of the ADC")
 
     @model_validator(mode="after")
     def _limits_in_order(self) -> Self:

@@ -45,21 +45,21 @@ class GainStitch(Effect):
     )
     strength: ClassVar[str] = "gain_change"
     separate: ClassVar[Mapping[str, str]] = {
-        "adc_inl": "a ramp of light over all codes: a stitch is one kink, INL bends everywhere",
-        "nonlinearity": "a shifted bias (pedestal): a stitch stays at its DN, nonlinearity at its charge",
-        "adc_dnl": "a ramp over many codes: a stitch moves all codes above it, DNL single ones",
-        "branching_counts": "a shifted bias: the surplus of many electrons moves with it",
-        "signal_dependent_noise": "a shifted bias: a stitch stays at its DN, noise with the electrons",
+        "adc_inl": "a ramp of light over all codes: a stitch is one kink, INL is curved everywhere",
+        "nonlinearity": "a shifted bias (pedestal): a stitch is fixed in DN, nonlinearity in charge",
+        "adc_dnl": "a ramp over many codes: a stitch shifts all codes above it, DNL single codes",
+        "branching_counts": "a shifted bias: an excess of high electron numbers shifts with it",
+        "signal_dependent_noise": "a shifted bias: a stitch is fixed in DN, noise in electrons",
     }
     gain_change: Ratio = Field(
-        ge=-0.5, le=0.5, description="relative change of the DN per electron above the level, no unit"
+        ge=-0.5, le=0.5, description="relative change of DN per electron above the level, no unit"
     )
-    level_dn: Dn = Field(ge=0, le=1e6, description="level at which the two gains are joined, DN")
+    level_dn: Dn = Field(ge=0, le=1e6, description="level of the transition between the gains, DN")
     origin_dn: Dn | None = Field(
         default=None,
         ge=-_FARTHEST,
         le=_FARTHEST,
-        description="point at which both gains give the same, DN; null: the level, so without a step",
+        description="DN at which both gains agree; null: the level (no step)",
     )
 
     #: gains that differ by 1 % above 130 DN, of either sign

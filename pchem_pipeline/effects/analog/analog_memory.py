@@ -39,7 +39,7 @@ class AnalogMemory(Effect):
 
     tag: Literal["analog_memory"] = Field(default="analog_memory", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "memory of the analog chain (incomplete reset)"
+    title: ClassVar[str] = "analog memory (incomplete reset)"
     source: ClassVar[str] = "Janesick 2001 (incomplete reset); Boone et al. 2018 (memory of readout chains)"
     signature: ClassVar[tuple[str, ...]] = (
         "time.cross.readout_charge", "time.lag1.readout.mean", "time.lag1.charge.mean",
@@ -49,28 +49,27 @@ class AnalogMemory(Effect):
     reach_frames = 1
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {
-        "flicker_noise": "frames without any exposure: flicker remains there, memory does not",
-        "dark_current_rts": "one bright frame and then dark ones: memory fades within a frame, defects stay",
-        "repeated_frames": "frame counters; repeated frames are equal in every sample",
+        "flicker_noise": "frames without exposure: 1/f noise remains, memory vanishes",
+        "dark_current_rts": "dark frames after a bright one: memory fades within a frame, blinking stays",
+        "repeated_frames": "frame counters: repeated frames are equal in every sample",
     }
     memory: Ratio = Field(
         ge=-0.5,
         le=0.5,
-        description="part of the charge of the frame before that is read again, mean of the pixels, no unit; "
+        description="share of the previous charge that is read again, mean of the pixels, no unit; "
         "negative: overshoot",
     )
     spread: Ratio = Field(
         default=0.0,
         ge=0,
         le=2,
-        description="standard deviation of the logarithm of the memory, which differs from pixel to pixel; "
-        "0: alike in all",
+        description="standard deviation of the logarithm of the memory between pixels; 0: uniform",
     )
     saturation_e: Electrons | None = Field(
         default=None,
         gt=0,
         le=1e9,
-        description="charge of the frame before at which the memory levels off, e-; none: in proportion",
+        description="previous charge at which the memory saturates, e-; none: proportional",
     )
 
     #: residue, overshoot, and a residue that differs

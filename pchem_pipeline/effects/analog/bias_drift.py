@@ -66,10 +66,10 @@ class BiasDrift(OffsetEffect):
     )
     strength: ClassVar[str] = "drift_dn"
     separate: ClassVar[Mapping[str, str]] = {
-        "exposure_drift": "a map of exposures: charge drifts in proportion to it, the bias everywhere alike",
-        "gain_drift": "a bright and a dark region: gain drift grows with the signal, bias drift does not",
-        "bias_jumps": "means of the quadrants, frame by frame: jumps are sudden and each quadrant's own",
-        "flicker_noise": "block means of single pixels: flicker is each pixel's own, a drift common to all",
+        "exposure_drift": "a map of exposures: an exposure drift is proportional to it, a bias drift uniform",
+        "gain_drift": "a bright and a dark region: gain drift is proportional to the signal",
+        "bias_jumps": "means of the quadrants, frame by frame: jumps are sudden and independent",
+        "flicker_noise": "block means of single pixels: 1/f noise is independent, a drift common",
     }
     drift_dn: Dn = Field(
         ge=-1e6,

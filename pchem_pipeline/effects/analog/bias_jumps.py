@@ -53,7 +53,7 @@ class BiasJumps(OffsetEffect):
     """
 
     tag: Literal["bias_jumps"] = Field(default="bias_jumps", description="name of the effect")
-    title: ClassVar[str] = "bias jumps (popcorn mesa noise of an output)"
+    title: ClassVar[str] = "bias jumps (popcorn mesa noise)"
     source: ClassVar[str] = "WFPC2 Data Handbook (STScI), bias jumps; Rauscher 2015, PASP 127, 1144"
     signature: ClassVar[tuple[str, ...]] = (
         "frame.readout.quadrants",
@@ -65,16 +65,16 @@ class BiasJumps(OffsetEffect):
     strength: ClassVar[str] = "amplitude_dn"
     power: ClassVar[float] = 2.0
     separate: ClassVar[Mapping[str, str]] = {
-        "bias_drift": "means of the quadrants, frame by frame: a drift is slow and common to all of them",
-        "flicker_noise": "means of the quadrants: flicker of single pixels averages out",
-        "rts_noise": "histograms of single pixels: RTS shows in few of them, jumps in all of a quadrant",
+        "bias_drift": "means of the quadrants, frame by frame: a drift is slow and common to all",
+        "flicker_noise": "means of the quadrants: 1/f noise of single pixels averages out",
+        "rts_noise": "histograms of single pixels: RTS affects few, jumps a whole quadrant",
     }
     amplitude_dn: Dn = Field(
-        ge=0, le=1e6, description="distance between neighbouring levels, DN; the scale of `path` if given"
+        ge=0, le=1e6, description="distance between adjacent levels, DN; the scale of `path` if given"
     )
     rate: PerFrame = Field(default=1e-3, ge=0, le=0.5, description="jumps per frame of each part")
     levels: Count = Field(default=2, ge=2, le=64, description="number of evenly spaced levels")
-    parts: Parts = Field(default="quadrants", description="parts of the sensor with an output of their own")
+    parts: Parts = Field(default="quadrants", description="parts of the sensor with separate outputs")
     path: tuple[Path, ...] = Field(
         default=(),
         description="the jumps as they were, instead of random ones: for each part (top left, top right, "

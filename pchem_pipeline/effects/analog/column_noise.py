@@ -32,9 +32,9 @@ class ColumnNoise(SharedNoise):
     strength: ClassVar[str] = "column_noise_dn"
     shared_by: ClassVar[Literal["frame", "row", "column"]] = "column"
     separate: ClassVar[Mapping[str, str]] = {
-        "interpixel_capacitance": "pixels far apart in a column: they are as correlated as neighbours",
-        "frame_noise": "means of columns within a frame: frame noise shifts them all alike",
-        "row_noise": "means of rows and of columns within a frame, one beside the other",
+        "interpixel_capacitance": "distant pixels of a column: column noise correlates them like neighbours",
+        "frame_noise": "column means within a frame: frame noise is common to all",
+        "row_noise": "row and column means within a frame: only column means scatter",
     }
     column_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the columns' offsets, DN")
 

@@ -58,15 +58,15 @@ class NoiseMode(Section):
     The correlation at a distance holds for the opposite one, too; at those that are not given it is 0.
     """
 
-    of: Shared = Field(description="what has a value of its own: each sample, row, column or frame")
-    share: float = Field(ge=0, le=1, description="part of the power of the noise, no unit")
+    of: Shared = Field(description="one value for each sample, row, column or frame")
+    share: float = Field(ge=0, le=1, description="share of the noise power, no unit")
     lags: tuple[Lag, ...] = Field(default=(), max_length=64, description="distances: frames, rows, columns")
     correlation: tuple[float, ...] = Field(
-        default=(), max_length=64, description="correlation of the values at each of them, no unit"
+        default=(), max_length=64, description="correlation at each distance, no unit"
     )
     changes: Changed = Field(
         default="offset",
-        description="what it changes: the offset, the gain, the light, or the size of the read noise",
+        description="what it changes: offset, gain, light, or size of the read noise",
     )
     signal_dn: float = Field(
         default=1.0,
@@ -136,19 +136,19 @@ class NoiseMode(Section):
     def describe(self, rms: float | None) -> str:
         """Return in words what varies by so many DN (None: that is said elsewhere), and who shares it."""
         own = self.of == "sample" and (self.lags or self.wave is not None)
-        whole = "" if own else f"the same in a whole {self.of}"
+        whole = "" if own else f"common to each {self.of}"
         order = np.argsort(-np.abs(self.correlation))[:_FEW]
-        apart = [f"{self.correlation[i]:.2g} ({_lag_words(self.lags[i])})" for i in order]
+        apart = [f"{self.correlation[i]:+.2g} over {_lag_words(self.lags[i])}" for i in order]
         more = f" and {len(self.lags) - _FEW} other distances" if len(self.lags) > _FEW else ""
-        shared = f"correlated by {', '.join(apart)}{more}" if apart else ""
+        shared = f"correlation {', '.join(apart)}{more}" if apart else ""
         if self.profile:
-            whole = f"of one shape in each {self.of} ({', '.join(f'{p:+.2g}' for p in self.profile)})"
+            whole = f"with a profile along each {self.of} ({', '.join(f'{p:+.2g}' for p in self.profile)})"
         if self.shape:
             whole += f", strongest in {self.strongest()}"
         what = "" if rms is None else self._size_words(rms)
         if self.wave is not None:
             shared = self._wave_words(self.wave)
-        burst = "" if self.burst is None else f"in {per_cent(self.burst)} of the {self.of}s only"
+        burst = "" if self.burst is None else f"only in {per_cent(self.burst)} of the {self.of}s"
         return ", ".join(part for part in (what, whole, burst, shared) if part)
 
     def _size_words(self, rms: float) -> str:
@@ -165,11 +165,9 @@ class NoiseMode(Section):
     def _wave_words(self, wave: Cycles) -> str:
         lines = [(each, _LINE[dim]) for each, dim in zip(wave, _LINE, strict=True) if dim in DIMS[self.of]]
         if root_mean_square(wave) == 1.0 and any(wave):
-            return (
-                f"changing its sign from {', from '.join(f'{one} to {one}' for each, one in lines if each)}"
-            )
+            return f"alternating from {', from '.join(f'{one} to {one}' for each, one in lines if each)}"
         cycles = [f"{each:{'.4g' if one == 'frame' else '.3g'}} per {one}" for each, one in lines]
-        return f"a wave of {' and '.join(cycles).replace(' per', ' cycles per', 1)}"
+        return f"a sine of {' and '.join(cycles).replace(' per', ' cycles per', 1)}"
 
     def values(self, number: int, context: EffectContext) -> FloatArray:
         """Return its values, of mean square 1, in a shape that fits (frame, y, x)."""
@@ -266,14 +264,14 @@ class NoiseMode(Section):
 
 
 def _lag_words(lag: Lag) -> str:
-    """Return a distance in words, for example ``1 frame and 2 columns apart``."""
+    """Describe a distance, for example ``1 frame and 2 columns``."""
     parts = [
         f"{abs(n)} {noun}{'s' if abs(n) > 1 else ''}"
         for n, noun in zip(lag, ("frame", "row", "column"), strict=True)
         if n
     ]
     slanted = sum(n < 0 for n in lag) % 2 == 1
-    return f"{' and '.join(parts)} apart{' (the other way)' if slanted and len(parts) > 1 else ''}"
+    return f"{' and '.join(parts)}{' on the other diagonal' if slanted and len(parts) > 1 else ''}"
 
 
 @register_effect
@@ -286,7 +284,7 @@ class EmpiricalNoise(Effect):
 
     tag: Literal["empirical_noise"] = Field(default="empirical_noise", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "measured noise that samples share, without an explanation"
+    title: ClassVar[str] = "empirical correlated noise"
     source: ClassVar[str] = "Wold 1938, Priestley 1981 (a stationary process by its spectrum)"
     strength: ClassVar[str] = "noise_dn"
     power: ClassVar[float] = 2.0
@@ -389,9 +387,9 @@ class EmpiricalNoise(Effect):
         of_all = len(self.modes) == 1 and self.modes[0].changes == "offset" and self.modes[0].burst is None
         parts = "; ".join(mode.describe(None if of_all else self.share_of(mode)) for mode in self.modes)
         if all(mode.changes == "offset" for mode in self.modes):
-            return f"noise of {self.noise_dn:.2g} DN{place} that samples share ({parts})"
+            return f"samples share noise of {self.noise_dn:.2g} DN{place} ({parts})"
         changed = dict.fromkeys(_CHANGED.get(mode.changes, "offset") for mode in self.modes)
-        return f"a change of the {' and the '.join(changed)}{place} that samples share ({parts})"
+        return f"samples share a variation of the {' and the '.join(changed)}{place} ({parts})"
 
 
 class _Average(NamedTuple):

@@ -139,7 +139,7 @@ class EmpiricalResponse(Effect):
 
     tag: Literal["empirical_response"] = Field(default="empirical_response", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "measured response to the charge of other samples, without an explanation"
+    title: ClassVar[str] = "empirical response to the charge of other samples"
     source: ClassVar[str] = "Volterra 1930, Priestley 1981 (linear responses)"
     strength: ClassVar[str] = "response"
     empirical: ClassVar[bool] = True
@@ -147,7 +147,7 @@ class EmpiricalResponse(Effect):
     response: Ratio = Field(
         ge=0,
         le=1,
-        description="part of the charge of another sample that a sample gets, for weight 1, no unit",
+        description="share of the charge of another sample that is added, for weight 1, no unit",
     )
     terms: tuple[ResponseTerm, ...] = Field(
         min_length=1,
@@ -257,7 +257,7 @@ class EmpiricalResponse(Effect):
             )
         told = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:_FEW]]
         more = f", and {len(followed) - _FEW} more" if len(followed) > _FEW else ""
-        return f"samples{place} that correlate with the charge of others ({', '.join(told)}{more})"
+        return f"samples{place} depend on the charge of other samples ({', '.join(told)}{more})"
 
 
 def _few(parts: Sequence[str]) -> str:

@@ -55,19 +55,19 @@ class FlickerNoise(Effect):
     strength: ClassVar[str] = "share"
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {
-        "analog_memory": "frames without any exposure: flicker remains there, memory does not",
-        "dark_current_rts": "a sweep of the exposure time: blinking charge grows with it, flicker does not",
-        "bias_drift": "pairs of distant pixels: a drift of the bias is common to them",
-        "bias_jumps": "pairs of pixels of a quadrant: a jump is common to them",
-        "gain_drift": "dark and bright pixels: a drift of the gain grows with the signal",
-        "rts_noise": "longer runs: slow telegraph noise has two levels and stays in the same few pixels",
+        "analog_memory": "frames without exposure: 1/f noise remains, memory vanishes",
+        "dark_current_rts": "a sweep of the exposure time: blinking grows with it, 1/f noise does not",
+        "bias_drift": "pairs of distant pixels: a bias drift is common to them",
+        "bias_jumps": "pairs of pixels of a quadrant: bias jumps are common to them",
+        "gain_drift": "dark and bright pixels: a gain drift is proportional to the signal",
+        "rts_noise": "longer runs: slow RTS noise has two levels, in the same few pixels",
     }
-    share: Ratio = Field(ge=0, le=1, description="part of the power of the read noise, no unit")
+    share: Ratio = Field(ge=0, le=1, description="share of the read noise power, no unit")
     correlation_frames: Frames = Field(
         default=30.0,
         gt=0,
         le=1e6,
-        description="correlation time of that part, frames; one_over_f: the longest one",
+        description="correlation time, frames; one_over_f: the longest one",
     )
     spectrum: Literal["lorentzian", "one_over_f"] = Field(
         default="lorentzian",

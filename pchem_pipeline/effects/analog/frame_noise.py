@@ -47,10 +47,10 @@ class FrameNoise(SharedNoise):
     strength: ClassVar[str] = "frame_noise_dn"
     shared_by: ClassVar[Literal["frame", "row", "column"]] = "frame"
     separate: ClassVar[Mapping[str, str]] = {
-        "black_clamp": "the camera's clamp switched off: its offsets follow the charge of some pixels",
-        "exposure_flicker": "frames without light and at short exposure: flicker of the exposure vanishes",
-        "periodic_pickup": "a spectrum of frame means of a longer run: pickup is a line, noise is flat",
-        "bias_drift": "a longer run: a drift grows with the time between two frames, noise does not",
+        "black_clamp": "clamp switched off: frame noise stays, offsets of the clamp vanish",
+        "exposure_flicker": "frames without light, or at short exposure: flicker vanishes",
+        "periodic_pickup": "spectrum of the frame means of a longer run: pickup is a line, noise is flat",
+        "bias_drift": "a longer run: a drift grows with time, noise does not",
     }
     frame_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the frames' offsets, DN")
 

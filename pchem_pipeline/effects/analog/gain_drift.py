@@ -53,7 +53,7 @@ class GainDrift(Effect):
 
     tag: Literal["gain_drift"] = Field(default="gain_drift", description="name of the effect")
     plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "drift of the conversion gain"
+    title: ClassVar[str] = "conversion gain drift"
     source: ClassVar[str] = "EMVA 1288 (stability of the gain); Janesick 2007"
     signature: ClassVar[tuple[str, ...]] = (
         "frame.gain.trend", "frame.gain.slow", "frame.readout.trend", "frame.readout.slow",
@@ -62,10 +62,10 @@ class GainDrift(Effect):
     strength: ClassVar[str] = "drift"
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {
-        "bias_drift": "frames without exposure: a drift of the bias remains there, one of the gain does not",
-        "exposure_drift": "a logged light level; the peaks keep their distance where it is the exposure",
-        "signal_dependent_noise": "repeating the run: a drift follows a time profile, noise does not",
-        "flicker_noise": "dark and bright pixels: a drift of the gain grows with the signal",
+        "bias_drift": "frames without exposure: a bias drift remains, a gain drift vanishes",
+        "exposure_drift": "peak spacing over time: constant if the exposure drifts; or a logged light level",
+        "signal_dependent_noise": "a repeated run: a drift has a time profile, noise has none",
+        "flicker_noise": "dark and bright pixels: a gain drift is proportional to the signal",
     }
     drift: Ratio = Field(
         ge=-0.5,

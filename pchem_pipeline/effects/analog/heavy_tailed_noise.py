@@ -48,17 +48,17 @@ class HeavyTailedNoise(Effect):
     strength: ClassVar[str] = "share"
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {
-        "rts_noise": "longer runs: telegraph noise stays in the same few pixels; or another "
-        "number of correlated samples, which moves its levels",
-        "adc_dnl": "a sweep of the bias: wrong codes stay where they are in DN, tails move along",
-        "signal_dependent_noise": "frames without any exposure: the tails remain there",
+        "rts_noise": "longer runs: RTS noise stays in the same few pixels; or another number of "
+        "correlated samples: it changes the levels of RTS noise",
+        "adc_dnl": "a sweep of the bias: DNL is fixed in DN, tails shift with the peaks",
+        "signal_dependent_noise": "frames without exposure: heavy tails remain",
     }
     share: Ratio = Field(ge=0, le=1, description="probability that a sample is noisy, no unit")
     factor: Ratio = Field(
         default=3.0,
         ge=1,
         le=30,
-        description="noise of such a sample relative to that of the others, no unit",
+        description="noise of such a sample relative to others, no unit",
     )
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:

@@ -48,13 +48,13 @@ class InterpixelCapacitance(Effect):
     reach_rows = 1
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {
-        "optical_crosstalk": "single hot pixels: light makes whole electrons in the neighbours, "
-        "capacitance moves their peaks by a fraction of one",
-        "row_noise": "distant pixels of a row: row noise reaches them, capacitance does not",
-        "column_noise": "distant pixels of a column: column noise reaches them, capacitance does not",
+        "optical_crosstalk": "single hot pixels: crosstalk adds whole electrons to neighbours, "
+        "capacitance shifts their peaks by a fraction of an electron",
+        "row_noise": "distant pixels of a row: correlated by row noise, not by capacitance",
+        "column_noise": "distant pixels of a column: correlated by column noise, not by capacitance",
     }
     coupling: Ratio = Field(
-        ge=0, le=0.2, description="part of a neighbour's charge that a pixel shows (mean of four), no unit"
+        ge=0, le=0.2, description="share of a neighbour's charge added to a pixel (mean of four), no unit"
     )
     anisotropy: Ratio = Field(
         default=0.0,

@@ -41,17 +41,16 @@ class NoiseSkew(Effect):
     strength: ClassVar[str] = "share"
     power: ClassVar[float] = 3.0
     separate: ClassVar[Mapping[str, str]] = {
-        "heavy_tailed_noise": "frames without any exposure: a skew shows on one side of the peak, "
-        "heavy tails on both",
-        "signal_dependent_noise": "frames without any exposure: the skew remains there",
-        "nonlinearity": "a sweep of the exposure: the skew does not grow with the signal",
-        "adc_inl": "a sweep of the bias: the skew moves along with the peaks, wrong codes do not",
-        "rts_noise": "longer runs: telegraph noise stays in the same few pixels",
+        "heavy_tailed_noise": "frames without exposure: skewed noise has one tail, heavy-tailed noise two",
+        "signal_dependent_noise": "frames without exposure: the skewness remains",
+        "nonlinearity": "a sweep of the exposure: the skewness is independent of the signal",
+        "adc_inl": "a sweep of the bias: skewness shifts with the peaks, INL is fixed in DN",
+        "rts_noise": "longer runs: RTS noise stays in the same few pixels",
     }
     share: Ratio = Field(
         ge=-1,
         le=1,
-        description="standard deviation of the exponential part relative to that of all read noise, no unit; "
+        description="standard deviation of the exponential part over the read noise, no unit; "
         "negative: tail to low DN",
     )
 

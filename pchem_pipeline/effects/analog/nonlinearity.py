@@ -42,20 +42,19 @@ class Nonlinearity(Effect):
     strength: ClassVar[str] = "step_change"
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {
-        "adc_inl": "a sweep of the bias: the ADC's error stays where it is in DN, the pixel's in electrons",
-        "signal_dependent_noise": "a ladder of exposures: nonlinearity bends the means, noise the variances",
-        "noise_skew": "a ladder of exposures: the bend grows with the signal, the skew does not",
-        "branching_counts": "a sweep of the bias voltage or exposure: a bent comb stays bent at any exposure",
+        "adc_inl": "a sweep of the bias: INL is fixed in DN, pixel nonlinearity in electrons",
+        "signal_dependent_noise": "a series of exposures: nonlinearity bends the means, noise the variances",
+        "noise_skew": "a series of exposures: nonlinearity grows with the signal, skewed noise does not",
+        "branching_counts": "a series of exposures: nonlinear peak spacing is the same at any exposure",
     }
     step_change: PerElectron = Field(
         ge=-0.2,
         le=0.2,
-        description="relative change of the step per electron (five electrons up, steps differ by five times "
-        "this), 1/e-",
+        description="relative change of the peak spacing per electron, 1/e-",
     )
     noise: Noise = Field(
         default="kept",
-        description="kept: what bends comes before the read noise (sense node); bent: after it (amplifiers)",
+        description="kept: nonlinearity before the read noise (sense node); bent: after it (amplifiers)",
     )
 
     #: steps that grow and steps that shrink

@@ -56,10 +56,10 @@ class PeriodicPickup(OffsetEffect):
     power: ClassVar[float] = 2.0
     may_be_at_bound: ClassVar[tuple[str, ...]] = ("cycles_per_row", "cycles_per_frame", "cycles_per_column")
     separate: ClassVar[Mapping[str, str]] = {
-        "row_noise": "a spectrum of the row means within a frame: pickup is a line, row noise is flat",
-        "frame_noise": "a spectrum of the frame means: pickup is a line, frame noise is flat",
-        "readout_alternation": "another frame rate: pickup moves away from half the frame rate",
-        "bias_drift": "a second run: the phase of pickup is another, a warming up repeats itself",
+        "row_noise": "spectrum of the row means within a frame: pickup is a line, row noise is flat",
+        "frame_noise": "spectrum of the frame means: pickup is a line, frame noise is flat",
+        "readout_alternation": "another frame rate: pickup leaves half the frame rate",
+        "bias_drift": "a second run: pickup has another phase, a warm-up drift is repeated",
     }
     amplitude_dn: Dn = Field(ge=0, le=1e6, description="amplitude of the sine, DN")
     cycles_per_row: Turns = Field(
@@ -75,7 +75,7 @@ class PeriodicPickup(OffsetEffect):
         description="f_x: advance of the phase from column to column, cycles; 0 with column-parallel readout",
     )
     phase: Radians = Field(default=0.0, ge=-100, le=100, description="phase at row, column and frame 0, rad")
-    random_phase: bool = Field(default=False, description="true: a new random phase in every frame")
+    random_phase: bool = Field(default=False, description="true: random phase in every frame")
 
     #: at 0.092 DN: along rows and frames, frames alone, at random phase, along columns
     typical_values = (

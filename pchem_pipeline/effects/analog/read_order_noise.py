@@ -30,7 +30,7 @@ class ReadOrderNoise(OffsetEffect):
     """
 
     tag: Literal["read_order_noise"] = Field(default="read_order_noise", description="name of the effect")
-    title: ClassVar[str] = "1/f noise in the order of reading"
+    title: ClassVar[str] = "1/f noise along the readout"
     source: ClassVar[str] = "Rauscher 2015, PASP 127, 1144 (correlated pink noise)"
     signature: ClassVar[tuple[str, ...]] = (
         "space.row.readout.lag1",
@@ -42,15 +42,15 @@ class ReadOrderNoise(OffsetEffect):
     strength: ClassVar[str] = "noise_dn"
     power: ClassVar[float] = 2.0
     separate: ClassVar[Mapping[str, str]] = {
-        "row_noise": "pixels far apart in a row: here they are less alike than neighbours",
-        "frame_noise": "rows far apart in a frame: here they are not alike",
-        "interpixel_capacitance": "dark frames: noise of an amplifier stays, coupled charge is gone",
-        "periodic_pickup": "a spectrum in the order of reading: pickup is a line, 1/f noise falls",
-        "bias_jumps": "successive frames: 1/f noise is new in each",
+        "row_noise": "distant pixels of a row: 1/f noise correlates them less than neighbours",
+        "frame_noise": "distant rows of a frame: 1/f noise does not correlate them",
+        "interpixel_capacitance": "dark frames: amplifier noise stays, coupled charge vanishes",
+        "periodic_pickup": "spectrum in readout order: pickup is a line, 1/f noise falls",
+        "bias_jumps": "successive frames: 1/f noise is independent",
     }
-    noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of this noise, DN")
+    noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation, DN")
     taps: Count = Field(
-        default=1, ge=1, le=4096, description="blocks of columns read at the same time, noise of their own"
+        default=1, ge=1, le=4096, description="column blocks read in parallel, with independent noise"
     )
 
     #: at 0.5 DN, of one tap and of four

@@ -41,8 +41,8 @@ class ReadoutAlternation(OffsetEffect):
     signature: ClassVar[tuple[str, ...]] = ("frame.readout.alternating", "frame.readout.lag1")
     strength: ClassVar[str] = "alternation_dn"
     separate: ClassVar[Mapping[str, str]] = {
-        "periodic_pickup": "another frame rate: pickup moves away from half the frame rate",
-        "frame_noise": "a spectrum of frame means: alternation is all at half the frame rate",
+        "periodic_pickup": "another frame rate: pickup leaves half the frame rate",
+        "frame_noise": "spectrum of the frame means: alternation is a line at half the frame rate",
     }
     alternation_dn: Dn = Field(
         ge=-1e6, le=1e6, description="offset of even frames, and minus that of odd ones, DN"

@@ -32,10 +32,10 @@ class RowNoise(SharedNoise):
     strength: ClassVar[str] = "row_noise_dn"
     shared_by: ClassVar[Literal["frame", "row", "column"]] = "row"
     separate: ClassVar[Mapping[str, str]] = {
-        "read_order_noise": "pixels far apart in a row: as alike as neighbours here, less alike there",
-        "periodic_pickup": "a spectrum of the row means within a frame: pickup is a line, row noise is flat",
-        "interpixel_capacitance": "pixels far apart in a row: they are as correlated as neighbours",
-        "frame_noise": "means of rows within a frame: frame noise shifts them all alike",
+        "read_order_noise": "distant pixels of a row: 1/f noise correlates them less than neighbours",
+        "periodic_pickup": "spectrum of the row means within a frame: pickup is a line, row noise is flat",
+        "interpixel_capacitance": "distant pixels of a row: row noise correlates them like neighbours",
+        "frame_noise": "row means within a frame: frame noise is common to all",
     }
     row_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the rows' offsets, DN")
 

@@ -91,12 +91,12 @@ class RtsNoise(Effect):
     strength: ClassVar[str] = "fraction"
     power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {
-        "heavy_tailed_noise": "longer runs: telegraph noise stays in the same few pixels; or another "
-        "number of correlated samples, which moves its levels",
-        "dark_current_rts": "a sweep of the exposure time: blinking charge grows with it, telegraph noise of "
+        "heavy_tailed_noise": "longer runs: RTS noise stays in the same few pixels; or another number of "
+        "correlated samples: it changes the levels of RTS noise",
+        "dark_current_rts": "a sweep of the exposure time: dark-current RTS grows with it, RTS noise of "
         "the source follower does not",
-        "overdispersed_counts": "frames without any exposure: telegraph noise remains there",
-        "flicker_noise": "longer runs: slow telegraph noise has two levels and stays in the same few pixels",
+        "overdispersed_counts": "frames without exposure: RTS noise remains",
+        "flicker_noise": "longer runs: slow RTS noise has two levels, in the same few pixels",
     }
     fraction: Ratio = Field(ge=0, le=1, description="share of the pixels that have a trap, no unit")
     amplitude_e: Electrons = Field(
@@ -124,7 +124,7 @@ class RtsNoise(Effect):
         description="correlated: samples averaged before and after (1: double sampling)",
     )
     correlation_frames: Frames = Field(
-        default=30.0, gt=0, le=1e6, description="single: correlation time of the trap's state, frames"
+        default=30.0, gt=0, le=1e6, description="single: correlation time of the trap, frames"
     )
     times_spread: Ratio = Field(
         default=0.0,

@@ -38,13 +38,13 @@ class SignalDependentNoise(Effect):
     strength: ClassVar[str] = "noise_e"
     power: ClassVar[float] = 2.0
     separate: ClassVar[Mapping[str, str]] = {
-        "nonlinearity": "a ladder of exposures: nonlinearity bends the means, this the variances",
-        "noise_skew": "frames without any exposure: a skew remains there, this does not",
-        "heavy_tailed_noise": "frames without any exposure: heavy tails remain there, this does not",
-        "overdispersed_counts": "higher exposure: peaks of few electrons that are still narrow exclude this",
-        "gain_drift": "repeating the run: a drift follows a time profile, noise does not",
+        "nonlinearity": "a series of exposures: nonlinearity bends the means, noise the variances",
+        "noise_skew": "frames without exposure: skewness remains, signal-dependent noise vanishes",
+        "heavy_tailed_noise": "frames without exposure: heavy tails remain, signal-dependent noise vanishes",
+        "overdispersed_counts": "higher exposure: signal-dependent noise widens all peaks above 0 electrons",
+        "gain_drift": "a repeated run: a drift has a time profile, noise has none",
     }
-    noise_e: Electrons = Field(ge=0, description="standard deviation that one electron adds, e-")
+    noise_e: Electrons = Field(ge=0, description="noise of one electron, e-")
     growth: Literal["root", "linear"] = Field(
         default="root",
         description="root: each electron adds variance of its own (noise_e k^(1/2)); linear: the electrons "

@@ -51,12 +51,12 @@ class BranchingCounts(Effect):
     signature: ClassVar[tuple[str, ...]] = ("shape.C2.mean", "shape.C3.mean", "code.smooth")
     strength: ClassVar[str] = "branching"
     separate: ClassVar[Mapping[str, str]] = {
-        "overdispersed_counts": "several light levels: the excess variance grows like H here, like H^2 there",
-        "optical_crosstalk": "correlation of the electron numbers of neighbours: none here",
-        "exposure_flicker": "correlation between pixels of one frame: none here",
+        "overdispersed_counts": "several exposures: excess variance grows as H, by over-dispersion as H^2",
+        "optical_crosstalk": "electron numbers of neighbours: correlated by crosstalk only",
+        "exposure_flicker": "pixels of one frame: correlated by flicker only",
     }
     branching: Ratio = Field(
-        ge=0, le=0.5, description="mean number of further electrons made by each electron (l), no unit"
+        ge=0, le=0.5, description="mean number of secondary electrons per electron (l), no unit"
     )
 
     #: at half a percent, and at the tenth of a silicon photomultiplier

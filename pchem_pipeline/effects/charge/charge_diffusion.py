@@ -35,8 +35,8 @@ class ChargeDiffusion(Effect):
     strength: ClassVar[str] = "fraction"
     reach_rows = 1
     untestable: ClassVar[str] = (
-        "Poisson electrons that each move by chance stay independent Poisson electrons, so only the map of H "
-        "changes; an edge, a spot or single X-rays would show it"
+        "randomly moved Poisson electrons remain independent and Poisson, only the map of H changes; an "
+        "edge, a spot or single X-rays would show it"
     )
     fraction: Ratio = Field(ge=0, le=0.9, description="probability that an electron moves, no unit")
 

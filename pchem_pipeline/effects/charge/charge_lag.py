@@ -32,11 +32,11 @@ class ChargeLag(Effect):
     strength: ClassVar[str] = "fraction"
     reach_frames = 1
     untestable: ClassVar[str] = (
-        "Poisson electrons that are each delayed by chance stay independent Poisson electrons; a bright "
-        "frame followed by dark ones would show it"
+        "randomly delayed Poisson electrons remain independent and Poisson; a bright frame followed by dark "
+        "ones would show it"
     )
     fraction: Ratio = Field(
-        ge=0, le=0.9, description="probability that an electron is one frame late, no unit"
+        ge=0, le=0.9, description="probability that an electron is delayed by one frame, no unit"
     )
 
     #: at a fifth

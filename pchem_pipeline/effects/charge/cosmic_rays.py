@@ -83,31 +83,27 @@ class CosmicRays(Effect):
     signature: ClassVar[tuple[str, ...]] = ("tail.high.count", "tail.high.clusters", "tail.high.pixels")
     strength: ClassVar[str] = "tracks_per_frame"
     separate: ClassVar[Mapping[str, str]] = {
-        "heavy_tailed_noise": "samples far below the bias as well as above: none here",
-        "rts_noise": "the same pixels again and again: tracks fall everywhere",
-        "branching_counts": "the excess grows with the exposure: tracks do not",
+        "heavy_tailed_noise": "samples far below the bias: none by tracks",
+        "rts_noise": "a longer run: RTS noise stays in the same pixels, tracks hit all",
+        "branching_counts": "several exposures: tracks are independent of the exposure",
     }
-    tracks_per_frame: PerFrame = Field(
-        ge=0, le=100, description="mean number of tracks and clouds on the sensor in a frame"
-    )
+    tracks_per_frame: PerFrame = Field(ge=0, le=100, description="mean number of tracks and clouds per frame")
     length_um: Micrometres = Field(
         default=15.0, gt=0, description="mean length of a track projected on the sensor, um"
     )
     electrons_per_um: ElectronsPerUm = Field(
-        default=80.0, gt=0, description="electrons freed per length of the projected track, e-/um"
+        default=80.0, gt=0, description="electrons per length of the projected track, e-/um"
     )
     pixel_pitch_um: Micrometres = Field(default=3.0, gt=0, description="distance between pixels, um")
-    cloud_share: Ratio = Field(
-        default=0.0, ge=0, le=1, description="share of them that are round clouds, as alpha particles leave"
-    )
+    cloud_share: Ratio = Field(default=0.0, ge=0, le=1, description="share of round clouds (alpha particles)")
     cloud_electrons: Electrons = Field(
         default=2e4, gt=0, description="median of the electrons of a cloud, e-"
     )
     cloud_range: Ratio = Field(
-        default=0.0, ge=0, le=3, description="standard deviation of the logarithm of its electrons, no unit"
+        default=0.0, ge=0, le=3, description="standard deviation of the logarithm of these electrons, no unit"
     )
     cloud_um: Micrometres = Field(
-        default=3.0, gt=0, description="standard deviation of such a cloud along an axis, um"
+        default=3.0, gt=0, description="standard deviation of a cloud along an axis, um"
     )
 
     #: at one track in 80 frames

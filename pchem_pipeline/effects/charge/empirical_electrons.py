@@ -63,12 +63,12 @@ class ElectronMode(Section):
     def describe(self, chance: float) -> str:
         """Return in words how the numbers vary together, with a chance (or a mean number)."""
         if self.fate == "emptied":
-            return f"{per_cent(chance)} of the samples have none"
+            return f"{per_cent(chance)} of the samples have no electrons"
         where = neighbour_words(self.place) if any(self.place) else "the same sample"
         if self.fate == "followed":
-            return f"for each one {where} has {chance:.2g} more on average"
-        more = f", and {where} as many more" if self.fate == "moved" else ""
-        return f"a sample of k has {chance:.2g} k (k - 1) fewer than independent ones would be{more}"
+            return f"{chance:+.2g} electrons in {where} per electron"
+        more = f", to {where}" if self.fate == "moved" else ""
+        return f"a sample of k electrons loses {chance:.2g} k (k - 1) of them{more}"
 
 
 @register_effect
@@ -83,13 +83,11 @@ class EmpiricalElectrons(Effect):
         default="empirical_electrons", description="name of the effect"
     )
     plane: ClassVar[Plane] = Plane.CHARGE
-    title: ClassVar[str] = "measured law of electron numbers, without an explanation"
+    title: ClassVar[str] = "empirical electron-number correlations"
     source: ClassVar[str] = "Cox and Isham 1980, Point processes (factorial cumulants)"
     strength: ClassVar[str] = "chance"
     empirical: ClassVar[bool] = True
-    chance: Ratio = Field(
-        ge=0, le=0.5, description="largest chance or mean number, that of weight 1, no unit"
-    )
+    chance: Ratio = Field(ge=0, le=0.5, description="largest probability or mean number (weight 1), no unit")
     modes: tuple[ElectronMode, ...] = Field(
         min_length=1, max_length=8, description="what happens: its `fate`, `place` and relative `weight`"
     )
@@ -164,7 +162,7 @@ class EmpiricalElectrons(Effect):
         """Return what is known of it."""
         place = f" in {place_words(self)}" if place_words(self) else ""
         told = [mode.describe(chance) for mode, chance in zip(self.modes, self._chances(), strict=True)]
-        return f"electron numbers{place} that are not independent ({'; '.join(told)})"
+        return f"electron numbers{place} are not independent ({'; '.join(told)})"
 
 
 def _gone(electrons: IntArray, u: FloatArray, chance: float) -> IntArray:

@@ -42,12 +42,12 @@ class OpticalCrosstalk(Effect):
     strength: ClassVar[str] = "probability"
     reach_rows = 1
     separate: ClassVar[Mapping[str, str]] = {
-        "interpixel_capacitance": "the readout residual and the neighbour's electrons: it follows them there",
-        "exposure_flicker": "correlation of distant pixels: none here",
-        "cosmic_rays": "longer exposures: tracks are rare and bright, crosstalk is everywhere and single",
+        "interpixel_capacitance": "residuals and neighbour's electrons: correlated by capacitance only",
+        "exposure_flicker": "distant pixels: correlated by flicker only",
+        "cosmic_rays": "longer exposures: tracks are rare and bright, crosstalk is frequent and single",
     }
     probability: Ratio = Field(
-        ge=0, le=0.5, description="probability that an electron makes one more in a neighbour, no unit"
+        ge=0, le=0.5, description="probability that an electron creates one in a neighbour, no unit"
     )
 
     #: at one percent

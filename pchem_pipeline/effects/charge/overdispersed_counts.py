@@ -52,9 +52,9 @@ class OverdispersedCounts(Effect):
     signature: ClassVar[tuple[str, ...]] = ("shape.C2.mean", "shape.C2.slope", "code.smooth", "shape.C3.mean")
     strength: ClassVar[str] = "relative_variance"
     separate: ClassVar[Mapping[str, str]] = {
-        "branching_counts": "several light levels: the excess variance grows like H^2 here, like H there",
-        "exposure_flicker": "correlation between pixels of one frame: none here",
-        "dark_current_rts": "slower frames and longer runs: blinking pixels become correlated in time",
+        "branching_counts": "several exposures: excess variance grows as H^2, by branching as H",
+        "exposure_flicker": "pixels of one frame: correlated by flicker only",
+        "dark_current_rts": "slower frames and longer runs: blinking pixels are correlated in time",
     }
     relative_variance: Ratio = Field(
         ge=0, le=1, description="variance of the exposure divided by its squared mean (a), no unit"

@@ -32,8 +32,8 @@ class SpuriousCharge(Effect):
     )
     strength: ClassVar[str] = "mean_e"
     untestable: ClassVar[str] = (
-        "sums of Poisson electrons are Poisson, so it is part of H; a series of integration times would show "
-        "it (the part of H that does not grow with time)"
+        "sums of Poisson electrons are Poisson, so that it is part of H; a series of integration times would "
+        "show it (the part of H independent of time)"
     )
     mean_e: Electrons = Field(
         ge=0, le=1e6, description="mean number of spurious electrons per pixel and frame, e-"

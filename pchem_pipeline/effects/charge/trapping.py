@@ -66,7 +66,7 @@ class Trapping(Effect):
 
     tag: Literal["trapping"] = Field(default="trapping", description="name of the effect")
     plane: ClassVar[Plane] = Plane.CHARGE
-    title: ClassVar[str] = "trapping of electrons in the pixels"
+    title: ClassVar[str] = "charge trapping"
     source: ClassVar[str] = (
         "Shockley and Read 1952, Phys. Rev. 87, 835; Massey et al. 2010, Mon. Not. R. Astron. Soc. 401, 371"
     )
@@ -75,25 +75,25 @@ class Trapping(Effect):
     )  # fmt: skip
     strength: ClassVar[str] = "capture"
     separate: ClassVar[Mapping[str, str]] = {
-        "overdispersed_counts": "longer runs: electron numbers of successive frames are opposite here, and "
-        "independent there",
-        "branching_counts": "longer runs: electron numbers of successive frames are opposite here, and "
-        "independent there",
-        "analog_memory": "one bright frame and then dark ones: a trap gives back whole electrons, one at a "
-        "time; memory fades within a frame",
-        "dark_current_rts": "longer runs: the sum over many frames varies as that of Poisson electrons here, "
-        "and more there",
+        "overdispersed_counts": "longer runs: trapping anticorrelates electron numbers of successive frames, "
+        "over-dispersion does not",
+        "branching_counts": "longer runs: trapping anticorrelates electron numbers of successive frames, "
+        "branching does not",
+        "analog_memory": "dark frames after a bright one: traps release single electrons, memory fades "
+        "within a frame",
+        "dark_current_rts": "longer runs: the sum over many frames is Poisson with trapping, over-dispersed "
+        "with dark-current RTS",
     }
     capture: Ratio = Field(
         ge=0,
         le=_LIMITS[1],
-        description="chance that an empty trap catches an electron of a sample that has any, no unit",
+        description="probability that an empty trap captures an electron of a sample that has any, no unit",
     )
     release: Ratio = Field(
         default=0.3,
         ge=_LIMITS[0],
         le=_LIMITS[1],
-        description="chance that a full trap gives its electron to a sample, in each frame, no unit",
+        description="probability per frame that a full trap releases its electron, no unit",
     )
     fraction: Ratio = Field(default=1.0, ge=0, le=1, description="share of the pixels with a trap, no unit")
 

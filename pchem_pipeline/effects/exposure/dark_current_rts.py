@@ -63,10 +63,10 @@ class DarkCurrentRts(Effect):
     strength: ClassVar[str] = "fraction"
     resample_pixels: ClassVar[bool] = True
     separate: ClassVar[Mapping[str, str]] = {
-        "rts_noise": "the exposure time: the jumps grow with it here, and not there",
-        "flicker_noise": "the jumps are in the electron numbers here, in the readout residual there",
-        "persistence": "a longer run: regions fade once there, single pixels jump up and down here",
-        "overdispersed_counts": "slower and longer runs: the blinking becomes correlated in time",
+        "rts_noise": "several exposure times: jumps of the dark current grow with it",
+        "flicker_noise": "dark current jumps in the electron numbers, 1/f noise in the readout residuals",
+        "persistence": "a longer run: persistence fades once in regions, single pixels blink repeatedly",
+        "overdispersed_counts": "slower and longer runs: blinking is correlated in time",
     }
     fraction: Ratio = Field(ge=0, le=1, description="fraction of the pixels that blink, no unit")
     step_e: Electrons = Field(

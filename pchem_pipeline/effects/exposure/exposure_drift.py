@@ -42,7 +42,7 @@ class ExposureDrift(Effect):
 
     tag: Literal["exposure_drift"] = Field(default="exposure_drift", description="name of the effect")
     plane: ClassVar[Plane] = Plane.EXPOSURE
-    title: ClassVar[str] = "drift of the illumination or of the dark current"
+    title: ClassVar[str] = "illumination or dark-current drift"
     source: ClassVar[str] = "Widenhorn et al. 2002, Proc. SPIE 4669, 193 (dark current and temperature)"
     signature: ClassVar[tuple[str, ...]] = (
         "frame.charge.trend",
@@ -52,11 +52,11 @@ class ExposureDrift(Effect):
     )
     strength: ClassVar[str] = "drift"
     separate: ClassVar[Mapping[str, str]] = {
-        "glow": "a map of the change along the run: a drift goes with H, a glow has its place",
-        "gain_drift": "the readout residual of bright pixels against that of dim ones: constant here",
-        "bias_drift": "covered pixels, or frames without exposure: constant here",
-        "persistence": "the map of the change: proportional to H here",
-        "exposure_flicker": "a reference photodiode or the logged temperature",
+        "glow": "a map of the change along the run: a drift is proportional to H, a glow local",
+        "gain_drift": "readout residuals of bright and dim pixels: constant with an exposure drift",
+        "bias_drift": "covered pixels, or frames without exposure: constant with an exposure drift",
+        "persistence": "a map of the change: proportional to H for a drift",
+        "exposure_flicker": "a reference photodiode, or the logged temperature",
     }
     drift: Ratio = Field(
         ge=-2, le=2, description="(H_last - H_first) / H_mean (range of the time profile for a path), no unit"

@@ -41,7 +41,7 @@ class ExposureFlicker(Effect):
 
     tag: Literal["exposure_flicker"] = Field(default="exposure_flicker", description="name of the effect")
     plane: ClassVar[Plane] = Plane.EXPOSURE
-    title: ClassVar[str] = "flicker of the illumination (intensity noise)"
+    title: ClassVar[str] = "illumination flicker (intensity noise)"
     source: ClassVar[str] = (
         "EMVA Standard 1288, release 4.0 (2021), sec. 6; Petermann 1988, Laser Diode Modulation"
     )
@@ -55,10 +55,10 @@ class ExposureFlicker(Effect):
     power: ClassVar[float] = 2.0
     may_be_at_bound: ClassVar[tuple[str, ...]] = ("phase_cycles",)
     separate: ClassVar[Mapping[str, str]] = {
-        "glow": "a map of the bright frames: a flicker is bright where H is, a glow at its place",
-        "exposure_drift": "a longer run: a flicker does not go on in one direction",
-        "frame_noise": "covered pixels, or frames without exposure: constant here",
-        "overdispersed_counts": "correlation between pixels of one frame: all of them here",
+        "glow": "a map of the bright frames: flicker is proportional to H, a glow local",
+        "exposure_drift": "a longer run: flicker has no trend",
+        "frame_noise": "covered pixels, or frames without exposure: constant with flicker",
+        "overdispersed_counts": "pixels of one frame: all are correlated by flicker",
     }
     rms: Ratio = Field(ge=0, le=1, description="standard deviation of the exposure over its mean, no unit")
     correlation_frames: Frames = Field(

@@ -41,7 +41,7 @@ class Glow(Effect):
 
     tag: Literal["glow"] = Field(default="glow", description="name of the effect")
     plane: ClassVar[Plane] = Plane.EXPOSURE
-    title: ClassVar[str] = "glow or light leak at one place"
+    title: ClassVar[str] = "local glow or light leak"
     source: ClassVar[str] = "Janesick 2001, Scientific Charge-Coupled Devices (amplifier luminescence)"
     signature: ClassVar[tuple[str, ...]] = (
         "space.row.charge.lag1",
@@ -55,11 +55,11 @@ class Glow(Effect):
     strength: ClassVar[str] = "peak_e"
     may_be_at_bound: ClassVar[tuple[str, ...]] = ("centre_y", "centre_x")
     separate: ClassVar[Mapping[str, str]] = {
-        "exposure_flicker": "a map of the bright frames: a flicker is bright where H is, a glow at its place",
-        "exposure_drift": "a map of the change along the run: a drift goes with H, a glow has its place",
+        "exposure_flicker": "a map of the bright frames: flicker is proportional to H, a glow local",
+        "exposure_drift": "a map of the change along the run: a drift is proportional to H, a glow local",
         "persistence": "a run after a longer time in the dark: persistence is gone, a glow grows again",
-        "cosmic_rays": "longer runs: a glow comes at the same place each time",
-        "optical_crosstalk": "dark frames without the source of the glow: crosstalk follows each electron",
+        "cosmic_rays": "longer runs: a glow is always at the same place",
+        "optical_crosstalk": "dark frames without the source of the glow: crosstalk remains",
     }
     peak_e: Electrons = Field(
         ge=0, le=1e6, description="largest additional exposure of the brightest pixel, e-"

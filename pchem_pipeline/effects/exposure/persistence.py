@@ -65,9 +65,9 @@ class Persistence(Effect):
     may_be_at_bound: ClassVar[tuple[str, ...]] = ("slow_share", "centre_y", "centre_x")
     separate: ClassVar[Mapping[str, str]] = {
         "glow": "a run after a longer time in the dark: persistence is gone, a glow is not",
-        "exposure_drift": "a run after a longer time in the dark: the change, not proportional to H, is gone",
-        "dark_current_rts": "a longer run: single pixels jump up and down there, regions fade once here",
-        "bias_drift": "frames without exposure: the residual stays here",
+        "exposure_drift": "a run after a longer time in the dark: persistence is gone, a drift is not",
+        "dark_current_rts": "a longer run: single pixels blink repeatedly, persistence fades once in regions",
+        "bias_drift": "electron numbers in dark frames: persistence changes them, a bias drift does not",
     }
     peak_e: ElectronsPerFrame = Field(
         ge=0, le=_BRIGHTEST, description="largest additional exposure in the first frame, e- per frame"

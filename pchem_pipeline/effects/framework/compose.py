@@ -72,7 +72,7 @@ class PixelPlaces:
         if effect.when is None:
             return 1.0
         if not self.frames.size:
-            raise ValueError("these samples have no order in time; leave out `when`")
+            raise ValueError("these samples have no frame order; leave out `when`")
         return effect.when.share(self.frames)
 
 
@@ -148,7 +148,7 @@ def _with_effect(
     if effect.everywhere:
         return [(pixels, effect.sample_law(law, _some(maps, pixels)))]
     if places is None:
-        raise ValueError("where and when these samples were taken is not known")
+        raise ValueError("pixels and frames of these samples are not known")
     inside = places.inside(effect)[pixels]
     share = places.share(effect)
     if share == 0.0 or not inside.any():
@@ -176,16 +176,16 @@ def place_words(effect: Effect) -> str:
 
 
 def effect_words(effect: Effect) -> str:
-    """Return an effect in words, for example ``row_noise in columns 120 to 159, frames 0 to 99``."""
+    """Describe an effect, for example ``row_noise in columns 120 to 159, frames 0 to 99``."""
     return effect.tag if effect.everywhere else f"{effect.tag} in {place_words(effect)}"
 
 
 def title_words(effect: Effect) -> str:
-    """Return the same with the name of the effect in the literature."""
+    """Describe an effect by its title."""
     title = type(effect).title or effect.tag
     return title if effect.everywhere else f"{title} in {place_words(effect)}"
 
 
 def model_words(effects: Sequence[Effect]) -> str:
-    """Return the model in words, for example ``PCD + row_noise + rts_noise``."""
+    """Describe a model, for example ``PCD + row_noise + rts_noise``."""
     return " + ".join(["PCD", *map(effect_words, effects)])

@@ -133,8 +133,8 @@ class Effect(Section):
     may_be_at_bound: ClassVar[tuple[str, ...]] = ()
     reach_rows: ClassVar[int] = 0
     reach_frames: ClassVar[int] = 0
-    region: Region | None = Field(default=None, description="where on the sensor it acts; null: everywhere")
-    when: When | None = Field(default=None, description="in which frames it acts; null: in all")
+    region: Region | None = Field(default=None, description="region of the sensor; null: everywhere")
+    when: When | None = Field(default=None, description="frames concerned; null: all")
 
     @model_serializer(mode="wrap")
     def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -264,11 +264,11 @@ class Effect(Section):
         return type(self).model_validate(values)
 
     def stuck_words(self) -> str:
-        """Return in words which parameters stand at a limit; empty: none."""
-        return " and ".join(f"its {name} stands at its limit, {v:g}" for name, v in self.at_limits().items())
+        """State which parameters are at a limit; empty if none."""
+        return " and ".join(f"its {name} is at the limit of {v:g}" for name, v in self.at_limits().items())
 
     def at_limits(self) -> dict[str, float]:
-        """Return the parameters that stand at a limit of their field, by name.
+        """Return the parameters at a limit of their field, by name.
 
         Not those at their default, nor those of :attr:`may_be_at_bound`.
         """

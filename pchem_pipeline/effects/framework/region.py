@@ -2,7 +2,7 @@
 
 A :class:`Region` is a set of pixels and a :class:`When` a set of frames, both written as a lab would say it:
 ranges of rows and columns, readout taps, a quadrant, a list of pixels; ranges of frames, a period, single
-frames. Of several conditions all must hold. Ranges are (first, behind the last), counted from 0.
+frames. Of several conditions all must hold. Ranges are (first, last + 1), counted from 0.
 
 In a YAML either is a mapping or the same in one line, as ``pchem demo --hidden EFFECT@...`` takes it::
 
@@ -71,11 +71,11 @@ def _spans(value: Any) -> Any:
 def _ascending(spans: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
     for first, last in spans:
         if not 0 <= first < last:
-            raise ValueError(f"{first}:{last} is no range; give [first, behind the last], counted from 0")
+            raise ValueError(f"{first}:{last} is no range; give [first, last + 1], counted from 0")
     return tuple(sorted(spans))
 
 
-#: A range: first, and behind the last.
+#: A range: first and last + 1.
 Span = tuple[int, int]
 Spans = Annotated[tuple[Span, ...], BeforeValidator(_spans)]
 Numbers = Annotated[tuple[int, ...], BeforeValidator(lambda v: (v,) if isinstance(v, int) else v)]
@@ -99,10 +99,10 @@ class Taps(_Place):
     Column c belongs to group ``(c - first) // width``, modulo ``every`` where that is given.
     """
 
-    which: Numbers = Field(min_length=1, description="numbers of the groups, from 0")
+    which: Numbers = Field(min_length=1, description="numbers of the groups, counted from 0")
     width: int = Field(default=1, ge=1, description="columns of a group")
-    every: int | None = Field(default=None, ge=1, description="groups after which the numbers begin again")
-    first: int = Field(default=0, description="column at which group 0 begins")
+    every: int | None = Field(default=None, ge=1, description="groups after which numbering restarts")
+    first: int = Field(default=0, description="first column of group 0")
     along: Literal["columns", "rows"] = Field(default="columns", description="what is grouped")
 
     @model_validator(mode="after")
@@ -133,7 +133,7 @@ class Region(_Place):
     quadrant: Quadrant | None = Field(default=None, description="a quarter of the sensor")
     pixels: tuple[tuple[int, int, int], ...] = Field(
         default=(),
-        description="runs of pixels: row, first column, behind the last (a mask is read into it)",
+        description="runs of pixels: row, first column, last column + 1 (also made from a mask)",
     )
 
     @model_validator(mode="before")
@@ -165,7 +165,7 @@ class Region(_Place):
         if not (self.rows or self.columns or self.taps or self.quadrant or self.pixels):
             raise ValueError(f"no place is given; write {GRAMMAR}; or leave it out for the whole sensor")
         if any(not (row >= 0 and 0 <= first < last) for row, first, last in self.pixels):
-            raise ValueError("pixels: each is [row, first column, behind the last], counted from 0")
+            raise ValueError("pixels: each is [row, first column, last column + 1], counted from 0")
         return self
 
     @classmethod
@@ -228,8 +228,8 @@ class When(_Place):
 
     range: Spans = Field(default=(), description="range or ranges of frames")
     every: int | None = Field(default=None, ge=2, description="period, frames")
-    phase: int = Field(default=0, ge=0, description="first frame of the period that counts")
-    length: int = Field(default=1, ge=1, description="successive frames of each period that count")
+    phase: int = Field(default=0, ge=0, description="first frame within the period")
+    length: int = Field(default=1, ge=1, description="number of successive frames in each period")
     single: Numbers = Field(default=(), description="numbers of single frames")
 
     @model_validator(mode="before")

@@ -20,6 +20,5 @@ class ModelSettings(Section):
     set_aside_e: tuple[tuple[float | None, float | None], ...] = Field(
         default=(),
         description="codes that the fit leaves out, since the model does not describe them: intervals of "
-        "their place on the comb of the plain fit, (x - bias) * gain, null for no limit ([[null, 0.5]] sets "
-        "the 0-electron peak aside), e-",
+        "(x - bias) * gain of the plain fit, e-; null: no limit ([[null, 0.5]]: without the 0-electron peak)",
     )

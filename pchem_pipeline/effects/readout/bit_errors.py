@@ -45,7 +45,7 @@ class BitErrors(Effect):
 
     tag: Literal["bit_errors"] = Field(default="bit_errors", description="name of the effect")
     plane: ClassVar[Plane] = Plane.READOUT
-    title: ClassVar[str] = "stuck, lost or flipping bit of the digital number"
+    title: ClassVar[str] = "stuck, missing or flipping bit"
     source: ClassVar[str] = "Eldred 1959, J. ACM 6, 33 (stuck-at faults); Boone et al. 2018, PASP 130, 064504"
     signature: ClassVar[tuple[str, ...]] = (
         "code.smooth",
@@ -58,14 +58,14 @@ class BitErrors(Effect):
     strength: ClassVar[str] = "share"
     rough_law: ClassVar[bool] = True
     separate: ClassVar[Mapping[str, str]] = {
-        "adc_dnl": "a ramp of light: a wrong bit puts samples far from the ramp, a wrong code width does not",
-        "heavy_tailed_noise": "a shifted bias: a bit's errors follow the codes, a noise's the peaks",
-        "rts_noise": "a shifted bias: a bit's errors are in all pixels and follow the codes",
-        "clipping": "a shifted bias: a limit is one code, a bit has a period",
+        "adc_dnl": "a ramp of light: bit errors put samples far from the ramp, DNL does not",
+        "heavy_tailed_noise": "a shifted bias: bit errors are fixed in DN, heavy tails shift with the peaks",
+        "rts_noise": "a shifted bias: bit errors affect all pixels and are fixed in DN",
+        "clipping": "a shifted bias: clipping affects one code, a bit error is periodic in DN",
     }
-    share: Ratio = Field(ge=0, le=1, description="share of the samples in which the bit is wrong, no unit")
-    bit: Count = Field(ge=0, lt=_MOST_BITS, description="which bit, 0 the least significant")
-    fault: Fault = Field(default="zero", description="what it reads then: zero, one, or flip: its opposite")
+    share: Ratio = Field(ge=0, le=1, description="share of the samples with an error, no unit")
+    bit: Count = Field(ge=0, lt=_MOST_BITS, description="the bit, 0 is the least significant")
+    fault: Fault = Field(default="zero", description="value in error: zero, one, or flip (the opposite)")
 
     def faulty(self, codes: AnyArray) -> AnyArray:
         """Return what comes out instead of codes, DN."""

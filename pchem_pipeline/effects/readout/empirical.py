@@ -99,11 +99,11 @@ class Empirical(Effect):
     tag: Literal["empirical"] = Field(default="empirical", description="name of the effect")
     plane: ClassVar[Plane] = Plane.READOUT
     along: ClassVar[int] = 3
-    title: ClassVar[str] = "measured moves of samples, without an explanation"
+    title: ClassVar[str] = "empirical shifts of samples"
     source: ClassVar[str] = "Laird 1978, Lindsay 1983 (mixing laws); Raftery 1985 (mixture transitions)"
     strength: ClassVar[str] = "share"
     empirical: ClassVar[bool] = True
-    share: Ratio = Field(ge=0, le=1, description="share of the samples that are moved, no unit")
+    share: Ratio = Field(ge=0, le=1, description="share of shifted samples, no unit")
     moves: tuple[Move, ...] = Field(min_length=1, max_length=16, description="how; one of them each")
     together: Together = Field(
         default="sample", description="what is moved alike: each sample by itself, a row, a column or a frame"
@@ -209,7 +209,7 @@ class Empirical(Effect):
         order = np.argsort(-shares)[:_MOST_TOLD]
         told = [f"{per_cent(shares[i])} {self.moves[i].describe()}" for i in order]
         how = f" {self.moves[0].describe()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
-        return f"{per_cent(self.share)} of the {what}{place} differ from the model as if they were moved{how}"
+        return f"{per_cent(self.share)} of the {what}{place} are shifted{how}"
 
 
 def _averaged(values: IntArray, chosen: BoolArray) -> IntArray:

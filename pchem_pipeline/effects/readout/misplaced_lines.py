@@ -49,14 +49,13 @@ class MisplacedLines(Effect):
     strength: ClassVar[str] = "share"
     reach_rows = 2  # whether a row changes places with the next depends on the two before
     separate: ClassVar[Mapping[str, str]] = {
-        "repeated_lines": "equality of neighbouring lines: lines that change places differ from each other",
-        "interpixel_capacitance": "a line's samples taken together: a coupling moves all lines a little",
+        "repeated_lines": "neighbouring lines: repeated lines are equal, misplaced ones are not",
+        "interpixel_capacitance": "whole lines: capacitance changes all slightly, misplacement single ones",
     }
     share: Ratio = Field(
         ge=0,
         le=0.5,
-        description="probability that this happens to a line, no unit; of a line lost or delivered twice: "
-        "that it happens in a frame",
+        description="probability per line, no unit; of a line lost or delivered twice: per frame",
     )
     move: Move = Field(
         default="swapped",

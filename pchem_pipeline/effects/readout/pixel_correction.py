@@ -46,16 +46,16 @@ class PixelCorrection(Effect):
     strength: ClassVar[str] = "share"
     reach_rows = 1
     separate: ClassVar[Mapping[str, str]] = {
-        "row_noise": "the camera's corrections switched off; noise of rows makes no sample equal its median",
-        "frame_noise": "the camera's corrections switched off; a frame's noise moves all of its samples",
-        "optical_crosstalk": "the camera's corrections switched off; crosstalk raises neighbours of any size",
-        "clipping": "pixels of different bias: a limit is one code, a correction follows the neighbours",
+        "row_noise": "camera corrections switched off: row noise stays",
+        "frame_noise": "camera corrections switched off: frame noise stays",
+        "optical_crosstalk": "camera corrections switched off: crosstalk stays",
+        "clipping": "pixels of different bias: clipping is at one code, a correction at none",
     }
     threshold_dn: Code = Field(
-        ge=1, le=1 << 20, description="by how much a sample must exceed the prediction, DN"
+        ge=1, le=1 << 20, description="excess over the prediction from which samples are replaced, DN"
     )
     share: Ratio = Field(
-        default=1.0, ge=0, le=1, description="share of those samples that is replaced, no unit"
+        default=1.0, ge=0, le=1, description="share of those samples that are replaced, no unit"
     )
     predictor: Predictor = Field(
         default="median",

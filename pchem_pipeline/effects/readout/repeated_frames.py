@@ -50,18 +50,18 @@ class RepeatedFrames(Effect):
     )
     strength: ClassVar[str] = "probability"
     separate: ClassVar[Mapping[str, str]] = {
-        "analog_memory": "equality of successive frames, sample by sample: memory never makes them equal",
-        "flicker_noise": "equality of successive frames, sample by sample: correlated noise is never equal",
+        "analog_memory": "successive frames: repeated ones are exactly equal, memory leaves differences",
+        "flicker_noise": "successive frames: repeated ones are exactly equal, 1/f noise leaves differences",
     }
     probability: Ratio = Field(
         default=0.0, ge=0, le=0.5, description="probability that a frame repeats the one before, no unit"
     )
     frames: tuple[int, ...] = Field(
-        default=(), max_length=1 << 20, description="numbers of frames that repeat the one before, besides"
+        default=(), max_length=1 << 20, description="numbers of further frames that repeat the one before"
     )
 
     rows: tuple[int, int] | None = Field(
-        default=None, description="first row and the row after the last that are repeated; null: all rows"
+        default=None, description="repeated rows: first and last + 1; null: all"
     )
 
     #: at one frame in a thousand
@@ -71,7 +71,7 @@ class RepeatedFrames(Effect):
     @classmethod
     def _some_rows(cls, rows: tuple[int, int] | None) -> tuple[int, int] | None:
         if rows is not None and not 0 <= rows[0] < rows[1]:
-            raise ValueError(f"repeated_frames: rows {list(rows)} hold none; give [first, after the last]")
+            raise ValueError(f"repeated_frames: rows {list(rows)} hold none; give [first, last + 1]")
         return rows
 
     @field_validator("frames")

@@ -37,9 +37,9 @@ class RepeatedLines(Effect):
     signature: ClassVar[tuple[str, ...]] = ("space.repeated.rows", "space.repeated.columns")
     strength: ClassVar[str] = "share"
     separate: ClassVar[Mapping[str, str]] = {
-        "interpixel_capacitance": "equality of lines, sample by sample: coupling never makes them equal",
-        "repeated_frames": "equality within a frame: there it is the frame before that is repeated",
-        "row_noise": "equality of lines, sample by sample: noise never makes them equal",
+        "interpixel_capacitance": "neighbouring lines: repeated ones are exactly equal, coupled ones not",
+        "repeated_frames": "neighbouring lines of a frame, not successive frames, are equal",
+        "row_noise": "neighbouring lines: repeated ones are exactly equal, noisy ones not",
     }
     share: Ratio = Field(ge=0, le=0.5, description="probability that a line repeats the one before, no unit")
     lines: Literal["rows", "columns"] = Field(default="rows", description="which lines")

@@ -1,7 +1,7 @@
-"""How much of the disagreement a named effect closes: the gap against its floor, and pulls before and after.
+"""The gap between data and model, and the largest pulls, before and after effects were added.
 
-The gap is an estimate of the Kullback-Leibler divergence between the laws of the data's and of the model's
-statistics, per sample; its floor is what chance alone makes of it.
+The gap is an estimate of the Kullback-Leibler divergence per sample; its floor is the 95 % limit of sampling
+noise.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ MICRO = 1e6
 _FAMILY_WORDS = {
     "shape": "shape of the pixels' histograms",
     "code": "single codes",
-    "tail": "samples beyond the PCD",
+    "tail": "samples beyond the range of the PCD",
     "time": "pixels along time",
     "frame": "means of the frames",
     "space": "rows, columns, neighbours",
 }
 
 _GAP_CAPTION = (
-    "Gap before and after on a logarithmic axis, with intervals where they are known, the floor (gray: "
-    "chance alone), and what the second-best effect and a placebo (a wrong effect, fitted in the same "
-    "way) leave. Open triangles at the edge are gaps below the axis. By family: before and after."
+    "Gap before and after with 95 % intervals, the floor (gray: sampling noise), and the remaining gap with "
+    "the next best effect and with an unrelated control instead, fitted in the same way. Open triangles at "
+    "the edge are gaps below the axis. By family of statistics: before and after."
 )
 _PULLS_CAPTION = (
-    "The statistics farthest from chance, before (circles) and after effects were added (diamonds). The gray "
-    "band is two standard deviations; with some hundred statistics the largest lies near 3 by chance."
+    "The largest deviations from the model, before (circles) and after effects were added (diamonds). The "
+    "gray band is 2 sigma; the largest of some hundred statistics is near 3 sigma by sampling noise."
 )
 
 
@@ -76,7 +76,7 @@ def gap_figures(data: DiscrepancyData) -> list[Figure]:
 
 
 def pull_figures(data: DiscrepancyData) -> list[Figure]:
-    """Return the statistics farthest from chance, before and after."""
+    """Return the figure of the largest deviations before and after."""
     rows = largest_pulls(data)
     if not rows:
         return []
@@ -90,9 +90,9 @@ def pull_figures(data: DiscrepancyData) -> list[Figure]:
         Figure(
             "discrepancy_pulls",
             "shown",
-            "The statistics farthest from chance, before and after",
+            "Largest deviations, before and after",
             _PULLS_CAPTION,
-            f"Standard deviations of chance. {_pull_text(rows)}.",
+            f"In sigma. {_pull_text(rows)}.",
             (DataTable(columns, dict.fromkeys(("before", "after"), "standard deviations")),),
             pulls_chart(rows),
             PAGE_MM,
@@ -125,10 +125,9 @@ _GAP_UNIT = "1e-6 nats/sample"
 
 
 def largest_pulls(data: DiscrepancyData) -> list[Pull]:
-    """Return the statistics farthest from chance before and after: of the vectors ``z_before``, ``z_after``.
+    """Return the statistics that deviate most before or after, from the vectors ``z_before``, ``z_after``.
 
-    Beside them those of a part of the sensor or the run, which only the JSON tells; of all it tells where no
-    vectors are kept.
+    Those of a part of the sensor or the run are only in the JSON; without vectors all are from the JSON.
     """
     rows: dict[str, Pull] = {}
     if "z_before" in data.arrays:
@@ -185,7 +184,7 @@ class GapBar:
 
 
 def gap_bars(found: Verdict) -> list[GapBar]:
-    """Return the lines of the figure: the plain model, each with effects, the rivals of the last step."""
+    """Return the rows of the figure: the plain model, each with effects, the rivals of the last step."""
     bars = [_bar("plain model", found.gap.before, found.gap.interval_before, "before")]
     extended = [(step, words) for step in found.steps if (words := found.added(step))]
     for i, (step, words) in enumerate(extended):
@@ -195,9 +194,12 @@ def gap_bars(found: Verdict) -> list[GapBar]:
         lead = "" if words.startswith("nearest") else "with " if i == 0 else "… and "
         bars.append(_bar(f"{lead}{words}", after, interval, "after"))
     for step, _ in extended[-1:]:
-        for rival, role in ((step.runner_up, "runner-up"), (step.placebo, "placebo")):
+        for rival, role, words in (
+            (step.runner_up, "runner-up", "next best"),
+            (step.placebo, "placebo", "control"),
+        ):
             if rival is not None:
-                bars.append(_bar(f"{role}: {rival.effect}", rival.gap_after, (math.nan, math.nan), role))
+                bars.append(_bar(f"{words}: {rival.effect}", rival.gap_after, (math.nan, math.nan), role))
     return [bar for bar in bars if math.isfinite(bar.gap)]
 
 
@@ -228,7 +230,7 @@ _ROLES: dict[str, tuple[str, Shape]] = {
 
 
 def gap_chart(bars: Sequence[GapBar], families: Sequence[tuple[str, float, float]], floor: float) -> Chart:
-    """Return the gap before and after against its floor, with runner-up and placebo, and by family.
+    """Return the gap before and after against its floor, with rivals, and by family.
 
     Args:
         bars: of :func:`gap_bars`, at least one.
@@ -251,7 +253,7 @@ def _limits(
     if not positive:
         return 0.1, 10.0
     top = 10.0 ** math.ceil(math.log10(1.15 * max(positive)))
-    # what lies far below the floor is as good as nothing
+    # gaps far below the floor are equivalent to none
     least = floor / 10.0 if math.isfinite(floor) and floor > 0 else min(positive)
     return min(10.0 ** math.floor(math.log10(least)), top / 100.0), top
 
@@ -313,7 +315,7 @@ def _point(value: float, row: int, left: float, role: str, label: str = "") -> P
 
 
 def pulls_chart(rows: Sequence[Pull]) -> Chart:
-    """Return the largest pulls before and after, in standard deviations of chance.
+    """Return the largest pulls before and after, in sigma.
 
     Args:
         rows: the statistics, the farthest first; ``after`` is NaN where nothing was added.
@@ -331,7 +333,7 @@ def pulls_chart(rows: Sequence[Pull]) -> Chart:
             marks.append(Points(values[role][known], places[known], shape, 4.5, colour=colour, label=words))
     known_values = np.concatenate(list(values.values()))
     reach = max(float(np.nanmax(np.abs(known_values), initial=0.0)), 6.0)
-    x = Axis("standard deviations of chance", -1.4 * reach, 1.4 * reach)
+    x = Axis("deviation (sigma)", -1.4 * reach, 1.4 * reach)
     if reach > 12.0:
         steps = [t for t in (2, 4, 10, 100, 1000, 10_000, 100_000) if t <= 1.3 * reach]
         signed = [*(-t for t in reversed(steps)), 0, *steps]

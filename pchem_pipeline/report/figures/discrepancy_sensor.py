@@ -1,4 +1,4 @@
-"""Where on the sensor a model fails: maps of what each pixel shows, and pictures of rows and columns."""
+"""Disagreement of data and model on the sensor: maps of statistics of each pixel, and of rows and columns."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ _LEAST, _MOST = 4.0, 12.0
 _STANDS_OUT, _MOST_RINGS = 5.0, 60
 
 _MAPS_CAPTION = (
-    "The quantities of the pixels in which a part of the sensor stands out (outlined), then goodness of fit "
-    "and those farthest from chance. Below each map: its histogram (gray), that of the outlined part (red) "
-    "and that of chance (line). A shift of the whole histogram is an effect of all pixels, long tails are "
-    "one of few; these are ringed in the map where they are few."
+    "Statistics of each pixel: those with a deviating region (outlined), then goodness of fit and the most "
+    "deviating ones. Below each map: histogram of all pixels (gray), of the outlined region (red) and under "
+    "the model (line). A shift of the whole histogram is an effect in all pixels, long tails an effect in "
+    "few; these are ringed in the map."
 )
 _LINES_CAPTION = (
     "Left and middle: means of rows and of columns of the first frames. Right: scatter of each row or "
-    "column over all frames; 1 is what independent pixels give. Stripes in the readout are noise common "
-    "to a row or column, slanted lines are periodic pickup."
+    "column over all frames, relative to independent pixels (1). Stripes in the readout are row or column "
+    "noise, slanted lines are periodic pickup."
 )
 
 _SCORE_WORDS = {
@@ -60,27 +60,27 @@ _SCORE_WORDS = {
     "He3": "readout: skew (He3)",
     "He4": "readout: heavy tails (He4)",
     "He2C1": "peaks widen with k (He2C1)",
-    "He1C2": "spacing of the peaks grows (He1C2)",
-    "He2C2": "widening grows with k (He2C2)",
-    "He3C1": "skew grows with k (He3C1)",
+    "He1C2": "peak spacing grows with k (He1C2)",
+    "He2C2": "peak width grows faster at high k (He2C2)",
+    "He3C1": "peak skewness grows with k (He3C1)",
 }
 
 _PAIR_WORDS = {
     f"{axis}.{pair}": f"{words}, along {axis}"
     for axis in ("x", "y")
     for pair, words in (
-        ("kk", "charge: neighbours alike"),
-        ("rr", "readout: neighbours alike"),
-        ("rk", "readout follows the neighbour's charge"),
+        ("kk", "charge: neighbours correlated"),
+        ("rr", "readout: neighbours correlated"),
+        ("rk", "readout rises with the neighbour's charge"),
     )
 }
 
-#: How the means of rows and columns are called, by name of their array.
+#: Rows and columns in words, by name of their array.
 LINE_WORDS = {"row": "rows", "column": "columns"}
 
 
 def sensor_figures(data: DiscrepancyData) -> list[Figure]:
-    """Return the maps of what each pixel shows."""
+    """Return the maps of statistics of each pixel."""
     maps = [each for each in largest_maps(data.arrays, regions_of(data)) if finite(each.z).size]
     if not maps:
         return []
@@ -90,9 +90,9 @@ def sensor_figures(data: DiscrepancyData) -> list[Figure]:
     for each in maps:
         known = finite(each.z)
         words.append(
-            f"{each.title}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} (by chance 0 "
-            f"and 1), {count(each.outliers, 'pixel')} beyond 5"
-            + (f", most in {each.region.describe()}" if each.region is not None else "")
+            f"{each.title}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} "
+            f"(expected 0 and 1), {count(each.outliers, 'pixel')} beyond 5"
+            + (f", mainly in {each.region.describe()}" if each.region is not None else "")
         )
     columns = {each.title: each.z for each in maps}
     table = DataTable(columns, dict.fromkeys(columns, "standard deviations"), origin=origin)
@@ -102,7 +102,7 @@ def sensor_figures(data: DiscrepancyData) -> list[Figure]:
             "where",
             "On the sensor",
             _MAPS_CAPTION,
-            "Maps in standard deviations of chance. " + "; ".join(words).replace("-", "−") + ".",
+            "Maps in sigma. " + "; ".join(words).replace("-", "−") + ".",
             (table,),
             sensor_chart(maps, flagged, origin),
             PAGE_MM,
@@ -123,7 +123,9 @@ def line_figures(data: DiscrepancyData) -> list[Figure]:
             "where",
             "Rows and columns",
             _LINES_CAPTION,
-            "Scatter of the means over the frames, relative to chance (1). " + "; ".join(words) + ".",
+            "Scatter of the means over the frames, relative to independent pixels (1). "
+            + "; ".join(words)
+            + ".",
             tables,
             lines_chart(data.arrays, origin),
             PAGE_MM,
@@ -147,7 +149,7 @@ def line_tables(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int]) -> 
         axis, first = ("y", origin[0]) if line == "row" else ("x", origin[1])
         rms, image = np.asarray(arrays[f"{line}_rms"]), arrays.get(f"{line}_image")
         columns = {axis: first + np.arange(rms.shape[1])}
-        columns |= {f"{each}: rms / rms of chance": row for each, row in zip(CHANNELS, rms, strict=False)}
+        columns |= {f"{each}: rms / expected rms": row for each, row in zip(CHANNELS, rms, strict=False)}
         tables.append(DataTable(columns, {axis: "pixel"}, f"{line}_scatter"))
         if image is not None and image.size:
             means = dict(zip(CHANNELS, image, strict=False))
@@ -167,15 +169,15 @@ def _line_text(line: str, rms: np.ndarray[Any, Any]) -> str:
 
 @dataclass(frozen=True)
 class PixelMap:
-    """One quantity of every pixel in standard deviations of chance, with how far it is from chance.
+    """A statistic of every pixel in sigma, with its overall significance.
 
     Attributes:
-        title: what it is.
+        title: the statistic in words.
         z: map (y, x), NaN where there is no value.
         far: the largest of three departures from N(0, 1), each in its own standard errors: of the mean, of
             the mean square, and of the number of pixels beyond 5.
         outliers: pixels beyond 5.
-        region: part of the sensor where it stands out; None: everywhere alike.
+        region: deviating part of the sensor; None: uniform.
     """
 
     title: str
@@ -198,32 +200,32 @@ def regions_of(data: DiscrepancyData) -> dict[str, Region]:
 def largest_maps(
     arrays: Mapping[str, NDArray[Any]], regions: Mapping[str, Region] | None = None, most: int = 3
 ) -> list[PixelMap]:
-    """Return the maps with a place, then goodness of fit whatever it shows, then those farthest from chance.
+    """Return the maps with a deviating region, then goodness of fit, then the most deviating ones.
 
     Args:
         arrays: group ``discrepancy`` of the store.
-        regions: of maps that stand out in a part of the sensor.
-        most: at most so many.
+        regions: deviating part of the sensor by map.
+        most: largest number of maps.
     """
     regions = regions or {}
     named = _named_maps(arrays)
     maps = {name: _pixel_map(words, values, regions.get(name)) for name, (words, values) in named.items()}
     placed = [maps.pop(name) for name in regions if name in maps]
     first = [maps.pop("goodness")] if "goodness" in maps else []
-    # of neighbours only what has a place: where they all are alike, rows and columns show it better
+    # of neighbours only maps with a region: uniform correlations show better in rows and columns
     others = [each for name, each in maps.items() if np.isfinite(each.far) and name not in PAIRS]
     return (placed + first + sorted(others, key=lambda each: -each.far))[:most]
 
 
 def _named_maps(arrays: Mapping[str, NDArray[Any]]) -> dict[str, tuple[str, NDArray[Any]]]:
-    """Return words and values of all maps, by the names that :mod:`pchem_pipeline.discrepancy.where` has."""
+    """Return title and values of all maps, by the names in :mod:`pchem_pipeline.discrepancy.where`."""
     found: dict[str, tuple[str, NDArray[Any]]] = {}
     if "goodness" in arrays:
         found["goodness"] = ("goodness of fit (large: poor)", arrays["goodness"])
     for name, values in zip(SCORES, arrays.get("score", ()), strict=False):
         found[f"score.{name}"] = (_SCORE_WORDS.get(name, name), values)
     for array, short, words in (
-        ("block_spread", "spread", "block means wander"),
+        ("block_spread", "spread", "block means vary"),
         ("trend", "trend", "block means rise"),
         ("lag1", "lag", "successive frames correlated"),
     ):
@@ -241,7 +243,7 @@ def _pixel_map(words: str, values: NDArray[Any], region: Region | None = None) -
     outliers = int((np.abs(known) > _STANDS_OUT).sum())
     if known.size == 0:
         return PixelMap(words, z, float("nan"), 0, region)
-    # beyond 5, chance puts less than one pixel in a million: each counts fully
+    # fewer than one pixel in a million is beyond 5 sigma by sampling noise: each counts fully
     departures = (
         abs(float(known.mean())) * np.sqrt(n),
         abs(float((np.clip(known, -8, 8) ** 2).mean()) - 1.0) * np.sqrt(n / 2.0),
@@ -253,11 +255,11 @@ def _pixel_map(words: str, values: NDArray[Any], region: Region | None = None) -
 def sensor_chart(
     maps: Sequence[PixelMap], flagged: Sequence[tuple[int, int]] = (), origin: tuple[int, int] = (0, 0)
 ) -> Chart:
-    """Return maps of what each pixel shows, and below their histograms beside that of chance.
+    """Return maps of statistics of each pixel, and below their histograms with that under the model.
 
     Args:
         maps: as :func:`largest_maps` returns them.
-        flagged: pixels (y, x) of the sensor that the verdict points to; they are ringed.
+        flagged: pixels (y, x) of the sensor named in the verdict; they are ringed.
         origin: row and column of the sensor of the maps' first pixel.
     """
     shown = [
@@ -274,7 +276,7 @@ def _map_stack(each: PixelMap, flagged: Sequence[tuple[int, int]], origin: tuple
         limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
     image = Image(
         each.z, even_edges(-limit, limit), *place_of(each.z.shape, origin), scale=DIVERGING,
-        bar=even_bar(-limit, limit), unit="sd of chance",
+        bar=even_bar(-limit, limit), unit="sigma",
     )  # fmt: skip
     inside = _inside(each, origin)
     marks: list[Mark] = []
@@ -371,7 +373,7 @@ def _frames(image: NDArray[Any] | None, line: str, channel: str, first: int) -> 
     marks = (
         Image(
             image.T, even_edges(-_LEAST, _LEAST), across, down, scale=DIVERGING,
-            bar=even_bar(-_LEAST, _LEAST), unit="sd of chance",
+            bar=even_bar(-_LEAST, _LEAST), unit="sigma",
         ),
     )  # fmt: skip
     x = replace(x, low=across[0], high=across[1])
@@ -393,7 +395,7 @@ def _scatter(rms: FloatArray, line: str, first: int) -> Stack:
     marks.append(Level(1.0, colour="ink", width=0.8))
     known = finite(rms) if np.isfinite(rms).any() else np.ones(1)
     bottom, high = min(0.85, float(known.min()) - 0.05), float(known.max())
-    y = Axis("rms / rms of chance", bottom, max(1.25, bottom + _LEGEND_ROOM * (high - bottom)))
+    y = Axis("rms / expected rms", bottom, max(1.25, bottom + _LEGEND_ROOM * (high - bottom)))
     panel = Panel(y, tuple(marks), legend="upper right", columns=2)
     x = Axis(f"{'y' if line == 'row' else 'x'} (pixel)", whole=True)
     return Stack((panel,), x, f"scatter of the {LINE_WORDS[line]}", height_mm=46.0)

@@ -1,4 +1,4 @@
-"""Where along DN and time a model fails: residuals of the codes, and the means of the frames."""
+"""Disagreement of data and model along DN and time: residuals of the codes, and frame means."""
 
 from __future__ import annotations
 
@@ -36,26 +36,25 @@ _LINEAR = 8.0
 #: Number of stretches of the run over which frames are averaged.
 _STRETCHES = 24
 #: Factor and unit in which frames are shown, by what is shown of them, and the label of the axis.
-_SCALES = {"charge": (100.0, "%"), "readout": (1.0, "DN"), "noise": (1.0, "sd of chance")}
+_SCALES = {"charge": (100.0, "%"), "readout": (1.0, "DN"), "noise": (1.0, "sigma")}
 _LABELS = {
     "charge": "charge: exposure (%)",
     "readout": "readout: mean (DN)",
-    "noise": "noise (sd of chance)",
+    "noise": "noise (sigma)",
 }
 _PANEL_MM, _AXIS_MM = 42.0, 12.0
 
 _CODES_CAPTION = (
-    "All usable pixels together. Top: samples at each DN (gray) and those that the fitted PCDs lead to "
-    "expect (black; with what was added: purple). Below: the difference from the plain model in "
-    "standard deviations, even and odd DN in two colours; the gray band is two standard deviations. A "
-    "single tall line is a pile-up, alternating colours are a comb of the ADC, a slow wave is its "
-    "nonlinearity. Yellow: what the verdict points to."
+    "All usable pixels together. Top: samples at each DN (gray) and expectation from the fitted PCDs (black; "
+    "with added effects: purple). Bottom: difference from the plain model in sigma, even and odd DN in two "
+    "colours; the gray band is 2 sigma. A single tall line is saturation or clipping, alternating colours "
+    "are differential nonlinearity of the ADC, a slow wave is integral nonlinearity. Yellow: codes named in "
+    "the verdict."
 )
 _FRAMES_CAPTION = (
-    "Dots: means of the frames over all usable pixels, and how far the squares of their residuals lie above "
-    "those of other frames. Blue: means over stretches of the run; the gray "
-    "band is two standard deviations of these by chance. Dashed: path of the named effects, if it does "
-    "not depend on chance. Yellow: frames that the verdict points to."
+    "Dots: frame means over all usable pixels, and the excess of squared residuals of each frame (noise). "
+    "Blue: means over stretches of the run; the gray band is 2 sigma of their sampling noise. Dashed: time "
+    "course of the named effects, if deterministic. Yellow: frames named in the verdict."
 )
 
 
@@ -75,7 +74,7 @@ def code_figures(data: DiscrepancyData) -> list[Figure]:
         comb = f"{residual[even].mean():+.2f} on even and {residual[~even].mean():+.2f} on odd DN"
     alt = (
         f"Counts from {dn[0]:.0f} to {dn[-1]:.0f} DN and their residuals in standard deviations: root mean "
-        f"square {np.sqrt(np.mean(residual**2)):.2f} (by chance below 1); largest {largest}; mean "
+        f"square {np.sqrt(np.mean(residual**2)):.2f} (expected below 1); largest {largest}; mean "
         f"{comb.replace('-', '−')}."
     )
     return [
@@ -105,12 +104,12 @@ def frame_figures(data: DiscrepancyData) -> list[Figure]:
         (scale, unit), values = _SCALES[channel], frames[channel]
         centre, mean = stretches["frame"], stretches[channel]
         drift = float(np.polyfit(centre, mean, 1)[0] * np.ptp(centre)) if centre.size > 2 else math.nan
-        chance = f" (by chance {short(scale * sd)})" if np.isfinite(sd) else ""
+        chance = f" (expected {short(scale * sd)})" if np.isfinite(sd) else ""
         words.append(
             f"{channel}: standard deviation {short(float(values.std()))} {unit}{chance}, change "
             f"along the run {short(drift)} {unit}"
         )
-    path = "; the path of the named effects is drawn over them" if _model("readout") in frames else ""
+    path = "; the time course of the named effects is drawn over them" if _model("readout") in frames else ""
     return [
         Figure(
             "discrepancy_frames",
@@ -151,7 +150,7 @@ def code_table(arrays: Mapping[str, NDArray[Any]]) -> DataTable:
     return DataTable({name: values[kept] for name, values in columns.items()}, units)
 
 
-_NAMED = "expected with what was added"
+_NAMED = "expected with added effects"
 
 
 def frame_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, DataTable]:
@@ -200,7 +199,7 @@ def codes_chart(table: DataTable, marked: Sequence[Place] = ()) -> Chart:
         Steps(edges, expected, colour="ink", width=0.9, label="expected from the fitted PCDs"),
     ]
     if _NAMED in table:
-        above.append(Steps(edges, table[_NAMED], colour="purple", width=0.9, label="with what was added"))
+        above.append(Steps(edges, table[_NAMED], colour="purple", width=0.9, label="with added effects"))
     highest = max(float(observed.max()), 1.0)
     top = Panel(
         Axis("samples per DN", 0.5, 4.0 * highest, log=True), tuple(above), 1.0, legend="upper right",
@@ -278,7 +277,7 @@ def frames_chart(
     Args:
         frames: of :func:`frame_tables`.
         stretches: likewise.
-        sds: standard deviation of a frame by chance, in the stored unit, by what is shown.
+        sds: sampling noise of a frame mean, in the stored unit, by panel.
         marked: places whose frames are shaded.
     """
     panels = []
@@ -314,7 +313,7 @@ def _channel(
     centre, mean, n = (stretches[name] for name in ("frame", channel, "frames"))
     if np.isfinite(sd):
         half = 2.0 * sd / np.sqrt(n)
-        marks.append(Band(centre, -half, half, colour="edge", alpha=0.18, label="±2 sd of chance"))
+        marks.append(Band(centre, -half, half, colour="edge", alpha=0.18, label="±2 sigma"))
     # no line across frames that are not there
     steps = np.diff(centre)
     apart = np.flatnonzero(steps > 2.0 * np.median(steps)) + 1 if steps.size else np.empty(0, np.int64)

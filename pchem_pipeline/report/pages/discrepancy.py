@@ -1,4 +1,4 @@
-"""The page of a verdict on what the model is missing: verdict first, then its evidence."""
+"""The page of a search for missing effects: verdict first, then its evidence."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pchem_pipeline.discrepancy.verdict import (
     Step,
     Verdict,
     families_words,
+    sigma_text,
 )
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.report.data import DiscrepancyData
@@ -32,16 +33,15 @@ from pchem_pipeline.report.style.wording import (
     fitted_or_chosen,
     percent,
     short,
-    signed,
     typeset,
     unit_text,
 )
 
 #: File of the verdict's own page in the folder of a run.
 DISCREPANCY_PAGE = "discrepancy.html"
-#: Parameters that moved by less than this share of a pixel's standard error did not matter.
+#: Changes below this share of the standard error per pixel are negligible.
 _IMMATERIAL = 0.2
-#: And by less than this did not move.
+#: Changes below this are none.
 _NOT_MOVED = 0.01
 
 #: Verdict to its level and its name.
@@ -59,43 +59,42 @@ VERDICT_WORDS: dict[str, tuple[Level, str]] = {
 PARTS: tuple[tuple[str, str, str], ...] = (
     (
         "signature",
-        "What shows most, before and after",
-        "The statistic that the added effect moves most (where nothing was added, the largest disagreement), "
-        "and each statistic before and after, in standard deviations of chance.",
+        "Largest disagreement, before and after",
+        "The statistic that the added effect changes most (else the largest disagreement), and all "
+        "statistics before and after, in sigma.",
     ),
     (
         "where",
         "Where data and model disagree",
-        "Effects of light and charge show in the charge channel, those of the electronics in the readout "
-        "residuals. Pictures are of the frames to find with, numbers of these and those to confirm with.",
+        "Effects of light and charge show in the charge channel, effects of the electronics in the readout "
+        "residuals. Figures show the training frames, numbers training and test frames.",
     ),
     (
         "evidence",
-        "Which effect it is",
-        "Each candidate is fitted, and scored on frames that its strength was not fitted to: differences of "
-        "log-probability, larger is better. A difference below three standard errors decides nothing.",
+        "Identification of the effect",
+        "Log-likelihood of each fitted candidate on test frames, relative to the best; larger is better. A "
+        "difference below three standard errors is not decisive.",
     ),
     (
         "shown",
-        "How much of the gap is closed",
-        "The gap on frames that no fit has seen, in micronats.",
+        "Remaining gap between data and model",
+        "Gap on held-out frames, micronats per sample.",
     ),
     (
         "parameters",
-        "The effect, and what it changes",
+        "Parameters of the effect, and changes of the maps",
         "",
     ),
     (
         "limits",
-        "What these data cannot tell",
-        "Effects that frames of one constant exposure cannot show, whatever their number, and what was not "
-        "examined.",
+        "Limits of these data",
+        "Effects that no number of frames of one constant exposure can show, and the samples examined.",
     ),
 )
 
 _EMPTY = {
-    "where": "Nothing was kept to draw.",
-    "evidence": "No candidate was asked for: nothing disagrees beyond chance.",
+    "where": "No data were kept for figures.",
+    "evidence": "No candidates were compared: data and model agree within sampling noise.",
     "shown": "No gap was measured.",
     "parameters": "Nothing was added to the model.",
     "limits": "Nothing was recorded.",
@@ -113,7 +112,7 @@ class KeyFact:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the page: figures and tables under a heading; ``empty`` says why there are none."""
+    """A part of the page: figures and tables under a heading, or the reason ``empty`` of their absence."""
 
     id: str
     title: str
@@ -125,15 +124,15 @@ class Part:
 
 @dataclass(frozen=True)
 class DiscrepancyView:
-    """All that the templates show.
+    """Content of the templates.
 
     Attributes:
-        level: how grave it is (a class of the style sheet).
-        name: the verdict's name.
+        level: severity (a class of the style sheet).
+        name: name of the verdict.
         sentence: the verdict in one sentence.
-        frames: which samples it rests on.
+        frames: samples examined.
         facts: the key numbers.
-        remarks: what speaks for and against it.
+        remarks: evidence for and against it.
         parts: figures and tables.
     """
 
@@ -168,7 +167,7 @@ def discrepancy_view(data: DiscrepancyData, pictures: Sequence[Picture]) -> Disc
         )
         rows = tables.get(id_, [])
         if id_ == "signature" and not shown:
-            continue  # nothing disagrees, or nothing was kept to draw
+            continue  # no disagreement, or no data for figures
         if id_ == "where" and not data.found.where:
             title = "Data and model side by side"
         empty = "" if shown or rows else _empty(data.found, id_)
@@ -180,9 +179,9 @@ def discrepancy_view(data: DiscrepancyData, pictures: Sequence[Picture]) -> Disc
 
 
 def _empty(found: Verdict, part: str) -> str:
-    """Return why a part of the page has nothing to show."""
+    """Return why a part of the page is empty."""
     if part == "evidence" and any(step.verdict == "described" for step in found.steps):
-        return "No known effect explains what disagrees. It was measured instead, and has no rivals."
+        return "No known effect explains the disagreement; the empirical description has no rivals."
     return _EMPTY[part]
 
 
@@ -197,7 +196,7 @@ _PICTURES = (
 
 
 def _signature(found: Verdict) -> tuple[str, ...]:
-    """Return the figures that come first: of the statistic that matters most, and all before and after."""
+    """Return the first figures: that of the most important statistic, and all before and after."""
     pulls = [pull for step in found.steps[:1] for pull in step.pulls]
     statistic = pulls[0].statistic if pulls else next((place.statistic for place in found.where), "")
     if not statistic:
@@ -206,30 +205,28 @@ def _signature(found: Verdict) -> tuple[str, ...]:
 
 
 def frames_text(found: Verdict) -> str:
-    """Return which samples the verdict rests on."""
+    """Describe the samples examined."""
     seen = found.examined
-    dealt = f"{seen.train:,} to find with, {seen.test:,} to confirm with, {seen.final:,} only for the gap"
+    dealt = f"{seen.train:,} for training, {seen.test:,} for testing, {seen.final:,} for the gap"
     if seen.histograms is not None:
-        return f"{count(seen.histograms, 'histogram')}; their samples were dealt at random: {dealt}."
+        return f"{count(seen.histograms, 'histogram')}, samples split at random: {dealt}."
     share = f" ({percent(seen.share, 1.0)} of the run's samples)" if math.isfinite(seen.share) else ""
     place = f"rows {seen.rows[0]} to {seen.rows[1] - 1}, columns {seen.columns[0]} to {seen.columns[1] - 1}"
     rest = seen.frames - seen.train - seen.test - seen.final
-    over = f"; a rest of {count(rest, 'frame')}, too few to be dealt as well, is left out" if rest > 0 else ""
-    words = f"{count(seen.frames, 'frame')} of {place}{share}: {dealt} that is left{over}."
-    again = "" if seen.elsewhere is None else f" The model that was found was {seen.elsewhere.says()}."
+    over = f"; {rest} left over" if rest > 0 else ""
+    words = f"{count(seen.frames, 'frame')} of {place}{share}: {dealt}{over}."
+    again = "" if seen.elsewhere is None else f" The final model was {seen.elsewhere.says()}."
     return words + again + _unfitted_text(found)
 
 
 def _unfitted_text(found: Verdict) -> str:
-    """Return how many pixels are not compared, and where they come together; empty where none is left out."""
+    """State how many pixels are not compared, and where they cluster; empty if none."""
     seen = found.examined
     if not seen.unfitted:
         return ""
     spot = next((place for place in seen.places if place.map == "unfitted"), None)
-    where = (
-        "" if spot is None else f"; far more of them than chance puts there lie in {_words_of(spot.region)}"
-    )
-    return f" Not compared: {count(seen.unfitted, 'pixel')} without a fit to be relied upon{where}."
+    where = "" if spot is None else f", clustered in {_words_of(spot.region)}"
+    return f" Not compared: {count(seen.unfitted, 'pixel')} without a reliable fit{where}."
 
 
 def _words_of(region: dict[str, Any]) -> str:
@@ -237,7 +234,7 @@ def _words_of(region: dict[str, Any]) -> str:
 
 
 def verdict_level(found: Verdict) -> tuple[Level, str]:
-    """Return how grave a verdict is, and its name."""
+    """Return severity and name of a verdict."""
     return VERDICT_WORDS.get(found.verdict, ("note", found.verdict.capitalize()))
 
 
@@ -248,18 +245,17 @@ def key_facts(data: DiscrepancyData) -> list[KeyFact]:
 
 
 def _gap_fact(found: Verdict) -> list[KeyFact]:
-    """Return how much of the distance between data and model is closed; the distance itself stands below."""
+    """Return the closed share of the gap, with the gap below it."""
     gap = found.gap
     if not math.isfinite(gap.before):
         return []
     extended = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
     nats = f"{gap_text(gap.before)} → {gap_text(gap.after)}" if extended else gap_text(gap.before)
-    unit, chance = "micronats per sample", f"chance alone: up to {gap_text(gap.floor)}"
+    unit, chance = "micronats per sample", f"sampling noise: up to {gap_text(gap.floor)}"
     if not extended or gap.within_chance:
-        closed = ", so no share counts as closed" if extended else ""
-        return [KeyFact("distance of data and model", nats, (unit, chance + closed))]
+        return [KeyFact("gap between data and model", nats, (unit, chance))]
     more = (f"{nats} {unit}", chance + _interval(gap))
-    nearest = " by what is most like it, not named" if found.verdict == "unexplained" else ""
+    nearest = " by the closest effect, not named" if found.verdict == "unexplained" else ""
     return [KeyFact(f"of the gap closed{nearest}", percent(gap.closed_fraction, 1.0), more)]
 
 
@@ -267,9 +263,7 @@ def _interval(gap: GapChange) -> str:
     low, high = gap.interval_after
     if not (math.isfinite(low) and math.isfinite(high)):
         return ""
-    return (
-        f"; left: {gap_text(low)} to {gap_text(high)}" if low > 0.0 else f"; left: at most {gap_text(high)}"
-    )
+    return f"; remaining: {f'{gap_text(low)} to ' if low > 0.0 else 'at most '}{gap_text(high)}"
 
 
 def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
@@ -289,10 +283,10 @@ def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
 
 
 def _size_texts(step: Step, values: Sequence[str]) -> tuple[str, tuple[str, ...]]:
-    """Return the size of an effect, and the lines below it; its parameters where no size is known."""
+    """Format the size of an effect, and the lines below it; its parameters if the size is unknown."""
     size = step.size
     if size is None:
-        # the value stands in one line, which a name before it would make too long
+        # name and value do not fit in one line
         name, _, value = values[0].partition(" ")
         return value, (name, *values[1:3])
     part = "" if size.samples >= RARE else f", in {percent(size.samples, 1.0)} of the samples"
@@ -306,12 +300,12 @@ def _moved_fact(found: Verdict) -> list[KeyFact]:
         return []
     name, largest = moved
     unit = unit_text(largest.unit)
-    small = ", immaterial" if abs(largest.in_stderr) < _IMMATERIAL else ""
+    small = ", negligible" if abs(largest.in_stderr) < _IMMATERIAL else ""
     return [
         KeyFact(
-            f"largest move: {parameter_name(name)}",
-            f"{_signed(largest.median)} {unit}".strip(),
-            (f"{_signed(largest.in_stderr, 2)} standard errors of a pixel{small}",),
+            f"largest change: {parameter_name(name)}",
+            f"{_signed(largest.median, 2)} {unit}".strip(),
+            (f"{_signed(largest.in_stderr, 2)} standard errors per pixel{small}",),
         )
     ]
 
@@ -328,19 +322,19 @@ def _signed(value: float, digits: int = 3) -> str:
 def _chance_fact(found: Verdict) -> list[KeyFact]:
     if not math.isfinite(found.p_global.before):
         return []
-    more = [f"of a disagreement this large, from {found.replicates} replicates"] if found.replicates else []
+    more = [f"of the largest disagreement, {found.replicates} replicates"] if found.replicates else []
     before, after = probability_text(found.p_global.before), probability_text(found.p_global.after)
     value = f"{before} → {after}" if after and found.effects else before
-    return [KeyFact("probability by chance", value, tuple(more))]
+    return [KeyFact("p-value", value, tuple(more))]
 
 
 def remarks(data: DiscrepancyData) -> list[Flag]:
-    """Return what speaks for and against the verdict beside its sentence, the gravest first."""
+    """Return evidence for and against the verdict, the most severe first."""
     found = data.found
     flags: list[Flag] = []
     extended = [step for step in found.steps if step.effect]
     if found.doubt:
-        words = "What rests on the parameters of the pixels was not tested, and no size is given in e⁻"
+        words = "Statistics that depend on the pixels' parameters were not tested, and sizes have no e⁻"
         why = "" if found.doubt in found.sentence else f": {typeset(found.doubt)}"
         flags.append(Flag("caution", f"{words}{why}."))
     if extended:
@@ -348,71 +342,70 @@ def remarks(data: DiscrepancyData) -> list[Flag]:
         flags += [flag for step in extended for flag in _compared(step, data)]
     for step in found.steps:
         for rival, measurement in step.separate.items() if step.verdict == "ambiguous" else ():
-            flags.append(Flag("note", f"To tell {data.title(rival)} apart: {measurement}."))
+            flags.append(Flag("note", f"To distinguish {data.title(rival)}: {measurement}."))
     if found.unexplained:
         most = found.unexplained[0]
         words = most.sentence or most.statistic
-        flags.append(Flag("caution", f"What is left shows most in: {words} ({signed(most.z)} sd)."))
+        flags.append(Flag("caution", f"Largest remaining disagreement: {words} ({sigma_text(most.z)})."))
     flags += [
-        Flag("serious", f"A defect: the candidate {name} failed and was not compared: {why}.")
+        Flag("serious", f"Defect: candidate {name} failed and was not compared: {why}.")
         for name, why in found.defects.items()
     ]
     if found.untestable:
         flags.append(
-            Flag("note", f"Cannot be tested by these data: {', '.join(map(data.title, found.untestable))}.")
+            Flag("note", f"Not testable with these data: {', '.join(map(data.title, found.untestable))}.")
         )
     order = ("serious", "caution", "note", "good")
     return sorted(flags, key=lambda flag: order.index(flag.level))
 
 
 def _closing(found: Verdict) -> list[Flag]:
-    """Say whether the gap is at its floor."""
+    """State the remaining gap."""
     gap, flags = found.gap, []
     level: Level
     if math.isfinite(gap.after) and math.isfinite(gap.floor):
         if gap.within_chance:
-            words = (
-                "The gap is at its floor without the effect, too: single statistics show it, not their sum."
-            )
+            words = "The gap is within sampling noise before, too: only single statistics show it."
             flags.append(Flag("note", words))
         elif gap.after <= gap.floor and gap.standing_out:
-            words = f"In {families_words(gap.standing_out)} more of the gap is left than chance alone makes."
+            words = f"A significant discrepancy remains in {families_words(gap.standing_out)}."
             flags.append(Flag("caution", words))
         elif gap.after <= gap.floor:
-            flags.append(Flag("good", "The gap that is left is at its floor: chance alone makes as much."))
+            flags.append(Flag("good", "The remaining gap is within sampling noise."))
         else:
             left = percent(1.0 - gap.closed_fraction, 1.0)
-            words = f"{gap_text(gap.after)} against {gap_text(gap.floor)} micronats per sample"
+            words = f"{gap_text(gap.after)} micronats per sample, sampling noise up to {gap_text(gap.floor)}"
             level = "caution" if found.verdict == "named_in_part" else "note"
-            flags.append(Flag(level, f"{left} of the gap is left, more than chance alone makes: {words}."))
+            flags.append(Flag(level, f"{left} of the gap remains: {words}."))
     return flags
 
 
 def _short(data: DiscrepancyData, tag: str) -> str:
-    """Return the name of an effect without its other names."""
+    """Return the title of an effect without its synonyms."""
     return data.title(tag).partition(" (")[0]
 
 
 def _compared(step: Step, data: DiscrepancyData) -> list[Flag]:
-    """Say what the runner-up and the placebo of a step close in the place of the named effect."""
+    """State the share of the gap that the next best effect and an unrelated control close instead."""
     own, flags = step.closed, []
     name, runner_up, placebo = _short(data, step.effect or ""), step.runner_up, step.placebo
-    if step.within_chance:  # shares of what chance makes tell nothing
+    if step.within_chance:  # reductions of sampling noise mean nothing
         if runner_up is None or not runner_up.why:
             return []
-        return [Flag("note", f"Not the runner-up, {_short(data, runner_up.effect)}: {runner_up.why}.")]
+        rival = f"The next best effect, {_short(data, runner_up.effect)}"
+        return [Flag("note", f"{rival}, is rejected, since {runner_up.why}.")]
     if not own > 0.0:
         return []
     if runner_up is not None:
         share = percent(step.closed_by(runner_up), 1.0)
-        why = f": {runner_up.why}" if runner_up.why else ""
-        rival = f"In the place of {name} the runner-up, {_short(data, runner_up.effect)}"
-        flags.append(Flag("note", f"{rival}, would close {share} of the gap{why}."))
+        why = f" and is rejected, since {runner_up.why}" if runner_up.why else ""
+        rival = f"Instead of {name}, {_short(data, runner_up.effect)} (next best effect)"
+        flags.append(Flag("note", f"{rival} closes {share} of the gap{why}."))
     if placebo is None:
-        return [*flags, Flag("good", f"No effect unrelated to {name} closes any of the gap in its place.")]
+        return [*flags, Flag("good", f"No unrelated control instead of {name} closes any of the gap.")]
     of_that = min(step.closed_by(placebo) / own, 1.0)
     doubtful = of_that > CONVINCING_PLACEBO
-    end = ": take the name with caution" if doubtful else ""
-    text = f"A placebo in the place of {name} ({_short(data, placebo.effect)}, unrelated to it) closes"
-    words = f"{text} {percent(of_that, 1.0)} of what it closes{end}."
+    end = f": {name} is doubtful" if doubtful else ""
+    text = f"An unrelated control ({_short(data, placebo.effect)}) reduces the gap"
+    words = f"{text} {percent(of_that, 1.0)} as much as {name}{end}."
     return [*flags, Flag("caution" if doubtful else "good", words)]

@@ -1,4 +1,4 @@
-"""The tables of a verdict's page: where data and model disagree, candidates, gaps, parameters, limits."""
+"""The tables of a verdict's page: disagreements, candidates, gaps, parameters, limits."""
 
 from __future__ import annotations
 
@@ -28,34 +28,34 @@ from pchem_pipeline.report.style.wording import (
 
 #: Longer lists are in ``discrepancy.json`` only.
 _MOST_PLACES, _MOST_CANDIDATES = 12, 8
-#: What the maps of the survey show.
+#: Maps of the survey in words.
 _SURVEYED = {
-    "next_x": "neighbours in a row alike",
-    "next_y": "neighbours in a column alike",
-    "lag": "successive frames alike",
+    "next_x": "neighbours in a row correlated",
+    "next_y": "neighbours in a column correlated",
+    "lag": "successive frames correlated",
     "spread": "levels change along the run",
-    "unfitted": "pixels without a fit to be relied upon come together",
+    "unfitted": "clustered pixels without a reliable fit",
 }
 
 
 def probability_text(p: float) -> str:
-    """Return a probability as people write it."""
+    """Format a p-value."""
     if not math.isfinite(p):
         return ""
     return "< 0.001" if p < 0.001 else "> 0.999" if p > 0.999 else f"{p:.3f}"
 
 
 def parameter_texts(candidate: Candidate) -> list[tuple[str, str]]:
-    """Return the fields of a candidate as text, numbers to four digits."""
+    """Format the given fields of a candidate, numbers to three digits."""
     return [
-        (name, f"{value:.4g}" if isinstance(value, int | float) else str(value or ""))
+        (name, f"{value:.3g}" if isinstance(value, int | float) else str(value))
         for name, value in candidate.parameters.items()
-        if not isinstance(value, list | dict)
+        if value is not None and not isinstance(value, list | dict)
     ]
 
 
 def parameter_name(name: str) -> str:
-    """Return what a map is called, for people."""
+    """Return the name of a map in words."""
     try:
         return symbol(name)[1]
     except KeyError:
@@ -80,7 +80,7 @@ def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
 
 
 def place_text(place: Place) -> str:
-    """Return where a statistic points to: pixels, DN, frames; empty for the whole sensor and run."""
+    """Describe the pixels, DN and frames of a disagreement; empty for the whole sensor and run."""
     words = [place.spot()] if place.spot() else []
     if place.pixels:
         shown = ", ".join(f"({y}, {x})" for y, x in place.pixels[:4])
@@ -116,9 +116,8 @@ def _where(data: DiscrepancyData, places: Sequence[Place]) -> Table:
     return Table(
         "discrepancy-where",
         "Statistics that disagree",
-        "How far each lies from what the plain model gives, in standard deviations of chance, with its "
-        f"probability, the farthest first.{more}",
-        ("what it says", "channel", "standard deviations", "p", "where", "statistic"),
+        f"Deviation of each from the plain model in sigma, with its p-value; the largest first.{more}",
+        ("disagreement", "channel", "sigma", "p", "where", "statistic"),
         rows,
     )
 
@@ -130,7 +129,7 @@ def _sentence(data: DiscrepancyData, statistic: str) -> str:
 def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
     rows = []
     best = max((c.score for c in step.candidates if math.isfinite(c.score)), default=math.nan)
-    # what is measured competes with nothing
+    # an empirical description has no competitors
     for candidate in step.candidates[: 0 if step.verdict == "described" else _MOST_CANDIDATES]:
         behind = candidate.score - best
         rows.append(
@@ -139,7 +138,7 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
                 data.titles.get(candidate.effect, ""),
                 measured(candidate.score, candidate.stderr),
                 short(behind) if math.isfinite(behind) and behind < 0 else "best" if behind == 0 else "",
-                probability_text(candidate.probability) if len(step.candidates) > 1 else "no other one",
+                probability_text(candidate.probability) if len(step.candidates) > 1 else "only candidate",
                 ", ".join(f"{name} {value}" for name, value in parameter_texts(candidate)),
             )
         )
@@ -147,16 +146,16 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
         outcome = f"{step.effect} was named"
     elif data.found.verdict == "ambiguous":
         several = len(step.candidates) > 1
-        outcome = "these data cannot tell them apart" if several else "the final samples do not confirm it"
+        outcome = "these data do not decide" if several else "not confirmed by the final samples"
     else:
-        outcome = "none of them explains it"
+        outcome = "none explains the data"
     title = f"Candidates, step {index + 1}" if len(data.found.steps) > 1 else "Candidates"
     return Table(
         f"discrepancy-candidates-{index + 1}",
         f"{title}: {outcome}",
-        "Held-out score with its standard error (nats, larger is better), how far behind the best one, and "
-        "the share of the probability among the candidates.",
-        ("effect", "in the literature", "score", "behind", "probability", "parameters"),
+        "Held-out log-likelihood and its standard error, difference to the best (nats, larger is better) and "
+        "posterior probability.",
+        ("effect", "name", "log-likelihood", "difference", "probability", "parameters"),
         tuple(rows),
     )
 
@@ -168,7 +167,7 @@ def _rivals(data: DiscrepancyData) -> Table:
             data.titles.get(rival.effect, ""),
             step.effect,
             short(-rival.behind) if math.isfinite(rival.behind) else "not scored",
-            rival.why or "its lower score",
+            rival.why or "it has a lower log-likelihood",
         )
         for step in data.found.steps
         if step.effect
@@ -176,10 +175,10 @@ def _rivals(data: DiscrepancyData) -> Table:
     )
     return Table(
         "discrepancy-rivals",
-        "Why not another effect",
-        "The next best effects, each fitted in the place of the named one: nats of held-out log-probability "
-        "that it lies behind, and what speaks against it.",
-        ("effect", "in the literature", "in the place of", "behind", "what speaks against it"),
+        "Rejected effects",
+        "The next best effects, each fitted instead of the named one: difference of the held-out "
+        "log-likelihood, nats, and reason of the rejection.",
+        ("effect", "name", "instead of", "log-likelihood lower by", "reason"),
         rows,
     )
 
@@ -188,9 +187,9 @@ def _separate(steps: Sequence[Step]) -> Table:
     rows = tuple(dict.fromkeys((rival, text) for step in steps for rival, text in step.separate.items()))
     return Table(
         "discrepancy-separate",
-        "What would tell them apart",
-        "Measurements that separate the effects named here from those that they are confused with.",
-        ("effect", "measurement"),
+        "Measurements that decide",
+        "What distinguishes the effects above from similar ones.",
+        ("similar effect", "measurement: difference"),
         rows,
     )
 
@@ -200,7 +199,7 @@ def _gaps(found: Verdict) -> Table:
     for i, step in enumerate(found.steps):
         low, high = step.gap_interval_after
         interval = f" ({gap_text(low)} to {gap_text(high)})" if math.isfinite(low) else ""
-        none = "none closes any" if step.effect else "not fitted"
+        none = "none reduces it" if step.effect else "not fitted"
         rivals = [
             f"{gap_text(rival.gap_after)} ({rival.effect})" if rival is not None else none
             for rival in (step.runner_up, step.placebo)
@@ -217,24 +216,24 @@ def _gaps(found: Verdict) -> Table:
     return Table(
         "discrepancy-gap",
         "Gap by step",
-        "In micronats per sample on frames that no fit has seen, with its interval; runner-up and placebo "
-        "were fitted in the place of the named effect.",
-        ("step", "before", "after", "floor", "runner-up instead", "placebo instead"),
+        "Gap on held-out frames, micronats per sample, with 95 % interval. The next best effect and the "
+        "unrelated control were fitted instead of the named effect.",
+        ("step", "before", "after", "floor", "next best effect instead", "unrelated control instead"),
         tuple(rows),
     )
 
 
 def _how(step: Step, found: Verdict) -> str:
-    """Return in which way an effect is known that was not named: measured, or but the likeliest."""
+    """Return the status of an effect that was not named: empirical, or only the likeliest."""
     if step.effect:
         return ""
     if step.verdict != "described":
         return " (the likeliest)"
-    return " (measured)" if found.part_of_model(step) else " (measured, not in the model)"
+    return " (empirical)" if found.part_of_model(step) else " (empirical, not in the model)"
 
 
 def _beside(step: Step, found: Verdict) -> str:
-    """Return what stands beside the title of an effect: where it acts, and how it is known."""
+    """Return region and status of an effect, for its title."""
     return f"{f', in {step.place}' if step.place else ''}{_how(step, found)}"
 
 
@@ -249,15 +248,15 @@ def _parameters(data: DiscrepancyData) -> Table:
     return Table(
         "discrepancy-parameters",
         "Parameters of the effects",
-        "The strength with its standard error, and the numbers and words that set its form, which were "
-        "chosen and have none. They are the keys of model.effects in the run's YAML.",
+        "The strength with its standard error, and fixed parameters without one; names are keys of "
+        "model.effects in the run's YAML.",
         ("parameter", "value", "effect", "source"),
         rows,
     )
 
 
 def _values(step: Step) -> dict[str, str]:
-    """Return the numbers and words of an effect, as text."""
+    """Format the parameters and text fields of an effect."""
     numbers = {n: fitted_or_chosen(p.value, p.stderr, unit_text(p.unit)) for n, p in step.parameters.items()}
     return numbers | step.form
 
@@ -271,16 +270,16 @@ def _moved(found: Verdict) -> Table:
                 (
                     f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
                     f"{step.likeliest}{_how(step, found)}",
-                    short(each.median) if math.isfinite(each.median) else "not known",
+                    short(each.median, 2) if math.isfinite(each.median) else "not known",
                     signed(each.in_stderr),
                 )
             )
     return Table(
         "discrepancy-moved",
-        "How the delivered parameters moved",
-        "Median of (with the effect − without it) over the pixels of its place, also in standard errors of a "
-        "pixel. An effect that fewer than half of these have, a few at random, moves no median.",
-        ("parameter", "effect added", "moved by", "in standard errors"),
+        "Changes of the parameter maps",
+        "Median over the pixels concerned of (with the effect − without it), also in standard errors per "
+        "pixel. An effect in fewer than half of them does not change a median.",
+        ("parameter", "effect added", "change", "in standard errors"),
         tuple(rows),
     )
 
@@ -289,9 +288,9 @@ def _untestable(data: DiscrepancyData) -> Table:
     rows = tuple((tag, data.title(tag), why or "") for tag, why in data.found.untestable.items())
     return Table(
         "discrepancy-untestable",
-        "Not tested by these data",
-        "They may be there or not: nothing in these frames depends on it.",
-        ("effect", "in the literature", "why, and what would show it"),
+        "Effects that are not testable with these data",
+        "",
+        ("effect", "name", "reason, and data that would show it"),
         rows,
     )
 
@@ -303,9 +302,9 @@ def _unexplained(places: Sequence[Place]) -> Table:
     )
     return Table(
         "discrepancy-unexplained",
-        "Left unexplained",
-        "What remains of the disagreement after all that was named.",
-        ("what it says", "standard deviations", "where", "statistic"),
+        "Unexplained",
+        "Remaining disagreements with all named effects in the model.",
+        ("disagreement", "sigma", "where", "statistic"),
         rows,
     )
 
@@ -314,21 +313,21 @@ def _defects(found: Verdict) -> Table:
     return Table(
         "discrepancy-defects",
         "Defects",
-        "Candidates that failed and were not compared: the verdict says nothing of them.",
+        "Candidates that failed and were not compared; the verdict does not cover them.",
         ("effect", "error"),
         tuple(found.defects.items()),
     )
 
 
 def _surveyed(name: str, data: DiscrepancyData) -> str:
-    """Return in words what stands out of a map of the whole sensor."""
+    """Describe a deviating map of the whole sensor."""
     kind, _, rest = name.partition(".")
     if kind == "pairs":
         mode, _, channel = rest.partition(".")
-        return f"pixels of a {mode} move together ({'charge' if channel == 'charge' else 'readout'})"
+        return f"pixels of a {mode} correlated ({'charge' if channel == 'charge' else 'readout'})"
     if kind in ("score", "goodness"):
         _, sentence = data.statistics.get(f"shape.{rest or kind}.mean", ("", name))
-        return sentence.removesuffix(", in the mean of the pixels")
+        return sentence.removesuffix(" (mean over pixels)")
     return _SURVEYED.get(name, name)
 
 
@@ -336,9 +335,9 @@ def _examined(data: DiscrepancyData) -> Table:
     found, rows = data.found, []
     for key, words in (
         ("frames", "frames"),
-        ("train", "frames to find and fit with"),
-        ("test", "frames to confirm and score with"),
-        ("final", "frames kept for the last gap"),
+        ("train", "training frames"),
+        ("test", "test frames"),
+        ("final", "frames for the final gap"),
         ("rows", "rows"),
         ("columns", "columns"),
     ):
@@ -347,7 +346,7 @@ def _examined(data: DiscrepancyData) -> Table:
     examined = found.examined
     if math.isfinite(examined.share):
         rows.append(("share of the run's samples", percent(examined.share, 1.0)))
-        rows.append(("share that was looked at for places", percent(examined.surveyed, 1.0)))
+        rows.append(("share surveyed for deviating regions", percent(examined.surveyed, 1.0)))
         rows += [(f"share: {kind}", percent(share, 1.0)) for kind, share in examined.surveyed_by.items()]
     for place in examined.places:
         words = Region.model_validate(place.region).describe()
@@ -356,10 +355,10 @@ def _examined(data: DiscrepancyData) -> Table:
         )
     if examined.elsewhere is not None:
         there = examined.elsewhere
-        rows.append(("looked at again", f"{there.words()}: {there.deviates or 'the model holds there'}"))
+        rows.append(("tested again", f"{there.words()}: {there.deviates or 'the model holds'}"))
     if found.replicates:
         rows.append(("simulated replicates", f"{found.replicates:,}"))
     if math.isfinite(found.work):
-        rows.append(("work of the search, CPU s of a core of about 2020", f"{found.work:,.0f}"))
+        rows.append(("counted work of the search, CPU s of a core of about 2020", f"{found.work:,.0f}"))
     rows += [(f"version: {name}", str(version)) for name, version in found.versions.items()]
-    return Table("discrepancy-examined", "What was examined", "", ("item", "value"), tuple(rows))
+    return Table("discrepancy-examined", "Samples examined", "", ("item", "value"), tuple(rows))

@@ -66,14 +66,13 @@ def _quick_look(data: ReportData) -> Table:
         )
         for check in look.checks
     )
-    missing = "".join(f" Not looked at: {part} ({why})." for part, why in look.missing.items())
+    missing = "".join(f" Not tested: {part} ({why})." for part, why in look.missing.items())
     return Table(
         "quick-look",
         "Quick look",
-        "Samples that follow the model are independent from pixel to pixel and from frame to frame. From "
-        "sums that every run keeps this is tested for all pixels; the probability is that of as much by "
-        f"chance anywhere in this table.{missing}",
-        ("what was looked for", "found", "size", "would be found from", "by chance", "where"),
+        "Under the model, samples of different pixels and frames are independent. This is tested for all "
+        f"pixels from sums that every run keeps; p-values are corrected for the number of checks.{missing}",
+        ("check", "found", "size", "detection limit", "p-value", "where"),
         rows,
         "discrepancy",
     )

@@ -1,4 +1,4 @@
-"""The verdict of a discrepancy search as the terminal shows it: a dozen plain lines."""
+"""The verdict of a search for missing effects as text for the terminal: about a dozen lines."""
 
 from __future__ import annotations
 
@@ -9,7 +9,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pchem_pipeline.discrepancy.verdict import Place, Rival, Step, Verdict, micronats
+from pchem_pipeline.discrepancy.verdict import (
+    Place,
+    Rival,
+    Step,
+    Verdict,
+    micronats,
+    share_text,
+    sigma_text,
+)
 from pchem_pipeline.model.histogram.odd_frames import frame_words
 from pchem_pipeline.report.style.wording import fitted_or_chosen
 
@@ -17,15 +25,15 @@ _WIDTH = 100
 #: Longer lists end with a count.
 _MOST_PLACES, _MOST_CANDIDATES, _MOST_LEFT = 3, 5, 4
 _LEAD = "where: "
-_DEFECT = "DEFECT: the candidate {} failed and was not compared: {}"
+_DEFECT = "DEFECT: candidate {} failed and was not compared: {}"
 _PLAIN = str.maketrans({"−": "-", "→": "->", "⁻": "-", "±": "+-", "…": "...", "\u00a0": " "})
-# a number and its unit stay in one line
+# no line break between a number and its unit
 _HELD = "\u00a0"
-_BEFORE_UNIT = re.compile(r"(?<=\d) (?=%|DN|e-|sd\b|nats)")
+_BEFORE_UNIT = re.compile(r"(?<=\d) (?=%|DN|e-|sigma\b|nats)")
 
 
 def verdict_text(found: Verdict) -> str:
-    """Return the verdict, where data and model disagree, the candidates, the gap, and what is not tested.
+    """Format the verdict, the disagreements, candidates and gap, and the effects that are not testable.
 
     Returns:
         Lines of at most 100 characters, without one at the end.
@@ -38,18 +46,16 @@ def verdict_text(found: Verdict) -> str:
     lines += _gap(found)
     if found.examined.left_out:
         words = frame_words(np.array(found.examined.left_out))
-        lines += _wrapped(f"left out, empty or far from the others: {words}")
+        lines += _wrapped(f"left out (empty or outlying): {words}")
     if found.proposed:
         tags = ", ".join(str(effect["tag"]) for effect in found.proposed)
-        lines += _wrapped(
-            f"proposed, not in the model: {tags} (discrepancy.json: proposed); it leaves a part"
-        )
+        lines += _wrapped(f"proposed, not in the model: {tags} (see proposed in discrepancy.json)")
     if found.examined.elsewhere is not None:
         lines += _wrapped(found.examined.elsewhere.says())
     if found.doubt and found.steps:
-        lines += _wrapped(f"not tested, and no size in e-: {found.doubt}")
+        lines += _wrapped(f"not tested, and no sizes in e-: {found.doubt}")
     if found.unexplained:
-        lines += _places("left unexplained: ", found.unexplained, _MOST_LEFT)
+        lines += _places("unexplained: ", found.unexplained, _MOST_LEFT)
     lines += [line for tag, why in found.defects.items() for line in _wrapped(_DEFECT.format(tag, why))]
     if found.untestable:
         lines += _listed("not testable with such frames", list(found.untestable), 0)
@@ -57,7 +63,7 @@ def verdict_text(found: Verdict) -> str:
 
 
 def _wrapped(text: str, indent: str = "  ") -> list[str]:
-    # line breaks inside a stranger's message would break the columns
+    # line breaks in a plug-in's message would break the columns
     words = _BEFORE_UNIT.sub(_HELD, " ".join(text.translate(_PLAIN).split()))
     lines = textwrap.wrap(words, _WIDTH - 7, subsequent_indent=indent, break_long_words=True) or [""]
     return [line.replace(_HELD, " ") for line in lines]
@@ -72,7 +78,7 @@ def _places(title: str, places: Sequence[Place], most: int) -> list[str]:
     indent = " " * len(_LEAD)
     for i, place in enumerate(places[:most]):
         spots = _spots(place)
-        words = f"{place.sentence or place.statistic} ({_sd(place.z)}{f'; {spots}' if spots else ''})"
+        words = f"{place.sentence or place.statistic} ({sigma_text(place.z)}{f'; {spots}' if spots else ''})"
         first, *rest = _wrapped(words)
         if i == 0 and len(title) > len(indent):
             lines.append(title.rstrip())
@@ -94,47 +100,40 @@ def _spots(place: Place) -> str:
     return ", ".join(words)
 
 
-def _sd(z: float) -> str:
-    return f"{z:+.1f} sd" if math.isfinite(z) else "sd not known"
-
-
 def _step(step: Step, number: int, found: Verdict) -> list[str]:
-    """Return what was named in a step and why its rivals lost, or the table of those not told apart."""
+    """Format the named effect of a step and its rejected rivals, or the table of an ambiguous step."""
     lines = []
     title = f"step {number}" if number else "candidate"
-    if step.effect:
-        lines += [line for rival in step.rivals for line in _beaten(step.effect, rival)]
-    elif len(step.candidates) > 1 and found.verdict == "ambiguous":
+    if not step.effect and len(step.candidates) > 1 and found.verdict == "ambiguous":
         lines.append(f"{title:<28}{'score':>10}{'stderr':>9}{'probability':>13}")
         for each in step.candidates[:_MOST_CANDIDATES]:
             row = f"  {each.effect:<26}{_number(each.score):>10}{_number(each.stderr):>9}"
             lines.append(f"{row}{_number(each.probability, 3):>13}".translate(_PLAIN)[:_WIDTH])
         more = len(step.candidates) - _MOST_CANDIDATES
         lines += [f"  and {more} more"] if more > 0 else []
-    # of several candidates none has numbers of its own
+    # parameters are those of a single candidate
     if step.parameters and (step.effect or (len(step.candidates) == 1 and found.verdict == "ambiguous")):
         values = [
             f"{name} = {fitted_or_chosen(p.value, p.stderr, p.unit)}" for name, p in step.parameters.items()
         ]
         values += [f"{name} = {word}" for name, word in step.form.items()]
         lines += _listed(f"{step.likeliest} in {step.place}" if step.place else step.likeliest, values, 0)
-    if not step.effect and found.verdict == "ambiguous":
+    if step.effect:
+        lines += [line for rival in step.rivals for line in _rejected(rival)]
+    elif found.verdict == "ambiguous":
         lines += [
             line
             for rival, text in step.separate.items()
-            for line in _wrapped(f"to tell {rival} apart: {text}")
+            for line in _wrapped(f"to distinguish {rival}: {text}")
         ]
     return lines
 
 
-def _beaten(effect: str, rival: Rival) -> list[str]:
+def _rejected(rival: Rival) -> list[str]:
     nats = -rival.behind
-    behind = f" ({nats:{',.0f' if nats >= 100.0 else '.3g'}} nats behind)" if math.isfinite(nats) else ""
-    return _wrapped(
-        f"{effect}, not {rival.effect}{behind}: {rival.why}"
-        if rival.why
-        else f"{effect}, not {rival.effect}{behind}"
-    )
+    lower = f"log-likelihood lower by {nats:{',.0f' if nats >= 100.0 else '.2g'}}"
+    score = f" ({lower})" if math.isfinite(nats) else ""
+    return _wrapped(f"{rival.effect} is rejected{score}{f'; {rival.why}' if rival.why else ''}")
 
 
 def _number(value: float, digits: int = 1) -> str:
@@ -150,18 +149,16 @@ def _gap(found: Verdict) -> list[str]:
         words += f" -> {micronats(gap.after)}"
     words += f" micronats per sample (floor {micronats(gap.floor)}"
     if found.steps and gap.within_chance:
-        words += ": chance alone makes as much, before and after"
+        words += ": within sampling noise before and after"
     elif found.steps and math.isfinite(gap.closed_fraction):
-        nearest = " by what is most like it" if found.verdict == "unexplained" else ""
-        words += f", {100 * gap.closed_fraction:.1f} % closed{nearest}"
+        nearest = " by the closest effect" if found.verdict == "unexplained" else ""
+        words += f", {share_text(gap.closed_fraction)} closed{nearest}"
     words += ")"
     for step in found.steps:
-        if step.within_chance:
-            continue  # what anything leaves of it tells nothing
-        for role, rival in (("runner-up", step.runner_up), ("placebo", step.placebo)):
-            if rival is not None and step.effect:
-                left = f"{rival.effect} leaves {micronats(rival.gap_after)}"
-                words += f"; in the place of {step.effect} the {role} {left}"
-        if step.effect and step.placebo is None:
-            words += f"; no effect unrelated to {step.effect} closes any of it"
+        if step.within_chance or not step.effect:
+            continue  # reductions of sampling noise mean nothing
+        rivals = (step.runner_up, "next best effect"), (step.placebo, "unrelated control")
+        left = [f"{micronats(r.gap_after)} with {r.effect} ({role})" for r, role in rivals if r is not None]
+        left += ["no unrelated control reduces it"] if step.placebo is None else []
+        words += f"; instead of {step.effect}: {', '.join(left)}"
     return _wrapped(words)

@@ -58,7 +58,7 @@ def test_beside_an_effect_that_moves_more_and_does_not_fit_there_is_no_name() ->
         effect, gap = _hypothesis(tag, np.zeros(1)).effect, Gap(1.0, 0.1, (1.0, 1.0), {})
         return Addition(effect, True, against, (), 0.01, gap, gap, (), None, ())
 
-    mimic, good = one("frame_noise", "too much of the gap is left beside it"), one("row_noise", "")
+    mimic, good = one("frame_noise", "it leaves too much of the discrepancy"), one("row_noise", "")
     assert [each.fits for each in without_company([mimic, good])] == [False, False]
     assert without_company([good, mimic]) == [good, mimic]
     assert without_company([good, good]) == [good, good]
@@ -424,27 +424,27 @@ def test_what_nearly_disagrees_is_said_beside_consistent() -> None:
         for quiet, z in ((True, calm), (False, high))
         for gap in (near, far)
     }
-    assert words[True, True] == "The frames agree with the model in every statistic tested."
-    assert "by chance in one of" in words[False, True]
-    assert "more frames would tell" in words[True, False]
-    assert "taken together the frames" in words[True, False]
-    assert "taken together the frames" not in words[False, True]
+    assert words[True, True] == "Data and model agree in every statistic tested."
+    assert "; borderline: " in words[False, True]
+    assert "take more frames to decide" in words[True, False]
+    assert "all statistics together exceed" in words[True, False]
+    assert "all statistics together exceed" not in words[False, True]
     high[5] = 60.0  # a gap at its floor does not excuse it
     sure = Findings("frames", Measured(high, high, high), null, null, near, [], False, nothing)
     assert sure.state == "unexplained"
     z = Measured(calm, calm, calm)
     joint = _sentence(Findings("histograms", z, null, null, near, [], False, nothing), {})
-    assert "frames, rows, columns and neighbours were not looked at" in joint
+    assert "frames, rows, columns and neighbours were not tested" in joint
 
 
 @pytest.mark.parametrize(
     ("effect", "rival", "score", "says"),
     [
-        ("noise_skew", "heavy_tailed_noise", -3.0, "heavy tails on both"),
-        ("heavy_tailed_noise", "noise_skew", -3.0, "heavy tails on both"),  # known to the rival alone
+        ("noise_skew", "heavy_tailed_noise", -3.0, "heavy-tailed noise two"),
+        ("heavy_tailed_noise", "noise_skew", -3.0, "heavy-tailed noise two"),  # known to the rival alone
         ("noise_skew", "row_noise", -4.0, "9 times as many samples"),
-        ("noise_skew", "row_noise", -0.1, "another exposure"),
-        ("noise_skew", "row_noise", 0.0, "another exposure"),
+        ("noise_skew", "row_noise", -0.1, "a second exposure"),
+        ("noise_skew", "row_noise", 0.0, "a second exposure"),
     ],
 )
 def test_rivals_that_frames_cannot_tell_apart_come_with_the_measurement_that_can(
@@ -461,7 +461,7 @@ def test_rivals_that_frames_cannot_tell_apart_come_with_the_measurement_that_can
 def test_a_statistic_says_what_its_sign_says() -> None:
     assert "skewed to low DN" in Place.of("shape.He3.mean", z=-17.0).sentence
     assert "skewed to high DN" in Place.of("shape.He3.mean", z=17.0).sentence
-    assert "less than the model makes it" in Place.of("space.follows.line", z=-5.0).sentence
+    assert "less than the model predicts" in Place.of("space.follows.line", z=-5.0).sentence
     part = STATISTICS["space.x.rr@columns=24:28"]
     assert "anticorrelated, along x, in columns 24 to 27" in part.says(-5.0)
 
@@ -480,16 +480,16 @@ def test_what_the_final_frames_do_not_confirm_has_no_name(before: float, after: 
     assert found.state == addition.verdict == state
     assert bool(found.named) == bool(found.model((), (effect,))) == (state == "named")
     words = _sentence(found, {})
-    assert ("do not confirm" in words) == (state == "ambiguous"), words
+    assert ("not confirmed" in words) == (state == "ambiguous"), words
     step = addition.step(None)
     assert (step.effect, len(step.candidates)) == (("flicker_noise", 2) if state == "named" else (None, 1))
     both = Added((addition, replace(addition, alone=False)), last)
     words = _sentence(replace(found, added=both), {})
-    assert "cannot tell apart" in words
-    assert ("do not confirm" in words) == (state == "ambiguous"), words
+    assert "do not decide" in words
+    assert ("not confirmed" in words) == (state == "ambiguous"), words
 
 
-@pytest.mark.parametrize(("left", "words"), [(5e-5, "would close 50 % of what that closes"), (8e-5, "")])
+@pytest.mark.parametrize(("left", "words"), [(5e-5, "explains 50 % of that, too"), (8e-5, "")])
 def test_an_unrelated_effect_that_closes_much_is_told_with_its_share(left: float, words: str) -> None:
     effect = effect_class("row_noise")(row_noise_dn=1.0)
     first, last = (Gap(value, 3e-5, (0.0, 0.0), {}) for value in (9e-5, 1e-5))
@@ -498,7 +498,7 @@ def test_an_unrelated_effect_that_closes_much_is_told_with_its_share(left: float
     found = Findings("frames", None, None, None, first, [], False, Added((addition,), last))  # type: ignore[arg-type]
     sentence = _sentence(found, {})
     assert words in sentence
-    assert ("unrelated to row noise" in sentence) == ("with caution" in sentence) == bool(words)
+    assert ("unrelated control" in sentence) == ("is doubtful" in sentence) == bool(words)
 
 
 def test_what_one_statistic_shows_still_is_a_part_that_has_no_name() -> None:
@@ -525,7 +525,7 @@ def test_the_verdict_says_where_the_fit_itself_breaks_down(left: float) -> None:
     gap = Gap(left + 0.02, 3e-5, (left, left + 0.04), {})
     found = Findings("frames", Measured(z, z, z), null, null, gap, [], True, Added((), gap))
     assert found.state == "unexplained"
-    assert ("the fit itself breaks down" in _sentence(found, {})) == (left > 0.1)
+    assert ("is too large for the fit" in _sentence(found, {})) == (left > 0.1)
 
 
 def test_the_place_of_an_effect_stands_behind_its_size() -> None:

@@ -132,10 +132,10 @@ def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tri
     found = find_discrepancies(noisy_rows, settings=short, tell=told.append).verdict
     assert found.verdict == "unexplained"
     assert found.effects == ()
-    assert "ended at its limit" in found.limit
+    assert "used its budget" in found.limit
     assert "row_noise" in found.limit
     assert found.limit in found.sentence
-    assert "none that was tried explains it" in found.sentence
+    assert "no effect tried explains it" in found.sentence
     assert "--effort" in verdict_text(found)
     assert find_discrepancies(noisy_rows, settings=short).verdict == found
 
@@ -156,7 +156,7 @@ def test_a_law_of_too_many_peaks_is_not_begun_with():
     frames = PlainCamera(0.3, 4.0, 12.0, (16, 16), 600).frames(1)
     seen = observe(frames, np.arange(600), n_run=600, block_frames=50)
     wave = PeriodicPickup(amplitude_dn=1.0, cycles_per_row=0.36)
-    with pytest.raises(NotFittedError, match="would be 80"):
+    with pytest.raises(NotFittedError, match="would have 80"):
         refit_maps(frames, seen.maps, [NoiseSkew(share=0.83), wave], seen.covariance)
 
 

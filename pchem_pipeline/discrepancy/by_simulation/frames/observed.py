@@ -99,11 +99,11 @@ class ObservedFrames:
         lost = (
             f"the bias of {100 * share:.0f} % of the pixels may be off by an electron"
             if share >= _NOT_IDENTIFIED
-            else f"only {100 * usable:.0f} % of the pixels have a fit that can be relied upon"
+            else f"only {100 * usable:.0f} % of the pixels have a reliable fit"
         )
         return (
-            f"{lost} (fitted read noise {noise:.2f} e-, {frames:,} frames); several exposures fitted "
-            "together (pchem joint) identify them, and many more frames or a lower read noise may do so, too"
+            f"{lost} (read noise {noise:.2f} e-, {frames:,} frames); fit several exposures jointly (pchem "
+            "joint), or take many more frames"
         )
 
 
@@ -111,7 +111,7 @@ def _check(plain: Evidence) -> None:
     usable = plain.maps.usable
     if usable.size < _FEWEST_PIXELS:
         raise InputError(
-            f"a sensor of {usable.size} pixels, fewer than {_FEWEST_PIXELS}: nothing can be compared"
+            f"a sensor of {usable.size} pixels is too small to compare; {_FEWEST_PIXELS} are needed"
         )
     if usable.sum() < _FEWEST_PIXELS:
         raise InputError(

@@ -1,1 +1,1 @@
-"""What no known effect explains, measured in the samples: moves, noise, gain, electrons, responses."""
+"""Empirical descriptions of unexplained data: shifts, noise, gain, electron numbers, responses."""

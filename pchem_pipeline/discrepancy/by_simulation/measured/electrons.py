@@ -1,4 +1,4 @@
-"""The empirical component: what electrons do to each other, by how their numbers vary, alone and together.
+"""Empirical component: correlated electron numbers, from their variances and covariances.
 
 The excess of the variance over Poisson is measured by the score of the second Charlier polynomial (Rao 1948),
 and how numbers go together by the products of the expected electrons of samples beside each other and of

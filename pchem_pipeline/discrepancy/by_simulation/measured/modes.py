@@ -1,4 +1,4 @@
-"""The empirical component: gain, light or size of the noise that samples of a frame, row or column share.
+"""Empirical component: common variation of gain, light or read noise in frames, rows or columns.
 
 To first order a common change of the offset, the gain, the light or the read noise moves the sum of the
 samples' scores for it, by the information that they have of it. Where there is none such a sum is Gaussian,

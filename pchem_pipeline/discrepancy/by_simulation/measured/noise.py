@@ -1,4 +1,4 @@
-"""The empirical component: noise that samples share, by its covariance over frames, rows and columns.
+"""Empirical component: correlated noise, from its covariance over frames, rows and columns.
 
 The readout residuals of pairs of samples are multiplied, and their mean products sorted by distance: those of
 near samples, of samples far apart in one row, far apart in one column, and far apart in both. What the model

@@ -1,4 +1,4 @@
-"""The empirical component: which samples follow the charge of which others, by distance and as whole lines.
+"""Empirical component: response of samples to the charge of others, by distance and of whole lines.
 
 The map of all distances is searched for what stands out most: one distance, or all samples of a row, a column
 or a frame alike. Its part is taken off, and the rest searched again (matching pursuit, Mallat and Zhang 1993;

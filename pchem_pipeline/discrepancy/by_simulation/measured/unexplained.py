@@ -1,4 +1,4 @@
-"""What no known effect explains, measured in several forms: everywhere and by part, the best one first."""
+"""Empirical descriptions of several forms, everywhere and by part of the sensor, the best one first."""
 
 from __future__ import annotations
 

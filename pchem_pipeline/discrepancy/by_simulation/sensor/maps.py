@@ -105,7 +105,7 @@ def refit_maps(
         New maps; the old ones where the effects cannot be fitted with.
 
     Raises:
-        NotFittedError: hardly a pixel can be fitted, or each would take seconds.
+        NotFittedError: almost no pixel can be fitted, or each would take seconds.
     """
     shape = maps.usable.shape
     flat = maps.flat.maps
@@ -116,7 +116,7 @@ def refit_maps(
     except ConfigError:
         return Refit(maps, {}, covariance)
     if law.components > _MOST_COMPONENTS:
-        raise NotFittedError(f"each of its peaks would be {law.components}")
+        raise NotFittedError(f"each peak would have {law.components} components")
     histograms = histogram_frames(frames)
     counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
     near = np.stack(flat, axis=1)
@@ -135,7 +135,7 @@ def refit_maps(
     probed = known[:: max(1, known.size // _PROBED)]
     probe = fitted(probed)
     if np.mean(np.isfinite(probe.bias)) < _LEAST_FITTED:
-        raise NotFittedError("hardly a pixel can be fitted with it")
+        raise NotFittedError("almost no pixel can be fitted with it")
     fit = fitted(np.arange(len(near)))
     for start in (off_by(near, -1.0), off_by(near, 1.0), _of_usual_noise(near, fit.columns)):
         if np.mean(_likelier(fitted(probed, start), probe)) > _OFTEN_BETTER:

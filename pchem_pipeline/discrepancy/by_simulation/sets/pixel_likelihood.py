@@ -327,4 +327,4 @@ def _refuses(error: Exception) -> bool:
 def note_defect(defects: dict[str, str], tag: str, error: Exception) -> None:
     """Keep why an effect is not compared, and warn."""
     defects[tag] = error_words(error)
-    _log.warning("a defect in the candidate %s, which is not compared: %s", tag, defects[tag])
+    _log.warning("candidate %s failed and is not compared: %s", tag, defects[tag])

@@ -166,7 +166,7 @@ def test_a_single_noisy_row_is_told() -> None:
 
     check = by_name(looked(stack(rng, SHAPE, moved)))["row_noise"]
     assert check.found
-    assert check.where == "most in row 21"
+    assert check.where == "mainly in row 21"
 
 
 def test_row_noise_of_a_tap_is_found_there_with_its_size_there() -> None:
@@ -180,7 +180,7 @@ def test_row_noise_of_a_tap_is_found_there_with_its_size_there() -> None:
     check = checks["row_noise"]
     assert check.found
     assert check.region == {"columns": [[24, 32]]}
-    assert checks["neighbours_x"].advice == "as the noise that they share there makes them"
+    assert checks["neighbours_x"].advice == "explained by the noise common to their line"
     assert check.where == "columns 24 to 31"
     assert check.size == pytest.approx(0.8 * SIGMA, rel=0.1)
     assert check.level == "serious"
@@ -280,7 +280,7 @@ def test_charge_of_the_frame_before_and_of_neighbours_is_found() -> None:
 
     look = looked(stack(rng, SHAPE, charge=memory))
     assert [check.name for check in look.found] == ["lag"]
-    assert "the gain, e⁻/DN, reads high by about as much" in look.found[0].advice
+    assert "gain (e⁻/DN) is too high by about this share" in look.found[0].advice
     expected = 0.02 * EXPOSURE / GAIN**2 / VARIANCE
     assert look.found[0].size == pytest.approx(expected, abs=5 / np.sqrt(np.prod(SHAPE)))
 

@@ -97,7 +97,7 @@ def test_what_cannot_be_said_is_refused_in_one_line():
         mass([clip.at_place(None, WHEN)])
     with pytest.raises(ConfigError, match=r"row_noise in columns 2 to 3 .* not known"):
         sample_law([EFFECTS[0].at_place(REGION)], maps())
-    with pytest.raises(ConfigError, match="no order in time"):
+    with pytest.raises(ConfigError, match="no frame order"):
         mass([EFFECTS[0].at_place(None, WHEN)], PixelPlaces.of_block(None, SHAPE, np.arange(0)))
     with pytest.raises(ConfigError, match="the sensor has 4 columns"):
         mass([EFFECTS[0].at_place(Region(columns=((2, 9),)))])

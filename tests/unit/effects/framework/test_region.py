@@ -138,7 +138,7 @@ def test_a_wrong_line_says_the_grammar(text):
         ({"taps": {"every": 4, "which": 4}}, "there is no group"),
         ({"taps": {"which": 4}}, "give width, or every"),
         ({"quadrant": "middle"}, "top left"),
-        ({"pixels": [[1, 5, 2]]}, "behind the last"),
+        ({"pixels": [[1, 5, 2]]}, r"last column \+ 1"),
         ({"mask": "nothing.npy"}, "cannot be read"),
         ("frames=2:3", "no place"),
     ],

@@ -120,7 +120,7 @@ def test_the_verdict_comes_first(base: ReportData, verdict: str) -> None:
     terms = {str(a["href"])[1:] for tag, a in own.tags if a.get("class") == "term"}
     assert {"term-gap", "term-micronat", "term-readout-and-charge"} <= terms  # explained where they stand
     # what nothing disagrees with has no signature
-    assert ("What shows most" in own.text) == (verdict != "consistent")
+    assert ("Largest disagreement, before" in own.text) == (verdict != "consistent")
     assert own.text[:first].rstrip().endswith(verdict.replace("_", " ").capitalize())
     page = harmless(report.html)
     assert page.text.count(data.found.sentence) >= 2
@@ -148,21 +148,21 @@ def test_a_named_effect_has_all_its_evidence(base: ReportData) -> None:
         "10 % of the",
         "0.032 e⁻ rms",
         "477 → 0.4",
-        "chance alone: up to 0.66",
+        "sampling noise: up to 0.66",
         "of the gap closed",
         "0.3512 ± 0.0041 DN",
-        "unrelated to it) closes 3",
-        ", would close 75 % of the",
-        "with it in the model adjacent rows have similar means",
+        "An unrelated control (flicker noise) reduces the gap 3",
+        " closes 75 % of the",
+        "it leaves a misfit of 9.1 sigma: row means",
         "−16.8 ± 3.3",
         "0.985",
         "pixels (y, x) (3, 4), (10, 20), (30, 39)",
         "148 to 152 DN",
-        "the candidate odd_plugin failed and was not compared: ValueError: boom",
-        "largest move: read noise",
-        "standard errors of a pixel",
+        "candidate odd_plugin failed and was not compared: ValueError: boom",
+        "largest change: read noise",
+        "standard errors per pixel",
         "a faster or slower row time moves the line of a pickup",
-        "frames to find and fit with",
+        "training frames",
         "Janesick 2007",
     ):
         assert words in text, words
@@ -182,9 +182,9 @@ def test_what_is_measured_has_its_numbers_and_no_rivals(base: ReportData) -> Non
     row, form = tables["discrepancy-parameters"].rows
     assert form[:2] == ("empirical_noise: spectrum", "one_over_f")
     assert row[:2] == ("empirical_noise: noise_dn", "0.784 ± 0.021 DN")
-    assert row[2].endswith("(measured)")
+    assert row[2].endswith("(empirical)")
     text = Page(rendered(base, data).pages["discrepancy.html"]).text
-    assert "It was measured instead, and has no rivals." in text
+    assert "the empirical description has no rivals." in text
 
 
 def test_the_legend_over_the_scatter_of_lines_covers_no_point() -> None:
@@ -201,18 +201,18 @@ def test_the_legend_over_the_scatter_of_lines_covers_no_point() -> None:
 def test_frames_that_no_part_has_are_told() -> None:
     seen = {"frames": 1000, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320,
             "histograms": None}  # fmt: skip
-    words = "; a rest of 40 frames, too few to be dealt as well, is left out."
+    words = "; 40 left over."
     assert frames_text(discrepancy_data("named", examined=seen).found).endswith(words)
     whole = {**seen, "frames": 960}
-    assert "rest" not in frames_text(discrepancy_data("named", examined=whole).found)
+    assert "left over" not in frames_text(discrepancy_data("named", examined=whole).found)
 
 
 def test_where_the_model_was_looked_at_again_is_told() -> None:
     seen = {"frames": 960, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320,
             "elsewhere": {"rows": [8, 16], "columns": [0, 8]}}  # fmt: skip
     found = discrepancy_data("named", examined=seen).found
-    words = "looked at again in rows 8 to 15, columns 0 to 7: it holds"
-    assert frames_text(found).endswith(f" The model that was found was {words}.")
+    words = "tested again in rows 8 to 15, columns 0 to 7: the model holds"
+    assert frames_text(found).endswith(f" The final model was {words}.")
     assert words in verdict_text(found)
 
 
@@ -220,10 +220,10 @@ def test_pixels_that_are_not_compared_are_told_with_their_place() -> None:
     seen = {"frames": 960, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320,
             "histograms": None, "unfitted": 7}  # fmt: skip
     words = frames_text(discrepancy_data("named", examined=seen).found)
-    assert words.endswith(" Not compared: 7 pixels without a fit to be relied upon.")
+    assert words.endswith(" Not compared: 7 pixels without a reliable fit.")
     spot = {"map": "unfitted", "region": {"columns": [[2, 5]]}, "p": 1e-6}
     words = frames_text(discrepancy_data("named", examined={**seen, "places": [spot]}).found)
-    assert words.endswith("; far more of them than chance puts there lie in columns 2 to 4.")
+    assert words.endswith(", clustered in columns 2 to 4.")
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -379,12 +379,12 @@ def test_a_map_with_a_place_comes_first_with_its_outline() -> None:
     found = data.found.model_copy(update={"where": (moved, *data.found.where)})
     placed = replace(data, found=found)
     first = largest_maps(placed.arrays, regions_of(placed))[0]
-    assert first.title == "readout: neighbours alike, along x"
+    assert first.title == "readout: neighbours correlated, along x"
     figure = next(each for each in discrepancy_figures(placed) if each.name == "discrepancy_maps")
-    assert f"most in columns {origin[1] + 3} to {origin[1] + 6}" in figure.alt
+    assert f"mainly in columns {origin[1] + 3} to {origin[1] + 6}" in figure.alt
     # two edges of each row and two of each column
     assert outlined(figure) == 2 * first.z.shape[0] + 2 * 4
-    assert place_text(moved) == f"most in columns {origin[1] + 3} to {origin[1] + 6}"
+    assert place_text(moved) == f"mainly in columns {origin[1] + 3} to {origin[1] + 6}"
 
 
 def test_a_place_that_goes_on_beyond_the_part_examined_is_drawn_as_far_as_that_goes() -> None:
@@ -437,8 +437,8 @@ def test_the_gap_has_a_line_for_every_model() -> None:
         ("plain model", "before", 477.0),
         ("with row_noise", "after", 31.0),
         ("… and bias_drift", "after", 0.4),
-        ("runner-up: periodic_pickup", "runner-up", 120.0),
-        ("placebo: flicker_noise", "placebo", 116.4),
+        ("next best: periodic_pickup", "runner-up", 120.0),
+        ("control: flicker_noise", "placebo", 116.4),
     ]
     doubt = [bar.label for bar in discrepancy_gap.gap_bars(verdict_of("ambiguous"))]
     assert doubt[1] == "with row_noise or periodic_pickup or interpixel_capacitance"
@@ -473,13 +473,13 @@ def test_a_placebo_that_closes_the_gap_is_a_caution() -> None:
     last = {**steps[-1], "placebo": {"effect": "flicker_noise", "gap_after": 30e-6}}
     doubted = replace(data, found=verdict_of("named", steps=[steps[0], last]))
     words = {flag.text: flag.level for flag in remarks(doubted)}
-    doubt = next(text for text in words if "placebo" in text and "drift" in text)
-    assert "unrelated to it) closes 75 % of what it closes: take the name with caution" in doubt
+    doubt = next(text for text in words if "control" in text and "drift" in text)
+    assert "reduces the gap 75 % as much as Bias drift: Bias drift is doubtful" in doubt
     assert words[doubt] == "caution"
     part = {flag.text: flag.level for flag in remarks(replace(data, found=verdict_of("named_in_part")))}
-    assert [level for text, level in part.items() if "more than chance alone makes" in text] == ["caution"]
+    assert [level for text, level in part.items() if "of the gap remains" in text] == ["caution"]
     closed = replace(data, found=verdict_of("named", gap={**gap, "after": 0.5e-6}))
-    at_floor = [f for f in remarks(closed) if "at its floor" in f.text]
+    at_floor = [f for f in remarks(closed) if "within sampling noise" in f.text]
     assert [flag.level for flag in at_floor] == ["good"]
 
 
@@ -488,11 +488,11 @@ def test_a_gap_that_chance_makes_is_not_said_to_be_closed() -> None:
     gap = {**result("named")["gap"], "before": 0.6e-6, "after": 0.0, "floor": 1e-6, "closed_fraction": 1.0}
     data = discrepancy_data("named", steps=[weak], gap=gap)
     told = [flag.text for flag in remarks(data)]
-    assert not any("would close" in text or "placebo" in text.lower() for text in told)
-    assert any(text.startswith("Not the runner-up, Periodic pickup: with it in the model") for text in told)
+    assert not any("closes" in text or "control" in text for text in told)
+    assert any("Periodic pickup, is rejected, since it leaves a misfit" in text for text in told)
     facts = {fact.label: fact for fact in key_facts(data)}
     assert "of the gap closed" not in facts
-    assert facts["distance of data and model"].value == "0.6 → 0"
+    assert facts["gap between data and model"].value == "0.6 → 0"
 
 
 def test_a_named_effect_says_why_no_other_one_and_where_it_is() -> None:
@@ -521,7 +521,7 @@ def test_a_single_candidate_has_no_share_of_the_probability() -> None:
         for each in discrepancy_tables(discrepancy_data("ambiguous", steps=[alone]))["evidence"]
         if each.id == "discrepancy-candidates-1"
     ]
-    assert table.rows[0][4] == "no other one"
+    assert table.rows[0][4] == "only candidate"
 
 
 def test_places_of_a_window_are_places_of_the_sensor() -> None:

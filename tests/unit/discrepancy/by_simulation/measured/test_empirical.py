@@ -261,9 +261,8 @@ def test_a_described_sensor_is_said_so_and_keeps_the_component_in_its_model() ->
     assert found.model((), (effect,)) == (effect,)
     step = addition.step(None)
     assert (step.verdict, step.effect) == ("described", None)
-    assert "0.4 % of the samples differ from the model as if they were moved by -8 DN" in _sentence(found, {})
-    assert "it is like that throughout" in _sentence(found, {})
-    assert "not known" in _sentence(replace(found, still=True), {})
+    assert "empirically, 0.4 % of the samples are shifted by -8 DN; this" in _sentence(found, {})
+    assert "still disagree" in _sentence(replace(found, still=True), {})
 
 
 def test_a_description_that_leaves_a_part_of_the_gap_is_proposed_and_not_in_the_model() -> None:
@@ -279,11 +278,13 @@ def test_a_description_that_leaves_a_part_of_the_gap_is_proposed_and_not_in_the_
     assert found.model((), (named, effect)) == (named,)
     assert found.proposed == (effect,)
     said = _sentence(found, {})
-    assert "90 % of the gap on unseen frames is closed" in said
-    assert "proposed and not in the model" in said
+    assert "explains 90 % of the discrepancy in unseen frames" in said
+    assert "proposed, not added to the model" in said
     # a gap that chance alone makes, or that only grew, has no shares
     for before, after in ((0.0, 1e-4), (-2e-5, 1e-4), (1e-4, 3e-4)):
         gaps = [Gap(value, 5e-5, (0.0, 0.0), {}) for value in (before, after)]
-        assert "is no smaller" in _sentence(replace(found, before=gaps[0], added=Added(steps, gaps[1])), {})
+        assert "does not reduce the discrepancy" in _sentence(
+            replace(found, before=gaps[0], added=Added(steps, gaps[1])), {}
+        )
         assert closed_share(before, after) == 0.0
     assert closed_share(1e-4, -3e-5) == 1.0

@@ -68,7 +68,7 @@ def test_a_gain_that_moves_is_told_by_what_shares_it(of: str, shape: tuple[int, 
     # its own variance is known to sqrt(2 / n); the scores see a little less where the peaks overlap
     error = 0.02 * SIGNAL * np.sqrt(0.5 / np.prod(shape))
     assert abs(found.noise_dn - 0.02 * SIGNAL) < 5 * error + 0.15 * 0.02 * SIGNAL
-    words = f"% of the gain, {found.noise_dn:.2g} DN at a signal of 21 DN, the same in a whole {of})"
+    words = f"% of the gain, {found.noise_dn:.2g} DN at a signal of 21 DN, common to each {of})"
     assert words in found.describe()
 
 
@@ -100,8 +100,8 @@ def test_frames_that_are_noisier_are_told_with_how_many_they_are() -> None:
     assert 0.5 < found.noise_dn / (0.5 * np.sqrt(some.mean()) * 0.25 * STEP) < 1.2
     assert found.empirical_unnamed
     # of bursts their size in the frames that have them
-    size = r"\(\+[34]\d % of the read noise, 1\.\d DN of 3.51 DN, the same in"
-    assert re.search(f"a change of the read noise that samples share {size}", found.describe())
+    size = r"\(\+[34]\d % of the read noise, 1\.\d DN of 3.51 DN, common to"
+    assert re.search(f"samples share a variation of the read noise {size}", found.describe())
 
 
 @pytest.mark.parametrize("size", [0.3, 1.0, 2.5])
@@ -194,7 +194,7 @@ def test_a_wave_of_gain_or_light_is_told_by_its_frequencies(
     assert abs(known[1] - per_line) < 4.0 * error / max(sums.information.size, 2)
     # the scores see a little less where the peaks overlap
     assert found.noise_dn / SIGNAL == pytest.approx(amplitude / np.sqrt(2.0), rel=0.15)
-    assert "a wave of" in found.describe()
+    assert "a sine of" in found.describe()
 
 
 def test_a_wave_that_a_model_makes_is_not_measured_again() -> None:
@@ -240,10 +240,10 @@ def test_an_offset_that_takes_turns_is_told_as_that() -> None:
     mode = NoiseMode(of="sample", share=1.0, wave=(0.5, 0.5, -0.5))
     assert mode.takes_turns
     assert mode.describe(0.3) == (
-        "0.3 DN, changing its sign from frame to frame, from row to row, from column to column"
+        "0.3 DN, alternating from frame to frame, from row to row, from column to column"
     )
     assert NoiseMode(of="column", share=1.0, wave=(0.1, 0.0, 0.25)).describe(0.3) == (
-        "0.3 DN, the same in a whole column, a wave of 0.1 cycles per frame and 0.25 per column"
+        "0.3 DN, common to each column, a sine of 0.1 cycles per frame and 0.25 per column"
     )
 
 
@@ -261,7 +261,7 @@ def test_an_offset_in_bursts_is_told_with_how_often_and_how_large() -> None:
     assert mode.burst == pytest.approx(some.mean(), rel=0.05)  # a frame of 320 samples tells it
     # the scores see a little less where the peaks overlap
     assert found.noise_dn == pytest.approx(1.5 * np.sqrt(some.mean()), rel=0.15)
-    assert "of the frames only" in found.describe()
+    assert re.search(r"only in \S+ % of the frames", found.describe())
 
 
 def test_what_a_model_makes_is_taken_off() -> None:

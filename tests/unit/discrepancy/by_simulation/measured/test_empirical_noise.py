@@ -253,7 +253,7 @@ model:
 """
     (effect,) = parse_config(text).model.effects
     assert effect.describe() == (
-        "noise of 0.7 DN that samples share (the same in a whole row, correlated by 0.48 (1 row apart))"
+        "samples share noise of 0.7 DN (common to each row, correlation +0.48 over 1 row)"
     )
 
 

@@ -312,12 +312,12 @@ def test_it_is_no_candidate_and_says_what_follows() -> None:
     assert "empirical_response" not in candidate_classes(DiscrepancySettings())
     terms = ResponseTerm(place=(0, 0, -16)), ResponseTerm(of="row", weight=-0.5, number=32)
     assert EmpiricalResponse(response=0.004, terms=terms).describe() == (
-        "samples that correlate with the charge of others (+0.4 % of the sample 16 columns to the left, "
+        "samples depend on the charge of other samples (+0.4 % of the sample 16 columns to the left, "
         "-0.2 % of each other sample of the row)"
     )
     terms = tuple(ResponseTerm(place=(0, 0, 1), columns=each) for each in ((0, 1), (2, 5)))
     assert EmpiricalResponse(response=0.01, terms=terms).describe() == (
-        "samples that correlate with the charge of others (+1 % in column 0, +1 % in columns 2 to 4 of "
+        "samples depend on the charge of other samples (+1 % in column 0, +1 % in columns 2 to 4 of "
         "the sample one column to the right)"
     )
     near = EmpiricalResponse(response=0.004, terms=(ResponseTerm(place=(0, 0, -1)),))
@@ -328,7 +328,7 @@ def test_columns_that_follow_one_across_the_rows_are_told_together() -> None:
     """The last sample of a row is the one read before the first of the next."""
     terms = tuple(ResponseTerm(place=(0, -1, 63 - n), columns=(n, n + 1), weight=0.5**n) for n in range(6))
     assert EmpiricalResponse(response=0.16, terms=terms).describe() == (
-        "samples that correlate with the charge of others (+16 % in column 0, +8 % in column 1, "
+        "samples depend on the charge of other samples (+16 % in column 0, +8 % in column 1, "
         "+4 % in column 2, +2 % in column 3 and 2 more of the sample one row above in column 63)"
     )
 

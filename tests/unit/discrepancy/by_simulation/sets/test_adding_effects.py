@@ -728,7 +728,7 @@ def test_effects_that_meet_in_one_part_are_one_cause_without_a_name(second: str)
 @pytest.mark.parametrize(
     ("left", "words"),
     [
-        ({"frame.covariance": 6.0}, "with it in the model"),
+        ({"frame.covariance": 6.0}, "it leaves a misfit"),
         ({"frame.covariance": 3.0}, ""),
         ({"shape.He4.mean": 6.0}, ""),
     ],
@@ -748,7 +748,7 @@ def test_what_is_left_in_the_family_of_a_signature_speaks_against_a_name(
     # what stands in its place, whatever it is
     there = np.array([0.0, 0.0, 0.0, 6.0])
     assert not unexplained_of_its_kind(everywhere, part, there, null)
-    assert unexplained_of_its_kind(placed, part, there, null).startswith("with it in the model")
+    assert unexplained_of_its_kind(placed, part, there, null).startswith("it leaves a misfit")
     # of what it moves itself, nothing else
     assert not unexplained_of_its_own(part, rest, null)
     assert bool(unexplained_of_its_own(part + 9.0 * np.eye(4)[1], rest, null)) == bool(words)
@@ -1147,7 +1147,7 @@ def test_what_widens_the_gap_of_the_final_frames_stays_outside(monkeypatch: pyte
 
 
 @pytest.mark.parametrize(
-    ("anisotropy", "against"), [(-1.0, "its anisotropy stands at its limit, -1"), (-0.9, "")]
+    ("anisotropy", "against"), [(-1.0, "its anisotropy is at the limit of -1"), (-0.9, "")]
 )
 def test_an_effect_that_can_go_no_further_gets_no_name(
     monkeypatch: pytest.MonkeyPatch, anisotropy: float, against: str
