@@ -1,17 +1,18 @@
 """Scan statistics: the place on a map, or the stretch of a series, whose values stand out most.
 
 Each value is about N(0, 1) and independent of the others where nothing is wrong. Of every place of some
-family (bands of rows or columns, rectangles, discs, lines at a period, single pixels; ranges of frames, a
-period, single frames) the mean inside is compared with the mean outside, so that something everywhere alike
-has no place. The probability is that of the largest deviation among all places of the family (the union
-bound), of all families: it counts every place that was looked at.
+family (bands of rows or columns, rectangles, discs, lines at a period, single pixels) the mean inside is
+compared with the mean outside, so that something everywhere alike has no place. A series is a map of one row:
+its bands are ranges of frames, its pixels single frames. The probability is that of the largest deviation
+among all places of the family (the union bound), of all families: it counts every place that was looked at.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,41 +21,42 @@ from scipy import special
 from pchem_pipeline.effects.framework.region import Region, When
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 #: Values count as no more than this many standard deviations, so that a few pixels are no band of columns.
 _CLIP = 6.0
-#: Cells along an edge of the map (or the series) on which all rectangles (ranges) are tried.
+#: Cells along an edge of a map on which all rectangles are tried, and cells of lines on which all ranges are.
 _CELLS, _STRETCHES = 32, 400
 _RADII = (1.5, 2.5, 4.0, 6.0, 9.0, 13.0, 19.0, 28.0)
 _FINER = (0.72, 0.8, 0.9, 1.12, 1.25, 1.4)
-_PERIODS = (2, 4, 8, 16, 32)
-_FRAME_PERIODS = tuple(range(2, 33))
+#: Periods of lines, and of frames.
+PERIODS, _FRAME_PERIODS = (2, 4, 8, 16, 32), range(2, 33)
 #: Sweeps of the edges of a rectangle over the pixels, and of a range over the frames.
 _SWEEPS = 3
 _RIDGE = 1e-3  # of a covariance of series that may all but coincide
-_FEWEST = 3  # pixels of a place
+#: Pixels, frames or events of a place, at least.
+FEWEST = 3
 _LEAST = -690.0  # logarithm of the smallest probability that is written
 _SURE = 0.05
 _LITTLE = 0.25  # of the mean inside a place, that outside
 #: Nats by which a place of a further family must be less probable than a simpler one.
 _BETTER = 3.0
+_MOST_SINGLE = 1000  # frames that are listed
 
 
-@dataclass(frozen=True)
-class Suspect:
-    """A place on the sensor where a map stands out.
+@dataclass(frozen=True, kw_only=True)
+class Cluster:
+    """A part of a map or of a series that stands out.
 
     Attributes:
-        region: the place.
-        family: rows, columns, rectangle, disc, period or pixels.
+        family: rows, columns, rectangle, disc, period or pixels; of frames range, period or frames.
         z: deviation of its mean from that of the rest, standard errors.
         log_p: logarithm of the probability of such a deviation by chance in any place.
-        inside, outside: mean of the map there and elsewhere.
+        inside, outside: mean there and elsewhere.
         share: of its pixels that deviate, at least (at 95 %, for all places at once).
     """
 
-    region: Region
     family: str
     z: float
     log_p: float
@@ -78,26 +80,18 @@ class Suspect:
         return abs(self.outside) < _LITTLE * abs(self.inside)
 
 
-@dataclass(frozen=True)
-class Stretch:
-    """Frames in which a series stands out; as :class:`Suspect`, of a series."""
+@dataclass(frozen=True, kw_only=True)
+class Suspect(Cluster):
+    """A place on the sensor where a map stands out."""
+
+    region: Region
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stretch(Cluster):
+    """Frames in which a series stands out."""
 
     when: When
-    family: str
-    z: float
-    log_p: float
-    inside: float
-    outside: float
-
-    @property
-    def p(self) -> float:
-        """Probability of such a deviation by chance, at least 1e-300."""
-        return math.exp(max(self.log_p, _LEAST))
-
-    @property
-    def only_there(self) -> bool:
-        """Whether little of it is elsewhere."""
-        return abs(self.outside) < _LITTLE * abs(self.inside)
 
 
 @dataclass(frozen=True)
@@ -109,8 +103,37 @@ class Found:
     z: float
     log_p: float
 
+    def means(self, values: FloatArray, some: BoolArray) -> dict[str, Any]:
+        """Return what a :class:`Cluster` says of the place, with the means of values over pixels that count.
 
-# -- maps ---------------------------------------------------------------------------------------
+        Args:
+            values: of the map, (y, x).
+            some: pixels that count, (y, x).
+        """
+        inside, outside = (float(values[each].mean()) for each in (some & self.mask, some & ~self.mask))
+        return {
+            "family": self.family, "z": self.z, "log_p": self.log_p, "inside": inside, "outside": outside,
+        }  # fmt: skip
+
+
+_C = TypeVar("_C", bound=Cluster)
+
+
+def successive(
+    best: Callable[[BoolArray], tuple[BoolArray, _C] | None], some: BoolArray, most: int
+) -> list[_C]:
+    """Return what stands out most, then what does so without it, and so on.
+
+    Args:
+        best: returns the most significant place among pixels that count, and all its pixels; None without.
+        some: pixels that count.
+        most: places at most.
+    """
+    found: list[_C] = []
+    while len(found) < most and (one := best(some)) is not None:
+        some = some & ~one[0]
+        found.append(one[1])
+    return found
 
 
 def scan_map(
@@ -133,21 +156,71 @@ def scan_map(
         next_along: axis along which each value is of a pixel and the next one: places reach one further.
     """
     some = usable & np.isfinite(values)
-    found: list[Suspect] = []
-    left = some.copy()
-    while len(found) < most and left.sum() > 2 * _FEWEST:
-        best = _best(values, left, single)
-        if best is not None:
-            best = _checked(_odd_side(best, values, left), values, left)
-        if best is None or best.log_p > math.log(significance):
-            break
-        mask = best.mask & left
-        inside, outside = float(values[mask].mean()), float(values[left & ~mask].mean())
-        share = affected_share(np.where(some, math.copysign(1.0, best.z) * values, -np.inf)[some], mask[some])
-        region = Region.of_mask(_reaching(best.mask, next_along))
-        found.append(Suspect(region, best.family, best.z, best.log_p, inside, outside, share))
-        left &= ~best.mask
-    return found
+
+    def best(left: BoolArray) -> tuple[BoolArray, Suspect] | None:
+        contrast = Contrast.of(values, left)
+        if contrast is None:
+            return None
+        found = best_place(contrast, [*regions(contrast), _single(values, left) if single else None])
+        found = None if found is None else _checked(_odd_side(found, values, left), values, left)
+        if found is None or found.log_p > math.log(significance):
+            return None
+        deviations = np.where(some, math.copysign(1.0, found.z) * values, -np.inf)[some]
+        share = affected_share(deviations, (found.mask & left)[some])
+        region = Region.of_mask(_reaching(found.mask, next_along))
+        return found.mask, Suspect(**found.means(values, left), region=region, share=share)
+
+    return successive(best, some, most)
+
+
+def scan_series(
+    values: FloatArray,
+    numbers: IntArray,
+    *,
+    significance: float = 1e-3,
+    most: int = 2,
+    shortest: int = FEWEST,
+) -> list[Stretch]:
+    """Return the frames that stand out of a series, the most significant first.
+
+    Args:
+        values: N(0, 1) and independent where nothing is wrong, (n,).
+        numbers: frame numbers, increasing, (n,).
+        significance: largest probability of a chance.
+        most: stretches at most.
+        shortest: frames that a range or a phase of a period must have.
+    """
+    row = values[None]
+
+    def best(left: BoolArray) -> tuple[BoolArray, Stretch] | None:
+        contrast = Contrast.of(row, left, shortest)
+        if contrast is None:
+            return None
+        families = [
+            _bands(contrast, 1, lambda z, n: _log_p_range(z, n, shortest)),
+            # a multiple of a period is no better than it
+            _periodic(contrast, 1, numbers, _FRAME_PERIODS, cycles=4, better=1.02),
+            _single(row, left),
+        ]
+        found = best_place(contrast, families, better=0.0)
+        found = None if found is None else _checked(found, row, left)
+        if found is None or found.log_p > math.log(significance):
+            return None
+        family, when = _frames(found, numbers)
+        return found.mask, Stretch(**{**found.means(row, left), "family": family}, when=when)
+
+    return successive(best, np.isfinite(row), most)
+
+
+def _frames(found: Found, numbers: IntArray) -> tuple[str, When]:
+    """Return the frames of a place in a series, and what they are."""
+    at = numbers[found.mask[0]]
+    if found.family == "columns":
+        return "range", When(range=((int(at[0]), int(at[-1]) + 1),))
+    if found.family == "period":
+        period = int(np.gcd.reduce(np.diff(at)))
+        return "period", When(every=period, phase=int(at[0]) % period)
+    return "frames", When(single=tuple(int(number) for number in at[:_MOST_SINGLE]))
 
 
 def _reaching(mask: BoolArray, axis: int | None) -> BoolArray:
@@ -173,46 +246,42 @@ def _checked(found: Found, values: FloatArray, some: BoolArray) -> Found:
     if abs(z) >= abs(found.z):
         return found
     places = found.log_p - float(special.log_ndtr(-abs(found.z)))
-    return Found(found.family, found.mask, z, min(0.0, float(special.log_ndtr(-abs(z))) + places))
+    return replace(found, z=z, log_p=min(0.0, float(special.log_ndtr(-abs(z))) + places))
 
 
-def _best(values: FloatArray, some: BoolArray, single: bool) -> Found | None:
-    """Return the place of the smallest probability, a simpler one where that is nearly as small."""
-    kept = np.clip(np.where(some, values, 0.0), -_CLIP, _CLIP)
-    contrast = Contrast.of(kept, some)
-    return None if contrast is None else best_place(contrast, some, _single(values, some) if single else None)
-
-
-def best_place(contrast: Contrast, some: BoolArray, *others: Found | None) -> Found | None:
-    """Return the place of the smallest probability of all families; None where none divides the pixels.
-
-    Args:
-        contrast: of a map, (y, x).
-        some: pixels that count, (y, x).
-        others: the best places of further families.
-    """
-    families = [
+def regions(contrast: Contrast) -> list[Found | None]:
+    """Return the best place of a map of every family but single pixels, the simpler ones first."""
+    return [
         _bands(contrast, 0),
         _bands(contrast, 1),
         _periodic(contrast, 0),
         _periodic(contrast, 1),
         _rectangle(contrast),
         _disc(contrast),
-        *others,
     ]
-    there = [each for each in families if each is not None and _parts(each.mask, some)]
+
+
+def best_place(contrast: Contrast, families: Sequence[Found | None], better: float = _BETTER) -> Found | None:
+    """Return the place of the smallest probability of all families; None where none divides the pixels.
+
+    Args:
+        contrast: of a map, (y, x).
+        families: the best place of each.
+        better: nats by which one of a later family must be less probable.
+    """
+    some = contrast.some > 0
+    # a sensor of one row has no band of rows
+    there = [
+        each for each in families
+        if each is not None and (some & each.mask).any() and (some & ~each.mask).any()
+    ]  # fmt: skip
     if not there:
         return None
     best = there[0]
     for each in there[1:]:
-        if each.log_p < best.log_p - _BETTER:
+        if each.log_p < best.log_p - better:
             best = each
-    return Found(best.family, best.mask, best.z, best.log_p + math.log(len(families)))
-
-
-def _parts(mask: BoolArray, some: BoolArray) -> bool:
-    """Return whether a place divides the pixels: a sensor of one row has no band of rows."""
-    return bool((some & mask).any() and (some & ~mask).any())
+    return replace(best, log_p=best.log_p + math.log(len(families)))
 
 
 def _odd_side(found: Found, values: FloatArray, some: BoolArray) -> Found:
@@ -220,7 +289,7 @@ def _odd_side(found: Found, values: FloatArray, some: BoolArray) -> Found:
     inside, outside = values[some & found.mask].mean(), values[some & ~found.mask].mean()
     if abs(inside) >= abs(outside):
         return found
-    return Found(found.family, ~found.mask, -found.z, found.log_p)
+    return replace(found, mask=~found.mask, z=-found.z)
 
 
 @dataclass(frozen=True)
@@ -237,13 +306,14 @@ class Contrast:
     values: FloatArray
     some: FloatArray
     spread: float
-    fewest: int = _FEWEST
+    fewest: int = FEWEST
 
     @classmethod
-    def of(cls, values: FloatArray, some: BoolArray, fewest: int = _FEWEST) -> Contrast | None:
-        """Centre a map, to look for places of so many values or more; None where it has too few."""
+    def of(cls, values: FloatArray, some: BoolArray, fewest: int = FEWEST) -> Contrast | None:
+        """Clip and centre a map, to look for places of so many values or more; None where it has too few."""
+        values = np.clip(np.where(some, values, 0.0), -_CLIP, _CLIP)
         inside = values[some]
-        if inside.size <= 2 * _FEWEST:
+        if inside.size <= 2 * FEWEST:
             return None
         # what stands out widens the spread of the whole: take it from the middle
         spread = max(1.0, float(np.subtract(*np.quantile(inside, [0.75, 0.25]))) / 1.349)
@@ -287,40 +357,65 @@ def _log_p_range(z: float, n: int, shortest: int) -> float:
 
 
 def _intervals(contrast: Contrast, sums: FloatArray, counts: FloatArray) -> tuple[float, int, int]:
-    """Return the deviation and the ends of the best range of lines."""
+    """Return the deviation and the ends of the best range of lines: of cells of many, then moved by lines."""
+    n = sums.size
     total, number = (np.concatenate([[0.0], np.cumsum(values)]) for values in (sums, counts))
-    z = contrast.z(total[None, :] - total[:, None], number[None, :] - number[:, None])
-    z = np.where(np.arange(total.size)[None, :] > np.arange(total.size)[:, None], z, 0.0)
-    a, b = np.unravel_index(int(np.argmax(np.abs(z))), z.shape)
-    return float(z[a, b]), int(a), int(b)
+    edges = np.unique(np.linspace(0, n, min(_STRETCHES, n) + 1).astype(int))
+    some, many = total[edges], number[edges]
+    z = np.triu(np.abs(contrast.z(some[None, :] - some[:, None], many[None, :] - many[:, None])), 1)
+    first, last = (int(edges[i]) for i in np.unravel_index(int(np.argmax(z)), z.shape))
+    near = math.ceil(n / _STRETCHES) + 1
+    for _ in range(2 if first < last and edges.size <= n else 0):
+        starts = np.arange(max(first - near, 0), min(first + near, last - 1) + 1)
+        tried = contrast.z(total[last] - total[starts], number[last] - number[starts])
+        first = int(starts[np.argmax(np.abs(tried))])
+        ends = np.arange(max(last - near, first + 1), min(last + near, n) + 1)
+        tried = contrast.z(total[ends] - total[first], number[ends] - number[first])
+        last = int(ends[np.argmax(np.abs(tried))])
+    return float(contrast.z(total[last] - total[first], number[last] - number[first])), first, last
 
 
-def _bands(contrast: Contrast, axis: int) -> Found:
-    """Return the best band of rows (axis 0) or columns (axis 1)."""
-    across = 1 - axis
-    sums, counts = contrast.values.sum(axis=across), contrast.some.sum(axis=across)
+def _bands(contrast: Contrast, axis: int, log_p: Callable[[float, int], float] | None = None) -> Found:
+    """Return the best band of rows (axis 0) or columns (axis 1); ``log_p`` of a deviation among n lines."""
+    sums, counts = (values.sum(axis=1 - axis) for values in (contrast.values, contrast.some))
     z, a, b = _intervals(contrast, sums, counts)
     lines = np.zeros(sums.size, np.bool_)
     lines[a:b] = True
-    return Found("columns" if axis else "rows", _lines(lines, axis, contrast), z, _log_p(z, sums.size**2 / 2))
+    chance = _log_p(z, sums.size**2 / 2) if log_p is None else log_p(z, sums.size)
+    return Found("columns" if axis else "rows", _lines(lines, axis, contrast), z, chance)
 
 
 def _lines(lines: BoolArray, axis: int, contrast: Contrast) -> BoolArray:
     return np.broadcast_to(lines if axis else lines[:, None], contrast.values.shape).copy()
 
 
-def _periodic(contrast: Contrast, axis: int) -> Found:
-    """Return the best set of every n-th row or column."""
-    across = 1 - axis
-    sums, counts = contrast.values.sum(axis=across), contrast.some.sum(axis=across)
+def _periodic(
+    contrast: Contrast,
+    axis: int,
+    numbers: IntArray | None = None,
+    periods: Sequence[int] = PERIODS,
+    cycles: int = 2,
+    better: float = 1.0,
+) -> Found:
+    """Return the best set of every n-th row or column.
+
+    Args:
+        contrast: of a map.
+        axis: 0 for rows, 1 for columns.
+        numbers: of the lines; None: from 0 on.
+        periods: that are tried, increasing.
+        cycles: of a period, at least, among the lines.
+        better: factor by which a longer period must deviate more.
+    """
+    sums, counts = (values.sum(axis=1 - axis) for values in (contrast.values, contrast.some))
     best, lines, tried = 0.0, np.zeros(sums.size, np.bool_), 0
-    number = np.arange(sums.size)
-    for period in (p for p in _PERIODS if 2 * p <= sums.size):
+    number = np.arange(sums.size) if numbers is None else numbers
+    for period in (p for p in periods if cycles * p <= sums.size):
         phase = number % period
-        z = contrast.z(np.bincount(phase, sums), np.bincount(phase, counts))
+        z = contrast.z(np.bincount(phase, sums, period), np.bincount(phase, counts, period))
         tried += period
         at = int(np.argmax(np.abs(z)))
-        if abs(z[at]) > abs(best):
+        if abs(z[at]) > abs(best) * better:
             best, lines = float(z[at]), phase == at
     return Found("period", _lines(lines, axis, contrast), best, _log_p(best, max(tried, 1)))
 
@@ -428,43 +523,6 @@ def affected_share(z: FloatArray, inside: BoolArray, level: float = 0.05) -> flo
     return float(max(bound.max(), 0.0) / n)
 
 
-# -- series -------------------------------------------------------------------------------------
-
-
-def scan_series(
-    values: FloatArray,
-    numbers: NDArray[np.int64],
-    *,
-    significance: float = 1e-3,
-    most: int = 2,
-    shortest: int = _FEWEST,
-) -> list[Stretch]:
-    """Return the frames that stand out of a series, the most significant first.
-
-    Args:
-        values: N(0, 1) and independent where nothing is wrong, (n,).
-        numbers: frame numbers, increasing, (n,).
-        significance: largest probability of a chance.
-        most: stretches at most.
-        shortest: frames that a range or a phase of a period must have.
-    """
-    left = np.isfinite(values)
-    found: list[Stretch] = []
-    while len(found) < most and left.sum() > 2 * _FEWEST:
-        best = _best_frames(values, numbers, left, shortest)
-        if best is None:
-            break
-        when, place = best[0], _checked(best[1], values, left)
-        if place.log_p > math.log(significance):
-            break
-        mask = place.mask & left
-        inside, outside = float(values[mask].mean()), float(values[left & ~mask].mean())
-        family = "frames" if place.family == "pixels" else place.family
-        found.append(Stretch(when, family, place.z, place.log_p, inside, outside))
-        left &= ~place.mask
-    return found
-
-
 def sharpest_range(series: FloatArray, first: int, last: int, shortest: int) -> tuple[int, int]:
     """Return the range of frames, its end excluded, with which all series together are most probable.
 
@@ -488,7 +546,7 @@ def sharpest_range(series: FloatArray, first: int, last: int, shortest: int) -> 
     )
     n = len(x)
 
-    def nats(a: NDArray[np.int64], b: NDArray[np.int64]) -> FloatArray:
+    def nats(a: IntArray, b: IntArray) -> FloatArray:
         inside, whole = (total[b] - total[a], square[b] - square[a]), (total[-1], square[-1])
         outside = whole[0] - inside[0], whole[1] - inside[1]
         likely = _normal(b - a, *inside) + _normal(n - b + a, *outside)
@@ -504,71 +562,10 @@ def sharpest_range(series: FloatArray, first: int, last: int, shortest: int) -> 
     return (first, last) if gain > price else given
 
 
-def _normal(count: NDArray[np.int64], sums: FloatArray, squares: FloatArray) -> FloatArray:
+def _normal(count: IntArray, sums: FloatArray, squares: FloatArray) -> FloatArray:
     """Return the largest log likelihood of normal vectors, given their number, sums and sums of squares."""
     m = np.maximum(count, 1)[:, None]
     mean = sums / m
     covariance = squares / m[:, :, None] - mean[:, :, None] * mean[:, None, :]
     ridge = _RIDGE * np.eye(sums.shape[-1])
     return np.asarray(-0.5 * m[:, 0] * np.linalg.slogdet(covariance + ridge)[1])
-
-
-def _best_frames(
-    values: FloatArray, numbers: NDArray[np.int64], some: BoolArray, shortest: int
-) -> tuple[When, Found] | None:
-    kept = np.clip(np.where(some, values, 0.0), -_CLIP, _CLIP)
-    contrast = Contrast.of(kept, some, shortest)
-    if contrast is None:
-        return None
-    families = [_frame_range(contrast), _frame_period(contrast, numbers), _single(values, some)]
-    there = [each for each in families if each is not None and each.mask.any()]
-    if not there:
-        return None
-    best = min(there, key=lambda each: each.log_p)
-    log_p = best.log_p + math.log(len(families))
-    at = np.flatnonzero(best.mask)
-    if best.family == "range":
-        when = When(range=((int(numbers[at[0]]), int(numbers[at[-1]]) + 1),))
-    elif best.family == "period":
-        period = int(np.gcd.reduce(np.diff(numbers[at])))
-        when = When(every=period, phase=int(numbers[at[0]]) % period)
-    else:
-        when = When(single=tuple(int(i) for i in numbers[at][:1000]))
-    return when, Found(best.family, best.mask, best.z, log_p)
-
-
-def _frame_range(contrast: Contrast) -> Found | None:
-    """Return the best range of frames: of whole cells, then its ends moved by frames; None: all too short."""
-    n = contrast.values.size
-    total, number = (np.concatenate([[0.0], np.cumsum(v)]) for v in (contrast.values, contrast.some))
-    edges = np.unique(np.linspace(0, n, min(_STRETCHES, n) + 1).astype(int))
-    z, a, b = _intervals(contrast, np.diff(total[edges]), np.diff(number[edges]))
-    first, last = int(edges[a]), int(edges[b])
-    if last <= first:
-        return None
-    near = int(np.ceil(n / _STRETCHES)) + 1
-    for _ in range(2):
-        starts = np.arange(max(first - near, 0), min(first + near, last - 1) + 1)
-        scores = contrast.z(total[last] - total[starts], number[last] - number[starts])
-        first = int(starts[np.argmax(np.abs(scores))])
-        ends = np.arange(max(last - near, first + 1), min(last + near, n) + 1)
-        scores = contrast.z(total[ends] - total[first], number[ends] - number[first])
-        last = int(ends[np.argmax(np.abs(scores))])
-        z = float(scores[np.argmax(np.abs(scores))])
-    mask = np.zeros(n, np.bool_)
-    mask[first:last] = True
-    return Found("range", mask, z, _log_p_range(z, n, contrast.fewest))
-
-
-def _frame_period(contrast: Contrast, numbers: NDArray[np.int64]) -> Found | None:
-    """Return the best phase of a period of frames."""
-    best, mask, tried = 0.0, np.zeros(numbers.size, np.bool_), 0
-    for period in (p for p in _FRAME_PERIODS if 4 * p <= numbers.size):
-        phase = numbers % period
-        sums, counts = (np.bincount(phase, v, period) for v in (contrast.values, contrast.some))
-        z = contrast.z(sums, counts)
-        tried += period
-        at = int(np.argmax(np.abs(z)))
-        if abs(z[at]) > abs(best) * 1.02:  # a multiple of a period is no better than it
-            best, mask = float(z[at]), np.asarray(phase == at)
-    return Found("period", mask, best, _log_p(best, max(tried, 1))) if tried else None

@@ -10,20 +10,28 @@ are expected in all does not matter.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.scan import Contrast, Found, Stretch, Suspect, best_place
+from pchem_pipeline.discrepancy.scan import (
+    FEWEST,
+    Contrast,
+    Found,
+    Stretch,
+    Suspect,
+    best_place,
+    regions,
+    successive,
+)
 from pchem_pipeline.effects.framework.region import Region, When
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_FEWEST = 3  # events in all, and in a place
 _MOST = 500  # frames with an event that are looked at: so many drawn of them tell a range as well
 _SEED = 1
 
@@ -43,24 +51,20 @@ def scan_event_map(
     Returns:
         Places; ``inside`` and ``outside`` are events beyond those expected per pixel.
     """
-    left = usable & (expected > 0.0)
-    seen, wanted = seen & left, np.where(left, expected, 0.0)
-    found: list[Suspect] = []
-    while len(found) < most and (seen & left).sum() >= _FEWEST:
-        chance = np.where(left, wanted, 0.0)
-        contrast = _Events(np.where(left, seen, 0.0), chance / chance.sum(), 1.0, _FEWEST)
-        best = best_place(contrast, left)
-        if best is None:
-            break
-        mask = best.mask & left
-        log_p = contrast.exact(best, mask)
-        if log_p > math.log(significance):
-            break
-        inside, outside = (float((seen[m] - wanted[m]).mean()) for m in (mask, left & ~mask))
-        share = max(float(seen[mask].sum() - wanted[mask].sum()), 0.0) / mask.sum()
-        found.append(Suspect(Region.of_mask(best.mask), best.family, best.z, log_p, inside, outside, share))
-        left &= ~best.mask
-    return found
+
+    def best(left: BoolArray) -> tuple[BoolArray, Suspect] | None:
+        events, chance = np.where(left, seen, 0.0), np.where(left, expected, 0.0)
+        if events.sum() < FEWEST:
+            return None
+        contrast = _Events(events, chance / chance.sum(), 1.0)
+        found = best_place(contrast, regions(contrast))
+        if found is None or (log_p := contrast.exact(found)) > math.log(significance):
+            return None
+        means = replace(found, log_p=log_p).means(events - chance, left)
+        share = max(means["inside"], 0.0)
+        return found.mask, Suspect(**means, region=Region.of_mask(found.mask), share=share)
+
+    return successive(best, usable & (expected > 0.0), most)
 
 
 @dataclass(frozen=True)
@@ -83,11 +87,11 @@ class _Events(Contrast):
         more = (events > total * share) & (events > self.fewest - 0.5)
         return np.where(more, np.sqrt(2.0 * np.maximum(information, 0.0)), 0.0)
 
-    def exact(self, found: Found, mask: BoolArray) -> float:
+    def exact(self, found: Found) -> float:
         """Return the logarithm of the probability of a place by the binomial law itself."""
         places = found.log_p - float(special.log_ndtr(-abs(found.z)))
-        seen, total, share = self.values[mask].sum(), self.values.sum(), self.some[mask].sum()
-        return min(0.0, places + log_binomial_tail(float(seen), float(total), float(share)))
+        seen, share = (float(values[found.mask].sum()) for values in (self.values, self.some))
+        return min(0.0, places + log_binomial_tail(seen, float(self.values.sum()), share))
 
 
 def scan_event_frames(
@@ -118,9 +122,9 @@ def scan_event_frames(
         expected *= _MOST / positions.size
         positions = np.sort(np.random.default_rng(_SEED).choice(positions, _MOST, replace=False))
     m, n = positions.size, numbers.size
-    if m < _FEWEST or n < 2 * shortest:
+    if m < FEWEST or n < 2 * shortest:
         return None
-    first, last = np.triu_indices(m, _FEWEST - 1)
+    first, last = np.triu_indices(m, FEWEST - 1)
     length = positions[last] - positions[first] + 1
     log_p = _log_tails(last - first, m - 1, np.maximum(length, shortest) / n)
     at = int(np.argmin(log_p))
@@ -130,9 +134,10 @@ def scan_event_frames(
     begin, end = _ends(int(positions[first[at]]), int(positions[last[at]]), int(last[at] - first[at]), n)
     inside = (positions >= begin) & (positions < end)
     seen = (float(inside.sum()), end - begin), (float((~inside).sum()), max(n - end + begin, 1))
-    rates = (events / frames - expected / n for events, frames in seen)
+    rates = [events / frames - expected / n for events, frames in seen]
     when = When(range=((int(numbers[begin]), int(numbers[end - 1]) + 1),))
-    return Stretch(when, "range", float(-special.ndtri_exp(float(log_p[at]))), value, *rates)
+    z = float(-special.ndtri_exp(float(log_p[at])))
+    return Stretch(family="range", z=z, log_p=value, inside=rates[0], outside=rates[1], when=when)
 
 
 def _ends(first: int, last: int, gaps: int, n: int) -> tuple[int, int]:

@@ -19,7 +19,7 @@ from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.observe.pairs import CHANNELS, MODES, PERIOD, Pairs, Samples, pairs_of
-from pchem_pipeline.discrepancy.scan import Suspect
+from pchem_pipeline.discrepancy.scan import PERIODS, Suspect, successive
 from pchem_pipeline.discrepancy.scan_edges import Side, sharpened
 from pchem_pipeline.effects.framework.region import Region, Taps
 
@@ -27,7 +27,6 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_PERIODS = (2, 4, 8, 16, 32)
 _FEWEST_LINES = 2  # of a period
 #: Guesses that are held against the scatter of the frames, the most significant first.
 _MEASURED = 8
@@ -36,17 +35,15 @@ _FAMILIES = 5
 _LINE_BY_CHANCE = 1e-4  # probability of a line that stands out by itself, among all
 
 
-@dataclass(frozen=True)
-class Shared:
-    """A place whose pixels move together, unlike the rest.
+@dataclass(frozen=True, kw_only=True)
+class Shared(Suspect):
+    """A place whose pixels move together, unlike the rest; inside and outside are mean correlations of pairs.
 
     Attributes:
-        place: it; ``inside`` and ``outside`` are mean correlations of pairs.
         channel: 0 for electron numbers, 1 for residuals.
         mode: row, column or frame: what the pixels share.
     """
 
-    place: Suspect
     channel: int
     mode: str
 
@@ -91,15 +88,14 @@ def scan_pairs(
         limits: of their sizes.
     """
     limits = limits or Limits()
-    found: list[Shared] = []
-    while len(found) < most and samples.usable.sum() > 2 * limits.fewest:
-        best = _most_significant(samples, math.log(significance), limits)
-        if best is None:
-            break
-        found.append(best)
-        shape = samples.usable.shape[0], samples.usable.shape[1]
-        samples = samples.without(best.place.region.mask(shape))
-    return found
+
+    def best(left: BoolArray) -> tuple[BoolArray, Shared] | None:
+        if left.sum() <= 2 * limits.fewest:
+            return None
+        found = _most_significant(replace(samples, usable=left), math.log(significance), limits)
+        return None if found is None else (found.region.mask((left.shape[0], left.shape[1])), found)
+
+    return successive(best, samples.usable, most)
 
 
 def _most_significant(samples: Samples, log_limit: float, limits: Limits) -> Shared | None:
@@ -128,11 +124,11 @@ def _most_significant(samples: Samples, log_limit: float, limits: Limits) -> Sha
         if _holds(place, log_limit, limits):
             sharper = _with_ends(samples, channel, pairs, best, place)
             place = sharper if _holds(sharper, log_limit, limits) else place
-            return Shared(place, channel, pairs.mode)
+            return place
     return None
 
 
-def _holds(place: Suspect, log_limit: float, limits: Limits) -> bool:
+def _holds(place: Shared, log_limit: float, limits: Limits) -> bool:
     """Tell whether a place is significant, and little of it is elsewhere."""
     return place.log_p <= log_limit and abs(place.outside) < limits.contrast * place.inside
 
@@ -161,7 +157,7 @@ def _region(best: _Best, pairs: Pairs, shape: tuple[int, int]) -> Region | None:
     return None if mask.all() else Region.of_mask(mask)
 
 
-def _measured(samples: Samples, channel: int, mode: str, region: Region, best: _Best) -> Suspect:
+def _measured(samples: Samples, channel: int, mode: str, region: Region, best: _Best) -> Shared:
     """Return a place with its significance by theory or by the scatter of the frames, whichever is less."""
     inside = region.mask((samples.usable.shape[0], samples.usable.shape[1]))
     usable = samples.usable
@@ -178,10 +174,19 @@ def _measured(samples: Samples, channel: int, mode: str, region: Region, best: _
     freedom = 2.0 * n * own / max(partners - 1.0, 1e-9) ** 2
     z = float(chi_square(max(freedom + z * math.sqrt(2.0 * freedom), 0.0), freedom))
     rest = (float(total.sum()) - float(energy.sum())) / max(n * (every - own), 1.0)
-    return Suspect(region, best.family, z, _log_p(z, best.places), float(energy.sum()) / (n * own), rest)
+    return Shared(
+        family=best.family,
+        z=z,
+        log_p=_log_p(z, best.places),
+        inside=float(energy.sum()) / (n * own),
+        outside=rest,
+        region=region,
+        channel=channel,
+        mode=mode,
+    )
 
 
-def _with_ends(samples: Samples, channel: int, pairs: Pairs, best: _Best, place: Suspect) -> Suspect:
+def _with_ends(samples: Samples, channel: int, pairs: Pairs, best: _Best, place: Shared) -> Shared:
     """Return the place of a box with its ends told line by line."""
     lines, across = Side.of(pairs.lines, best.lines), Side.of(pairs.across, best.across)
     if best.taps is not None or best.scattered or (lines.exact and across.exact):
@@ -262,7 +267,7 @@ def _periods(pairs: Pairs) -> list[_Best]:
     for along, sums, counts in zip(ways, pairs.phases, pairs.phase_counts, strict=True):
         total, number = float(sums.sum()), float(counts.sum())
         length = int((pairs.columns if along == "columns" else pairs.rows)[-1])
-        for period in (p for p in _PERIODS if _FEWEST_LINES * p <= length and number > 0):
+        for period in (p for p in PERIODS if _FEWEST_LINES * p <= length and number > 0):
             for phase in range(period):
                 some = np.ix_(*2 * (np.arange(PERIOD) % period == phase,))
                 inside, counted = float(sums[some].sum()), float(counts[some].sum())

@@ -211,13 +211,13 @@ def places_of_bands(
         for each in scan_pairs(samples, significance=_SIGNIFICANCE / len(bands), most=1):
             name = f"pairs.{each.mode}.{CHANNELS[each.channel]}"
             mask = np.zeros((ny, nx), np.bool_)
-            mask[first:last] = each.place.region.mask((last - first, nx))
+            mask[first:last] = each.region.mask((last - first, nx))
             root = math.sqrt(numbers.size)
             place = SensorPlace(
                 Region.of_mask(mask),
-                min(1.0, each.place.p * len(bands)),
-                each.place.inside * root,
-                each.place.outside * root,
+                min(1.0, each.p * len(bands)),
+                each.inside * root,
+                each.outside * root,
             )
             if name not in places or place.p < places[name].p:
                 places[name] = place

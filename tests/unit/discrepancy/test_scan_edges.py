@@ -39,7 +39,7 @@ def test_edges_within_cells_are_found(mode: str, axes: tuple[int, ...], place: d
     region = Region.model_validate(place)
     found = scan_pairs(samples_of(noisy(region, axes, 0.5)), most=1)
     assert found[0].mode == mode
-    assert found[0].place.region.overlap(region, SHAPE) == 1.0
+    assert found[0].region.overlap(region, SHAPE) == 1.0
 
 
 def test_without_single_lines_the_edges_of_the_cells_would_be_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -47,7 +47,7 @@ def test_without_single_lines_the_edges_of_the_cells_would_be_wrong(monkeypatch:
     samples = samples_of(noisy(region, (FRAMES, 1, 1), 0.5))
     monkeypatch.setattr(Side, "exact", True)
     found = scan_pairs(samples, most=1)
-    assert 0.8 < found[0].place.region.overlap(region, SHAPE) < 1.0
+    assert 0.8 < found[0].region.overlap(region, SHAPE) < 1.0
 
 
 def test_dead_lines_at_an_edge_belong_to_nothing_and_do_not_end_a_place() -> None:
@@ -55,8 +55,8 @@ def test_dead_lines_at_an_edge_belong_to_nothing_and_do_not_end_a_place() -> Non
     usable = np.ones(SHAPE, np.bool_)
     usable[[7, 8, 15, 24, 25]] = False
     found = scan_pairs(samples_of(noisy(region, (FRAMES, 1, 1), 0.4), usable), most=1)
-    assert found[0].place.region.mask(SHAPE)[usable].sum() == region.mask(SHAPE)[usable].sum()
-    assert found[0].place.region.rows == ((9, 24),)
+    assert found[0].region.mask(SHAPE)[usable].sum() == region.mask(SHAPE)[usable].sum()
+    assert found[0].region.rows == ((9, 24),)
 
 
 def test_what_single_lines_hardly_show_leaves_the_edges_as_they_are() -> None:

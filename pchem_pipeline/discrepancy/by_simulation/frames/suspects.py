@@ -71,7 +71,7 @@ def suspected_parts(evidence: Evidence, frames: NDArray[np.unsignedinteger[Any]]
     regions = [
         *_regions(evidence, usable),
         *_regions_of_rare(evidence),
-        *(_Found(each.place.z, Part(each.place.region)) for each in shared),
+        *(_Found(each.z, Part(each.region)) for each in shared),
     ]
     places = _apart(regions, usable.shape)
     stretches = [*_stretches(evidence, time), *_stretches_of_rare(evidence, time)]
@@ -131,7 +131,7 @@ def _told_apart(found: Sequence[_Found], frames: NDArray[np.int64]) -> list[Part
 def _frames_of_places(shared: Sequence[Shared], samples: Samples, time: TimeSeries) -> Iterator[_Found]:
     """Yield places in those frames only in which their pixels share noise."""
     for each in shared:
-        mask = samples.usable & each.place.region.mask((samples.usable.shape[0], samples.usable.shape[1]))
+        mask = samples.usable & each.region.mask((samples.usable.shape[0], samples.usable.shape[1]))
         energy = samples.energies(each.channel, each.mode, mask)
         values = (energy - np.median(energy)) / max(robust_sd(energy), 1e-300)
         for one in scan_series(
@@ -139,7 +139,7 @@ def _frames_of_places(shared: Sequence[Shared], samples: Samples, time: TimeSeri
         ):
             inside = one.when.frames(time.frames).sum()
             if FEWEST_FRAMES <= inside <= _LARGEST * time.frames.size and one.inside > one.outside:
-                yield _Found(one.z, Part(each.place.region, _with_unseen(one.when, time.frames)))
+                yield _Found(one.z, Part(each.region, _with_unseen(one.when, time.frames)))
 
 
 def _places_of_frames(
@@ -154,7 +154,7 @@ def _places_of_frames(
             most=1,
             limits=Limits(FEWEST_PIXELS, _LARGEST),
         ):
-            yield _Found(each.place.z, Part(each.place.region, part.when))
+            yield _Found(each.z, Part(each.region, part.when))
 
 
 def _regions(evidence: Evidence, usable: NDArray[np.bool_]) -> Iterator[_Found]:

@@ -75,9 +75,9 @@ def test_a_place_is_found_from_twelve_standard_errors_of_its_pairs_on(
     frames = rng.standard_normal((FRAMES, *SHAPE)) + mask * shared
     found = scan_pairs(samples_of(np.clip(frames, -6, 6)), significance=1e-3)
     assert found[0].mode == mode
-    assert found[0].place.region.overlap(region, SHAPE) > 0.7
+    assert found[0].region.overlap(region, SHAPE) > 0.7
     # the scatter of the noise put in and the root take up to half of it, the best of all places adds
-    assert 6.0 < found[0].place.z < 16.0
+    assert 6.0 < found[0].z < 16.0
 
 
 @pytest.mark.parametrize("mode", ["row", "column"])
@@ -93,7 +93,7 @@ def test_scattered_lines_are_one_place(mode: str, lines: list[tuple[int, int]]) 
     found = scan_pairs(samples_of(np.clip(frames, -6, 6)), significance=1e-3)
     # one guess of each channel is the same, since both are
     assert found[0].mode == mode
-    assert np.array_equal(found[0].place.region.mask(SHAPE), mask)
+    assert np.array_equal(found[0].region.mask(SHAPE), mask)
     assert len(found) == 1
 
 
