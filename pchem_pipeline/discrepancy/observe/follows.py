@@ -253,10 +253,7 @@ def _charge_of(
     laws: PixelLaws, maps: PixelMaps
 ) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array]:
     """Return the correlation of charge and residual, the scale of what it leaves, mean and spread, (y, x)."""
-    shape = maps.usable.shape
-    pixels = pixel_statistics(
-        laws, maps.quanta_exposure.ravel(), maps.conversion_gain.ravel(), (shape[0], shape[1])
-    )
+    pixels = pixel_statistics(laws, maps)
     usable = pixels.usable
     correlation = pixels.cross / np.sqrt(np.where(usable, pixels.charge * pixels.readout, 1.0))
     left = 1.0 - correlation**2

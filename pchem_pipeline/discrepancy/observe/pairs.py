@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
-from pchem_pipeline.discrepancy.observe.tables import pixel_laws
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.model.histogram.count import histogram_frames
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -80,14 +79,7 @@ class Stack:
 
 def laws_of_frames(frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> PixelLaws:
     """Compare the histograms of frames (n, y, x) with the fit of their pixels."""
-    histograms = histogram_frames(frames)
-    return pixel_laws(
-        histograms.counts.reshape(-1, histograms.counts.shape[2]),
-        histograms.origin.ravel().astype(np.int64),
-        np.stack([histograms.under.ravel(), histograms.over.ravel()], axis=1).astype(np.float64),
-        maps.columns,
-        maps.usable.ravel(),
-    )
+    return pixel_laws(PixelHistograms.of(frames), maps.columns, maps.usable.ravel())
 
 
 @dataclass(frozen=True)
@@ -119,8 +111,7 @@ class Samples:
     @classmethod
     def by_laws(cls, frames: FrameBlocks, laws: PixelLaws, maps: PixelMaps) -> Samples:
         """Prepare frames by the laws of their pixels, made of all samples of the frames or of more."""
-        shape = (maps.usable.shape[0], maps.usable.shape[1])
-        pixels = pixel_statistics(laws, maps.quanta_exposure.ravel(), maps.conversion_gain.ravel(), shape)
+        pixels = pixel_statistics(laws, maps)
         usable = pixels.usable
         first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T.astype(np.int32)
         codes = np.where(laws.good, laws.support[:, 1], 0)
@@ -129,7 +120,7 @@ class Samples:
             deviation = np.sqrt(np.where(usable, variance, 1.0)).ravel().astype(np.float32)
             tables[channel, 1:] /= np.repeat(deviation, codes)
         np.clip(tables, -_CLIP, _CLIP, out=tables)
-        first, last, start = (values.reshape(shape) for values in (first, first + length - 1, start))
+        first, last, start = (values.reshape(usable.shape) for values in (first, first + length - 1, start))
         return cls(frames, first, last, start, tables, usable)
 
     @property

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.observe import sums_numba as kernel
 from pchem_pipeline.discrepancy.observe import tables_numba as columns_of
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -73,11 +74,8 @@ class FrameSums:
             the k before, k with the r before, (8, y, x).
         row_noise: weighted sums of r^2 of each row, less their means, (n, y).
         column_noise: the same of each column, (n, x).
-        n_pairs: number of products behind lags 1, 2, 3.
+        n_pairs: number of products behind each of them.
         next_column, next_row: mean products kk, rr and rk + kr with the next column or row, (3, y, x).
-        repeated: positions of frames equal to the one before.
-        repeated_rows: number of rows (of other frames) equal to those before.
-        consecutive: number of frames that directly follow another.
         hits: samples above the support of their pixel: frame position, y, x, DN, (n_hits, 4).
         low_hits: the same below it.
     """
@@ -89,12 +87,9 @@ class FrameSums:
     lags: FloatArray
     row_noise: FloatArray
     column_noise: FloatArray
-    n_pairs: tuple[int, int, int]
+    n_pairs: tuple[int, ...]
     next_column: FloatArray
     next_row: FloatArray
-    repeated: IntArray
-    repeated_rows: int
-    consecutive: int
     hits: IntArray
     low_hits: IntArray
 
@@ -106,11 +101,10 @@ def blocks_of(numbers: IntArray, block_frames: int) -> IntArray:
     return np.concatenate([*starts, [numbers.size]]).astype(np.int64)
 
 
-def pixel_statistics(
-    laws: PixelLaws, exposure: FloatArray, gain: FloatArray, shape: tuple[int, int]
-) -> PixelStatistics:
+def pixel_statistics(laws: PixelLaws, maps: PixelMaps) -> PixelStatistics:
     """Collect the moments of the channels; pixels in which one of them is constant do not count."""
-    moments = laws.moments
+    moments, shape = laws.moments, maps.usable.shape
+    exposure, gain = maps.quanta_exposure.ravel(), maps.conversion_gain.ravel()
     kk, rr, kr = (moments[:, c] for c in (columns_of.MEAN_KK, columns_of.MEAN_RR, columns_of.MEAN_KR))
     usable = laws.good & (kk > 1e-12) & (rr > 1e-12)
 
@@ -139,9 +133,7 @@ def pixel_statistics(
     )  # fmt: skip
 
 
-def sum_frames(
-    frames: NDArray[Any], numbers: IntArray, edges: IntArray, laws: PixelLaws, pixels: PixelStatistics
-) -> FrameSums:
+def sum_frames(frames: NDArray[Any], edges: IntArray, laws: PixelLaws, pixels: PixelStatistics) -> FrameSums:
     """Sum over the frames (n, y, x) of a split whose blocks begin at ``edges``."""
     n, ny, nx = frames.shape
     size = max(1, min(n, _CHUNK_SAMPLES // (ny * nx)))
@@ -164,17 +156,13 @@ def sum_frames(
         )  # fmt: skip
         kernel.sum_block(frames[first:last], channels, charge, readout, block)
     lengths = np.diff(edges)
-    pairs = [int(np.maximum(lengths - lag, 0).sum()) for lag in (1, 2, 3)]
-    lags /= np.maximum([*pairs, *pairs, pairs[0], pairs[0]], 1)[:, None, None]
-    consecutive = np.concatenate([[False], np.diff(numbers) == 1])
-    repeated = np.zeros(n, np.bool_)
-    repeated_rows = kernel.count_repeats(frames, consecutive, repeated)
+    pairs = tuple(int(np.maximum(lengths - lag, 0).sum()) for lag in (1, 2, 3, 1, 2, 3, 1, 1))
+    lags /= np.maximum(pairs, 1)[:, None, None]
     gain = (gain - pixels.gain_offset) / max(pixels.gain_norm, 1e-300)
     return FrameSums(
         rows, columns.transpose(1, 0, 2), gain, blocks, lags,
         row_noise - row_noise.mean(axis=0), column_noise - column_noise.mean(axis=0, dtype=np.float64),
-        (pairs[0], pairs[1], pairs[2]), next_column / n, next_row / n, np.flatnonzero(repeated),
-        int(repeated_rows), int(consecutive.sum()),
+        pairs, next_column / n, next_row / n,
         _hits(frames, laws, pixels.usable, above=True), _hits(frames, laws, pixels.usable, above=False),
     )  # fmt: skip
 

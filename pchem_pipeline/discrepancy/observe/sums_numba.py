@@ -264,33 +264,6 @@ def sum_block(
 
 
 @kernel
-def count_repeats(frames: NDArray[Any], consecutive: NDArray[np.bool_], repeated: NDArray[np.bool_]) -> int:
-    """Mark frames equal to the one before, and return the number of such rows in the other frames.
-
-    Args:
-        frames: codes (frame, y, x).
-        consecutive: whether a frame directly follows the one before it in the stack, (frame,).
-        repeated: to fill, (frame,).
-    """
-    n, ny, nx = frames.shape
-    found = 0
-    for t in range(1, n):
-        if not consecutive[t]:
-            continue
-        rows = 0
-        for y in range(ny):
-            x = 0
-            while x < nx and frames[t, y, x] == frames[t - 1, y, x]:
-                x += 1
-            rows += x == nx
-        if rows == ny:
-            repeated[t] = True
-        else:
-            found += rows
-    return found
-
-
-@kernel
 def find_hits(frames: NDArray[Any], pixels: IntArray, ends: IntArray, hits: IntArray) -> int:
     """Fill ``hits`` (frame, y, x, DN) with samples of m pixels beyond ``ends``, (m, 2); return how many."""
     found = 0

@@ -33,10 +33,34 @@ def in_order(found: Mapping[str, float]) -> dict[str, float]:
     return {name: float(found[name]) for name in STATISTICS if name in found and np.isfinite(found[name])}
 
 
-def outliers(z: FloatArray, *, two_sided: bool) -> float:
-    """Return the statistic of how many pixels stand out, z being N(0, 1) otherwise."""
-    count = int(np.sum((np.abs(z) if two_sided else z) > STANDS_OUT))
-    return laws.poisson(count, _TAIL * z.size * (2.0 if two_sided else 1.0))
+def pixel_forms(
+    z: FloatArray,
+    *,
+    normal: FloatArray | None = None,
+    kurtosis: FloatArray | float = 0.0,
+    two_sided: bool = True,
+) -> dict[str, float]:
+    """Return the statistics of deviations of pixels, N(0, 1) by chance: their mean, their squares, outliers.
+
+    Args:
+        z: of mean 0 and variance 1, (n,).
+        normal: the same as normal quantiles, (n,); None: they are.
+        kurtosis: excess of each.
+        two_sided: whether far below counts as far above.
+    """
+    quantiles = z if normal is None else normal
+    count = int(np.sum((np.abs(quantiles) if two_sided else quantiles) > STANDS_OUT))
+    spread = np.sum(np.broadcast_to(np.maximum(2.0 + kurtosis, 1.0), z.shape))
+    return {
+        "mean": float(z.sum() / np.sqrt(z.size)),
+        "chi": float((z @ z - z.size) / np.sqrt(spread)),
+        "cnt": laws.poisson(count, _TAIL * z.size * (2.0 if two_sided else 1.0)),
+    }
+
+
+def named(start: str, forms: Mapping[str, float]) -> dict[str, float]:
+    """Return statistics by the names that begin with ``start``."""
+    return {f"{start}.{form}": value for form, value in forms.items()}
 
 
 def goodness_of(moments: FloatArray, chi_square: int = column.CHI2) -> FloatArray:
@@ -65,10 +89,7 @@ def sample_statistics(pixels: PixelLaws, exposure: FloatArray, residuals: CodeRe
     moments = pixels.moments[good]
     for name, chi_square in (("goodness", column.CHI2), ("peaks", column.PEAKS_CHI2)):
         z = goodness_of(moments, chi_square)
-        n = z.size
-        found[f"shape.{name}.mean"] = float(z.sum() / np.sqrt(n))
-        found[f"shape.{name}.chi"] = float((np.sum(z**2) - n) / np.sqrt(2.0 * n))
-        found[f"shape.{name}.cnt"] = outliers(z, two_sided=False)
+        found |= named(f"shape.{name}", pixel_forms(z, two_sided=False))
     for side, near, far in (
         ("low", moments[:, _LOW], moments[:, _FAR_LOW]),
         ("high", moments[:, _HIGH], moments[:, _FAR_HIGH]),
@@ -90,19 +111,16 @@ def _beyond(near: FloatArray, far: FloatArray) -> float:
 
 
 def _score_statistics(scores: FloatArray, log_exposure: FloatArray) -> dict[str, float]:
-    found = {}
+    found: dict[str, float] = {}
     spread = log_exposure.std()
     for j, name in enumerate(SCORES):
         fit = np.isfinite(scores[:, 0, j])
         z, skewness, kurtosis = scores[fit, :, j].T
-        n = int(z.size)
-        if n == 0:
+        if z.size == 0:
             continue
         normal = laws.without_skew(z, skewness)
-        found[f"shape.{name}.mean"] = float(z.sum() / np.sqrt(n))
-        found[f"shape.{name}.chi"] = float((z @ z - n) / np.sqrt(np.sum(np.maximum(2.0 + kurtosis, 1.0))))
-        found[f"shape.{name}.cnt"] = outliers(normal, two_sided=True)
-        if n >= 3 and spread > 1e-6:
+        found |= named(f"shape.{name}", pixel_forms(z, normal=normal, kurtosis=kurtosis))
+        if z.size >= 3 and spread > 1e-6:
             slope = log_exposure[fit] - log_exposure[fit].mean()
             found[f"shape.{name}.slope"] = float(slope @ z / np.sqrt(max(float(slope @ slope), 1e-300)))
     return found

@@ -2,19 +2,21 @@
 
 Given the histograms, frames without an effect are in random order. Centred series of n frames then have
 ``E[u_t u_s] = -1 / (n - 1)`` of their variance at different times, exactly; every mean below takes that into
-account, and likewise what the removal of a common mode does to the pixels that share it.
+account, and likewise what the removal of a common mode does to the pixels that share it. Every form is taken
+of every series, or of all lines, or of all pixels; those that are no statistics of the catalogue are dropped.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.discrepancy.observe.sums import FrameSums, PixelStatistics
-from pchem_pipeline.discrepancy.observe.vector import outliers
+from pchem_pipeline.discrepancy.observe.vector import named, pixel_forms
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -62,6 +64,12 @@ class FrameView:
         """Pattern of what is common to all pixels: H for a change of the exposure, 1 for one of the bias."""
         return self.pixels.usable.astype(np.float64) if channel else self.pixels.exposure
 
+    def lines(self, channel: int, axis: int) -> FloatArray:
+        """Sums of k or r of each row (axis 1) or column (axis 0), (n, lines)."""
+        if axis == 0:
+            return np.asarray(self.sums.columns[channel], np.float64)
+        return np.asarray(self.sums.rows[2 * channel : 2 * channel + 2].sum(axis=0))
+
     def remaining(self, channel: int) -> FloatArray:
         """Variance of each pixel after the frame's common mode was removed, 1 in unusable pixels, (y, x)."""
         v, h = self.variance(channel), self.mode(channel)
@@ -74,10 +82,25 @@ class FrameView:
         """Variance of the weighted squares of r in each pixel, (y, x)."""
         return np.asarray((self.pixels.square * self.pixels.readout) ** 2 * self.pixels.noise)
 
-    @property
-    def frame_noise(self) -> FloatArray:
-        """By how much the squares of r of each frame exceed their mean, of variance 1 by chance, (n,)."""
-        return np.asarray(self.sums.row_noise.sum(axis=1) / np.sqrt(max(self.noise_variance.sum(), 1e-300)))
+    @cached_property
+    def series(self) -> dict[str, FloatArray]:
+        """Sums of the frames, of variance 1 by chance, (n,) each.
+
+        Of k, of r, of their product for the gain, and of the squares of r less their mean (the noise).
+        """
+        sums, pixels = self.sums, self.pixels
+        found = {
+            name: self.lines(channel, 1).sum(axis=1) / np.sqrt(self.variance(channel).sum())
+            for channel, name in enumerate(CHANNELS)
+        }
+        found["gain"] = sums.gain * pixels.gain_norm / np.sqrt(max(pixels.gain_variance, 1e-300))
+        found["noise"] = sums.row_noise.sum(axis=1) / np.sqrt(max(self.noise_variance.sum(), 1e-300))
+        return found
+
+    @cached_property
+    def neighbours(self) -> dict[str, Neighbours]:
+        """Correlations of neighbours: x.kk, x.rr, x.rk, y.kk and so on."""
+        return {f"{axis}.{kind}": seen for axis in "xy" for kind, seen in _neighbours(self, axis).items()}
 
     def full_blocks(self, series: FloatArray) -> FloatArray:
         """Return the full blocks of a series (n, ...) as (blocks, block_frames, ...)."""
@@ -116,18 +139,8 @@ class FrameView:
         return np.asarray(np.add.reduceat(series, self.edges[:-1], axis=0) / np.sqrt(lengths))
 
 
-def _frame_series(view: FrameView, channel: int) -> FloatArray:
-    total = view.sums.rows[2 * channel : 2 * channel + 2].sum(axis=(0, 2))
-    return np.asarray(total / np.sqrt(view.variance(channel).sum()))
-
-
-def _trend(view: FrameView, u: FloatArray) -> float:
-    time = view.numbers - view.numbers.mean()
-    return float(time @ u / np.sqrt(time @ time) * np.sqrt((view.n - 1.0) / view.n))
-
-
 def _lag1(view: FrameView, u: FloatArray) -> float:
-    """Return the statistic of products of successive frames of a block, summed over the other axes."""
+    """Return the statistic of products of successive frames of a block."""
     inside = np.ones(view.n, np.bool_)
     inside[view.edges[:-1]] = False
     t = np.flatnonzero(inside)
@@ -135,48 +148,42 @@ def _lag1(view: FrameView, u: FloatArray) -> float:
     return float((products.sum() + products.size / (view.n - 1.0)) / np.sqrt(max(products.size, 1)))
 
 
-def _line(view: FrameView, u: FloatArray) -> float | None:
+def _line(view: FrameView, u: FloatArray) -> float:
     blocks = view.full_blocks(u)
     length = blocks.shape[1]
     if length < SHORTEST_PERIODOGRAM or blocks.shape[0] == 0:
-        return None
+        return float("nan")
     power = np.abs(np.fft.rfft(blocks, axis=1)[:, 1 : (length + 1) // 2]) ** 2 / length
     return laws.largest_power(power.mean(axis=0), blocks.shape[0])
 
 
-def frame_statistics(view: FrameView, expected_repeats: tuple[float, float]) -> dict[str, float]:
-    """Return the family frame; ``expected_repeats`` of frames and of rows by chance."""
+def _series_forms(view: FrameView, u: FloatArray) -> dict[str, float]:
+    """Return the statistics of a series of the frames, of variance 1 by chance, (n,)."""
+    time = view.numbers - view.numbers.mean()
+    sign = np.where(view.numbers % 2 == 0, 1.0, -1.0)
+    sign -= sign.mean()
+    return {
+        "variance": float(laws.chi_square(u @ u, view.n)),
+        "lag1": _lag1(view, u),
+        "slow": view.slow(view.block_sums(u)[:, None]),
+        "trend": float(time @ u / np.sqrt(time @ time) * np.sqrt((view.n - 1.0) / view.n)),
+        "line": _line(view, u),
+        "alternating": float(sign @ u / np.sqrt(max(float(sign @ sign), 1e-300))),
+        "largest": laws.largest_normal(u),
+    }
+
+
+def frame_statistics(view: FrameView) -> dict[str, float]:
+    """Return the family frame but for repeats."""
+    pixels, series = view.pixels, view.series
     found: dict[str, float] = {}
-    series = []
+    for name, u in series.items():
+        found |= named(f"frame.{name}", _series_forms(view, u))
     for channel, name in enumerate(CHANNELS):
-        u = _frame_series(view, channel)
-        series.append(u)
-        sign = np.where(view.numbers % 2 == 0, 1.0, -1.0)
-        sign -= sign.mean()
-        found[f"frame.{name}.variance"] = float(laws.chi_square(u @ u, view.n))
-        found[f"frame.{name}.lag1"] = _lag1(view, u)
-        found[f"frame.{name}.slow"] = view.slow(view.block_sums(u)[:, None])
-        found[f"frame.{name}.trend"] = _trend(view, u)
-        line = _line(view, u)
-        if line is not None:
-            found[f"frame.{name}.line"] = line
-        found[f"frame.{name}.alternating"] = float(sign @ u / np.sqrt(max(float(sign @ sign), 1e-300)))
-        found[f"frame.{name}.largest"] = laws.largest_normal(u)
-        quadrants = _quadrants(view, channel)
-        if quadrants is not None:
-            found[f"frame.{name}.quadrants"] = quadrants
-    k, r = series
-    pixels = view.pixels
+        found[f"frame.{name}.quadrants"] = _quadrants(view, channel)
     rho = float(pixels.cross.sum() / np.sqrt(pixels.charge.sum() * pixels.readout.sum()))
-    found["frame.covariance"] = float((k @ r - view.n * rho) / np.sqrt(view.n * (1.0 + rho**2)))
-    gain = view.sums.gain * pixels.gain_norm / np.sqrt(max(pixels.gain_variance, 1e-300))
-    found["frame.gain.slow"] = view.slow(view.block_sums(gain)[:, None])
-    found["frame.gain.trend"] = _trend(view, gain)
-    noise = view.frame_noise
-    found["frame.noise.variance"] = float(laws.chi_square(noise @ noise, view.n))
-    found["frame.noise.slow"] = view.slow(view.block_sums(noise)[:, None])
-    found["frame.repeated"] = laws.repeats(view.sums.repeated.size, expected_repeats[0])
-    found["frame.repeated_rows"] = laws.repeats(view.sums.repeated_rows, expected_repeats[1])
+    product = float(series["charge"] @ series["readout"])
+    found["frame.covariance"] = (product - view.n * rho) / np.sqrt(view.n * (1.0 + rho**2))
     return found
 
 
@@ -201,11 +208,11 @@ def without_mode(values: FloatArray, pattern: FloatArray) -> FloatArray:
     return np.asarray(values - (values @ unit)[..., None] * unit)
 
 
-def _quadrants(view: FrameView, channel: int) -> float | None:
+def _quadrants(view: FrameView, channel: int) -> float:
     variance = quadrant_sums(view.variance(channel))
     some = variance > 0
     if some.sum() < 2:
-        return None
+        return float("nan")
     scale = np.sqrt(variance[some])
     u = quadrant_series(view.sums.rows[2 * channel : 2 * channel + 2])[:, some] / scale
     rest = without_mode(view.block_sums(u), quadrant_sums(view.mode(channel))[some] / scale)
@@ -228,69 +235,42 @@ def time_statistics(view: FrameView, lags: FloatArray) -> dict[str, float]:
     """Return the family time from the autocorrelations of :func:`pixel_lags`."""
     found: dict[str, float] = {}
     usable = view.pixels.usable
-    n_pixels = int(usable.sum())
+    names = [f"time.lag{lag}.{name}" for name in CHANNELS for lag in (1, 2, 3)]
+    names += ["time.cross.readout_charge", "time.cross.charge_readout"]
+    for name, values, pairs in zip(names, lags, view.sums.n_pairs, strict=True):
+        if pairs:
+            forms = pixel_forms(values[usable] * np.sqrt(pairs))
+            found |= {name: forms["mean"], **named(name, forms)}
     for channel, name in enumerate(CHANNELS):
-        for lag in (1, 2, 3):
-            if view.sums.n_pairs[lag - 1] == 0:
-                continue
-            z = lags[3 * channel + lag - 1][usable] * np.sqrt(view.sums.n_pairs[lag - 1])
-            found[f"time.lag{lag}.{name}.mean"] = float(z.sum() / np.sqrt(n_pixels))
-            if lag == 1:
-                found[f"time.lag1.{name}.chi"] = _unlike(z)
-                found[f"time.lag1.{name}.cnt"] = outliers(z, two_sided=True)
-        found |= _block_statistics(view, channel, name)
-    if view.sums.n_pairs[0]:
-        root = np.sqrt(view.sums.n_pairs[0] / n_pixels)
-        found["time.cross.readout_charge"] = float(lags[6].sum() * root)
-        found["time.cross.readout_charge.chi"] = _unlike(lags[6][usable] * root * np.sqrt(n_pixels))
-        found["time.cross.charge_readout"] = float(lags[7].sum() * root)
+        sums, mode = view.sums.blocks[:, channel], view.mode(channel)
+        rest = sums - (sums.sum(axis=(1, 2)) / mode.sum())[:, None, None] * mode
+        lengths = np.diff(view.edges)[:, None]
+        u = rest[:, usable] / np.sqrt(lengths * view.remaining(channel)[usable])
+        chi2 = np.sum(u**2, axis=0)
+        forms = pixel_forms(laws.chi_square(chi2, view.freedom), two_sided=False)
+        found |= named(f"time.block.{name}", {**forms, "chi": view.slow(u, chi2.size)})
     return found
-
-
-def _unlike(z: FloatArray) -> float:
-    """Return by how many standard deviations the squares of standard normal deviates exceed their number."""
-    return float((z @ z - z.size) / np.sqrt(2.0 * z.size))
-
-
-def _block_statistics(view: FrameView, channel: int, name: str) -> dict[str, float]:
-    sums, mode = view.sums.blocks[:, channel], view.mode(channel)
-    rest = sums - (sums.sum(axis=(1, 2)) / mode.sum())[:, None, None] * mode
-    lengths = np.diff(view.edges)[:, None]
-    u = rest[:, view.pixels.usable] / np.sqrt(lengths * view.remaining(channel)[view.pixels.usable])
-    chi2 = np.sum(u**2, axis=0)
-    return {
-        f"time.block.{name}.chi": view.slow(u, chi2.size),
-        f"time.block.{name}.cnt": outliers(laws.chi_square(chi2, view.freedom), two_sided=False),
-    }
 
 
 def space_statistics(view: FrameView) -> dict[str, float]:
-    """Return the family space."""
+    """Return the family space, as far as it is of lines and neighbours."""
     found: dict[str, float] = {}
-    for channel, name in enumerate(CHANNELS):
-        rows = view.sums.rows[2 * channel : 2 * channel + 2].sum(axis=0)
-        columns = view.sums.columns[channel].astype(np.float64)
-        for line, values, axis in (("row", rows, 1), ("column", columns, 0)):
+    sums, pixels = view.sums, view.pixels
+    for line, axis in (("row", 1), ("column", 0)):
+        for channel, name in enumerate(CHANNELS):
             variance, mode = view.variance(channel).sum(axis), view.mode(channel).sum(axis)
-            found |= {
-                f"space.{line}.{what}": z
-                for what, z in _line_statistics(view, values, variance, mode, name).items()
-            }
-    for line, values, axis in (("row", view.sums.row_noise, 1), ("column", view.sums.column_noise, 0)):
+            values = view.lines(channel, axis)
+            forms = _line_forms(view, values, variance, mode, waves=name == "readout")
+            found |= named(f"space.{line}.{name}", forms)
+        noise = sums.column_noise if axis == 0 else sums.row_noise
         # of a common relative change of the noise
-        mode = (view.pixels.square * view.pixels.readout).sum(axis)
-        lines = _line_statistics(view, values, view.noise_variance.sum(axis), mode, "noise")
-        if lines:
-            found[f"space.{line}.noise.variance"] = lines["noise.variance"]
-    for along in ("x", "y"):
-        for pair, seen in neighbour_sums(view, along).items():
-            if seen.products and np.isfinite(seen.correlation):
-                found[f"space.{along}.{pair}"] = seen.z
-    return found
+        mode = (pixels.square * pixels.readout).sum(axis)
+        found |= named(f"space.{line}.noise", _line_forms(view, noise, view.noise_variance.sum(axis), mode))
+    return found | {f"space.{name}": seen.z for name, seen in view.neighbours.items()}
 
 
-def _line_statistics(
-    view: FrameView, values: FloatArray, variance: FloatArray, mode: FloatArray, name: str
+def _line_forms(
+    view: FrameView, values: FloatArray, variance: FloatArray, mode: FloatArray, *, waves: bool = False
 ) -> dict[str, float]:
     """Return the statistics of sums over lines (n, lines), the common mode of each frame removed."""
     some = variance > 0
@@ -301,27 +281,23 @@ def _line_statistics(
     pattern = mode[some] / scale
     rest = np.zeros(values.shape)
     rest[:, some] = without_mode(values[:, some] / scale, pattern)
-    found = {f"{name}.variance": float(laws.chi_square(np.sum(rest**2), view.n * (m - 1.0)))}
+    found = {"variance": float(laws.chi_square(np.sum(rest**2), view.n * (m - 1.0)))}
     adjacent = np.flatnonzero(some[:-1] & some[1:])
     if adjacent.size and m > 2:
         weights = np.zeros(some.size)
         weights[some] = pattern / np.sqrt(pattern @ pattern)
         shared = float(weights[adjacent] @ weights[adjacent + 1])
         products = float(np.sum(rest[:, adjacent] * rest[:, adjacent + 1]))
-        found[f"{name}.lag1"] = (products + view.n * shared) / np.sqrt(view.n * adjacent.size)
-    if name == "readout" and m >= SHORTEST_PERIODOGRAM:
-        line = _line_over_lines(view, rest, m)
-        if line is not None:
-            found[f"{name}.line"] = line
-    return found
+        found["lag1"] = (products + view.n * shared) / np.sqrt(view.n * adjacent.size)
+    return {**found, "line": _line_over_lines(view, rest, m)} if waves else found
 
 
-def _line_over_lines(view: FrameView, rest: FloatArray, used: int) -> float | None:
+def _line_over_lines(view: FrameView, rest: FloatArray, used: int) -> float:
     """Return the statistic of a wave across the lines, coherent over a block or over one frame only."""
     blocks = view.full_blocks(rest)
     count, length, lines = blocks.shape
-    if count == 0 or length < SHORTEST_PERIODOGRAM:
-        return None
+    if count == 0 or min(length, used) < SHORTEST_PERIODOGRAM:
+        return float("nan")
     power = np.abs(np.fft.fft(np.fft.rfft(blocks, axis=2)[:, :, 1:], axis=1)) ** 2 / (length * used)
     single = power[:, :, : (lines - 1) // 2].mean(axis=(0, 1))
     moving = np.ones(length, np.bool_)
@@ -347,7 +323,7 @@ class Neighbours:
     deviation: FloatArray
 
 
-def neighbour_sums(view: FrameView, axis: str) -> dict[str, Neighbours]:
+def _neighbours(view: FrameView, axis: str) -> dict[str, Neighbours]:
     """Return the correlation of neighbours along x or y, by kind."""
     pixels, n = view.pixels, view.n
     products = view.sums.next_column if axis == "x" else view.sums.next_row

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe.laws import extreme, poisson
-from pchem_pipeline.discrepancy.observe.tables import pixel_laws
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import CHI2, CodeSums
 from pchem_pipeline.discrepancy.observe.vector import width_statistics
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
@@ -99,7 +99,7 @@ def _sums(sample: CodeSample) -> CodeSums | None:
         found = np.stack([fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
     usable: NDArray[np.bool_] = np.asarray(np.isfinite(found).all(axis=1))
     for _ in range(2):  # of all pixels, then without those that may be at a wrong maximum
-        laws = pixel_laws(counts, origin, np.zeros((usable.size, 2)), found, usable)
+        laws = pixel_laws(PixelHistograms.alone(counts, origin), found, usable)
         if not laws.good.any():
             return None
         ratio = laws.moments[:, CHI2] / np.maximum(laws.moments[:, CHI2 + 1], 1.0)

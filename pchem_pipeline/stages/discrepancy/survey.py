@@ -22,7 +22,7 @@ from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.compute.memory import resident_bytes
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
 from pchem_pipeline.discrepancy.observe.pairs import CHANNELS, Samples, pairs_bytes
-from pchem_pipeline.discrepancy.observe.tables import pixel_laws
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
 from pchem_pipeline.discrepancy.quick.places import CellMap, SensorPlace, sensor_cells, sensor_place
@@ -289,9 +289,11 @@ def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]
     usable &= counts.sum(axis=2) >= np.maximum(_FEWEST_SAMPLES, 100.0 * sum(outside))
     maps = PixelMaps(values[0], values[1], values[2], values[3], usable)
     laws = pixel_laws(
-        counts.reshape(-1, counts.shape[2]),
-        store.read("histogram/origin", part).ravel().astype(np.int64),
-        np.stack([each.ravel() for each in outside], axis=1).astype(np.float64),
+        PixelHistograms(
+            counts.reshape(-1, counts.shape[2]),
+            store.read("histogram/origin", part).ravel().astype(np.int64),
+            np.stack([each.ravel() for each in outside], axis=1).astype(np.float64),
+        ),
         np.stack([each.ravel() for each in values], axis=1),
         usable.ravel(),
     )
