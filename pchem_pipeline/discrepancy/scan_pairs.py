@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import chi_square
-from pchem_pipeline.discrepancy.observe.pairs import CHANNELS, MODES, PERIOD, Pairs, Samples, pairs_of
+from pchem_pipeline.discrepancy.observe.pairs import MODES, PERIOD, Pairs, Samples, pairs_of
+from pchem_pipeline.discrepancy.observe.sums import CHANNELS
 from pchem_pipeline.discrepancy.scan import PERIODS, Suspect, successive
 from pchem_pipeline.discrepancy.scan_edges import Side, sharpened
 from pchem_pipeline.effects.framework.region import Region, Taps

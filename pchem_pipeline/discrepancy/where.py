@@ -24,6 +24,7 @@ FloatArray = NDArray[np.float64]
 PAIRS = ("x.kk", "x.rr", "x.rk", "y.kk", "y.rr", "y.rk")
 _FALSE_DISCOVERY_RATE = 0.05
 _MOST_LISTED = 50
+_CERTAIN = 6.0  # standard deviations that a pixel with samples beyond its law counts as
 _MOST_PLACES = 20
 _WIDEST_CODE_WINDOW = 24
 
@@ -252,7 +253,7 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
     wanted = {m for n in names if (m := map_of(n)) is not None and evidence.time is not None}
     regions = suspected_regions(evidence, significance, wanted)
     frames = suspected_frames(evidence, significance, {s for n in names if (s := series_of(n)) is not None})
-    places = []
+    maps, places = pixel_maps(evidence), []
     for index, p in found.items():
         name = null.names[index]
         spots: dict[str, Any] = {}
@@ -271,7 +272,7 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
                 name,
                 z=float(pulls[index]),
                 p=p,
-                pixels=_pixels(name, evidence),
+                pixels=_pixels(name, evidence, maps),
                 dn=_codes(name, evidence),
                 frames=_frames(name, evidence),
                 **spots,
@@ -280,11 +281,18 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
     return places
 
 
-def _pixels(name: str, evidence: Evidence) -> tuple[tuple[int, int], ...]:
-    """Return the pixels that stand out in the map behind a statistic (Benjamini-Hochberg)."""
-    values = _pixel_map(name, evidence)
-    if values is None:
+def _pixels(name: str, evidence: Evidence, maps: Mapping[str, FloatArray]) -> tuple[tuple[int, int], ...]:
+    """Return the pixels that stand out in the map behind a statistic of few pixels (Benjamini-Hochberg)."""
+    parts = name.split(".")
+    if parts[-1] not in ("cnt", "chi", "pixels", "count"):
         return ()
+    if parts[0] == "tail":
+        seen = evidence.tail_low if parts[1] == "low" else evidence.tail_high
+        values = np.where(seen > 0, _CERTAIN, 0.0)
+    elif name.startswith("time.block.") and evidence.time is not None:
+        values = _block_variance(evidence, evidence.time, parts[2])
+    else:
+        values = maps[map_of(name) or ""]
     deviations = np.abs(np.where(evidence.maps.usable, values, 0.0)).ravel()
     p = 2.0 * special.ndtr(-deviations)
     order = np.argsort(p, kind="stable")
@@ -294,34 +302,16 @@ def _pixels(name: str, evidence: Evidence) -> tuple[tuple[int, int], ...]:
     return tuple((int(i) // values.shape[1], int(i) % values.shape[1]) for i in order[:count])
 
 
-def _pixel_map(name: str, evidence: Evidence) -> NDArray[np.floating] | None:
-    """Return a map of about standard normal deviations behind a statistic of few pixels."""
-    parts = name.split(".")
-    if parts[-1] not in ("cnt", "chi", "pixels", "count"):
-        return None
-    time = evidence.time
-    if parts[0] == "shape":
-        whole = {"goodness": evidence.goodness, "peaks": evidence.peaks}
-        return whole[parts[1]] if parts[1] in whole else evidence.scores[parts[1]]
-    if parts[0] == "tail":
-        counts = evidence.tail_low if parts[1] == "low" else evidence.tail_high
-        return 6.0 * np.asarray(counts > 0, np.float64)
-    if parts[0] == "time" and time is not None:
-        if parts[1] == "lag1":
-            lag = time.lag_charge if parts[2] == "charge" else time.lag_readout
-            return np.asarray(lag[0] * np.sqrt(time.n_pairs))
-        if parts[1] == "cross":
-            return np.asarray(time.lag_readout_charge * np.sqrt(time.n_pairs))
-        blocks, std = (
-            (time.block_charge, evidence.charge_std)
-            if parts[2] == "charge"
-            else (time.block_readout, evidence.readout_std)
-        )
-        n = blocks.shape[0]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = blocks.var(axis=0, ddof=1) * time.block_frames / std**2
-        return np.asarray((ratio - 1.0) * np.sqrt((n - 1) / 2.0))
-    return None
+def _block_variance(evidence: Evidence, time: TimeSeries, channel: str) -> FloatArray:
+    """Return by how many standard deviations the variance of each pixel's block means is too large."""
+    blocks, std = (
+        (time.block_charge, evidence.charge_std)
+        if channel == "charge"
+        else (time.block_readout, evidence.readout_std)
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = blocks.var(axis=0, ddof=1) * time.block_frames / std**2
+    return np.asarray((ratio - 1.0) * np.sqrt((len(blocks) - 1) / 2.0))
 
 
 def _codes(name: str, evidence: Evidence) -> tuple[int, int] | None:

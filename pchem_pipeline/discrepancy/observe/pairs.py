@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
+from pchem_pipeline.discrepancy.observe.sums import CHANNELS, pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -26,7 +26,6 @@ Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-CHANNELS = ("charge", "readout")
 #: What pixels share: their row, their column, or only the frame (neither row nor column).
 MODES = ("row", "column", "frame")
 #: Lines are told apart by their number modulo this.

@@ -22,6 +22,8 @@ from pchem_pipeline.effects.framework.evidence import PixelMaps
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+#: What a sample is split into: k and r.
+CHANNELS = ("charge", "readout")
 MOST_HITS = 20_000
 _NO_CODE = np.iinfo(np.int64).max  # above all
 _CHUNK_SAMPLES = 1 << 16

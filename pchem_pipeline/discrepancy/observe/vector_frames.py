@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import laws
-from pchem_pipeline.discrepancy.observe.sums import FrameSums, PixelStatistics
+from pchem_pipeline.discrepancy.observe.sums import CHANNELS, FrameSums, PixelStatistics
 from pchem_pipeline.discrepancy.observe.vector import named, pixel_forms
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 _Slices = tuple[slice, slice]
 
-CHANNELS = ("charge", "readout")
 SHORTEST_PERIODOGRAM = 8
 _SLOWEST = (2, 4, 8, 16, 32)
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.quick.sums import StackSums
-from pchem_pipeline.discrepancy.scan import scan_map
+from pchem_pipeline.discrepancy.scan import Suspect, scan_map
 from pchem_pipeline.effects.framework.region import Region
 
 FloatArray = NDArray[np.float64]
@@ -25,27 +25,6 @@ _AT_ONCE = 1 << 17
 _FEWEST_BLOCKS = 4
 #: Axis along which the values of a map are of a pixel and the next one.
 _NEXT_ALONG = {"next_x": 1, "next_y": 0}
-
-
-@dataclass(frozen=True)
-class SensorPlace:
-    """A part of the sensor whose map stands out.
-
-    Attributes:
-        region: the place.
-        p: probability of such a place by chance, anywhere on the sensor.
-        inside, outside: mean of the map there and elsewhere, standard deviations of a pixel.
-    """
-
-    region: Region
-    p: float
-    inside: float
-    outside: float
-
-    @property
-    def only_there(self) -> bool:
-        """Whether little of it is elsewhere."""
-        return abs(self.outside) < 0.25 * abs(self.inside)
 
 
 def block_deviations(sums: StackSums) -> FloatArray:
@@ -124,13 +103,16 @@ def sensor_cells(sums: StackSums) -> dict[str, CellMap]:
     return found
 
 
-def sensor_place(name: str, cells: CellMap, significance: float) -> SensorPlace | None:
+def sensor_place(name: str, cells: CellMap, significance: float) -> Suspect | None:
     """Return the part of the sensor where a map stands out most; None where it is everywhere alike.
 
     Args:
         name: of the map, as :func:`sensor_cells` calls it.
         cells: the map.
         significance: largest probability of a chance.
+
+    Returns:
+        A place whose means are those of the map, standard deviations of a pixel.
     """
     usable = cells.counts > 0
     # standard normal as the pixels are
@@ -144,4 +126,5 @@ def sensor_place(name: str, cells: CellMap, significance: float) -> SensorPlace 
     if not (usable[inside].any() and usable[~inside].any()):
         return None
     means = [float(cells.sums[part].sum() / cells.counts[part].sum()) for part in (inside, ~inside)]
-    return SensorPlace(Region.of_mask(cells.mask(inside)), places[0].p, means[0], means[1])
+    region = Region.of_mask(cells.mask(inside))
+    return replace(places[0], region=region, inside=means[0], outside=means[1])

@@ -27,14 +27,10 @@ from pchem_pipeline.discrepancy.observe.laws import chi_square, without_skew
 from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLook, check_of, graded
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.levels import levels_check
-from pchem_pipeline.discrepancy.quick.places import (
-    SensorPlace,
-    block_deviations,
-    sensor_cells,
-    sensor_place,
-)
+from pchem_pipeline.discrepancy.quick.places import block_deviations, sensor_cells, sensor_place
 from pchem_pipeline.discrepancy.quick.series import normal_p, of_many, series_checks
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
+from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, frame_words, odd_words
 from pchem_pipeline.model.maps.ordered import median_of
@@ -221,7 +217,7 @@ def _told_once(checks: list[Check], noise: str, neighbours: str) -> list[Check]:
     ]
 
 
-def _placed(check: Check, place: SensorPlace, sums: StackSums) -> Check:
+def _placed(check: Check, place: Suspect, sums: StackSums) -> Check:
     """Return a check with its place; noise of lines has the size that it has there."""
     p, size = check.p, check.size
     if check.name in _LOCAL:
@@ -235,7 +231,7 @@ def _placed(check: Check, place: SensorPlace, sums: StackSums) -> Check:
     return replace(check, p=p, size=size, where=check.where or words, region=numbers)
 
 
-def _local_drift(sums: StackSums, place: SensorPlace | None) -> Check:
+def _local_drift(sums: StackSums, place: Suspect | None) -> Check:
     """Return whether a part of the sensor moves along the run, and the rest does not."""
     if place is None:
         return check_of("local_drift", 1.0, 0.0)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.discrepancy.quick.places import SensorPlace
+from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
@@ -55,7 +55,7 @@ def choose_window(
     shape: tuple[int, int, int],
     settings: DiscrepancySettings,
     roi: Sequence[int] | None = None,
-    places: Mapping[str, SensorPlace] | None = None,
+    places: Mapping[str, Suspect] | None = None,
     left_out: Sequence[int] = (),
 ) -> Window:
     """Return what to look at: everything if small enough, else a window and blocks over the whole run.
@@ -160,7 +160,7 @@ def within_memory(
     return settings
 
 
-def _worst(places: Mapping[str, SensorPlace], shape: tuple[int, int]) -> NDArray[np.bool_] | None:
+def _worst(places: Mapping[str, Suspect], shape: tuple[int, int]) -> NDArray[np.bool_] | None:
     """Return the most significant place as a mask, (y, x)."""
     if not places:
         return None
