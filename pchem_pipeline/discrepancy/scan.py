@@ -18,18 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.effects.framework.region import Region, When
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-#: Values count as no more than this many standard deviations, so that a few pixels are no band of columns.
-_CLIP = 6.0
 #: Cells along an edge of a map on which all rectangles are tried, and cells of lines on which all ranges are.
 _CELLS, _STRETCHES = 32, 400
 _RADII = (1.5, 2.5, 4.0, 6.0, 9.0, 13.0, 19.0, 28.0)
 _FINER = (0.72, 0.8, 0.9, 1.12, 1.25, 1.4)
+#: Probability of a chance, in any place, below which it counts.
+SIGNIFICANCE = 1e-3
 #: Periods of lines, and of frames.
 PERIODS, _FRAME_PERIODS = (2, 4, 8, 16, 32), range(2, 33)
 #: Sweeps of the edges of a rectangle over the pixels, and of a range over the frames.
@@ -140,7 +141,7 @@ def scan_map(
     values: FloatArray,
     usable: BoolArray,
     *,
-    significance: float = 1e-3,
+    significance: float = SIGNIFICANCE,
     most: int = 3,
     single: bool = True,
     next_along: int | None = None,
@@ -177,7 +178,7 @@ def scan_series(
     values: FloatArray,
     numbers: IntArray,
     *,
-    significance: float = 1e-3,
+    significance: float = SIGNIFICANCE,
     most: int = 2,
     shortest: int = FEWEST,
 ) -> list[Stretch]:
@@ -311,7 +312,7 @@ class Contrast:
     @classmethod
     def of(cls, values: FloatArray, some: BoolArray, fewest: int = FEWEST) -> Contrast | None:
         """Clip and centre a map, to look for places of so many values or more; None where it has too few."""
-        values = np.clip(np.where(some, values, 0.0), -_CLIP, _CLIP)
+        values = np.clip(np.where(some, values, 0.0), -FAR, FAR)
         inside = values[some]
         if inside.size <= 2 * FEWEST:
             return None

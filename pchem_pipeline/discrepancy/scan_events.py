@@ -18,6 +18,7 @@ from scipy import special
 
 from pchem_pipeline.discrepancy.scan import (
     FEWEST,
+    SIGNIFICANCE,
     Contrast,
     Found,
     Stretch,
@@ -37,7 +38,12 @@ _SEED = 1
 
 
 def scan_event_map(
-    seen: BoolArray, expected: FloatArray, usable: BoolArray, *, significance: float = 1e-3, most: int = 3
+    seen: BoolArray,
+    expected: FloatArray,
+    usable: BoolArray,
+    *,
+    significance: float = SIGNIFICANCE,
+    most: int = 3,
 ) -> list[Suspect]:
     """Return the places with more events than their share, the most significant first.
 
@@ -99,7 +105,7 @@ def scan_event_frames(
     numbers: IntArray,
     *,
     expected: float = 0.0,
-    significance: float = 1e-3,
+    significance: float = SIGNIFICANCE,
     shortest: int = 1,
 ) -> Stretch | None:
     """Return the range of frames in which events come together most; None where chance explains it.

@@ -20,7 +20,7 @@ from scipy import special
 from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.observe.pairs import MODES, PERIOD, Pairs, Samples, pairs_of
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
-from pchem_pipeline.discrepancy.scan import PERIODS, Suspect, successive
+from pchem_pipeline.discrepancy.scan import PERIODS, SIGNIFICANCE, Suspect, successive
 from pchem_pipeline.discrepancy.scan_edges import Side, sharpened
 from pchem_pipeline.effects.framework.region import Region, Taps
 
@@ -29,6 +29,9 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 _FEWEST_LINES = 2  # of a period
+#: Pixels of a place, its share of the sensor at most, and the mean outside over that inside at most.
+FEWEST_PIXELS, LARGEST = 16, 0.6
+_CONTRAST = 0.4
 #: Guesses that are held against the scatter of the frames, the most significant first.
 _MEASURED = 8
 #: Families of places: bands of lines, bands across them, rectangles, periods, scattered lines.
@@ -50,21 +53,6 @@ class Shared(Suspect):
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Pixels that a place must have, the share of the sensor that it may have, and the contrast it needs.
-
-    Attributes:
-        fewest: pixels.
-        largest: share of all pixels.
-        contrast: of the mean inside, the most that the mean outside may be.
-    """
-
-    fewest: int = 16
-    largest: float = 0.6
-    contrast: float = 0.4
-
-
-@dataclass(frozen=True)
 class _Best:
     """The best place of a family: cells of lines and across them, or a tap, or lines; z, number of places."""
 
@@ -77,29 +65,25 @@ class _Best:
     scattered: tuple[int, ...] = ()
 
 
-def scan_pairs(
-    samples: Samples, *, significance: float = 1e-3, most: int = 2, limits: Limits | None = None
-) -> list[Shared]:
+def scan_pairs(samples: Samples, *, significance: float = SIGNIFICANCE, most: int = 2) -> list[Shared]:
     """Return the places whose pixels share noise, the most significant first, each without those before it.
 
     Args:
         samples: standardised frames.
         significance: largest probability of a chance in any place, mode and channel.
         most: places at most.
-        limits: of their sizes.
     """
-    limits = limits or Limits()
 
     def best(left: BoolArray) -> tuple[BoolArray, Shared] | None:
-        if left.sum() <= 2 * limits.fewest:
+        if left.sum() <= 2 * FEWEST_PIXELS:
             return None
-        found = _most_significant(replace(samples, usable=left), math.log(significance), limits)
+        found = _most_significant(replace(samples, usable=left), math.log(significance))
         return None if found is None else (found.region.mask((left.shape[0], left.shape[1])), found)
 
     return successive(best, samples.usable, most)
 
 
-def _most_significant(samples: Samples, log_limit: float, limits: Limits) -> Shared | None:
+def _most_significant(samples: Samples, log_limit: float) -> Shared | None:
     """Return the place of the smallest probability that holds against the scatter of the frames, too."""
     shape = samples.usable.shape[0], samples.usable.shape[1]
     guesses = sorted(
@@ -108,9 +92,9 @@ def _most_significant(samples: Samples, log_limit: float, limits: Limits) -> Sha
             for channel, modes in enumerate(pairs_of(samples))
             for pairs in modes.values()
             for best in (
-                *_boxes(pairs, samples.usable, limits),
+                *_boxes(pairs, samples.usable),
                 *_periods(pairs),
-                *_scattered(pairs, samples.usable, limits),
+                *_scattered(pairs, samples.usable),
             )
         ),
         key=lambda guess: guess[0],
@@ -122,16 +106,16 @@ def _most_significant(samples: Samples, log_limit: float, limits: Limits) -> Sha
         if region is None:
             continue
         place = _measured(samples, channel, pairs.mode, region, best)
-        if _holds(place, log_limit, limits):
+        if _holds(place, log_limit):
             sharper = _with_ends(samples, channel, pairs, best, place)
-            place = sharper if _holds(sharper, log_limit, limits) else place
+            place = sharper if _holds(sharper, log_limit) else place
             return place
     return None
 
 
-def _holds(place: Shared, log_limit: float, limits: Limits) -> bool:
+def _holds(place: Shared, log_limit: float) -> bool:
     """Tell whether a place is significant, and little of it is elsewhere."""
-    return place.log_p <= log_limit and abs(place.outside) < limits.contrast * place.inside
+    return place.log_p <= log_limit and abs(place.outside) < _CONTRAST * place.inside
 
 
 def _log_p(z: float, places: float) -> float:
@@ -211,7 +195,7 @@ def _number_of_pairs(pixels: BoolArray, mode: str) -> float:
 # -- families -----------------------------------------------------------------------------------
 
 
-def _boxes(pairs: Pairs, usable: BoolArray, limits: Limits) -> list[_Best]:
+def _boxes(pairs: Pairs, usable: BoolArray) -> list[_Best]:
     """Return the best band of lines, band across them, and rectangle."""
     lines, across = pairs.lines.size - 1, pairs.across.size - 1
     c, d = np.triu_indices(across + 1, 1)
@@ -225,7 +209,7 @@ def _boxes(pairs: Pairs, usable: BoolArray, limits: Limits) -> list[_Best]:
     for a in range(lines):
         counted = pairs.from_line(counts, a)
         size = area[a + 1 :, d] - area[a, d] - area[a + 1 :, c] + area[a, c]
-        some = (size >= limits.fewest) & (size <= limits.largest * usable.sum()) & (counted > 0)
+        some = (size >= FEWEST_PIXELS) & (size <= LARGEST * usable.sum()) & (counted > 0)
         with np.errstate(invalid="ignore", divide="ignore"):
             z = pairs.from_line(sums, a) - counted * total / number
             z /= np.sqrt(2.0 * counted * (1.0 - counted / number))
@@ -284,7 +268,7 @@ def _periods(pairs: Pairs) -> list[_Best]:
     return [replace(best, places=float(tried))] if best.z > 0 else []
 
 
-def _scattered(pairs: Pairs, usable: BoolArray, limits: Limits) -> list[_Best]:
+def _scattered(pairs: Pairs, usable: BoolArray) -> list[_Best]:
     """Return the rows (columns) that stand out each by itself, where they are more than one band."""
     if pairs.mode == "frame":
         return []
@@ -302,7 +286,7 @@ def _scattered(pairs: Pairs, usable: BoolArray, limits: Limits) -> list[_Best]:
     chosen = np.flatnonzero(z > -special.ndtri(_LINE_BY_CHANCE / n))
     area = np.add.reduceat((usable.T if pairs.mode == "column" else usable).sum(axis=1), pairs.lines[:-1])
     size = int(area[chosen].sum())
-    if not (np.diff(chosen) > 1).any() or not limits.fewest <= size <= limits.largest * usable.sum():
+    if not (np.diff(chosen) > 1).any() or not FEWEST_PIXELS <= size <= LARGEST * usable.sum():
         return []
     together = float(z[chosen] @ np.sqrt(counts[chosen]) / np.sqrt(counts[chosen].sum()))
     # of all sets of as many lines

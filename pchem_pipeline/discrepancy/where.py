@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.null import NullModel
-from pchem_pipeline.discrepancy.observe.laws import chi_square
-from pchem_pipeline.discrepancy.scan import Stretch, Suspect, scan_map, scan_series
+from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
+from pchem_pipeline.discrepancy.scan import SIGNIFICANCE, Stretch, Suspect, scan_map, scan_series
 from pchem_pipeline.discrepancy.scan_events import scan_event_map
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.effects.framework.evidence import SCORES, Evidence, TimeSeries
@@ -24,13 +24,12 @@ FloatArray = NDArray[np.float64]
 PAIRS = ("x.kk", "x.rr", "x.rk", "y.kk", "y.rr", "y.rk")
 _FALSE_DISCOVERY_RATE = 0.05
 _MOST_LISTED = 50
-_CERTAIN = 6.0  # standard deviations that a pixel with samples beyond its law counts as
 _MOST_PLACES = 20
 _WIDEST_CODE_WINDOW = 24
 
 
 def suspected_regions(
-    evidence: Evidence, significance: float = 1e-3, names: Collection[str] | None = None
+    evidence: Evidence, significance: float = SIGNIFICANCE, names: Collection[str] | None = None
 ) -> dict[str, list[Suspect]]:
     """Return where on the sensor each map of the evidence stands out from the rest of the sensor.
 
@@ -62,7 +61,7 @@ def suspected_regions(
 
 
 def suspected_frames(
-    evidence: Evidence, significance: float = 1e-3, names: Collection[str] | None = None
+    evidence: Evidence, significance: float = SIGNIFICANCE, names: Collection[str] | None = None
 ) -> dict[str, list[Stretch]]:
     """Return in which frames each series of the evidence stands out, as :func:`suspected_regions` does."""
     series = {name: s for name, s in frame_series(evidence).items() if names is None or name in names}
@@ -76,7 +75,7 @@ def suspected_frames(
     return {name: frames for name, frames in found.items() if frames}
 
 
-def unfitted_place(usable: NDArray[np.bool_], significance: float = 1e-3) -> Suspect | None:
+def unfitted_place(usable: NDArray[np.bool_], significance: float = SIGNIFICANCE) -> Suspect | None:
     """Return where pixels without a fit to be relied upon come together; None where chance explains it.
 
     An effect of single pixels in a part of the sensor may leave only that to be seen.
@@ -288,7 +287,7 @@ def _pixels(name: str, evidence: Evidence, maps: Mapping[str, FloatArray]) -> tu
         return ()
     if parts[0] == "tail":
         seen = evidence.tail_low if parts[1] == "low" else evidence.tail_high
-        values = np.where(seen > 0, _CERTAIN, 0.0)
+        values = np.where(seen > 0, FAR, 0.0)
     elif name.startswith("time.block.") and evidence.time is not None:
         values = _block_variance(evidence, evidence.time, parts[2])
     else:

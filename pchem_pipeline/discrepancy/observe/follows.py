@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from pchem_pipeline.discrepancy.observe import laws as laws_of
-from pchem_pipeline.discrepancy.observe.digital.predicted import GROUP, groups_of
+from pchem_pipeline.discrepancy.observe.digital.predicted import GROUP, MOST_SAMPLES, groups_of
 from pchem_pipeline.discrepancy.observe.pairs import Samples
 from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
@@ -36,8 +36,6 @@ Axes = tuple[int, ...]  # of (frame, y, x)
 SOURCES: tuple[Source, ...] = get_args(Source)
 _COLUMNS = 2  # the axis whose spectrum has one half only
 STEPS = 2  # the same frame, and the one before
-_MOST_SAMPLES = 1 << 18
-_AT_ONCE = 1 << 18  # samples that are transformed together
 _FEWEST = 3000  # products of a distance
 _RESOLVED = 0.05  # of the variance of the charge, at least, that its residual does not hold
 
@@ -135,7 +133,7 @@ class FollowingSamples:
         first = groups_of(edges, maps.usable.size, frames.size if most is None else most)
         if not first.size:
             return None
-        samples = replace(Samples.by_laws(_Groups(frames, first), laws, maps), most=_AT_ONCE)
+        samples = replace(Samples.by_laws(_Groups(frames, first), laws, maps), most=MOST_SAMPLES)
         inside = samples.usable if inside is None else samples.usable & inside
         return cls(samples, inside, *_charge_of(laws, maps))
 
@@ -311,7 +309,7 @@ def follow_statistics(
     Left out are the samples next to it in the same frame and its own one frame before, which have their own.
     Arguments as of :meth:`FollowingSamples.of`.
     """
-    prepared = FollowingSamples.of(frames, edges, laws, maps, most=_MOST_SAMPLES)
+    prepared = FollowingSamples.of(frames, edges, laws, maps, most=MOST_SAMPLES)
     if prepared is None:
         return {}
     (found,) = prepared.by_distance()

@@ -18,7 +18,12 @@ FloatArray = NDArray[np.float64]
 _SMALL = 1e-12
 # an event that is next to impossible counts as much as this many standard deviations
 _CERTAIN = 10.0
-_RARE = 1e-3
+#: Coincidences expected, below which each is proof.
+RARE = 1e-3
+#: Standard deviations: values beyond count as so many, so that a few of them make no mean.
+FAR = 6.0
+#: Slowest waves along a series whose squares are summed (the adaptive test of Neyman, Fan 1996).
+SLOWEST = (2, 4, 8, 16, 32)
 _SHORT_END = 0.25  # of the cubic root of a gamma law
 
 
@@ -51,7 +56,7 @@ def poisson(count: int, expected: float) -> float:
 
 def repeats(count: int, expected: float) -> float:
     """Return 10 for each coincidence that cannot happen; where they do happen, what :func:`counted` says."""
-    return float(_CERTAIN * count) if expected < _RARE else float(counted(count, expected))
+    return float(_CERTAIN * count) if expected < RARE else float(counted(count, expected))
 
 
 def largest_normal(values: FloatArray) -> float:

@@ -27,7 +27,7 @@ from pchem_pipeline.discrepancy.observe.digital.repeats import (
 )
 from pchem_pipeline.discrepancy.observe.follows import follow_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
-from pchem_pipeline.discrepancy.observe.sums import blocks_of, pixel_statistics, sum_frames
+from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS, blocks_of, pixel_statistics, sum_frames
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of, in_order, sample_statistics
@@ -50,7 +50,6 @@ from pchem_pipeline.model.fit.status import FAILED, FitStatus
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-MINIMUM_BLOCKS = 4
 #: Pixels with one of these flags are left out. A poor fit is no reason: it is what is looked for. Nor is a
 #: bias that may be off by one electron: all that is looked at stays nearly the same, but to choose the pixels
 #: with an unambiguous sample would bias the statistics of the rest.

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS, pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
@@ -34,8 +35,6 @@ PERIOD = 32
 _CELLS = 64
 #: Of each table of sums of products: two channels and the counts, as gathered and as told.
 _COPIES = 9
-#: Samples count as no more than so many standard deviations: a track of a particle is no common mode.
-_CLIP = 6.0
 
 
 class FrameBlocks(Protocol):
@@ -118,7 +117,8 @@ class Samples:
         for channel, variance in enumerate((pixels.charge, pixels.readout)):
             deviation = np.sqrt(np.where(usable, variance, 1.0)).ravel().astype(np.float32)
             tables[channel, 1:] /= np.repeat(deviation, codes)
-        np.clip(tables, -_CLIP, _CLIP, out=tables)
+        # a track of a particle is no common mode
+        np.clip(tables, -FAR, FAR, out=tables)
         first, last, start = (values.reshape(usable.shape) for values in (first, first + length - 1, start))
         return cls(frames, first, last, start, tables, usable)
 

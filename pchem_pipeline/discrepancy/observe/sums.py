@@ -24,6 +24,8 @@ IntArray = NDArray[np.int64]
 
 #: What a sample is split into: k and r.
 CHANNELS = ("charge", "readout")
+#: Blocks of frames, whose means are compared.
+MINIMUM_BLOCKS = 4
 MOST_HITS = 20_000
 _NO_CODE = np.iinfo(np.int64).max  # above all
 _CHUNK_SAMPLES = 1 << 16

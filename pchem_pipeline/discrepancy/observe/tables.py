@@ -24,11 +24,9 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 #: Pixels whose law covers more codes than this are not looked at.
-LONGEST_SUPPORT = 8192
-#: Samples expected beyond the support of a pixel on either side, at most.
-ALLOWED_BEYOND = 1e-2
-#: The same far beyond it, in all pixels together.
-ALLOWED_FAR_BEYOND = 1e-2
+_LONGEST_SUPPORT = 8192
+#: Samples expected beyond the support of a pixel on either side, at most, and far beyond it in all pixels.
+_BEYOND = 1e-2
 _NEGLIGIBLE = 1e-5  # samples expected beyond the electron numbers considered, in all pixels
 _LONGEST_AXIS = 1 << 17
 _COARSE, _MOST_BINS = 16, 256
@@ -95,7 +93,7 @@ def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np
     samples = float(seen.counts.sum(axis=1).max(initial=1)) + float(seen.outside.sum(axis=1).max(initial=0.0))
     supports(*np.ascontiguousarray(natural.T), np.log(_NEGLIGIBLE / (samples * n)), electrons, window)
     length = window[:, 1] - window[:, 0] + 1
-    good = usable & (length <= LONGEST_SUPPORT)
+    good = usable & (length <= _LONGEST_SUPPORT)
     axis, n_codes = _code_axis(window[good])
     coarse = _COARSE
     while n_codes > coarse * _MOST_BINS:
@@ -119,7 +117,7 @@ def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np
         codes=codes,
     )
     fitted = Fitted(seen.counts, seen.origin, seen.outside, natural, electrons, window)
-    kernel.summarise_pixels(fitted, ALLOWED_BEYOND, ALLOWED_FAR_BEYOND / max(int(good.sum()), 1), laws)
+    kernel.summarise_pixels(fitted, _BEYOND, _BEYOND / max(int(good.sum()), 1), laws)
     for covariance in (codes.fold_covariance, codes.bin_covariance):
         covariance += np.tril(covariance, -1).T
     return laws
@@ -128,8 +126,12 @@ def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np
 def _natural(parameters: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
     """Return H, 1/g (DN), mu and the analog read noise (DN); harmless numbers for unusable pixels."""
     exposure, gain, bias, sigma = np.where(usable[:, None], parameters, [1.0, 1.0, 0.0, 1.0]).T
-    width = np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, _SMALLEST_WIDTH**2))
-    return np.ascontiguousarray(np.stack([exposure, 1.0 / gain, bias, width], axis=1))
+    return np.ascontiguousarray(np.stack([exposure, 1.0 / gain, bias, analog_width(sigma)], axis=1))
+
+
+def analog_width(sigma: FloatArray) -> FloatArray:
+    """Return the analog read noise of a read noise with quantisation, DN; not below that of single codes."""
+    return np.asarray(np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, _SMALLEST_WIDTH**2)))
 
 
 def _code_axis(window: IntArray) -> tuple[int, int]:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.discrepancy.observe import tables_numba as column
@@ -20,7 +21,7 @@ FloatArray = NDArray[np.float64]
 
 #: A pixel beyond this many standard deviations counts as one that stands out.
 STANDS_OUT = 3.5
-_TAIL = 2.3262907903552504e-4  # of the normal distribution, above STANDS_OUT
+_TAIL = float(special.ndtr(-STANDS_OUT))
 _ENOUGH = 25.0  # samples expected of a code or bin that is judged by itself
 _LOW, _HIGH = [column.SEEN_LOW, column.EXPECTED_LOW], [column.SEEN_HIGH, column.EXPECTED_HIGH]
 _FAR_LOW = [column.SEEN_FAR_LOW, column.EXPECTED_FAR_LOW]

@@ -23,7 +23,6 @@ IntArray = NDArray[np.int64]
 _Slices = tuple[slice, slice]
 
 SHORTEST_PERIODOGRAM = 8
-_SLOWEST = (2, 4, 8, 16, 32)
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ class FrameView:
         """Return orthonormal waves along the blocks, slowest first, that centring leaves, (modes, b)."""
         root = np.sqrt(np.diff(self.edges).astype(np.float64))
         middle = 0.5 * (self.edges[:-1] + self.edges[1:]) / self.n
-        order = np.arange(min(root.size, 1 + _SLOWEST[-1]))
+        order = np.arange(min(root.size, 1 + laws.SLOWEST[-1]))
         basis, _ = np.linalg.qr(np.cos(np.pi * order * middle[:, None]) * root[:, None])
         return np.asarray(basis[:, 1:].T)
 
@@ -126,7 +125,7 @@ class FrameView:
         """
         energy = np.cumsum(np.sum((self.slow_modes() @ series) ** 2, axis=1))
         unit = freedom * self.n / (self.n - 1.0)
-        cuts = [c for c in _SLOWEST if c < self.edges.size - 2]
+        cuts = [c for c in laws.SLOWEST if c < self.edges.size - 2]
         z = [laws.chi_square(energy[c - 1], c * unit, 2.0 * c * freedom) for c in cuts]
         z.append(laws.chi_square(np.sum(series**2), freedom * self.freedom))
         # sums that share terms are alike

@@ -20,6 +20,7 @@ from scipy import fft, ndimage
 from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.vector_frames import SHORTEST_PERIODOGRAM
 from pchem_pipeline.effects.framework.evidence import PixelMaps, Wave
 
 Float32Array = NDArray[np.float32]
@@ -27,7 +28,7 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 _MOST_SAMPLES = 1 << 22
-_FEWEST_FRAMES, _FEWEST_LINES = 64, 8
+_FEWEST_FRAMES = 64
 _RAISED = 5.0  # standard errors by which the noise at some frequency must exceed white noise, to be no line
 _ALL_OF_IT = 0.7  # of the amplitude of a wave at any phase, for one whose phase runs on
 _FALSE_ALARM = 0.02  # probability of any wave where there is none
@@ -76,7 +77,7 @@ def waves_across(
     samples = Samples.by_laws(Stack(frames[: numbers.size]), laws, maps)
     samples = samples if inside is None else samples.without(~inside)
     pixels = int(np.count_nonzero(samples.usable))
-    if numbers.size < _FEWEST_FRAMES or min(ny, nx) < _FEWEST_LINES or not pixels:
+    if numbers.size < _FEWEST_FRAMES or min(ny, nx) < SHORTEST_PERIODOGRAM or not pixels:
         return Waves((), {})
     u = np.concatenate([chunk for (chunk,) in samples.chunks((1,))])
     mean, ratio = _spectrum(u, numbers, pixels)

@@ -19,7 +19,8 @@ from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_law
 from pchem_pipeline.discrepancy.observe.tables_numba import CHI2, CodeSums
 from pchem_pipeline.discrepancy.observe.vector import width_statistics
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
-from pchem_pipeline.discrepancy.quick.series import normal_p, of_many
+from pchem_pipeline.discrepancy.quick.series import normal_p
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 
@@ -130,7 +131,7 @@ def _widths(codes: CodeSums) -> Check | None:
     weight = chance**-2 / np.sum(chance**-2)
     excess = float(weight @ (rough**2 - chance)) / 1.5
     error = math.sqrt(float(weight**2 @ (4.0 * chance**2))) / 1.5
-    p_any = min(_CAUTION * of_many(p[worst], len(p)), 1.0)
+    p_any = min(_CAUTION * look_elsewhere(p[worst], len(p)), 1.0)
     size, limit = math.sqrt(max(excess, 0.0)), math.sqrt(5.4 * error)
     return check_of("codes", p_any, size, limit=limit, where=_WORDS[worst].format(code=code))
 

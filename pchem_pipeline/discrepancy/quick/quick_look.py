@@ -24,14 +24,16 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import chi_square, without_skew
+from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
 from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLook, check_of, graded
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.levels import levels_check
 from pchem_pipeline.discrepancy.quick.places import block_deviations, sensor_cells, sensor_place
-from pchem_pipeline.discrepancy.quick.series import normal_p, of_many, series_checks
+from pchem_pipeline.discrepancy.quick.series import normal_p, series_checks
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, frame_words, odd_words
 from pchem_pipeline.model.maps.ordered import median_of
 
@@ -50,7 +52,6 @@ _LARGEST_SQUARE = 25.0
 #: Standard deviations from which on a check fails for sure (19 of 20), with a dozen checks.
 _SURE = 5.4
 _FEWEST_LINES = 4
-_FEWEST_BLOCKS = 4
 _SHOWN = 6
 
 
@@ -129,7 +130,7 @@ def _wave(sums: StackSums) -> list[Check]:
     cycles = (f"{line[f'cycles_per_{of}']:+.3g} cycles per {of}" for of in ("column", "row"))
     # of so many means of exponential numbers the largest
     sure = (math.sqrt(2.0 * math.log(cells)) + 3.0) / math.sqrt(frames)
-    p = of_many(float(special.gammaincc(frames, frames * line["ratio"])), cells)
+    p = look_elsewhere(float(special.gammaincc(frames, frames * line["ratio"])), cells)
     limit, where = line["unit"] * math.sqrt(sure), ", ".join(cycles)
     return [check_of("wave", p, line["size"], limit=limit, where=where)]
 
@@ -221,7 +222,7 @@ def _placed(check: Check, place: Suspect, sums: StackSums) -> Check:
     """Return a check with its place; noise of lines has the size that it has there."""
     p, size = check.p, check.size
     if check.name in _LOCAL:
-        p = of_many(min(check.p, place.p), 2.0)
+        p = look_elsewhere(min(check.p, place.p), 2.0)
     if check.name in ("row_noise", "column_noise") and place.only_there:
         shared = sums.next_x if check.name == "row_noise" else sums.next_y
         inside = place.region.mask(sums.shape)
@@ -255,7 +256,7 @@ def _of_lines(lines: Lines) -> _Estimate:
     value, error = value[some], error[some]
     z = value / error
     centre = float(np.median(z))
-    reach = _CLIP * max(1.0, 1.4826 * float(np.median(np.abs(z - centre))))
+    reach = _CLIP * max(1.0, robust_sd(z, centre))
     value = np.clip(z, centre - reach, centre + reach) * error
     weight = error**-2
     total = float(weight.sum())
@@ -305,7 +306,7 @@ def _noise_check(name: str, found: _Estimate, lines: Lines | None = None, width:
     p, where = normal_p(found.z), ""
     if lines is not None:
         single, where = _single_lines(lines, name.removesuffix("_noise"), width)
-        p = of_many(min(p, single), 2.0)
+        p = look_elsewhere(min(p, single), 2.0)
     size, limit = math.sqrt(max(found.value, 0.0)), math.sqrt(_SURE * found.error)
     return check_of(name, p, size, limit=limit, where=where)
 
@@ -318,7 +319,7 @@ def _single_lines(lines: Lines, line: str, width: int) -> tuple[float, str]:
         return 1.0, ""
     z = value[some] / error[some]
     centre = float(np.median(z))
-    spread = max(1.0, 1.4826 * float(np.median(np.abs(z - centre))))
+    spread = max(1.0, robust_sd(z, centre))
     freedom = lines.freedom
     normal = chi_square(np.maximum(freedom + (z - centre) / spread * np.sqrt(2.0 * freedom), 0.0), freedom)
     p = special.ndtr(-normal)
@@ -328,7 +329,7 @@ def _single_lines(lines: Lines, line: str, width: int) -> tuple[float, str]:
     shown = ", ".join(str(i) for i in out[:_SHOWN])
     more = f" and {out.size - _SHOWN} more" if out.size > _SHOWN else ""
     words = f"most in {line}{'s' if out.size > 1 else ''} {shown}{more}" if out.size else ""
-    return of_many(float(p.min()), p.size), words
+    return look_elsewhere(float(p.min()), p.size), words
 
 
 def _third_moment(maps: PixelMaps) -> FloatArray:
@@ -446,7 +447,7 @@ def _neighbour_checks(sums: StackSums, common: _Common) -> list[Check]:
 def _wandering(sums: StackSums, maps: PixelMaps, third: FloatArray) -> list[Check]:
     """Return whether pixels change their level along the run, less what all pixels do."""
     lengths = sums.lengths
-    if lengths.size < _FEWEST_BLOCKS:
+    if lengths.size < MINIMUM_BLOCKS:
         return []
     means = sums.block_sum / lengths[:, None, None]
     means -= np.average(means, axis=0, weights=lengths)
@@ -468,5 +469,5 @@ def _wandering(sums: StackSums, maps: PixelMaps, third: FloatArray) -> list[Chec
     places = np.argwhere(some)[out[np.argsort(-chi2[out])][:3]]
     shown = ", ".join(f"({y}, {x})" for y, x in places)
     where = f"{out.size:,} pixels, most at (y, x) {shown}" if out.size else ""
-    p_any, share = of_many(float(p.min()), p.size), out.size / p.size
+    p_any, share = look_elsewhere(float(p.min()), p.size), out.size / p.size
     return [check_of("wandering_pixels", p_any, share, limit=2.0 / p.size, where=where)]

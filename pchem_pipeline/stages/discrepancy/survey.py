@@ -27,7 +27,7 @@ from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_law
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
 from pchem_pipeline.discrepancy.quick.places import CellMap, sensor_cells, sensor_place
-from pchem_pipeline.discrepancy.scan import Suspect
+from pchem_pipeline.discrepancy.scan import SIGNIFICANCE, Suspect
 from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
 from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
 from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
@@ -47,9 +47,7 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Probability of a chance, in any map of a kind, below which a place decides where the window lies.
-_SIGNIFICANCE = 1e-3
-#: The same of shapes: they rest on fits, whose errors are not quite normal.
+#: Probability of a chance in any map of shapes: they rest on fits, whose errors are not quite normal.
 _SIGNIFICANCE_OF_SHAPES = 1e-6
 #: Codes of the tables of a band at most, and rows at least.
 _MOST_CODES, _FEWEST_ROWS = 1 << 26, 8
@@ -176,7 +174,7 @@ def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, 
     """
     if sums is None or sums.shape != shape or sums.freedom <= 0:
         return None
-    return _places(sensor_cells(sums), _SIGNIFICANCE)
+    return _places(sensor_cells(sums), SIGNIFICANCE)
 
 
 def _places(maps: Mapping[str, CellMap], significance: float) -> dict[str, Suspect]:
@@ -219,7 +217,7 @@ def places_of_bands(
         samples = Samples.by_laws(_Band(source, (first, last), numbers), laws, fitted)
         samples = replace(samples, most=at_once)
         del laws
-        for each in scan_pairs(samples, significance=_SIGNIFICANCE / len(bands), most=1):
+        for each in scan_pairs(samples, significance=SIGNIFICANCE / len(bands), most=1):
             name = f"pairs.{each.mode}.{CHANNELS[each.channel]}"
             mask = np.zeros((ny, nx), np.bool_)
             mask[first:last] = each.region.mask((last - first, nx))

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import laws
-from pchem_pipeline.discrepancy.observe.digital.predicted import groups_of
+from pchem_pipeline.discrepancy.observe.digital.predicted import MOST_PAIRED, groups_of
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
-_MOST_SAMPLES = 1 << 19
 _WITHIN = (0.0, 0.15, 0.5, 1.5)  # read noises
 _INDEPENDENT = 2.5  # of these
 _FEWEST = 50.0  # pairs of which one agrees and another does not
@@ -33,7 +32,7 @@ def nearer_statistics(
         edges: positions of the blocks, (b + 1,).
         maps: parameters of the pixels.
     """
-    first = groups_of(edges, maps.usable.size, _MOST_SAMPLES)
+    first = groups_of(edges, maps.usable.size, MOST_PAIRED)
     half = first.size // 2
     if not half or not maps.usable.any():
         return {}

@@ -21,14 +21,16 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 GROUP = 4  # frames whose predictions are exchanged
-_MOST_SAMPLES = 1 << 18
+#: Samples of all groups together, unless there is but one, where all frames of a group are compared with all,
+#: and where they are compared two by two.
+MOST_SAMPLES, MOST_PAIRED = 1 << 18, 1 << 19
 _MOST_THRESHOLDS = 96
 _FARTHEST = 4.0  # of the thresholds, standard deviations of the samples
 _TAIL = 3e-3  # of samples above the threshold that is tested
 _EQUAL = 3.0  # standard deviations by which samples equal a prediction too often for it to be looked into
 
 
-def groups_of(edges: IntArray, samples_of_a_frame: int, most_samples: int) -> IntArray:
+def groups_of(edges: IntArray, samples_of_a_frame: int, most_samples: int = MOST_SAMPLES) -> IntArray:
     """Return positions of the first frames of groups of successive ones, evenly spread, (n,).
 
     Args:
@@ -54,7 +56,7 @@ def predicted_samples(
     """
     if min(usable.shape) < 3 or not usable[1:-1, 1:-1].any():
         return {}
-    first = groups_of(edges, usable.size, _MOST_SAMPLES)
+    first = groups_of(edges, usable.size)
     if not first.size:
         return {}
     chosen = frames[first[:, None] + np.arange(GROUP)].reshape(-1, *usable.shape)

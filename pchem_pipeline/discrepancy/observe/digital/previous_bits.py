@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import laws
-from pchem_pipeline.discrepancy.observe.digital.predicted import groups_of
+from pchem_pipeline.discrepancy.observe.digital.predicted import MOST_PAIRED, groups_of
 from pchem_pipeline.effects.framework.evidence import PreviousBits
 
 FloatArray = NDArray[np.float64]
 
 BITS = 8  # the lowest ones
-_MOST_SAMPLES = 1 << 19
 _SMALLEST = 1e-4  # variance of a bit that the value before leaves, relative: below it is that value
 
 
@@ -38,7 +37,7 @@ def previous_bits(
         noise: standard deviation of the samples of each pixel, DN, (y, x).
     """
     pairs = usable[:, 1:] & usable[:, :-1]
-    first = groups_of(edges, usable.size, _MOST_SAMPLES)
+    first = groups_of(edges, usable.size, MOST_PAIRED)
     if not first.size or not pairs.any():
         return None
     # of each group two pairs of frames

@@ -21,7 +21,6 @@ IntArray = NDArray[np.int64]
 Frames = NDArray[np.unsignedinteger[Any]]
 
 _FIRST = 2  # samples of a line that are compared before all of them are
-_IMPOSSIBLE = 1e-3  # repeats by chance, below which each is proof
 _MOST_CODES = 1 << 26  # of all pixels together
 
 
@@ -73,7 +72,7 @@ class Repeats:
         }
         for name, found in (("rows", self.rows), ("columns", self.columns)):
             expected = n_frames * chance[name]
-            if expected < _IMPOSSIBLE and by_axis[name].size > 1:
+            if expected < laws.RARE and by_axis[name].size > 1:
                 z[f"space.repeated.{name}"] = laws.repeats(found, expected)
         return z
 
