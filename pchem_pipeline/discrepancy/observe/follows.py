@@ -20,7 +20,7 @@ from scipy import fft
 
 from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.digital.predicted import GROUP, MOST_SAMPLES, groups_of
-from pchem_pipeline.discrepancy.observe.pairs import Samples
+from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
 from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.effects.analog.empirical_response import Source
@@ -71,25 +71,6 @@ class Follows:
 
 
 @dataclass(frozen=True)
-class _Groups:
-    """Groups of successive frames, one after the other; see :class:`~.pairs.FrameBlocks`."""
-
-    frames: NDArray[np.unsignedinteger[Any]]
-    first: IntArray
-
-    @property
-    def n_frames(self) -> int:
-        """Number of frames."""
-        return GROUP * self.first.size
-
-    def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
-        """Yield about so many frames at a time, whole groups."""
-        some = max(size // GROUP, 1)
-        for begin in range(0, self.first.size, some):
-            yield self.frames[(self.first[begin : begin + some, None] + np.arange(GROUP)).ravel()]
-
-
-@dataclass(frozen=True)
 class FollowingSamples:
     """Frames as residuals and as the charge that these do not hold, each in its standard deviation.
 
@@ -133,7 +114,8 @@ class FollowingSamples:
         first = groups_of(edges, maps.usable.size, frames.size if most is None else most)
         if not first.size:
             return None
-        samples = replace(Samples.by_laws(_Groups(frames, first), laws, maps), most=MOST_SAMPLES)
+        stack = Stack(frames, (first[:, None] + np.arange(GROUP)).ravel(), GROUP)
+        samples = replace(Samples.by_laws(stack, laws, maps), most=MOST_SAMPLES)
         inside = samples.usable if inside is None else samples.usable & inside
         return cls(samples, inside, *_charge_of(laws, maps))
 

@@ -27,7 +27,14 @@ from pchem_pipeline.discrepancy.observe.digital.repeats import (
 )
 from pchem_pipeline.discrepancy.observe.follows import follow_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
-from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS, blocks_of, pixel_statistics, sum_frames
+from pchem_pipeline.discrepancy.observe.sums import (
+    MINIMUM_BLOCKS,
+    blocks_of,
+    pairs_at_lags,
+    pixel_statistics,
+    samples_beyond,
+    sum_frames,
+)
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of, in_order, sample_statistics
@@ -104,6 +111,7 @@ def observe(
     pixels = pixel_statistics(laws, maps)
     sums = sum_frames(frames, edges, laws, pixels)
     view = FrameView(sums, pixels, numbers, edges, block_frames)
+    hits = [samples_beyond(frames, laws, maps.usable, above=above) for above in (True, False)]
     repeats = Repeats.of(frames, numbers)
     lags = pixel_lags(view)
     predicted = predicted_samples(frames, edges, maps.usable)
@@ -114,7 +122,7 @@ def observe(
     misplaced_z, misplaced = misplaced_lines(frames, seen.counts, seen.origin, maps.usable)
     z = {
         **evidence.z,
-        "tail.high.clusters": _clusters(sums.hits, laws, frames.shape),
+        "tail.high.clusters": _clusters(hits[0], laws, frames.shape),
         **time_statistics(view, lags),
         **frame_statistics(view),
         **space_statistics(view),
@@ -138,6 +146,8 @@ def observe(
         previous_bits=bits,
         misplaced_lines=misplaced,
         waves=waves.found,
+        hits=_numbered(hits[0], numbers),
+        low_hits=_numbered(hits[1], numbers),
     )
     return replace(evidence, time=time, z=in_order(z))
 
@@ -335,14 +345,12 @@ def _time_series(view: FrameView, lags: FloatArray, n_run: int, **others: Any) -
         lag_readout=mapped(lags[3:6]),
         lag_readout_charge=mapped(lags[6]),
         lag_charge_readout=mapped(lags[7]),
-        n_pairs=sums.n_pairs[0],
+        n_pairs=pairs_at_lags(view.edges)[0],
         neighbours={name: seen.correlation for name, seen in found.items()},
         neighbour_pairs={name: seen.products for name, seen in found.items()},
         neighbour_maps={name: seen.deviation.astype(np.float32) for name, seen in found.items()},
         **others,
         frame_noise=view.series["noise"],
-        hits=_numbered(sums.hits, view.numbers),
-        low_hits=_numbered(sums.low_hits, view.numbers),
     )
 
 

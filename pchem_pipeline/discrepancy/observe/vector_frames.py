@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import laws
-from pchem_pipeline.discrepancy.observe.sums import CHANNELS, FrameSums, PixelStatistics
+from pchem_pipeline.discrepancy.observe.sums import CHANNELS, PixelStatistics, pairs_at_lags
+from pchem_pipeline.discrepancy.observe.sums_numba import FrameSums
 from pchem_pipeline.discrepancy.observe.vector import named, pixel_forms
 
 FloatArray = NDArray[np.float64]
@@ -235,7 +236,7 @@ def time_statistics(view: FrameView, lags: FloatArray) -> dict[str, float]:
     usable = view.pixels.usable
     names = [f"time.lag{lag}.{name}" for name in CHANNELS for lag in (1, 2, 3)]
     names += ["time.cross.readout_charge", "time.cross.charge_readout"]
-    for name, values, pairs in zip(names, lags, view.sums.n_pairs, strict=True):
+    for name, values, pairs in zip(names, lags, pairs_at_lags(view.edges), strict=True):
         if pairs:
             forms = pixel_forms(values[usable] * np.sqrt(pairs))
             found |= {name: forms["mean"], **named(name, forms)}
