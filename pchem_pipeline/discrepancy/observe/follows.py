@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from pchem_pipeline.discrepancy.observe import laws as laws_of
-from pchem_pipeline.discrepancy.observe.digital.predicted import GROUP, MOST_SAMPLES, groups_of
+from pchem_pipeline.discrepancy.observe.digital.groups import GROUP, MOST_SAMPLES, groups_of
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
 from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws

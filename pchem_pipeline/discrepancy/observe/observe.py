@@ -15,10 +15,14 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe import tables_numba as column
+from pchem_pipeline.discrepancy.observe.digital.groups import (
+    bit_statistics,
+    nearer_statistics,
+    predicted_samples,
+    predicted_statistics,
+    previous_bits,
+)
 from pchem_pipeline.discrepancy.observe.digital.misplaced import misplaced_lines
-from pchem_pipeline.discrepancy.observe.digital.nearer import nearer_statistics
-from pchem_pipeline.discrepancy.observe.digital.predicted import predicted_samples, predicted_statistics
-from pchem_pipeline.discrepancy.observe.digital.previous_bits import bit_statistics, previous_bits
 from pchem_pipeline.discrepancy.observe.digital.repeats import (
     Repeats,
     equal_squares,
@@ -37,13 +41,15 @@ from pchem_pipeline.discrepancy.observe.sums import (
 )
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
-from pchem_pipeline.discrepancy.observe.vector import goodness_of, in_order, sample_statistics
-from pchem_pipeline.discrepancy.observe.vector_frames import (
+from pchem_pipeline.discrepancy.observe.vector import (
     FrameView,
     frame_statistics,
+    goodness_of,
+    in_order,
     pixel_lags,
     quadrant_series,
     quadrant_sums,
+    sample_statistics,
     space_statistics,
     time_statistics,
 )

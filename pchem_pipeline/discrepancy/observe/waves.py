@@ -20,7 +20,7 @@ from scipy import fft, ndimage
 from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
-from pchem_pipeline.discrepancy.observe.vector_frames import SHORTEST_PERIODOGRAM
+from pchem_pipeline.discrepancy.observe.vector import SHORTEST_PERIODOGRAM
 from pchem_pipeline.effects.framework.evidence import PixelMaps, Wave
 
 Float32Array = NDArray[np.float32]

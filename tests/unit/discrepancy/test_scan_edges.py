@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from helpers.standardised import samples_of
 
-from pchem_pipeline.discrepancy.scan_edges import Side, sharpened
-from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
+from pchem_pipeline.discrepancy.scan_pairs import Side, scan_pairs, sharpened
 from pchem_pipeline.effects.framework.region import Region
 
 SHAPE, FRAMES = (64, 200), 200

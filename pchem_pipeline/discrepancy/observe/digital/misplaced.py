@@ -16,13 +16,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.observe.digital.groups import MOST_PAIRED
 from pchem_pipeline.discrepancy.observe.digital.misplaced_numba import (
     N_PLACES,
     STEPS,
     compare_rows,
     fill_ratios,
 )
-from pchem_pipeline.discrepancy.observe.digital.predicted import MOST_PAIRED
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.histogram.count import histogram_frames
 

@@ -9,7 +9,7 @@ import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
 from pydantic import ValidationError
 
-from pchem_pipeline.discrepancy.observe.digital.previous_bits import BITS, bit_statistics, previous_bits
+from pchem_pipeline.discrepancy.observe.digital.groups import BITS, bit_statistics, previous_bits
 from pchem_pipeline.effects.adc.binary_offset import BinaryOffset
 from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
 from pchem_pipeline.effects.analog.row_noise import RowNoise
