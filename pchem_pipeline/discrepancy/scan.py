@@ -39,7 +39,7 @@ _RIDGE = 1e-3  # of a covariance of series that may all but coincide
 #: Pixels, frames or events of a place, at least.
 FEWEST = 3
 _LEAST = -690.0  # logarithm of the smallest probability that is written
-_SURE = 0.05
+_SURE = 0.05  # probability of a chance among all single pixels of a place
 _LITTLE = 0.25  # of the mean inside a place, that outside
 #: Nats by which a place of a further family must be less probable than a simpler one.
 _BETTER = 3.0
@@ -162,9 +162,9 @@ def scan_map(
         contrast = Contrast.of(values, left)
         if contrast is None:
             return None
-        found = best_place(contrast, [*regions(contrast), _single(values, left) if single else None])
-        found = None if found is None else _checked(_odd_side(found, values, left), values, left)
-        if found is None or found.log_p > math.log(significance):
+        families = [*regions(contrast), _single(values, left) if single else None]
+        found = _significant(best_place(contrast, families), values, left, significance, either_side=True)
+        if found is None:
             return None
         deviations = np.where(some, math.copysign(1.0, found.z) * values, -np.inf)[some]
         share = affected_share(deviations, (found.mask & left)[some])
@@ -203,9 +203,8 @@ def scan_series(
             _periodic(contrast, 1, numbers, _FRAME_PERIODS, cycles=4, better=1.02),
             _single(row, left),
         ]
-        found = best_place(contrast, families, better=0.0)
-        found = None if found is None else _checked(found, row, left)
-        if found is None or found.log_p > math.log(significance):
+        found = _significant(best_place(contrast, families, better=0.0), row, left, significance)
+        if found is None:
             return None
         family, when = _frames(found, numbers)
         return found.mask, Stretch(**{**found.means(row, left), "family": family}, when=when)
@@ -234,20 +233,32 @@ def _reaching(mask: BoolArray, axis: int | None) -> BoolArray:
     return grown
 
 
-def _checked(found: Found, values: FloatArray, some: BoolArray) -> Found:
-    """Return a place with its deviation in terms of the scatter inside and outside (Welch).
+def _significant(
+    found: Found | None,
+    values: FloatArray,
+    some: BoolArray,
+    significance: float,
+    *,
+    either_side: bool = False,
+) -> Found | None:
+    """Return a place with its deviation in terms of the scatter inside and outside (Welch), if significant.
 
-    Where values scatter more, a mean that is off says less.
+    Where values scatter more, a mean that is off says less. ``either_side``: the place, or all outside of it
+    where that is what deviates from 0.
     """
-    if found.family == "pixels":
-        return found
+    if found is None:
+        return None
     inside, outside = values[some & found.mask], values[some & ~found.mask]
-    variance = max(inside.var(), 1.0) / inside.size + max(outside.var(), 1.0) / outside.size
-    z = float((inside.mean() - outside.mean()) / np.sqrt(variance))
-    if abs(z) >= abs(found.z):
-        return found
-    places = found.log_p - float(special.log_ndtr(-abs(found.z)))
-    return replace(found, z=z, log_p=min(0.0, float(special.log_ndtr(-abs(z))) + places))
+    if either_side and abs(inside.mean()) < abs(outside.mean()):
+        found = replace(found, mask=~found.mask, z=-found.z)
+        inside, outside = outside, inside
+    if found.family != "pixels":
+        variance = max(inside.var(), 1.0) / inside.size + max(outside.var(), 1.0) / outside.size
+        z = float((inside.mean() - outside.mean()) / np.sqrt(variance))
+        if abs(z) < abs(found.z):
+            places = found.log_p - float(special.log_ndtr(-abs(found.z)))
+            found = replace(found, z=z, log_p=min(0.0, float(special.log_ndtr(-abs(z))) + places))
+    return found if found.log_p <= math.log(significance) else None
 
 
 def regions(contrast: Contrast) -> list[Found | None]:
@@ -283,14 +294,6 @@ def best_place(contrast: Contrast, families: Sequence[Found | None], better: flo
         if each.log_p < best.log_p - better:
             best = each
     return replace(best, log_p=best.log_p + math.log(len(families)))
-
-
-def _odd_side(found: Found, values: FloatArray, some: BoolArray) -> Found:
-    """Return the place, or all outside of it where that is what deviates from 0."""
-    inside, outside = values[some & found.mask].mean(), values[some & ~found.mask].mean()
-    if abs(inside) >= abs(outside):
-        return found
-    return replace(found, mask=~found.mask, z=-found.z)
 
 
 @dataclass(frozen=True)
@@ -501,7 +504,7 @@ def _single(values: FloatArray, some: BoolArray) -> Found | None:
     return Found("pixels", mask, float(values[at]), log_p)
 
 
-def affected_share(z: FloatArray, inside: BoolArray, level: float = 0.05) -> float:
+def affected_share(z: FloatArray, inside: BoolArray, level: float = _SURE) -> float:
     """Return a lower bound of the share of the values inside a place that are larger than by chance.
 
     All-resolutions inference (Rosenblatt et al. 2018; Goeman and Solari 2011): closed testing with Simes'

@@ -15,6 +15,7 @@ it where it shares half as much as those inside.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import chi_square
-from pchem_pipeline.discrepancy.observe.pairs import MODES, PERIOD, Pairs, Samples, pairs_of
+from pchem_pipeline.discrepancy.observe.pairs import MODES, PERIOD, Pairs, Samples, energies, pairs_of
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
 from pchem_pipeline.discrepancy.scan import PERIODS, SIGNIFICANCE, Suspect, successive
 from pchem_pipeline.effects.framework.region import Region, Taps
@@ -62,15 +63,37 @@ class Shared(Suspect):
 
 @dataclass(frozen=True)
 class _Best:
-    """The best place of a family: cells of lines and across them, or a tap, or lines; z, number of places."""
+    """The best place of a family: z, number of places, and a tap, or lines, or cells of lines and across."""
 
     family: str
     z: float
     places: float
-    lines: tuple[int, int] = (0, 0)
-    across: tuple[int, int] = (0, 0)
     taps: Taps | None = None
     scattered: tuple[int, ...] = ()
+    lines: tuple[int, int] = (0, 0)
+    across: tuple[int, int] = (0, 0)
+
+    def region(self, pairs: Pairs, shape: tuple[int, int]) -> Region | None:
+        """Return its pixels in the sensor's rows and columns; None for all of it."""
+        if self.taps is not None:
+            return Region(taps=self.taps)
+        if self.scattered:
+            spans = [slice(int(pairs.lines[i]), int(pairs.lines[i + 1])) for i in self.scattered]
+            return _boxes_of(pairs.mode, shape, [(span, slice(None)) for span in spans])
+        lines, across = (
+            slice(int(edges[a]), int(edges[b]))
+            for edges, (a, b) in ((pairs.lines, self.lines), (pairs.across, self.across))
+        )
+        return _boxes_of(pairs.mode, shape, [(lines, across)])
+
+
+def _boxes_of(mode: str, shape: tuple[int, int], boxes: Sequence[tuple[slice, slice]]) -> Region | None:
+    """Return the pixels of boxes, of lines and across them; None for all of the sensor."""
+    mask = np.zeros(shape, np.bool_)
+    turned = mask.T if mode == "column" else mask
+    for box in boxes:
+        turned[box] = True
+    return None if mask.all() else Region.of_mask(mask)
 
 
 def scan_pairs(samples: Samples, *, significance: float = SIGNIFICANCE, most: int = 2) -> list[Shared]:
@@ -110,14 +133,13 @@ def _most_significant(samples: Samples, log_limit: float) -> Shared | None:
     for log_p, channel, pairs, best in guesses[:_MEASURED]:
         if log_p > log_limit:
             break
-        region = _region(best, pairs, shape)
+        region = best.region(pairs, shape)
         if region is None:
             continue
         place = _measured(samples, channel, pairs.mode, region, best)
         if _holds(place, log_limit):
-            sharper = _with_ends(samples, channel, pairs, best, place)
-            place = sharper if _holds(sharper, log_limit) else place
-            return place
+            sharper = _with_ends(samples, channel, pairs, best)
+            return sharper if sharper is not None and _holds(sharper, log_limit) else place
     return None
 
 
@@ -132,31 +154,15 @@ def _log_p(z: float, places: float) -> float:
     return min(0.0, float(special.log_ndtr(-z)) + math.log(max(looks, 1.0)))
 
 
-def _region(best: _Best, pairs: Pairs, shape: tuple[int, int]) -> Region | None:
-    """Return the pixels of a place in the sensor's rows and columns; None for all of it."""
-    if best.taps is not None:
-        return Region(taps=best.taps)
-    mask = np.zeros(shape, np.bool_)
-    turned = mask.T if pairs.mode == "column" else mask
-    if best.scattered:
-        for line in best.scattered:
-            turned[pairs.lines[line] : pairs.lines[line + 1]] = True
-    else:
-        lines, across = (
-            slice(int(edges[a]), int(edges[b]))
-            for edges, (a, b) in ((pairs.lines, best.lines), (pairs.across, best.across))
-        )
-        turned[lines, across] = True
-    return None if mask.all() else Region.of_mask(mask)
-
-
 def _measured(samples: Samples, channel: int, mode: str, region: Region, best: _Best) -> Shared:
     """Return a place with its significance by theory or by the scatter of the frames, whichever is less."""
     inside = region.mask((samples.usable.shape[0], samples.usable.shape[1]))
     usable = samples.usable
     energy, total = (samples.energies(channel, mode, part) for part in (usable & inside, usable))
     n = energy.size
-    own, every = (_number_of_pairs(part, mode) for part in (usable & inside, usable))
+    # the products of ones are the number of pairs
+    ones = (part[None].astype(np.float32) for part in (usable & inside, usable))
+    own, every = (float(energies(each, mode)[0]) for each in ones)
     share = own / every
     apart = energy - share * total
     by_theory = math.sqrt(n * own * (1.0 - share))
@@ -179,25 +185,15 @@ def _measured(samples: Samples, channel: int, mode: str, region: Region, best: _
     )
 
 
-def _with_ends(samples: Samples, channel: int, pairs: Pairs, best: _Best, place: Shared) -> Shared:
-    """Return the place of a box with its ends told line by line."""
+def _with_ends(samples: Samples, channel: int, pairs: Pairs, best: _Best) -> Shared | None:
+    """Return the place of a box with its ends told line by line; None where the scan knows as much."""
     lines, across = Side.of(pairs.lines, best.lines), Side.of(pairs.across, best.across)
     if best.taps is not None or best.scattered or (lines.exact and across.exact):
-        return place
-    ends = [slice(*each) for each in sharpened(samples, channel, pairs.mode, lines, across)]
-    mask = np.zeros((samples.usable.shape[0], samples.usable.shape[1]), np.bool_)
-    mask[tuple(ends[::-1] if pairs.mode == "column" else ends)] = True
-    if mask.all():
-        return place
-    return _measured(samples, channel, pairs.mode, Region.of_mask(mask), best)
-
-
-def _number_of_pairs(pixels: BoolArray, mode: str) -> float:
-    """Return the pairs of pixels that share a mode in one frame."""
-    size = float(pixels.sum())
-    rows, columns = (float((pixels.sum(axis=axis, dtype=np.float64) ** 2).sum()) for axis in (1, 0))
-    twice = {"row": rows - size, "column": columns - size, "frame": size**2 - rows - columns + size}
-    return twice[mode] / 2.0
+        return None
+    first, second = (slice(*each) for each in sharpened(samples, channel, pairs.mode, lines, across))
+    shape = samples.usable.shape[0], samples.usable.shape[1]
+    region = _boxes_of(pairs.mode, shape, [(first, second)])
+    return None if region is None else _measured(samples, channel, pairs.mode, region, best)
 
 
 # -- families -----------------------------------------------------------------------------------
@@ -301,7 +297,14 @@ def _scattered(pairs: Pairs, usable: BoolArray) -> list[_Best]:
     log_places = (
         special.gammaln(n + 1) - special.gammaln(chosen.size + 1) - special.gammaln(n - chosen.size + 1)
     )
-    return [_Best("scattered", together, float(np.exp(log_places)), scattered=tuple(chosen.tolist()))]
+    return [
+        _Best(
+            "scattered",
+            together,
+            float(np.exp(log_places)),
+            scattered=tuple(chosen.tolist()),
+        )
+    ]
 
 
 class Side(NamedTuple):

@@ -153,63 +153,46 @@ def frame_series(evidence: Evidence) -> dict[str, FloatArray]:
         found["frame.noise"] = time.frame_noise
     for channel in ("charge", "readout"):
         found[f"scatter.{channel}"] = chi_square(found[f"frame.{channel}"] ** 2, 1.0)
-    for line, axis, channel, values, variance in (
-        ("row", 1, "charge", time.row_charge, charge),
-        ("row", 1, "readout", time.row_readout, readout),
-        ("column", 0, "charge", time.column_charge, charge),
-        ("column", 0, "readout", time.column_readout, readout),
-    ):
-        total = variance.sum(axis=axis)
-        some = total > 0
-        if some.sum() > 2:
-            u = values[:, some] * usable.sum(axis=axis)[some] / np.sqrt(total[some])
-            u = u - u.mean(axis=1, keepdims=True)
-            found[f"{line}.{channel}"] = np.asarray(chi_square((u**2).sum(axis=1), some.sum() - 1.0))
+    for line, axis in (("row", 1), ("column", 0)):
+        for channel, variance in (("charge", charge), ("readout", readout)):
+            total, number = variance.sum(axis=axis), usable.sum(axis=axis)
+            some = total > 0
+            if some.sum() > 2:
+                u = getattr(time, f"{line}_{channel}")[:, some] * number[some] / np.sqrt(total[some])
+                u = u - u.mean(axis=1, keepdims=True)
+                found[f"{line}.{channel}"] = np.asarray(chi_square((u**2).sum(axis=1), some.sum() - 1.0))
     return found
 
 
-#: The map in which a statistic would show where it is, by the beginning of its name; likewise the series.
+#: The map in which a statistic would show where it is, by the beginning of its name; likewise the series. {c}
+#: stands for the charge or the readout, {p} for pairs of samples of these.
 _MAP_OF = {
     "shape.goodness": "goodness",
     "shape.peaks": "peaks",
-    "time.lag1.charge": "lag.charge",
-    "time.lag2.charge": "lag.charge",
-    "time.lag1.readout": "lag.readout",
-    "time.lag2.readout": "lag.readout",
+    "time.lag1.{c}": "lag.{c}",
+    "time.lag2.{c}": "lag.{c}",
     "time.cross.readout_charge": "lag.cross",
-    "time.block.charge": "spread.charge",
-    "time.block.readout": "spread.readout",
-    "frame.charge.quadrants": "trend.charge",
-    "frame.readout.quadrants": "trend.readout",
-    "frame.charge.trend": "trend.charge",
-    "frame.readout.trend": "trend.readout",
-    "frame.charge.slow": "spread.charge",
-    "frame.readout.slow": "spread.readout",
-    "frame.charge.variance": "x.kk",
-    "frame.readout.variance": "x.rr",
-    "space.row.charge": "x.kk",
-    "space.row.readout": "x.rr",
-    "space.column.charge": "y.kk",
-    "space.column.readout": "y.rr",
+    "time.block.{c}": "spread.{c}",
+    "frame.{c}.quadrants": "trend.{c}",
+    "frame.{c}.trend": "trend.{c}",
+    "frame.{c}.slow": "spread.{c}",
+    "frame.{c}.variance": "x.{p}",
+    "space.row.{c}": "x.{p}",
+    "space.column.{c}": "y.{p}",
 }
 _SERIES_OF = {
-    "frame.charge": "frame.charge",
-    "frame.readout": "frame.readout",
-    "frame.charge.variance": "scatter.charge",
-    "frame.readout.variance": "scatter.readout",
+    "frame.{c}": "frame.{c}",
+    "frame.{c}.variance": "scatter.{c}",
     "frame.covariance": "scatter.charge",
     "frame.noise": "frame.noise",
     "space.row.noise": "frame.noise",
     "space.column.noise": "frame.noise",
-    "space.row.charge": "row.charge",
-    "space.row.readout": "row.readout",
-    "space.x.rr": "row.readout",
-    "space.x.kk": "row.charge",
-    "space.column.charge": "column.charge",
-    "space.column.readout": "column.readout",
-    "space.y.rr": "column.readout",
-    "space.y.kk": "column.charge",
+    "space.row.{c}": "row.{c}",
+    "space.x.{p}": "row.{c}",
+    "space.column.{c}": "column.{c}",
+    "space.y.{p}": "column.{c}",
 }
+_PAIR_OF = {"charge": "kk", "readout": "rr"}
 
 
 def map_of(statistic: str) -> str | None:
@@ -228,8 +211,13 @@ def series_of(statistic: str) -> str | None:
 
 
 def _longest(table: Mapping[str, str], name: str) -> str | None:
-    found = [start for start in table if name.startswith(start)]
-    return table[max(found, key=len)] if found else None
+    filled = {
+        start.format(c=channel, p=pair): shown.format(c=channel, p=pair)
+        for start, shown in table.items()
+        for channel, pair in _PAIR_OF.items()
+    }
+    found = [start for start in filled if name.startswith(start)]
+    return filled[max(found, key=len)] if found else None
 
 
 def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: float) -> list[Place]:

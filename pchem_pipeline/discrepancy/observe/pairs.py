@@ -158,11 +158,11 @@ class Samples:
             return np.zeros(self.n_frames)
         box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         inside = pixels[box].astype(np.float32)
-        found = [_energy(u * inside, mode) for (u,) in self.chunks((channel,), *box)]
+        found = [energies(u * inside, mode) for (u,) in self.chunks((channel,), *box)]
         return np.concatenate(found)
 
 
-def _energy(u: Float32Array, mode: str) -> FloatArray:
+def energies(u: Float32Array, mode: str) -> FloatArray:
     """Return the sum of the products of all pairs that share a mode, of frames (t, y, x)."""
     own = np.einsum("tyx,tyx->t", u, u, dtype=np.float64)
     rows, columns = (u.sum(axis=axis, dtype=np.float64) for axis in (2, 1))

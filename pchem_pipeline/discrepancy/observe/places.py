@@ -23,8 +23,6 @@ from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.region import Region, Span, When
 from pchem_pipeline.effects.framework.registry import effect_classes
 
-#: Frames of a part that is looked at by itself.
-FEWEST_FRAMES = 64
 _SAME = 0.8  # of two regions together, that one and the same has in common as two looks tell it
 _LEADING = 2  # statistics of a signature that are looked at
 

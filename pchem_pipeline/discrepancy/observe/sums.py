@@ -25,8 +25,8 @@ IntArray = NDArray[np.int64]
 
 #: What a sample is split into: k and r.
 CHANNELS = ("charge", "readout")
-#: Blocks of frames, whose means are compared.
-MINIMUM_BLOCKS = 4
+#: Blocks whose means are compared, and frames whose course along time is looked at, at least.
+MINIMUM_BLOCKS, FEWEST_FRAMES = 4, 64
 MOST_HITS = 20_000
 _NO_CODE = np.iinfo(np.int64).max  # above all
 _CHUNK_SAMPLES = 1 << 16

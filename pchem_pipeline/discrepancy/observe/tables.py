@@ -103,8 +103,8 @@ def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np
         first=axis,
         coarse=coarse,
         single=np.zeros((4, n_codes)),
-        fold=np.zeros(16),
-        fold_covariance=np.zeros((16, 16)),
+        fold=np.zeros(kernel.FOLD),
+        fold_covariance=np.zeros((kernel.FOLD, kernel.FOLD)),
         bins=np.zeros((3, n_bins)),
         bin_covariance=np.zeros((n_bins, n_bins)),
     )

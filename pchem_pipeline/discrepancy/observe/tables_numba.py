@@ -29,7 +29,8 @@ MODEL_STD_K, MODEL_STD_R, MEAN_KK, MEAN_RR, MEAN_KR, MEAN_KRR, MEAN_KKRR, OFFSET
 CHI2, CHI2_MEAN, CHI2_VARIANCE, EXPECTED_LOW, EXPECTED_HIGH, SEEN_LOW, SEEN_HIGH = range(8, 15)
 EXPECTED_FAR_LOW, EXPECTED_FAR_HIGH, SEEN_FAR_LOW, SEEN_FAR_HIGH = range(15, 19)
 PEAKS_CHI2, PEAKS_MEAN, PEAKS_VARIANCE, MEAN_RRRR = range(19, 23)
-_FOLD = 16
+#: Codes are summed by their number modulo this.
+FOLD = 16
 
 
 class Fitted(NamedTuple):
@@ -206,13 +207,13 @@ def _code_sums(
     Only the lower triangles of the covariances are filled.
     """
     size, origin, coarse = seen.size, sums.first, sums.coarse
-    folded = np.zeros((N_NUISANCE, _FOLD))
+    folded = np.zeros((N_NUISANCE, FOLD))
     begin = (first - origin) // coarse
     n_bins = (first + size - 1 - origin) // coarse - begin + 1
     binned = np.zeros((N_NUISANCE, n_bins))
     for x in range(size):
         residual = seen[x] - expected[x]
-        at, modulo = first + x - origin, (first + x) % _FOLD
+        at, modulo = first + x - origin, (first + x) % FOLD
         b = at // coarse
         used = 0.0
         for i in range(N_NUISANCE):
@@ -229,7 +230,7 @@ def _code_sums(
         sums.bins[2, b] += expected[x]
         sums.bin_covariance[b, b] += expected[x] * shift[x] ** 2
     for i in range(N_NUISANCE):
-        for a in range(_FOLD):
+        for a in range(FOLD):
             value = n * folded[i, a]
             for b in range(a + 1):
                 sums.fold_covariance[a, b] -= value * folded[i, b]

@@ -32,9 +32,11 @@ FloatArray = NDArray[np.float64]
 STANDS_OUT = 3.5
 _TAIL = float(special.ndtr(-STANDS_OUT))
 _ENOUGH = 25.0  # samples expected of a code or bin that is judged by itself
-_LOW, _HIGH = [column.SEEN_LOW, column.EXPECTED_LOW], [column.SEEN_HIGH, column.EXPECTED_HIGH]
-_FAR_LOW = [column.SEEN_FAR_LOW, column.EXPECTED_FAR_LOW]
-_FAR_HIGH = [column.SEEN_FAR_HIGH, column.EXPECTED_FAR_HIGH]
+#: Columns of samples seen and expected beyond the support, and far beyond it.
+_TAILS = {
+    "low": ((column.SEEN_LOW, column.EXPECTED_LOW), (column.SEEN_FAR_LOW, column.EXPECTED_FAR_LOW)),
+    "high": ((column.SEEN_HIGH, column.EXPECTED_HIGH), (column.SEEN_FAR_HIGH, column.EXPECTED_FAR_HIGH)),
+}
 _SMALLEST_EIGENVALUE = 0.02  # of residuals, relative to Poisson counts: below it the fits have absorbed them
 _Slices = tuple[slice, slice]
 
@@ -103,14 +105,14 @@ def sample_statistics(pixels: PixelLaws, exposure: FloatArray, residuals: CodeRe
     for name, chi_square in (("goodness", column.CHI2), ("peaks", column.PEAKS_CHI2)):
         z = goodness_of(moments, chi_square)
         found |= named(f"shape.{name}", pixel_forms(z, two_sided=False))
-    for side, near, far in (
-        ("low", moments[:, _LOW], moments[:, _FAR_LOW]),
-        ("high", moments[:, _HIGH], moments[:, _FAR_HIGH]),
-    ):
+    for side, tails in _TAILS.items():
+        near, far = (moments[:, list(columns)] for columns in tails)
         found[f"tail.{side}.count"] = _beyond(near.sum(axis=0), far.sum(axis=0))
-        pixels_near = [np.count_nonzero(near[:, 0]), -np.expm1(-near[:, 1]).sum()]
-        pixels_far = [np.count_nonzero(far[:, 0]), -np.expm1(-far[:, 1]).sum()]
-        found[f"tail.{side}.pixels"] = _beyond(np.array(pixels_near), np.array(pixels_far))
+        pixels_with = [
+            np.array([np.count_nonzero(seen), -np.expm1(-expected).sum()])
+            for seen, expected in (near.T, far.T)
+        ]
+        found[f"tail.{side}.pixels"] = _beyond(*pixels_with)
     return found | _code_statistics(pixels.codes, residuals)
 
 
@@ -182,7 +184,7 @@ def period_statistics(fold: FloatArray, covariance: FloatArray) -> dict[str, flo
         fold: sums of the residuals, (16,).
         covariance: of these, (16, 16).
     """
-    code = np.arange(16)
+    code = np.arange(column.FOLD)
     sign = (-1.0) ** code
     found = {"code.alternating": float(sign @ fold / np.sqrt(max(float(sign @ covariance @ sign), 1e-300)))}
     scale = np.diag(covariance).clip(1e-300)

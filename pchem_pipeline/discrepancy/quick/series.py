@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import FAR, SLOWEST, best, chi_square
+from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 
 FloatArray = NDArray[np.float64]
 
-_FEWEST_FRAMES = 64
 #: Frequencies on either side from which the noise around one is taken.
 _AROUND = 64
 
@@ -30,7 +30,7 @@ def series_checks(mean: FloatArray) -> list[Check]:
     They compare the series with itself in another order, so that noise of frame to frame is none of them.
     """
     n = mean.size
-    if n < _FEWEST_FRAMES:
+    if n < FEWEST_FRAMES:
         return []
     centre = float(np.median(mean))
     spread = max(robust_sd(mean, centre), 1e-300)

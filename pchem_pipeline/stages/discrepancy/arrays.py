@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import error_words
+from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
 from pchem_pipeline.discrepancy.where import PAIRS, pixel_maps
@@ -34,6 +35,8 @@ _log = logging.getLogger(__name__)
 _SHOWN_FRAMES = 96
 #: Rows of the sensor, and frames at a time, from which the path of a named effect is computed.
 _PATH_ROWS, _PATH_FRAMES = 4, 256
+#: Maps that effects are given.
+_TRUTH = ("quanta_exposure", "conversion_gain", "bias", "analog_read_noise_e")
 
 
 def evidence_arrays(
@@ -185,7 +188,8 @@ def _path(
 
     ny, nx = evidence.maps.usable.shape
     rows = np.unique(np.linspace(0, ny - 1, _PATH_ROWS).astype(np.int64))
-    truth = _filled(evidence, rows)
+    whole = truth_of(evidence.maps)
+    truth = {name: getattr(whole, name)[rows] for name in _TRUTH}
     parts = []
     for start in range(0, time.frames.size, _PATH_FRAMES):
         frames = np.asarray(time.frames[start : start + _PATH_FRAMES], dtype=np.int64)
@@ -201,21 +205,6 @@ def _path(
         )
         parts.append(_moved(effect, context))
     return np.concatenate(parts, axis=1)
-
-
-def _filled(evidence: Evidence, rows: NDArray[np.int64]) -> dict[str, FloatArray]:
-    """Return the fitted maps of some rows under the names of a truth, pixels without a fit filled in."""
-    maps = evidence.maps
-    found = {
-        "quanta_exposure": maps.quanta_exposure,
-        "conversion_gain": maps.conversion_gain,
-        "bias": maps.bias,
-        "analog_read_noise_e": maps.read_noise_dn * maps.conversion_gain,
-    }
-    return {
-        name: np.where(maps.usable, values, np.median(values[maps.usable]))[rows]
-        for name, values in found.items()
-    }
 
 
 def _moved(effect: Effect, context: EffectContext) -> FloatArray:

@@ -21,8 +21,9 @@ from scipy.ndimage import binary_dilation
 
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
-from pchem_pipeline.discrepancy.observe.places import FEWEST_FRAMES, Part
+from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.observe.rare import N_SETS, rare_samples
+from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
 from pchem_pipeline.discrepancy.scan import (
     SIGNIFICANCE,
     Cluster,

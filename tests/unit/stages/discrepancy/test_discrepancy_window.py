@@ -14,11 +14,12 @@ from pchem_pipeline.discrepancy.verdict import Elsewhere, Verdict
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.stages.discrepancy import discrepancy
-from pchem_pipeline.stages.discrepancy.clear import fewer_samples, is_clear
 from pchem_pipeline.stages.discrepancy.survey import Survey
 from pchem_pipeline.stages.discrepancy.window import (
     Window,
     choose_window,
+    fewer_samples,
+    is_clear,
     other_window,
     read_window,
     search_bytes,
