@@ -25,7 +25,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-#: Cells along an edge of a map on which all rectangles are tried, and cells of lines on which all ranges are.
+#: Cells along an edge of a map on which all rectangles are tried, and of a series on which all ranges are.
 _CELLS, _STRETCHES = 32, 400
 _RADII = (1.5, 2.5, 4.0, 6.0, 9.0, 13.0, 19.0, 28.0)
 _FINER = (0.72, 0.8, 0.9, 1.12, 1.25, 1.4)
@@ -198,7 +198,7 @@ def scan_series(
         if contrast is None:
             return None
         families = [
-            _bands(contrast, 1, lambda z, n: _log_p_range(z, n, shortest)),
+            _bands(contrast, 1, in_time=True),
             # a multiple of a period is no better than it
             _periodic(contrast, 1, numbers, _FRAME_PERIODS, cycles=4, better=1.02),
             _single(row, left),
@@ -360,16 +360,22 @@ def _log_p_range(z: float, n: int, shortest: int) -> float:
     return min(union, 3.0 * math.log(b) - b**2 / 2.0 - 0.5 * math.log(8.0 * math.pi) + math.log(total))
 
 
-def _intervals(contrast: Contrast, sums: FloatArray, counts: FloatArray) -> tuple[float, int, int]:
-    """Return the deviation and the ends of the best range of lines: of cells of many, then moved by lines."""
+def _intervals(
+    contrast: Contrast, sums: FloatArray, counts: FloatArray, cells: int | None = None
+) -> tuple[float, int, int]:
+    """Return the deviation and the ends of the best range of lines.
+
+    Of all ranges, or of those of so many cells of lines, whose ends are then moved by lines.
+    """
     n = sums.size
+    cells = n if cells is None else min(cells, n)
     total, number = (np.concatenate([[0.0], np.cumsum(values)]) for values in (sums, counts))
-    edges = np.unique(np.linspace(0, n, min(_STRETCHES, n) + 1).astype(int))
+    edges = np.unique(np.linspace(0, n, cells + 1).astype(int))
     some, many = total[edges], number[edges]
     z = np.triu(np.abs(contrast.z(some[None, :] - some[:, None], many[None, :] - many[:, None])), 1)
     first, last = (int(edges[i]) for i in np.unravel_index(int(np.argmax(z)), z.shape))
-    near = math.ceil(n / _STRETCHES) + 1
-    for _ in range(2 if first < last and edges.size <= n else 0):
+    near = math.ceil(n / cells) + 1
+    for _ in range(2 if first < last and cells < n else 0):
         starts = np.arange(max(first - near, 0), min(first + near, last - 1) + 1)
         tried = contrast.z(total[last] - total[starts], number[last] - number[starts])
         first = int(starts[np.argmax(np.abs(tried))])
@@ -379,14 +385,15 @@ def _intervals(contrast: Contrast, sums: FloatArray, counts: FloatArray) -> tupl
     return float(contrast.z(total[last] - total[first], number[last] - number[first])), first, last
 
 
-def _bands(contrast: Contrast, axis: int, log_p: Callable[[float, int], float] | None = None) -> Found:
-    """Return the best band of rows (axis 0) or columns (axis 1); ``log_p`` of a deviation among n lines."""
+def _bands(contrast: Contrast, axis: int, *, in_time: bool = False) -> Found:
+    """Return the best band of rows (axis 0) or columns (axis 1), or range of frames."""
     sums, counts = (values.sum(axis=1 - axis) for values in (contrast.values, contrast.some))
-    z, a, b = _intervals(contrast, sums, counts)
-    lines = np.zeros(sums.size, np.bool_)
+    n = sums.size
+    z, a, b = _intervals(contrast, sums, counts, _STRETCHES if in_time else None)
+    lines = np.zeros(n, np.bool_)
     lines[a:b] = True
-    chance = _log_p(z, sums.size**2 / 2) if log_p is None else log_p(z, sums.size)
-    return Found("columns" if axis else "rows", _lines(lines, axis, contrast), z, chance)
+    log_p = _log_p_range(z, n, contrast.fewest) if in_time else _log_p(z, n**2 / 2)
+    return Found("columns" if axis else "rows", _lines(lines, axis, contrast), z, log_p)
 
 
 def _lines(lines: BoolArray, axis: int, contrast: Contrast) -> BoolArray:

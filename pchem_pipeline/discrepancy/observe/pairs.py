@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe.laws import FAR
-from pchem_pipeline.discrepancy.observe.sums import CHANNELS, pixel_statistics
+from pchem_pipeline.discrepancy.observe.sums import CHANNELS, code_ranges, pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -118,7 +118,6 @@ class Samples:
         """Prepare frames by the laws of their pixels, made of all samples of the frames or of more."""
         pixels = pixel_statistics(laws, maps)
         usable = pixels.usable
-        first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T.astype(np.int32)
         codes = np.where(laws.good, laws.support[:, 1], 0)
         tables = laws.tables[: 1 + codes.sum()].T.copy()
         for channel, variance in enumerate((pixels.charge, pixels.readout)):
@@ -126,7 +125,7 @@ class Samples:
             tables[channel, 1:] /= np.repeat(deviation, codes)
         # a track of a particle is no common mode
         np.clip(tables, -FAR, FAR, out=tables)
-        first, last, start = (values.reshape(usable.shape) for values in (first, first + length - 1, start))
+        first, last, start = code_ranges(laws, usable)
         return cls(frames, first, last, start, tables, usable)
 
     @property

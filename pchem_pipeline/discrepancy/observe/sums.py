@@ -122,7 +122,7 @@ def sum_frames(frames: NDArray[Any], edges: IntArray, laws: PixelLaws, pixels: P
         next_row=np.zeros((3, ny, nx)),
     )
     channels = kernel.Channels(
-        support=_packed_support(laws, pixels.usable),
+        support=np.ascontiguousarray(code_ranges(laws, pixels.usable).transpose(1, 0, 2)),
         tables=laws.tables,
         modes=np.stack([pixels.exposure, pixels.usable]).astype(np.float32),
         weights=np.stack([pixels.factor, pixels.shift, pixels.square]).astype(np.float32),
@@ -146,11 +146,10 @@ def pairs_at_lags(edges: IntArray) -> list[int]:
     return [int(np.maximum(lengths - lag, 0).sum()) for lag in (1, 2, 3, 1, 2, 3, 1, 1)]
 
 
-def _packed_support(laws: PixelLaws, usable: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Return first code, last code and first table row as (y, 3, x); row 0 (zeros) for unusable pixels."""
+def code_ranges(laws: PixelLaws, usable: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Return first code, last code and first row of the tables, (3, y, x); row 0 (zeros) where not usable."""
     first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T
-    packed = np.stack([first, first + length - 1, start]).reshape(3, *usable.shape)
-    return np.ascontiguousarray(packed.transpose(1, 0, 2), np.int32)
+    return np.stack([first, first + length - 1, start]).reshape(3, *usable.shape).astype(np.int32)
 
 
 def samples_beyond(

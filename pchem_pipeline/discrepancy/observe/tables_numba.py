@@ -23,12 +23,12 @@ from pchem_pipeline.discrepancy.observe.law_numba import (
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Columns of ``moments``, see :func:`_channels` for the first eight and the last.
-N_MOMENTS = 23
-MODEL_STD_K, MODEL_STD_R, MEAN_KK, MEAN_RR, MEAN_KR, MEAN_KRR, MEAN_KKRR, OFFSET_K = range(8)
+#: Columns of ``moments``, see :func:`_channels` for the first eight.
+N_MOMENTS = 22
+MODEL_STD_K, MODEL_STD_R, MEAN_KK, MEAN_RR, MEAN_KR, MEAN_KRR, MEAN_KKRR, MEAN_RRRR = range(8)
 CHI2, CHI2_MEAN, CHI2_VARIANCE, EXPECTED_LOW, EXPECTED_HIGH, SEEN_LOW, SEEN_HIGH = range(8, 15)
 EXPECTED_FAR_LOW, EXPECTED_FAR_HIGH, SEEN_FAR_LOW, SEEN_FAR_HIGH = range(15, 19)
-PEAKS_CHI2, PEAKS_MEAN, PEAKS_VARIANCE, MEAN_RRRR = range(19, 23)
+PEAKS_CHI2, PEAKS_MEAN, PEAKS_VARIANCE = range(19, 22)
 #: Codes are summed by their number modulo this.
 FOLD = 16
 
@@ -155,8 +155,7 @@ def _channels(
     """Fill ``out`` with moments of the two channels, and centre their tables.
 
     0, 1: standard deviations of k and r by the law. 2 .. 7 with the samples (those beyond the support count
-    as its ends), k and r centred: means of k^2, r^2, k r, k r^2, k^2 r^2, and the mean of k before centring.
-    Last: that of r^4.
+    as its ends), k and r centred: means of k^2, r^2, k r, k r^2, k^2 r^2, r^4.
     """
     last = mass.size - 1
     total = mean_k = mean_r = square_k = square_r = 0.0
@@ -186,8 +185,7 @@ def _channels(
         out[4] += c * k * r / n
         out[5] += c * k * r * r / n
         out[6] += c * k * k * r * r / n
-        out[MEAN_RRRR] += c * r * r * r * r / n
-    out[7] = mean_k
+        out[7] += c * r * r * r * r / n
 
 
 @kernel
