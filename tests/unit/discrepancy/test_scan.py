@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pchem_pipeline.discrepancy.scan import affected_share, scan_map, scan_series, sharpest_range
-from pchem_pipeline.discrepancy.scan_events import log_binomial_tail, scan_event_frames, scan_event_map
+from pchem_pipeline.discrepancy.scan import (
+    affected_share,
+    log_binomial_tail,
+    scan_event_frames,
+    scan_event_map,
+    scan_map,
+    scan_series,
+    sharpest_range,
+)
 from pchem_pipeline.effects.framework.region import Region, When
 
 Mask = np.ndarray[Any, np.dtype[np.bool_]]

@@ -3,7 +3,7 @@
 What the scans of :mod:`pchem_pipeline.discrepancy.where` find in maps of pixels and series of frames, and
 what :mod:`pchem_pipeline.discrepancy.scan_pairs` finds in the pairs of pixels that share a row, a column or a
 frame: a common mode of a part is far larger in those than in any map. Samples that chance hardly makes, which
-no mean shows, are events with a scan of their own (:mod:`pchem_pipeline.discrepancy.scan_events`). A part was
+no mean shows, are events with a scan of their own (:mod:`pchem_pipeline.discrepancy.scan`). A part was
 chosen by the samples that it is then judged by, so none may be a chance: the probabilities count all places
 that were looked at.
 """
@@ -29,10 +29,11 @@ from pchem_pipeline.discrepancy.scan import (
     Cluster,
     Stretch,
     Suspect,
+    scan_event_frames,
+    scan_event_map,
     scan_series,
     sharpest_range,
 )
-from pchem_pipeline.discrepancy.scan_events import scan_event_frames, scan_event_map
 from pchem_pipeline.discrepancy.scan_pairs import FEWEST_PIXELS, LARGEST, Shared, scan_pairs
 from pchem_pipeline.discrepancy.where import frame_series, pixel_maps, suspected_regions
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
