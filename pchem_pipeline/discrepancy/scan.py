@@ -1,60 +1,70 @@
 """Scan statistics: the place on a map, or the stretch of a series, whose values stand out most.
 
 Each value is about N(0, 1) and independent of the others where nothing is wrong. Of every place of some
-family (bands of rows or columns, rectangles, discs, lines at a period, single pixels; ranges of frames, a
-period, single frames) the mean inside is compared with the mean outside, so that something everywhere alike
-has no place. The probability is that of the largest deviation among all places of the family (the union
-bound), of all families: it counts every place that was looked at.
+family (bands of rows or columns, rectangles, discs, lines at a period, single pixels) the mean inside is
+compared with the mean outside, so that something everywhere alike has no place. A series is a map of one row:
+its bands are ranges of frames, its pixels single frames. The probability is that of the largest deviation
+among all places of the family (the union bound), of all families: it counts every place that was looked at.
+
+Samples beyond all that the PCD allows are few, and maps of their numbers nothing like normal: they are
+events. Given how many there are in all, each lies by chance in a place with the share of it that the laws of
+the pixels give, and in a range of frames with the share of its frames. Probabilities are those of binomial
+laws, and only more than chance makes has a place. How many are expected in all does not matter.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.effects.framework.region import Region, When
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-#: Values count as no more than this many standard deviations, so that a few pixels are no band of columns.
-_CLIP = 6.0
-#: Cells along an edge of the map (or the series) on which all rectangles (ranges) are tried.
+#: Cells along an edge of a map on which all rectangles are tried, and of a series on which all ranges are.
 _CELLS, _STRETCHES = 32, 400
 _RADII = (1.5, 2.5, 4.0, 6.0, 9.0, 13.0, 19.0, 28.0)
 _FINER = (0.72, 0.8, 0.9, 1.12, 1.25, 1.4)
-_PERIODS = (2, 4, 8, 16, 32)
-_FRAME_PERIODS = tuple(range(2, 33))
+#: Probability of a chance, in any place, below which it counts.
+SIGNIFICANCE = 1e-3
+#: Periods of lines, and of frames.
+PERIODS, _FRAME_PERIODS = (2, 4, 8, 16, 32), range(2, 33)
 #: Sweeps of the edges of a rectangle over the pixels, and of a range over the frames.
 _SWEEPS = 3
 _RIDGE = 1e-3  # of a covariance of series that may all but coincide
-_FEWEST = 3  # pixels of a place
+#: Pixels, frames or events of a place, at least.
+FEWEST = 3
 _LEAST = -690.0  # logarithm of the smallest probability that is written
-_SURE = 0.05
+_SURE = 0.05  # probability of a chance among all single pixels of a place
 _LITTLE = 0.25  # of the mean inside a place, that outside
 #: Nats by which a place of a further family must be less probable than a simpler one.
 _BETTER = 3.0
+_MOST_SINGLE = 1000  # frames that are listed
+_MOST_EVENTS = 500  # frames with an event that are looked at: so many drawn of them tell a range as well
+_SEED = 1
 
 
-@dataclass(frozen=True)
-class Suspect:
-    """A place on the sensor where a map stands out.
+@dataclass(frozen=True, kw_only=True)
+class Cluster:
+    """A part of a map or of a series that stands out.
 
     Attributes:
-        region: the place.
-        family: rows, columns, rectangle, disc, period or pixels.
+        family: rows, columns, rectangle, disc, period or pixels; of frames range, period or frames.
         z: deviation of its mean from that of the rest, standard errors.
         log_p: logarithm of the probability of such a deviation by chance in any place.
-        inside, outside: mean of the map there and elsewhere.
+        inside, outside: mean there and elsewhere.
         share: of its pixels that deviate, at least (at 95 %, for all places at once).
     """
 
-    region: Region
     family: str
     z: float
     log_p: float
@@ -78,26 +88,18 @@ class Suspect:
         return abs(self.outside) < _LITTLE * abs(self.inside)
 
 
-@dataclass(frozen=True)
-class Stretch:
-    """Frames in which a series stands out; as :class:`Suspect`, of a series."""
+@dataclass(frozen=True, kw_only=True)
+class Suspect(Cluster):
+    """A place on the sensor where a map stands out."""
+
+    region: Region
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stretch(Cluster):
+    """Frames in which a series stands out."""
 
     when: When
-    family: str
-    z: float
-    log_p: float
-    inside: float
-    outside: float
-
-    @property
-    def p(self) -> float:
-        """Probability of such a deviation by chance, at least 1e-300."""
-        return math.exp(max(self.log_p, _LEAST))
-
-    @property
-    def only_there(self) -> bool:
-        """Whether little of it is elsewhere."""
-        return abs(self.outside) < _LITTLE * abs(self.inside)
 
 
 @dataclass(frozen=True)
@@ -109,15 +111,44 @@ class Found:
     z: float
     log_p: float
 
+    def means(self, values: FloatArray, some: BoolArray) -> dict[str, Any]:
+        """Return what a :class:`Cluster` says of the place, with the means of values over pixels that count.
 
-# -- maps ---------------------------------------------------------------------------------------
+        Args:
+            values: of the map, (y, x).
+            some: pixels that count, (y, x).
+        """
+        inside, outside = (float(values[each].mean()) for each in (some & self.mask, some & ~self.mask))
+        return {
+            "family": self.family, "z": self.z, "log_p": self.log_p, "inside": inside, "outside": outside,
+        }  # fmt: skip
+
+
+_C = TypeVar("_C", bound=Cluster)
+
+
+def successive(
+    best: Callable[[BoolArray], tuple[BoolArray, _C] | None], some: BoolArray, most: int
+) -> list[_C]:
+    """Return what stands out most, then what does so without it, and so on.
+
+    Args:
+        best: returns the most significant place among pixels that count, and all its pixels; None without.
+        some: pixels that count.
+        most: places at most.
+    """
+    found: list[_C] = []
+    while len(found) < most and (one := best(some)) is not None:
+        some = some & ~one[0]
+        found.append(one[1])
+    return found
 
 
 def scan_map(
     values: FloatArray,
     usable: BoolArray,
     *,
-    significance: float = 1e-3,
+    significance: float = SIGNIFICANCE,
     most: int = 3,
     single: bool = True,
     next_along: int | None = None,
@@ -133,21 +164,70 @@ def scan_map(
         next_along: axis along which each value is of a pixel and the next one: places reach one further.
     """
     some = usable & np.isfinite(values)
-    found: list[Suspect] = []
-    left = some.copy()
-    while len(found) < most and left.sum() > 2 * _FEWEST:
-        best = _best(values, left, single)
-        if best is not None:
-            best = _checked(_odd_side(best, values, left), values, left)
-        if best is None or best.log_p > math.log(significance):
-            break
-        mask = best.mask & left
-        inside, outside = float(values[mask].mean()), float(values[left & ~mask].mean())
-        share = affected_share(np.where(some, math.copysign(1.0, best.z) * values, -np.inf)[some], mask[some])
-        region = Region.of_mask(_reaching(best.mask, next_along))
-        found.append(Suspect(region, best.family, best.z, best.log_p, inside, outside, share))
-        left &= ~best.mask
-    return found
+
+    def best(left: BoolArray) -> tuple[BoolArray, Suspect] | None:
+        contrast = Contrast.of(values, left)
+        if contrast is None:
+            return None
+        families = [*regions(contrast), _single(values, left) if single else None]
+        found = _significant(best_place(contrast, families), values, left, significance, either_side=True)
+        if found is None:
+            return None
+        deviations = np.where(some, math.copysign(1.0, found.z) * values, -np.inf)[some]
+        share = affected_share(deviations, (found.mask & left)[some])
+        region = Region.of_mask(_reaching(found.mask, next_along))
+        return found.mask, Suspect(**found.means(values, left), region=region, share=share)
+
+    return successive(best, some, most)
+
+
+def scan_series(
+    values: FloatArray,
+    numbers: IntArray,
+    *,
+    significance: float = SIGNIFICANCE,
+    most: int = 2,
+    shortest: int = FEWEST,
+) -> list[Stretch]:
+    """Return the frames that stand out of a series, the most significant first.
+
+    Args:
+        values: N(0, 1) and independent where nothing is wrong, (n,).
+        numbers: frame numbers, increasing, (n,).
+        significance: largest probability of a chance.
+        most: stretches at most.
+        shortest: frames that a range or a phase of a period must have.
+    """
+    row = values[None]
+
+    def best(left: BoolArray) -> tuple[BoolArray, Stretch] | None:
+        contrast = Contrast.of(row, left, shortest)
+        if contrast is None:
+            return None
+        families = [
+            _bands(contrast, 1, in_time=True),
+            # a multiple of a period is no better than it
+            _periodic(contrast, 1, numbers, _FRAME_PERIODS, cycles=4, better=1.02),
+            _single(row, left),
+        ]
+        found = _significant(best_place(contrast, families, better=0.0), row, left, significance)
+        if found is None:
+            return None
+        family, when = _frames(found, numbers)
+        return found.mask, Stretch(**{**found.means(row, left), "family": family}, when=when)
+
+    return successive(best, np.isfinite(row), most)
+
+
+def _frames(found: Found, numbers: IntArray) -> tuple[str, When]:
+    """Return the frames of a place in a series, and what they are."""
+    at = numbers[found.mask[0]]
+    if found.family == "columns":
+        return "range", When(range=((int(at[0]), int(at[-1]) + 1),))
+    if found.family == "period":
+        period = int(np.gcd.reduce(np.diff(at)))
+        return "period", When(every=period, phase=int(at[0]) % period)
+    return "frames", When(single=tuple(int(number) for number in at[:_MOST_SINGLE]))
 
 
 def _reaching(mask: BoolArray, axis: int | None) -> BoolArray:
@@ -160,67 +240,67 @@ def _reaching(mask: BoolArray, axis: int | None) -> BoolArray:
     return grown
 
 
-def _checked(found: Found, values: FloatArray, some: BoolArray) -> Found:
-    """Return a place with its deviation in terms of the scatter inside and outside (Welch).
+def _significant(
+    found: Found | None,
+    values: FloatArray,
+    some: BoolArray,
+    significance: float,
+    *,
+    either_side: bool = False,
+) -> Found | None:
+    """Return a place with its deviation in terms of the scatter inside and outside (Welch), if significant.
 
-    Where values scatter more, a mean that is off says less.
+    Where values scatter more, a mean that is off says less. ``either_side``: the place, or all outside of it
+    where that is what deviates from 0.
     """
-    if found.family == "pixels":
-        return found
+    if found is None:
+        return None
     inside, outside = values[some & found.mask], values[some & ~found.mask]
-    variance = max(inside.var(), 1.0) / inside.size + max(outside.var(), 1.0) / outside.size
-    z = float((inside.mean() - outside.mean()) / np.sqrt(variance))
-    if abs(z) >= abs(found.z):
-        return found
-    places = found.log_p - float(special.log_ndtr(-abs(found.z)))
-    return Found(found.family, found.mask, z, min(0.0, float(special.log_ndtr(-abs(z))) + places))
+    if either_side and abs(inside.mean()) < abs(outside.mean()):
+        found = replace(found, mask=~found.mask, z=-found.z)
+        inside, outside = outside, inside
+    if found.family != "pixels":
+        variance = max(inside.var(), 1.0) / inside.size + max(outside.var(), 1.0) / outside.size
+        z = float((inside.mean() - outside.mean()) / np.sqrt(variance))
+        if abs(z) < abs(found.z):
+            places = found.log_p - float(special.log_ndtr(-abs(found.z)))
+            found = replace(found, z=z, log_p=min(0.0, float(special.log_ndtr(-abs(z))) + places))
+    return found if found.log_p <= math.log(significance) else None
 
 
-def _best(values: FloatArray, some: BoolArray, single: bool) -> Found | None:
-    """Return the place of the smallest probability, a simpler one where that is nearly as small."""
-    kept = np.clip(np.where(some, values, 0.0), -_CLIP, _CLIP)
-    contrast = Contrast.of(kept, some)
-    return None if contrast is None else best_place(contrast, some, _single(values, some) if single else None)
-
-
-def best_place(contrast: Contrast, some: BoolArray, *others: Found | None) -> Found | None:
-    """Return the place of the smallest probability of all families; None where none divides the pixels.
-
-    Args:
-        contrast: of a map, (y, x).
-        some: pixels that count, (y, x).
-        others: the best places of further families.
-    """
-    families = [
+def regions(contrast: Contrast) -> list[Found | None]:
+    """Return the best place of a map of every family but single pixels, the simpler ones first."""
+    return [
         _bands(contrast, 0),
         _bands(contrast, 1),
         _periodic(contrast, 0),
         _periodic(contrast, 1),
         _rectangle(contrast),
         _disc(contrast),
-        *others,
     ]
-    there = [each for each in families if each is not None and _parts(each.mask, some)]
+
+
+def best_place(contrast: Contrast, families: Sequence[Found | None], better: float = _BETTER) -> Found | None:
+    """Return the place of the smallest probability of all families; None where none divides the pixels.
+
+    Args:
+        contrast: of a map, (y, x).
+        families: the best place of each.
+        better: nats by which one of a later family must be less probable.
+    """
+    some = contrast.some > 0
+    # a sensor of one row has no band of rows
+    there = [
+        each for each in families
+        if each is not None and (some & each.mask).any() and (some & ~each.mask).any()
+    ]  # fmt: skip
     if not there:
         return None
     best = there[0]
     for each in there[1:]:
-        if each.log_p < best.log_p - _BETTER:
+        if each.log_p < best.log_p - better:
             best = each
-    return Found(best.family, best.mask, best.z, best.log_p + math.log(len(families)))
-
-
-def _parts(mask: BoolArray, some: BoolArray) -> bool:
-    """Return whether a place divides the pixels: a sensor of one row has no band of rows."""
-    return bool((some & mask).any() and (some & ~mask).any())
-
-
-def _odd_side(found: Found, values: FloatArray, some: BoolArray) -> Found:
-    """Return the place, or all outside of it where that is what deviates from 0."""
-    inside, outside = values[some & found.mask].mean(), values[some & ~found.mask].mean()
-    if abs(inside) >= abs(outside):
-        return found
-    return Found(found.family, ~found.mask, -found.z, found.log_p)
+    return replace(best, log_p=best.log_p + math.log(len(families)))
 
 
 @dataclass(frozen=True)
@@ -237,13 +317,14 @@ class Contrast:
     values: FloatArray
     some: FloatArray
     spread: float
-    fewest: int = _FEWEST
+    fewest: int = FEWEST
 
     @classmethod
-    def of(cls, values: FloatArray, some: BoolArray, fewest: int = _FEWEST) -> Contrast | None:
-        """Centre a map, to look for places of so many values or more; None where it has too few."""
+    def of(cls, values: FloatArray, some: BoolArray, fewest: int = FEWEST) -> Contrast | None:
+        """Clip and centre a map, to look for places of so many values or more; None where it has too few."""
+        values = np.clip(np.where(some, values, 0.0), -FAR, FAR)
         inside = values[some]
-        if inside.size <= 2 * _FEWEST:
+        if inside.size <= 2 * FEWEST:
             return None
         # what stands out widens the spread of the whole: take it from the middle
         spread = max(1.0, float(np.subtract(*np.quantile(inside, [0.75, 0.25]))) / 1.349)
@@ -286,41 +367,73 @@ def _log_p_range(z: float, n: int, shortest: int) -> float:
     return min(union, 3.0 * math.log(b) - b**2 / 2.0 - 0.5 * math.log(8.0 * math.pi) + math.log(total))
 
 
-def _intervals(contrast: Contrast, sums: FloatArray, counts: FloatArray) -> tuple[float, int, int]:
-    """Return the deviation and the ends of the best range of lines."""
+def _intervals(
+    contrast: Contrast, sums: FloatArray, counts: FloatArray, cells: int | None = None
+) -> tuple[float, int, int]:
+    """Return the deviation and the ends of the best range of lines.
+
+    Of all ranges, or of those of so many cells of lines, whose ends are then moved by lines.
+    """
+    n = sums.size
+    cells = n if cells is None else min(cells, n)
     total, number = (np.concatenate([[0.0], np.cumsum(values)]) for values in (sums, counts))
-    z = contrast.z(total[None, :] - total[:, None], number[None, :] - number[:, None])
-    z = np.where(np.arange(total.size)[None, :] > np.arange(total.size)[:, None], z, 0.0)
-    a, b = np.unravel_index(int(np.argmax(np.abs(z))), z.shape)
-    return float(z[a, b]), int(a), int(b)
+    edges = np.unique(np.linspace(0, n, cells + 1).astype(int))
+    some, many = total[edges], number[edges]
+    z = np.triu(np.abs(contrast.z(some[None, :] - some[:, None], many[None, :] - many[:, None])), 1)
+    first, last = (int(edges[i]) for i in np.unravel_index(int(np.argmax(z)), z.shape))
+    near = math.ceil(n / cells) + 1
+    for _ in range(2 if first < last and cells < n else 0):
+        starts = np.arange(max(first - near, 0), min(first + near, last - 1) + 1)
+        tried = contrast.z(total[last] - total[starts], number[last] - number[starts])
+        first = int(starts[np.argmax(np.abs(tried))])
+        ends = np.arange(max(last - near, first + 1), min(last + near, n) + 1)
+        tried = contrast.z(total[ends] - total[first], number[ends] - number[first])
+        last = int(ends[np.argmax(np.abs(tried))])
+    return float(contrast.z(total[last] - total[first], number[last] - number[first])), first, last
 
 
-def _bands(contrast: Contrast, axis: int) -> Found:
-    """Return the best band of rows (axis 0) or columns (axis 1)."""
-    across = 1 - axis
-    sums, counts = contrast.values.sum(axis=across), contrast.some.sum(axis=across)
-    z, a, b = _intervals(contrast, sums, counts)
-    lines = np.zeros(sums.size, np.bool_)
+def _bands(contrast: Contrast, axis: int, *, in_time: bool = False) -> Found:
+    """Return the best band of rows (axis 0) or columns (axis 1), or range of frames."""
+    sums, counts = (values.sum(axis=1 - axis) for values in (contrast.values, contrast.some))
+    n = sums.size
+    z, a, b = _intervals(contrast, sums, counts, _STRETCHES if in_time else None)
+    lines = np.zeros(n, np.bool_)
     lines[a:b] = True
-    return Found("columns" if axis else "rows", _lines(lines, axis, contrast), z, _log_p(z, sums.size**2 / 2))
+    log_p = _log_p_range(z, n, contrast.fewest) if in_time else _log_p(z, n**2 / 2)
+    return Found("columns" if axis else "rows", _lines(lines, axis, contrast), z, log_p)
 
 
 def _lines(lines: BoolArray, axis: int, contrast: Contrast) -> BoolArray:
     return np.broadcast_to(lines if axis else lines[:, None], contrast.values.shape).copy()
 
 
-def _periodic(contrast: Contrast, axis: int) -> Found:
-    """Return the best set of every n-th row or column."""
-    across = 1 - axis
-    sums, counts = contrast.values.sum(axis=across), contrast.some.sum(axis=across)
+def _periodic(
+    contrast: Contrast,
+    axis: int,
+    numbers: IntArray | None = None,
+    periods: Sequence[int] = PERIODS,
+    cycles: int = 2,
+    better: float = 1.0,
+) -> Found:
+    """Return the best set of every n-th row or column.
+
+    Args:
+        contrast: of a map.
+        axis: 0 for rows, 1 for columns.
+        numbers: of the lines; None: from 0 on.
+        periods: that are tried, increasing.
+        cycles: of a period, at least, among the lines.
+        better: factor by which a longer period must deviate more.
+    """
+    sums, counts = (values.sum(axis=1 - axis) for values in (contrast.values, contrast.some))
     best, lines, tried = 0.0, np.zeros(sums.size, np.bool_), 0
-    number = np.arange(sums.size)
-    for period in (p for p in _PERIODS if 2 * p <= sums.size):
+    number = np.arange(sums.size) if numbers is None else numbers
+    for period in (p for p in periods if cycles * p <= sums.size):
         phase = number % period
-        z = contrast.z(np.bincount(phase, sums), np.bincount(phase, counts))
+        z = contrast.z(np.bincount(phase, sums, period), np.bincount(phase, counts, period))
         tried += period
         at = int(np.argmax(np.abs(z)))
-        if abs(z[at]) > abs(best):
+        if abs(z[at]) > abs(best) * better:
             best, lines = float(z[at]), phase == at
     return Found("period", _lines(lines, axis, contrast), best, _log_p(best, max(tried, 1)))
 
@@ -405,7 +518,7 @@ def _single(values: FloatArray, some: BoolArray) -> Found | None:
     return Found("pixels", mask, float(values[at]), log_p)
 
 
-def affected_share(z: FloatArray, inside: BoolArray, level: float = 0.05) -> float:
+def affected_share(z: FloatArray, inside: BoolArray, level: float = _SURE) -> float:
     """Return a lower bound of the share of the values inside a place that are larger than by chance.
 
     All-resolutions inference (Rosenblatt et al. 2018; Goeman and Solari 2011): closed testing with Simes'
@@ -426,43 +539,6 @@ def affected_share(z: FloatArray, inside: BoolArray, level: float = 0.05) -> flo
     u = np.maximum(np.ceil(z.size * p / level), 1.0)
     bound = 1.0 - u + np.arange(1, n + 1)
     return float(max(bound.max(), 0.0) / n)
-
-
-# -- series -------------------------------------------------------------------------------------
-
-
-def scan_series(
-    values: FloatArray,
-    numbers: NDArray[np.int64],
-    *,
-    significance: float = 1e-3,
-    most: int = 2,
-    shortest: int = _FEWEST,
-) -> list[Stretch]:
-    """Return the frames that stand out of a series, the most significant first.
-
-    Args:
-        values: N(0, 1) and independent where nothing is wrong, (n,).
-        numbers: frame numbers, increasing, (n,).
-        significance: largest probability of a chance.
-        most: stretches at most.
-        shortest: frames that a range or a phase of a period must have.
-    """
-    left = np.isfinite(values)
-    found: list[Stretch] = []
-    while len(found) < most and left.sum() > 2 * _FEWEST:
-        best = _best_frames(values, numbers, left, shortest)
-        if best is None:
-            break
-        when, place = best[0], _checked(best[1], values, left)
-        if place.log_p > math.log(significance):
-            break
-        mask = place.mask & left
-        inside, outside = float(values[mask].mean()), float(values[left & ~mask].mean())
-        family = "frames" if place.family == "pixels" else place.family
-        found.append(Stretch(when, family, place.z, place.log_p, inside, outside))
-        left &= ~place.mask
-    return found
 
 
 def sharpest_range(series: FloatArray, first: int, last: int, shortest: int) -> tuple[int, int]:
@@ -488,7 +564,7 @@ def sharpest_range(series: FloatArray, first: int, last: int, shortest: int) -> 
     )
     n = len(x)
 
-    def nats(a: NDArray[np.int64], b: NDArray[np.int64]) -> FloatArray:
+    def nats(a: IntArray, b: IntArray) -> FloatArray:
         inside, whole = (total[b] - total[a], square[b] - square[a]), (total[-1], square[-1])
         outside = whole[0] - inside[0], whole[1] - inside[1]
         likely = _normal(b - a, *inside) + _normal(n - b + a, *outside)
@@ -504,7 +580,7 @@ def sharpest_range(series: FloatArray, first: int, last: int, shortest: int) -> 
     return (first, last) if gain > price else given
 
 
-def _normal(count: NDArray[np.int64], sums: FloatArray, squares: FloatArray) -> FloatArray:
+def _normal(count: IntArray, sums: FloatArray, squares: FloatArray) -> FloatArray:
     """Return the largest log likelihood of normal vectors, given their number, sums and sums of squares."""
     m = np.maximum(count, 1)[:, None]
     mean = sums / m
@@ -513,62 +589,127 @@ def _normal(count: NDArray[np.int64], sums: FloatArray, squares: FloatArray) -> 
     return np.asarray(-0.5 * m[:, 0] * np.linalg.slogdet(covariance + ridge)[1])
 
 
-def _best_frames(
-    values: FloatArray, numbers: NDArray[np.int64], some: BoolArray, shortest: int
-) -> tuple[When, Found] | None:
-    kept = np.clip(np.where(some, values, 0.0), -_CLIP, _CLIP)
-    contrast = Contrast.of(kept, some, shortest)
-    if contrast is None:
+def scan_event_map(
+    seen: BoolArray,
+    expected: FloatArray,
+    usable: BoolArray,
+    *,
+    significance: float = SIGNIFICANCE,
+    most: int = 3,
+) -> list[Suspect]:
+    """Return the places with more events than their share, the most significant first.
+
+    Args:
+        seen: pixels with an event, (y, x).
+        expected: number of events in each, in proportion, (y, x).
+        usable: pixels that count, (y, x).
+        significance: largest probability of a chance.
+        most: places at most.
+
+    Returns:
+        Places; ``inside`` and ``outside`` are events beyond those expected per pixel.
+    """
+
+    def best(left: BoolArray) -> tuple[BoolArray, Suspect] | None:
+        events, chance = np.where(left, seen, 0.0), np.where(left, expected, 0.0)
+        if events.sum() < FEWEST:
+            return None
+        contrast = _Events(events, chance / chance.sum(), 1.0)
+        found = best_place(contrast, regions(contrast))
+        if found is None or (log_p := contrast.exact(found)) > math.log(significance):
+            return None
+        means = replace(found, log_p=log_p).means(events - chance, left)
+        share = max(means["inside"], 0.0)
+        return found.mask, Suspect(**means, region=Region.of_mask(found.mask), share=share)
+
+    return successive(best, usable & (expected > 0.0), most)
+
+
+@dataclass(frozen=True)
+class _Events(Contrast):
+    """Events by pixel, and in ``some`` the share of all that chance puts there."""
+
+    def z(self, sums: NDArray[np.floating], counts: NDArray[np.floating]) -> FloatArray:
+        """Return the signed root of the likelihood ratio of events beyond their share, 0 where they are less.
+
+        Args:
+            sums: events of places.
+            counts: their shares.
+        """
+        total = float(self.values.sum())
+        share = np.clip(counts, 1e-12, 1.0 - 1e-12)
+        events = np.clip(sums, 0.0, total)
+        information = special.rel_entr(events, total * share) + special.rel_entr(
+            total - events, total * (1.0 - share)
+        )
+        more = (events > total * share) & (events > self.fewest - 0.5)
+        return np.where(more, np.sqrt(2.0 * np.maximum(information, 0.0)), 0.0)
+
+    def exact(self, found: Found) -> float:
+        """Return the logarithm of the probability of a place by the binomial law itself."""
+        places = found.log_p - float(special.log_ndtr(-abs(found.z)))
+        seen, share = (float(values[found.mask].sum()) for values in (self.values, self.some))
+        return min(0.0, places + log_binomial_tail(seen, float(self.values.sum()), share))
+
+
+def scan_event_frames(
+    positions: IntArray,
+    numbers: IntArray,
+    *,
+    expected: float = 0.0,
+    significance: float = SIGNIFICANCE,
+    shortest: int = 1,
+) -> Stretch | None:
+    """Return the range of frames in which events come together most; None where chance explains it.
+
+    Of n events in random order, those that follow the i-th by k in a share w of the frames are at least k of
+    the others with the probability of a binomial law, which is uniform whatever i and k: the union bound has
+    as many terms as there are pairs of events.
+
+    Args:
+        positions: of the frames with an event, increasing, none twice, (m,).
+        numbers: of all frames in the run, increasing, (n,).
+        expected: number of events in all frames.
+        significance: largest probability of a chance.
+        shortest: frames that a range must have.
+
+    Returns:
+        The range; ``inside`` and ``outside`` are events beyond those expected per frame.
+    """
+    if positions.size > _MOST_EVENTS:
+        expected *= _MOST_EVENTS / positions.size
+        positions = np.sort(np.random.default_rng(_SEED).choice(positions, _MOST_EVENTS, replace=False))
+    m, n = positions.size, numbers.size
+    if m < FEWEST or n < 2 * shortest:
         return None
-    families = [_frame_range(contrast), _frame_period(contrast, numbers), _single(values, some)]
-    there = [each for each in families if each is not None and each.mask.any()]
-    if not there:
+    first, last = np.triu_indices(m, FEWEST - 1)
+    length = positions[last] - positions[first] + 1
+    log_p = _log_tails(last - first, m - 1, np.maximum(length, shortest) / n)
+    at = int(np.argmin(log_p))
+    value = min(0.0, float(log_p[at]) + math.log(m * (m - 1) / 2))
+    if value > math.log(significance):
         return None
-    best = min(there, key=lambda each: each.log_p)
-    log_p = best.log_p + math.log(len(families))
-    at = np.flatnonzero(best.mask)
-    if best.family == "range":
-        when = When(range=((int(numbers[at[0]]), int(numbers[at[-1]]) + 1),))
-    elif best.family == "period":
-        period = int(np.gcd.reduce(np.diff(numbers[at])))
-        when = When(every=period, phase=int(numbers[at[0]]) % period)
-    else:
-        when = When(single=tuple(int(i) for i in numbers[at][:1000]))
-    return when, Found(best.family, best.mask, best.z, log_p)
+    begin, end = _ends(int(positions[first[at]]), int(positions[last[at]]), int(last[at] - first[at]), n)
+    inside = (positions >= begin) & (positions < end)
+    seen = (float(inside.sum()), end - begin), (float((~inside).sum()), max(n - end + begin, 1))
+    rates = [events / frames - expected / n for events, frames in seen]
+    when = When(range=((int(numbers[begin]), int(numbers[end - 1]) + 1),))
+    z = float(-special.ndtri_exp(float(log_p[at])))
+    return Stretch(family="range", z=z, log_p=value, inside=rates[0], outside=rates[1], when=when)
 
 
-def _frame_range(contrast: Contrast) -> Found | None:
-    """Return the best range of frames: of whole cells, then its ends moved by frames; None: all too short."""
-    n = contrast.values.size
-    total, number = (np.concatenate([[0.0], np.cumsum(v)]) for v in (contrast.values, contrast.some))
-    edges = np.unique(np.linspace(0, n, min(_STRETCHES, n) + 1).astype(int))
-    z, a, b = _intervals(contrast, np.diff(total[edges]), np.diff(number[edges]))
-    first, last = int(edges[a]), int(edges[b])
-    if last <= first:
-        return None
-    near = int(np.ceil(n / _STRETCHES)) + 1
-    for _ in range(2):
-        starts = np.arange(max(first - near, 0), min(first + near, last - 1) + 1)
-        scores = contrast.z(total[last] - total[starts], number[last] - number[starts])
-        first = int(starts[np.argmax(np.abs(scores))])
-        ends = np.arange(max(last - near, first + 1), min(last + near, n) + 1)
-        scores = contrast.z(total[ends] - total[first], number[ends] - number[first])
-        last = int(ends[np.argmax(np.abs(scores))])
-        z = float(scores[np.argmax(np.abs(scores))])
-    mask = np.zeros(n, np.bool_)
-    mask[first:last] = True
-    return Found("range", mask, z, _log_p_range(z, n, contrast.fewest))
+def _ends(first: int, last: int, gaps: int, n: int) -> tuple[int, int]:
+    """Return a range of frames about its first and last event, as wide as a constant rate asks for."""
+    beyond = round((last - first) / max(gaps, 1) / 2)
+    return max(first - beyond, 0), min(last + beyond + 1, n)
 
 
-def _frame_period(contrast: Contrast, numbers: NDArray[np.int64]) -> Found | None:
-    """Return the best phase of a period of frames."""
-    best, mask, tried = 0.0, np.zeros(numbers.size, np.bool_), 0
-    for period in (p for p in _FRAME_PERIODS if 4 * p <= numbers.size):
-        phase = numbers % period
-        sums, counts = (np.bincount(phase, v, period) for v in (contrast.values, contrast.some))
-        z = contrast.z(sums, counts)
-        tried += period
-        at = int(np.argmax(np.abs(z)))
-        if abs(z[at]) > abs(best) * 1.02:  # a multiple of a period is no better than it
-            best, mask = float(z[at]), np.asarray(phase == at)
-    return Found("period", mask, best, _log_p(best, max(tried, 1))) if tried else None
+def _log_tails(k: IntArray, n: int, share: FloatArray) -> FloatArray:
+    """Return the logarithms of the probabilities of at least k (one or more) of n events in a share, (m,)."""
+    tail = special.betainc(k, n - k + 1.0, np.minimum(share, 1.0))
+    return np.asarray(np.log(np.maximum(tail, 1e-300)))
+
+
+def log_binomial_tail(k: float, n: float, share: float) -> float:
+    """Return the logarithm of the probability of at least k (one or more) of n events in a share."""
+    return float(_log_tails(np.array([round(k)]), round(n), np.array([share]))[0])

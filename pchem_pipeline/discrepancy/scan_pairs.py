@@ -6,103 +6,115 @@ which all pixels share has no place. The standard error is ``1 / sqrt(N)`` of N 
 or what the frames' scatter gives where that is more; the sum of squares behind it is skewed, which Wilson and
 Hilferty's root takes away. The probability is the union bound over the places of the family, the families,
 modes and channels.
+
+Boxes are of cells, each of several rows or columns of a large sensor. How much a single line shares with the
+inside of a box is told by far more samples than where a box of many is best: a line near an edge belongs to
+it where it shares half as much as those inside.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import chi_square
-from pchem_pipeline.discrepancy.observe.pairs import CHANNELS, MODES, PERIOD, Pairs, Samples, pairs_of
-from pchem_pipeline.discrepancy.scan import Suspect
-from pchem_pipeline.discrepancy.scan_edges import Side, sharpened
+from pchem_pipeline.discrepancy.observe.pairs import MODES, PERIOD, Pairs, Samples, energies, pairs_of
+from pchem_pipeline.discrepancy.observe.sums import CHANNELS
+from pchem_pipeline.discrepancy.scan import PERIODS, SIGNIFICANCE, Suspect, successive
 from pchem_pipeline.effects.framework.region import Region, Taps
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_PERIODS = (2, 4, 8, 16, 32)
 _FEWEST_LINES = 2  # of a period
+#: Pixels of a place, its share of the sensor at most, and the mean outside over that inside at most.
+FEWEST_PIXELS, LARGEST = 16, 0.6
+_CONTRAST = 0.4
 #: Guesses that are held against the scatter of the frames, the most significant first.
 _MEASURED = 8
 #: Families of places: bands of lines, bands across them, rectangles, periods, scattered lines.
 _FAMILIES = 5
 _LINE_BY_CHANCE = 1e-4  # probability of a line that stands out by itself, among all
+#: Standard errors of a line's share that the share of the lines inside must exceed; where pairs count twice,
+#: so much over the square root of two.
+_CERTAIN = 6.0
+_HALF = 0.5
 
 
-@dataclass(frozen=True)
-class Shared:
-    """A place whose pixels move together, unlike the rest.
+@dataclass(frozen=True, kw_only=True)
+class Shared(Suspect):
+    """A place whose pixels move together, unlike the rest; inside and outside are mean correlations of pairs.
 
     Attributes:
-        place: it; ``inside`` and ``outside`` are mean correlations of pairs.
         channel: 0 for electron numbers, 1 for residuals.
         mode: row, column or frame: what the pixels share.
     """
 
-    place: Suspect
     channel: int
     mode: str
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Pixels that a place must have, the share of the sensor that it may have, and the contrast it needs.
-
-    Attributes:
-        fewest: pixels.
-        largest: share of all pixels.
-        contrast: of the mean inside, the most that the mean outside may be.
-    """
-
-    fewest: int = 16
-    largest: float = 0.6
-    contrast: float = 0.4
-
-
-@dataclass(frozen=True)
 class _Best:
-    """The best place of a family: cells of lines and across them, or a tap, or lines; z, number of places."""
+    """The best place of a family: z, number of places, and a tap, or lines, or cells of lines and across."""
 
     family: str
     z: float
     places: float
-    lines: tuple[int, int] = (0, 0)
-    across: tuple[int, int] = (0, 0)
     taps: Taps | None = None
     scattered: tuple[int, ...] = ()
+    lines: tuple[int, int] = (0, 0)
+    across: tuple[int, int] = (0, 0)
+
+    def region(self, pairs: Pairs, shape: tuple[int, int]) -> Region | None:
+        """Return its pixels in the sensor's rows and columns; None for all of it."""
+        if self.taps is not None:
+            return Region(taps=self.taps)
+        if self.scattered:
+            spans = [slice(int(pairs.lines[i]), int(pairs.lines[i + 1])) for i in self.scattered]
+            return _boxes_of(pairs.mode, shape, [(span, slice(None)) for span in spans])
+        lines, across = (
+            slice(int(edges[a]), int(edges[b]))
+            for edges, (a, b) in ((pairs.lines, self.lines), (pairs.across, self.across))
+        )
+        return _boxes_of(pairs.mode, shape, [(lines, across)])
 
 
-def scan_pairs(
-    samples: Samples, *, significance: float = 1e-3, most: int = 2, limits: Limits | None = None
-) -> list[Shared]:
+def _boxes_of(mode: str, shape: tuple[int, int], boxes: Sequence[tuple[slice, slice]]) -> Region | None:
+    """Return the pixels of boxes, of lines and across them; None for all of the sensor."""
+    mask = np.zeros(shape, np.bool_)
+    turned = mask.T if mode == "column" else mask
+    for box in boxes:
+        turned[box] = True
+    return None if mask.all() else Region.of_mask(mask)
+
+
+def scan_pairs(samples: Samples, *, significance: float = SIGNIFICANCE, most: int = 2) -> list[Shared]:
     """Return the places whose pixels share noise, the most significant first, each without those before it.
 
     Args:
         samples: standardised frames.
         significance: largest probability of a chance in any place, mode and channel.
         most: places at most.
-        limits: of their sizes.
     """
-    limits = limits or Limits()
-    found: list[Shared] = []
-    while len(found) < most and samples.usable.sum() > 2 * limits.fewest:
-        best = _most_significant(samples, math.log(significance), limits)
-        if best is None:
-            break
-        found.append(best)
-        shape = samples.usable.shape[0], samples.usable.shape[1]
-        samples = samples.without(best.place.region.mask(shape))
-    return found
+
+    def best(left: BoolArray) -> tuple[BoolArray, Shared] | None:
+        if left.sum() <= 2 * FEWEST_PIXELS:
+            return None
+        found = _most_significant(replace(samples, usable=left), math.log(significance))
+        return None if found is None else (found.region.mask((left.shape[0], left.shape[1])), found)
+
+    return successive(best, samples.usable, most)
 
 
-def _most_significant(samples: Samples, log_limit: float, limits: Limits) -> Shared | None:
+def _most_significant(samples: Samples, log_limit: float) -> Shared | None:
     """Return the place of the smallest probability that holds against the scatter of the frames, too."""
     shape = samples.usable.shape[0], samples.usable.shape[1]
     guesses = sorted(
@@ -111,9 +123,9 @@ def _most_significant(samples: Samples, log_limit: float, limits: Limits) -> Sha
             for channel, modes in enumerate(pairs_of(samples))
             for pairs in modes.values()
             for best in (
-                *_boxes(pairs, samples.usable, limits),
+                *_boxes(pairs, samples.usable),
                 *_periods(pairs),
-                *_scattered(pairs, samples.usable, limits),
+                *_scattered(pairs, samples.usable),
             )
         ),
         key=lambda guess: guess[0],
@@ -121,20 +133,19 @@ def _most_significant(samples: Samples, log_limit: float, limits: Limits) -> Sha
     for log_p, channel, pairs, best in guesses[:_MEASURED]:
         if log_p > log_limit:
             break
-        region = _region(best, pairs, shape)
+        region = best.region(pairs, shape)
         if region is None:
             continue
         place = _measured(samples, channel, pairs.mode, region, best)
-        if _holds(place, log_limit, limits):
-            sharper = _with_ends(samples, channel, pairs, best, place)
-            place = sharper if _holds(sharper, log_limit, limits) else place
-            return Shared(place, channel, pairs.mode)
+        if _holds(place, log_limit):
+            sharper = _with_ends(samples, channel, pairs, best)
+            return sharper if sharper is not None and _holds(sharper, log_limit) else place
     return None
 
 
-def _holds(place: Suspect, log_limit: float, limits: Limits) -> bool:
+def _holds(place: Shared, log_limit: float) -> bool:
     """Tell whether a place is significant, and little of it is elsewhere."""
-    return place.log_p <= log_limit and abs(place.outside) < limits.contrast * place.inside
+    return place.log_p <= log_limit and abs(place.outside) < _CONTRAST * place.inside
 
 
 def _log_p(z: float, places: float) -> float:
@@ -143,31 +154,15 @@ def _log_p(z: float, places: float) -> float:
     return min(0.0, float(special.log_ndtr(-z)) + math.log(max(looks, 1.0)))
 
 
-def _region(best: _Best, pairs: Pairs, shape: tuple[int, int]) -> Region | None:
-    """Return the pixels of a place in the sensor's rows and columns; None for all of it."""
-    if best.taps is not None:
-        return Region(taps=best.taps)
-    mask = np.zeros(shape, np.bool_)
-    turned = mask.T if pairs.mode == "column" else mask
-    if best.scattered:
-        for line in best.scattered:
-            turned[pairs.lines[line] : pairs.lines[line + 1]] = True
-    else:
-        lines, across = (
-            slice(int(edges[a]), int(edges[b]))
-            for edges, (a, b) in ((pairs.lines, best.lines), (pairs.across, best.across))
-        )
-        turned[lines, across] = True
-    return None if mask.all() else Region.of_mask(mask)
-
-
-def _measured(samples: Samples, channel: int, mode: str, region: Region, best: _Best) -> Suspect:
+def _measured(samples: Samples, channel: int, mode: str, region: Region, best: _Best) -> Shared:
     """Return a place with its significance by theory or by the scatter of the frames, whichever is less."""
     inside = region.mask((samples.usable.shape[0], samples.usable.shape[1]))
     usable = samples.usable
     energy, total = (samples.energies(channel, mode, part) for part in (usable & inside, usable))
     n = energy.size
-    own, every = (_number_of_pairs(part, mode) for part in (usable & inside, usable))
+    # the products of ones are the number of pairs
+    ones = (part[None].astype(np.float32) for part in (usable & inside, usable))
+    own, every = (float(energies(each, mode)[0]) for each in ones)
     share = own / every
     apart = energy - share * total
     by_theory = math.sqrt(n * own * (1.0 - share))
@@ -178,34 +173,33 @@ def _measured(samples: Samples, channel: int, mode: str, region: Region, best: _
     freedom = 2.0 * n * own / max(partners - 1.0, 1e-9) ** 2
     z = float(chi_square(max(freedom + z * math.sqrt(2.0 * freedom), 0.0), freedom))
     rest = (float(total.sum()) - float(energy.sum())) / max(n * (every - own), 1.0)
-    return Suspect(region, best.family, z, _log_p(z, best.places), float(energy.sum()) / (n * own), rest)
+    return Shared(
+        family=best.family,
+        z=z,
+        log_p=_log_p(z, best.places),
+        inside=float(energy.sum()) / (n * own),
+        outside=rest,
+        region=region,
+        channel=channel,
+        mode=mode,
+    )
 
 
-def _with_ends(samples: Samples, channel: int, pairs: Pairs, best: _Best, place: Suspect) -> Suspect:
-    """Return the place of a box with its ends told line by line."""
+def _with_ends(samples: Samples, channel: int, pairs: Pairs, best: _Best) -> Shared | None:
+    """Return the place of a box with its ends told line by line; None where the scan knows as much."""
     lines, across = Side.of(pairs.lines, best.lines), Side.of(pairs.across, best.across)
     if best.taps is not None or best.scattered or (lines.exact and across.exact):
-        return place
-    ends = [slice(*each) for each in sharpened(samples, channel, pairs.mode, lines, across)]
-    mask = np.zeros((samples.usable.shape[0], samples.usable.shape[1]), np.bool_)
-    mask[tuple(ends[::-1] if pairs.mode == "column" else ends)] = True
-    if mask.all():
-        return place
-    return _measured(samples, channel, pairs.mode, Region.of_mask(mask), best)
-
-
-def _number_of_pairs(pixels: BoolArray, mode: str) -> float:
-    """Return the pairs of pixels that share a mode in one frame."""
-    size = float(pixels.sum())
-    rows, columns = (float((pixels.sum(axis=axis, dtype=np.float64) ** 2).sum()) for axis in (1, 0))
-    twice = {"row": rows - size, "column": columns - size, "frame": size**2 - rows - columns + size}
-    return twice[mode] / 2.0
+        return None
+    first, second = (slice(*each) for each in sharpened(samples, channel, pairs.mode, lines, across))
+    shape = samples.usable.shape[0], samples.usable.shape[1]
+    region = _boxes_of(pairs.mode, shape, [(first, second)])
+    return None if region is None else _measured(samples, channel, pairs.mode, region, best)
 
 
 # -- families -----------------------------------------------------------------------------------
 
 
-def _boxes(pairs: Pairs, usable: BoolArray, limits: Limits) -> list[_Best]:
+def _boxes(pairs: Pairs, usable: BoolArray) -> list[_Best]:
     """Return the best band of lines, band across them, and rectangle."""
     lines, across = pairs.lines.size - 1, pairs.across.size - 1
     c, d = np.triu_indices(across + 1, 1)
@@ -219,7 +213,7 @@ def _boxes(pairs: Pairs, usable: BoolArray, limits: Limits) -> list[_Best]:
     for a in range(lines):
         counted = pairs.from_line(counts, a)
         size = area[a + 1 :, d] - area[a, d] - area[a + 1 :, c] + area[a, c]
-        some = (size >= limits.fewest) & (size <= limits.largest * usable.sum()) & (counted > 0)
+        some = (size >= FEWEST_PIXELS) & (size <= LARGEST * usable.sum()) & (counted > 0)
         with np.errstate(invalid="ignore", divide="ignore"):
             z = pairs.from_line(sums, a) - counted * total / number
             z /= np.sqrt(2.0 * counted * (1.0 - counted / number))
@@ -262,7 +256,7 @@ def _periods(pairs: Pairs) -> list[_Best]:
     for along, sums, counts in zip(ways, pairs.phases, pairs.phase_counts, strict=True):
         total, number = float(sums.sum()), float(counts.sum())
         length = int((pairs.columns if along == "columns" else pairs.rows)[-1])
-        for period in (p for p in _PERIODS if _FEWEST_LINES * p <= length and number > 0):
+        for period in (p for p in PERIODS if _FEWEST_LINES * p <= length and number > 0):
             for phase in range(period):
                 some = np.ix_(*2 * (np.arange(PERIOD) % period == phase,))
                 inside, counted = float(sums[some].sum()), float(counts[some].sum())
@@ -278,7 +272,7 @@ def _periods(pairs: Pairs) -> list[_Best]:
     return [replace(best, places=float(tried))] if best.z > 0 else []
 
 
-def _scattered(pairs: Pairs, usable: BoolArray, limits: Limits) -> list[_Best]:
+def _scattered(pairs: Pairs, usable: BoolArray) -> list[_Best]:
     """Return the rows (columns) that stand out each by itself, where they are more than one band."""
     if pairs.mode == "frame":
         return []
@@ -296,11 +290,135 @@ def _scattered(pairs: Pairs, usable: BoolArray, limits: Limits) -> list[_Best]:
     chosen = np.flatnonzero(z > -special.ndtri(_LINE_BY_CHANCE / n))
     area = np.add.reduceat((usable.T if pairs.mode == "column" else usable).sum(axis=1), pairs.lines[:-1])
     size = int(area[chosen].sum())
-    if not (np.diff(chosen) > 1).any() or not limits.fewest <= size <= limits.largest * usable.sum():
+    if not (np.diff(chosen) > 1).any() or not FEWEST_PIXELS <= size <= LARGEST * usable.sum():
         return []
     together = float(z[chosen] @ np.sqrt(counts[chosen]) / np.sqrt(counts[chosen].sum()))
     # of all sets of as many lines
     log_places = (
         special.gammaln(n + 1) - special.gammaln(chosen.size + 1) - special.gammaln(n - chosen.size + 1)
     )
-    return [_Best("scattered", together, float(np.exp(log_places)), scattered=tuple(chosen.tolist()))]
+    return [
+        _Best(
+            "scattered",
+            together,
+            float(np.exp(log_places)),
+            scattered=tuple(chosen.tolist()),
+        )
+    ]
+
+
+class Side(NamedTuple):
+    """A box of cells along one axis.
+
+    Attributes:
+        first, last: line that it begins with, and behind its last one.
+        low, high: the same with the cells beside it.
+        inner: the same without the cells at its ends, where it has others.
+        sure: whether it has, so that all of these lines are inside.
+    """
+
+    first: int
+    last: int
+    low: int
+    high: int
+    inner: tuple[int, int]
+    sure: bool
+
+    @classmethod
+    def of(cls, edges: IntArray, cells: tuple[int, int]) -> Side:
+        """Return that of cells from one to before another, given the edges of all."""
+        a, b = cells
+        low, high = int(edges[max(a - 1, 0)]), int(edges[min(b + 1, edges.size - 1)])
+        first, last = int(edges[a]), int(edges[b])
+        inner = (int(edges[a + 1]), int(edges[b - 1])) if b - a > 2 else (first, last)
+        # what ends with the sensor has its end there
+        inner = first if a == 0 else inner[0], last if b == edges.size - 1 else inner[1]
+        return cls(first, last, low, high, inner, b - a > 2)
+
+    @property
+    def exact(self) -> bool:
+        """Whether the cells beside it are single lines, of which the scan knows as much."""
+        return self.first - self.low <= 1 and self.high - self.last <= 1
+
+
+def sharpened(
+    samples: Samples, channel: int, mode: str, lines: Side, across: Side
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the first line of a box and the one behind its last, and the same across the lines.
+
+    Where too little is known of single lines, the ends stay.
+
+    Args:
+        samples: standardised frames.
+        channel: 0 for electron numbers, 1 for residuals.
+        mode: what pixels share: "row", "column", "frame".
+        lines: rows of the box, for "column" its columns.
+        across: the other axis.
+    """
+    turned = mode == "column"
+    rows, columns = (across, lines) if turned else (lines, across)
+    box = slice(rows.low, rows.high), slice(columns.low, columns.high)
+    sums: list[Any] = [0.0, 0.0]
+    for (u,) in samples.chunks((channel,), *box):
+        values = u.transpose(0, 2, 1) if turned else u
+        sums = [a + b for a, b in zip(sums, _products(values, mode, lines, across), strict=True)]
+    mask = samples.usable[box].astype(np.float32)[None]
+    pairs = _products(mask.transpose(0, 2, 1) if turned else mask, mode, lines, across)
+    found = (
+        _ends(side, total, samples.n_frames * number)
+        for side, total, number in zip((lines, across), sums, pairs, strict=True)
+    )
+    first, second = found
+    return first, second
+
+
+def _products(u: NDArray[np.float32], mode: str, lines: Side, across: Side) -> list[FloatArray]:
+    """Return how much each line, and each across, shares with the inside: sums of products of pairs.
+
+    Args:
+        u: (frame, line, across), of the box and the cells beside it.
+        mode: "frame", or any other for what pixels share in a line.
+        lines: of the box.
+        across: of the box, likewise.
+    """
+    of_lines, of_across = (_within(side, (side.first, side.last)) for side in (lines, across))
+    if mode == "frame":
+        return [
+            _with_inner(u[:, :, of_across].sum(axis=2, dtype=np.float64), lines),
+            _with_inner(u[:, of_lines].sum(axis=1, dtype=np.float64), across),
+        ]
+    band, rows = u[:, :, of_across], u[:, of_lines]
+    own = band.sum(axis=2, dtype=np.float64) ** 2 - np.einsum("tyx,tyx->ty", band, band, dtype=np.float64)
+    return [own.sum(axis=0), _with_inner(rows.reshape(-1, rows.shape[2]).astype(np.float64), across)]
+
+
+def _within(side: Side, span: tuple[int, int]) -> slice:
+    """Return lines of the sensor as those of the box and the cells beside it."""
+    return slice(span[0] - side.low, span[1] - side.low)
+
+
+def _with_inner(values: FloatArray, side: Side) -> FloatArray:
+    """Return sums over the products of each line with the others inside, of values (n, line)."""
+    inner = np.zeros(values.shape[1], np.bool_)
+    inner[_within(side, side.inner)] = True
+    together = values[:, inner].sum(axis=1)
+    return np.asarray(together @ values - inner * np.einsum("nl,nl->l", values, values))
+
+
+def _ends(side: Side, sums: FloatArray, pairs: FloatArray) -> tuple[int, int]:
+    """Return the first of the lines that share as much as those inside, and the one behind the last."""
+    inner = _within(side, side.inner)
+    total, number = float(sums[inner].sum()), float(pairs[inner].sum())
+    known = pairs > 0
+    share = np.where(known, sums / np.where(known, pairs, 1.0), 0.0)
+    inside = total / max(number, 1.0)
+    if side.exact or not known.any() or inside < _CERTAIN / float(np.median(pairs[known])) ** 0.5:
+        return side.first, side.last
+    apart = np.flatnonzero(known & (share <= _HALF * inside))
+    most = inner.start + int(np.argmax(share[inner]))
+    begin, end = (inner.start, inner.stop) if side.sure else (most, most + 1)
+    first = int(max(apart[apart < begin], default=-1)) + 1
+    last = int(min(apart[apart >= end], default=known.size))
+    # of lines without samples nothing is known
+    those = first + np.flatnonzero(known[first:last])
+    return int(those[0]) + side.low, int(those[-1]) + 1 + side.low

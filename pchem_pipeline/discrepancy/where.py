@@ -10,9 +10,15 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.null import NullModel
-from pchem_pipeline.discrepancy.observe.laws import chi_square
-from pchem_pipeline.discrepancy.scan import Stretch, Suspect, scan_map, scan_series
-from pchem_pipeline.discrepancy.scan_events import scan_event_map
+from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
+from pchem_pipeline.discrepancy.scan import (
+    SIGNIFICANCE,
+    Stretch,
+    Suspect,
+    scan_event_map,
+    scan_map,
+    scan_series,
+)
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.effects.framework.evidence import SCORES, Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import parse_place
@@ -29,7 +35,7 @@ _WIDEST_CODE_WINDOW = 24
 
 
 def suspected_regions(
-    evidence: Evidence, significance: float = 1e-3, names: Collection[str] | None = None
+    evidence: Evidence, significance: float = SIGNIFICANCE, names: Collection[str] | None = None
 ) -> dict[str, list[Suspect]]:
     """Return where on the sensor each map of the evidence stands out from the rest of the sensor.
 
@@ -61,7 +67,7 @@ def suspected_regions(
 
 
 def suspected_frames(
-    evidence: Evidence, significance: float = 1e-3, names: Collection[str] | None = None
+    evidence: Evidence, significance: float = SIGNIFICANCE, names: Collection[str] | None = None
 ) -> dict[str, list[Stretch]]:
     """Return in which frames each series of the evidence stands out, as :func:`suspected_regions` does."""
     series = {name: s for name, s in frame_series(evidence).items() if names is None or name in names}
@@ -75,7 +81,7 @@ def suspected_frames(
     return {name: frames for name, frames in found.items() if frames}
 
 
-def unfitted_place(usable: NDArray[np.bool_], significance: float = 1e-3) -> Suspect | None:
+def unfitted_place(usable: NDArray[np.bool_], significance: float = SIGNIFICANCE) -> Suspect | None:
     """Return where pixels without a fit to be relied upon come together; None where chance explains it.
 
     An effect of single pixels in a part of the sensor may leave only that to be seen.
@@ -153,63 +159,46 @@ def frame_series(evidence: Evidence) -> dict[str, FloatArray]:
         found["frame.noise"] = time.frame_noise
     for channel in ("charge", "readout"):
         found[f"scatter.{channel}"] = chi_square(found[f"frame.{channel}"] ** 2, 1.0)
-    for line, axis, channel, values, variance in (
-        ("row", 1, "charge", time.row_charge, charge),
-        ("row", 1, "readout", time.row_readout, readout),
-        ("column", 0, "charge", time.column_charge, charge),
-        ("column", 0, "readout", time.column_readout, readout),
-    ):
-        total = variance.sum(axis=axis)
-        some = total > 0
-        if some.sum() > 2:
-            u = values[:, some] * usable.sum(axis=axis)[some] / np.sqrt(total[some])
-            u = u - u.mean(axis=1, keepdims=True)
-            found[f"{line}.{channel}"] = np.asarray(chi_square((u**2).sum(axis=1), some.sum() - 1.0))
+    for line, axis in (("row", 1), ("column", 0)):
+        for channel, variance in (("charge", charge), ("readout", readout)):
+            total, number = variance.sum(axis=axis), usable.sum(axis=axis)
+            some = total > 0
+            if some.sum() > 2:
+                u = getattr(time, f"{line}_{channel}")[:, some] * number[some] / np.sqrt(total[some])
+                u = u - u.mean(axis=1, keepdims=True)
+                found[f"{line}.{channel}"] = np.asarray(chi_square((u**2).sum(axis=1), some.sum() - 1.0))
     return found
 
 
-#: The map in which a statistic would show where it is, by the beginning of its name; likewise the series.
+#: The map in which a statistic would show where it is, by the beginning of its name; likewise the series. {c}
+#: stands for the charge or the readout, {p} for pairs of samples of these.
 _MAP_OF = {
     "shape.goodness": "goodness",
     "shape.peaks": "peaks",
-    "time.lag1.charge": "lag.charge",
-    "time.lag2.charge": "lag.charge",
-    "time.lag1.readout": "lag.readout",
-    "time.lag2.readout": "lag.readout",
+    "time.lag1.{c}": "lag.{c}",
+    "time.lag2.{c}": "lag.{c}",
     "time.cross.readout_charge": "lag.cross",
-    "time.block.charge": "spread.charge",
-    "time.block.readout": "spread.readout",
-    "frame.charge.quadrants": "trend.charge",
-    "frame.readout.quadrants": "trend.readout",
-    "frame.charge.trend": "trend.charge",
-    "frame.readout.trend": "trend.readout",
-    "frame.charge.slow": "spread.charge",
-    "frame.readout.slow": "spread.readout",
-    "frame.charge.variance": "x.kk",
-    "frame.readout.variance": "x.rr",
-    "space.row.charge": "x.kk",
-    "space.row.readout": "x.rr",
-    "space.column.charge": "y.kk",
-    "space.column.readout": "y.rr",
+    "time.block.{c}": "spread.{c}",
+    "frame.{c}.quadrants": "trend.{c}",
+    "frame.{c}.trend": "trend.{c}",
+    "frame.{c}.slow": "spread.{c}",
+    "frame.{c}.variance": "x.{p}",
+    "space.row.{c}": "x.{p}",
+    "space.column.{c}": "y.{p}",
 }
 _SERIES_OF = {
-    "frame.charge": "frame.charge",
-    "frame.readout": "frame.readout",
-    "frame.charge.variance": "scatter.charge",
-    "frame.readout.variance": "scatter.readout",
+    "frame.{c}": "frame.{c}",
+    "frame.{c}.variance": "scatter.{c}",
     "frame.covariance": "scatter.charge",
     "frame.noise": "frame.noise",
     "space.row.noise": "frame.noise",
     "space.column.noise": "frame.noise",
-    "space.row.charge": "row.charge",
-    "space.row.readout": "row.readout",
-    "space.x.rr": "row.readout",
-    "space.x.kk": "row.charge",
-    "space.column.charge": "column.charge",
-    "space.column.readout": "column.readout",
-    "space.y.rr": "column.readout",
-    "space.y.kk": "column.charge",
+    "space.row.{c}": "row.{c}",
+    "space.x.{p}": "row.{c}",
+    "space.column.{c}": "column.{c}",
+    "space.y.{p}": "column.{c}",
 }
+_PAIR_OF = {"charge": "kk", "readout": "rr"}
 
 
 def map_of(statistic: str) -> str | None:
@@ -228,8 +217,13 @@ def series_of(statistic: str) -> str | None:
 
 
 def _longest(table: Mapping[str, str], name: str) -> str | None:
-    found = [start for start in table if name.startswith(start)]
-    return table[max(found, key=len)] if found else None
+    filled = {
+        start.format(c=channel, p=pair): shown.format(c=channel, p=pair)
+        for start, shown in table.items()
+        for channel, pair in _PAIR_OF.items()
+    }
+    found = [start for start in filled if name.startswith(start)]
+    return filled[max(found, key=len)] if found else None
 
 
 def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: float) -> list[Place]:
@@ -252,7 +246,7 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
     wanted = {m for n in names if (m := map_of(n)) is not None and evidence.time is not None}
     regions = suspected_regions(evidence, significance, wanted)
     frames = suspected_frames(evidence, significance, {s for n in names if (s := series_of(n)) is not None})
-    places = []
+    maps, places = pixel_maps(evidence), []
     for index, p in found.items():
         name = null.names[index]
         spots: dict[str, Any] = {}
@@ -271,7 +265,7 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
                 name,
                 z=float(pulls[index]),
                 p=p,
-                pixels=_pixels(name, evidence),
+                pixels=_pixels(name, evidence, maps),
                 dn=_codes(name, evidence),
                 frames=_frames(name, evidence),
                 **spots,
@@ -280,11 +274,18 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
     return places
 
 
-def _pixels(name: str, evidence: Evidence) -> tuple[tuple[int, int], ...]:
-    """Return the pixels that stand out in the map behind a statistic (Benjamini-Hochberg)."""
-    values = _pixel_map(name, evidence)
-    if values is None:
+def _pixels(name: str, evidence: Evidence, maps: Mapping[str, FloatArray]) -> tuple[tuple[int, int], ...]:
+    """Return the pixels that stand out in the map behind a statistic of few pixels (Benjamini-Hochberg)."""
+    parts = name.split(".")
+    if parts[-1] not in ("cnt", "chi", "pixels", "count"):
         return ()
+    if parts[0] == "tail":
+        seen = evidence.tail_low if parts[1] == "low" else evidence.tail_high
+        values = np.where(seen > 0, FAR, 0.0)
+    elif name.startswith("time.block.") and evidence.time is not None:
+        values = _block_variance(evidence, evidence.time, parts[2])
+    else:
+        values = maps[map_of(name) or ""]
     deviations = np.abs(np.where(evidence.maps.usable, values, 0.0)).ravel()
     p = 2.0 * special.ndtr(-deviations)
     order = np.argsort(p, kind="stable")
@@ -294,34 +295,16 @@ def _pixels(name: str, evidence: Evidence) -> tuple[tuple[int, int], ...]:
     return tuple((int(i) // values.shape[1], int(i) % values.shape[1]) for i in order[:count])
 
 
-def _pixel_map(name: str, evidence: Evidence) -> NDArray[np.floating] | None:
-    """Return a map of about standard normal deviations behind a statistic of few pixels."""
-    parts = name.split(".")
-    if parts[-1] not in ("cnt", "chi", "pixels", "count"):
-        return None
-    time = evidence.time
-    if parts[0] == "shape":
-        whole = {"goodness": evidence.goodness, "peaks": evidence.peaks}
-        return whole[parts[1]] if parts[1] in whole else evidence.scores[parts[1]]
-    if parts[0] == "tail":
-        counts = evidence.tail_low if parts[1] == "low" else evidence.tail_high
-        return 6.0 * np.asarray(counts > 0, np.float64)
-    if parts[0] == "time" and time is not None:
-        if parts[1] == "lag1":
-            lag = time.lag_charge if parts[2] == "charge" else time.lag_readout
-            return np.asarray(lag[0] * np.sqrt(time.n_pairs))
-        if parts[1] == "cross":
-            return np.asarray(time.lag_readout_charge * np.sqrt(time.n_pairs))
-        blocks, std = (
-            (time.block_charge, evidence.charge_std)
-            if parts[2] == "charge"
-            else (time.block_readout, evidence.readout_std)
-        )
-        n = blocks.shape[0]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = blocks.var(axis=0, ddof=1) * time.block_frames / std**2
-        return np.asarray((ratio - 1.0) * np.sqrt((n - 1) / 2.0))
-    return None
+def _block_variance(evidence: Evidence, time: TimeSeries, channel: str) -> FloatArray:
+    """Return by how many standard deviations the variance of each pixel's block means is too large."""
+    blocks, std = (
+        (time.block_charge, evidence.charge_std)
+        if channel == "charge"
+        else (time.block_readout, evidence.readout_std)
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = blocks.var(axis=0, ddof=1) * time.block_frames / std**2
+    return np.asarray((ratio - 1.0) * np.sqrt((len(blocks) - 1) / 2.0))
 
 
 def _codes(name: str, evidence: Evidence) -> tuple[int, int] | None:

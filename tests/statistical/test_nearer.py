@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.observe.digital.nearer import nearer_statistics
+from pchem_pipeline.discrepancy.observe.digital.groups import nearer_statistics
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 SHAPE, FRAMES, STACKS = (12, 12), 400, 80

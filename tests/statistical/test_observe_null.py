@@ -12,7 +12,7 @@ from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.discrepancy.observe import observe as observe_module
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.observe.vector_frames import FrameView
+from pchem_pipeline.discrepancy.observe.vector import FrameView
 
 N_STACKS, SHAPE, N_FRAMES, BLOCK = 60, (24, 24), 600, 50
 LIMIT = 5.0 / np.sqrt(N_STACKS)

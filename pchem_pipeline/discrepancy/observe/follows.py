@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from pchem_pipeline.discrepancy.observe import laws as laws_of
-from pchem_pipeline.discrepancy.observe.digital.predicted import GROUP, groups_of
-from pchem_pipeline.discrepancy.observe.pairs import Samples
+from pchem_pipeline.discrepancy.observe.digital.groups import GROUP, MOST_SAMPLES, groups_of
+from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
 from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.effects.analog.empirical_response import Source
@@ -36,8 +36,6 @@ Axes = tuple[int, ...]  # of (frame, y, x)
 SOURCES: tuple[Source, ...] = get_args(Source)
 _COLUMNS = 2  # the axis whose spectrum has one half only
 STEPS = 2  # the same frame, and the one before
-_MOST_SAMPLES = 1 << 18
-_AT_ONCE = 1 << 18  # samples that are transformed together
 _FEWEST = 3000  # products of a distance
 _RESOLVED = 0.05  # of the variance of the charge, at least, that its residual does not hold
 
@@ -70,25 +68,6 @@ class Follows:
         products, pairs = self.of(source)
         known = pairs >= _FEWEST
         return np.where(known, products / np.sqrt(np.where(known, pairs, 1.0)), np.nan) / self.wider[source]
-
-
-@dataclass(frozen=True)
-class _Groups:
-    """Groups of successive frames, one after the other; see :class:`~.pairs.FrameBlocks`."""
-
-    frames: NDArray[np.unsignedinteger[Any]]
-    first: IntArray
-
-    @property
-    def n_frames(self) -> int:
-        """Number of frames."""
-        return GROUP * self.first.size
-
-    def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
-        """Yield about so many frames at a time, whole groups."""
-        some = max(size // GROUP, 1)
-        for begin in range(0, self.first.size, some):
-            yield self.frames[(self.first[begin : begin + some, None] + np.arange(GROUP)).ravel()]
 
 
 @dataclass(frozen=True)
@@ -135,7 +114,8 @@ class FollowingSamples:
         first = groups_of(edges, maps.usable.size, frames.size if most is None else most)
         if not first.size:
             return None
-        samples = replace(Samples.by_laws(_Groups(frames, first), laws, maps), most=_AT_ONCE)
+        stack = Stack(frames, (first[:, None] + np.arange(GROUP)).ravel(), GROUP)
+        samples = replace(Samples.by_laws(stack, laws, maps), most=MOST_SAMPLES)
         inside = samples.usable if inside is None else samples.usable & inside
         return cls(samples, inside, *_charge_of(laws, maps))
 
@@ -253,10 +233,7 @@ def _charge_of(
     laws: PixelLaws, maps: PixelMaps
 ) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array]:
     """Return the correlation of charge and residual, the scale of what it leaves, mean and spread, (y, x)."""
-    shape = maps.usable.shape
-    pixels = pixel_statistics(
-        laws, maps.quanta_exposure.ravel(), maps.conversion_gain.ravel(), (shape[0], shape[1])
-    )
+    pixels = pixel_statistics(laws, maps)
     usable = pixels.usable
     correlation = pixels.cross / np.sqrt(np.where(usable, pixels.charge * pixels.readout, 1.0))
     left = 1.0 - correlation**2
@@ -314,7 +291,7 @@ def follow_statistics(
     Left out are the samples next to it in the same frame and its own one frame before, which have their own.
     Arguments as of :meth:`FollowingSamples.of`.
     """
-    prepared = FollowingSamples.of(frames, edges, laws, maps, most=_MOST_SAMPLES)
+    prepared = FollowingSamples.of(frames, edges, laws, maps, most=MOST_SAMPLES)
     if prepared is None:
         return {}
     (found,) = prepared.by_distance()

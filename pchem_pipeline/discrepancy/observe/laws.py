@@ -18,7 +18,12 @@ FloatArray = NDArray[np.float64]
 _SMALL = 1e-12
 # an event that is next to impossible counts as much as this many standard deviations
 _CERTAIN = 10.0
-_RARE = 1e-3
+#: Coincidences expected, below which each is proof.
+RARE = 1e-3
+#: Standard deviations: values beyond count as so many, so that a few of them make no mean.
+FAR = 6.0
+#: Slowest waves along a series whose squares are summed (the adaptive test of Neyman, Fan 1996).
+SLOWEST = (2, 4, 8, 16, 32)
 _SHORT_END = 0.25  # of the cubic root of a gamma law
 
 
@@ -43,15 +48,12 @@ def poisson(count: int, expected: float) -> float:
     expected = max(expected, _SMALL)
     if count == 0:
         return _quantile(np.log1p(-0.5 * np.exp(-expected)))
-    above = _log_poisson_tail(count, expected)
-    at = count * np.log(expected) - expected - special.gammaln(count + 1.0)
-    log_p = above + np.log1p(-0.5 * np.exp(min(at - above, 0.0)))
-    return _quantile(log_p)
+    return _quantile(_log_poisson_tail(count, expected))
 
 
 def repeats(count: int, expected: float) -> float:
     """Return 10 for each coincidence that cannot happen; where they do happen, what :func:`counted` says."""
-    return float(_CERTAIN * count) if expected < _RARE else float(counted(count, expected))
+    return float(_CERTAIN * count) if expected < RARE else float(counted(count, expected))
 
 
 def largest_normal(values: FloatArray) -> float:
@@ -85,14 +87,12 @@ def _quantile(log_p: float) -> float:
 
 
 def _log_poisson_tail(count: int, expected: float) -> float:
-    """Return log P(N >= count), count at least 1."""
+    """Return log(P(N > count) + P(N = count) / 2), count at least 1."""
+    at = count * np.log(expected) - expected - special.gammaln(count + 1.0)
     tail = float(special.gammainc(count, expected))
-    if tail > 1e-250:
-        return float(np.log(tail))
     ratio = expected / (count + 1.0)
-    return float(
-        count * np.log(expected) - expected - special.gammaln(count + 1.0) - np.log1p(-min(ratio, 0.5))
-    )
+    above = np.log(tail) if tail > 1e-250 else at - np.log1p(-min(ratio, 0.5))
+    return float(above + np.log1p(-0.5 * np.exp(min(at - above, 0.0))))
 
 
 def _log_gamma_tail(shape: float, value: float) -> float:
@@ -113,9 +113,7 @@ def extreme(count: int, on: float, beyond: float) -> float:
     on = max(on, _SMALL)
     # P(no sample beyond) is uniform; half of the chance of the extreme itself splits the ties
     nothing = _quantile(-beyond + np.log(0.5 + 0.5 * np.exp(-on)))
-    above = _log_poisson_tail(count, on)
-    at = count * np.log(on) - on - special.gammaln(count + 1.0)
-    piled = _quantile(above + np.log1p(-0.5 * np.exp(min(at - above, 0.0))) - np.log(-np.expm1(-on)))
+    piled = _quantile(_log_poisson_tail(count, on) - np.log(-np.expm1(-on)))
     return float((nothing + piled) / np.sqrt(2.0))
 
 

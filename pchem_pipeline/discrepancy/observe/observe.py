@@ -7,7 +7,7 @@ whatever the model of the run.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,25 +15,41 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe import tables_numba as column
-from pchem_pipeline.discrepancy.observe.digital.equal_squares import equal_squares, square_statistics
+from pchem_pipeline.discrepancy.observe.digital.groups import (
+    bit_statistics,
+    nearer_statistics,
+    predicted_samples,
+    predicted_statistics,
+    previous_bits,
+)
 from pchem_pipeline.discrepancy.observe.digital.misplaced import misplaced_lines
-from pchem_pipeline.discrepancy.observe.digital.nearer import nearer_statistics
-from pchem_pipeline.discrepancy.observe.digital.predicted import predicted_samples, predicted_statistics
-from pchem_pipeline.discrepancy.observe.digital.previous_bits import bit_statistics, previous_bits
-from pchem_pipeline.discrepancy.observe.digital.repeated_lines import line_statistics, repeated_lines
+from pchem_pipeline.discrepancy.observe.digital.repeats import (
+    Repeats,
+    equal_squares,
+    log_alike,
+    square_statistics,
+)
 from pchem_pipeline.discrepancy.observe.follows import follow_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
-from pchem_pipeline.discrepancy.observe.sums import blocks_of, pixel_statistics, sum_frames
-from pchem_pipeline.discrepancy.observe.tables import pixel_laws
+from pchem_pipeline.discrepancy.observe.sums import (
+    MINIMUM_BLOCKS,
+    blocks_of,
+    pairs_at_lags,
+    pixel_statistics,
+    samples_beyond,
+    sum_frames,
+)
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
-from pchem_pipeline.discrepancy.observe.vector import goodness_of, in_order, sample_statistics
-from pchem_pipeline.discrepancy.observe.vector_frames import (
+from pchem_pipeline.discrepancy.observe.vector import (
     FrameView,
     frame_statistics,
-    neighbour_sums,
+    goodness_of,
+    in_order,
     pixel_lags,
     quadrant_series,
     quadrant_sums,
+    sample_statistics,
     space_statistics,
     time_statistics,
 )
@@ -43,12 +59,10 @@ from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
-from pchem_pipeline.model.histogram.count import histogram_frames
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-MINIMUM_BLOCKS = 4
 #: Pixels with one of these flags are left out. A poor fit is no reason: it is what is looked for. Nor is a
 #: bias that may be off by one electron: all that is looked at stays nearly the same, but to choose the pixels
 #: with an unambiguous sample would bias the statistics of the rest.
@@ -89,58 +103,57 @@ def observe(
     """
     _check(frames, numbers, block_frames)
     shape = frames.shape[1:]
-    histograms = histogram_frames(frames)
-    counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
-    outside = np.stack([histograms.under.ravel(), histograms.over.ravel()], axis=1).astype(np.float64)
+    seen = PixelHistograms.of(frames)
     wanted = np.ones(shape, np.bool_) if exclude is None else ~exclude
-    origin = histograms.origin.ravel().astype(np.int64)
-    seen = _Seen(counts, origin, outside, histograms.minimum.ravel(), histograms.maximum.ravel())
     if fitted or start is None:
-        result, parameters, usable = _fitted(counts, origin, outside, wanted.ravel(), fit, start)
+        result, parameters, usable = _fitted(seen, wanted.ravel(), fit, start)
     else:
         result, parameters = None, start.columns
-        usable = (wanted & start.usable).ravel() & _inside(counts, outside)
+        usable = (wanted & start.usable).ravel() & _inside(seen)
     evidence, laws = _compared(seen, parameters, usable, (shape[0], shape[1]))
     evidence = evidence if result is None else _with_fit(evidence, result)
     edges = blocks_of(numbers, block_frames)
     maps = evidence.maps
-    pixels = pixel_statistics(
-        laws, maps.quanta_exposure.ravel(), maps.conversion_gain.ravel(), maps.usable.shape
-    )
-    sums = sum_frames(frames, numbers, edges, laws, pixels)
+    pixels = pixel_statistics(laws, maps)
+    sums = sum_frames(frames, edges, laws, pixels)
     view = FrameView(sums, pixels, numbers, edges, block_frames)
-    alike = _log_alike(counts, outside, (shape[0], shape[1]))
-    chance = _chance_of_repeats(alike, sums.consecutive)
+    hits = [samples_beyond(frames, laws, maps.usable, above=above) for above in (True, False)]
+    repeats = Repeats.of(frames, numbers)
     lags = pixel_lags(view)
     predicted = predicted_samples(frames, edges, maps.usable)
     spread = np.sqrt(maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2)
     bits = previous_bits(frames, edges, maps.usable, np.where(maps.usable, spread, 1.0))
-    lines, squares = repeated_lines(frames), equal_squares(frames)
+    squares = equal_squares(frames)
     waves = waves_across(frames, numbers, laws, maps)
-    misplaced_z, misplaced = misplaced_lines(frames, counts, origin, maps.usable)
+    misplaced_z, misplaced = misplaced_lines(frames, seen.counts, seen.origin, maps.usable)
     z = {
         **evidence.z,
-        "tail.high.clusters": _clusters(sums.hits, laws, frames.shape),
+        "tail.high.clusters": _clusters(hits[0], laws, frames.shape),
         **time_statistics(view, lags),
-        **frame_statistics(view, chance),
+        **frame_statistics(view),
         **space_statistics(view),
         **predicted_statistics(predicted),
         **bit_statistics(bits),
         **nearer_statistics(frames, edges, maps),
         **follow_statistics(frames, edges, laws, maps),
-        **line_statistics(lines, alike, len(frames)),
-        **square_statistics(squares, counts, origin, maps.usable, int(frames.max())),
+        **repeats.statistics(log_alike(seen, maps.usable.shape), len(frames)),
+        **square_statistics(squares, seen, maps.usable, int(frames.max())),
         **misplaced_z,
         **waves.z,
     }
-    time = _time_series(view, lags, n_run)
-    time = replace(
-        time,
+    time = _time_series(
+        view,
+        lags,
+        n_run,
+        repeated=numbers[repeats.frames],
+        repeated_rows=repeats.rows_in_time,
+        repeated_lines={"rows": repeats.rows, "columns": repeats.columns},
         predicted=predicted,
         previous_bits=bits,
-        repeated_lines=lines,
         misplaced_lines=misplaced,
         waves=waves.found,
+        hits=_numbered(hits[0], numbers),
+        low_hits=_numbered(hits[1], numbers),
     )
     return replace(evidence, time=time, z=in_order(z))
 
@@ -167,15 +180,10 @@ def observe_histograms(
     Raises:
         PchEmError: no pixel is usable.
     """
-    n = counts.shape[0]
-    filled = counts > 0
-    low = origin + np.argmax(filled, axis=1)
-    high = origin + counts.shape[1] - 1 - np.argmax(filled[:, ::-1], axis=1)
-    seen = _Seen(counts, origin.astype(np.int64), np.zeros((n, 2)), low, high)
+    n, seen = len(counts), PixelHistograms.alone(counts, origin)
     if parameters is not None:
         return _compared(seen, parameters, np.asarray(np.isfinite(parameters).all(axis=1)), (1, n))[0]
-    every = np.ones(n, np.bool_)
-    result, parameters, usable = _fitted(counts, seen.origin, seen.outside, every, fit, None)
+    result, parameters, usable = _fitted(seen, np.ones(n, np.bool_), fit, None)
     return _with_fit(_compared(seen, parameters, usable, (1, n))[0], result)
 
 
@@ -192,38 +200,19 @@ def _check(frames: NDArray[Any], numbers: IntArray, block_frames: int) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """Histograms (n, B), DN of bin 0, samples below and above (n, 2), smallest and largest code of each."""
-
-    counts: NDArray[Any]
-    origin: IntArray
-    outside: FloatArray
-    minimum: NDArray[Any]
-    maximum: NDArray[Any]
-
-
 def _compared(
-    seen: _Seen, parameters: FloatArray, usable: NDArray[np.bool_], shape: tuple[int, int]
+    seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np.bool_], shape: tuple[int, int]
 ) -> tuple[Evidence, PixelLaws]:
     """Compare histograms with the PCD at the parameters of a fit."""
-    counts, outside = seen.counts, seen.outside
-    inside = counts.sum(axis=1)
-    laws = pixel_laws(counts, seen.origin, outside, parameters, usable)
+    laws = pixel_laws(seen, parameters, usable)
     good = laws.good
     if not good.any():
         raise PchEmError(
             f"none of the {good.size} pixels has a fit that can be relied upon; see the flags of the fit"
         )
-    masked = np.where(good[:, None], parameters, np.nan)
     moments = np.where(good[:, None], laws.moments, np.nan)
-    residuals = CodeResiduals(
-        laws.codes.first,
-        laws.codes.single[0],
-        laws.codes.single[1],
-        int(seen.minimum[good].min()),
-        int(seen.maximum[good].max()),
-    )
+    codes = laws.codes
+    residuals = CodeResiduals(codes.first, codes.single[0], codes.single[1], *seen.extremes(good))
 
     def tail(moment: int) -> NDArray[np.uint32]:
         return np.where(good, laws.moments[:, moment], 0.0).reshape(shape).astype(np.uint32)
@@ -232,8 +221,8 @@ def _compared(
         return np.where(good, values, np.nan).reshape(shape).astype(np.float32)
 
     evidence = Evidence(
-        maps=_maps(masked, good.reshape(shape)),
-        n_frames=int((inside + outside.sum(axis=1)).max()),
+        maps=PixelMaps.known(parameters.T, good.reshape(shape)),
+        n_frames=int(seen.samples.max()),
         charge_std=moments[:, column.MODEL_STD_K].reshape(shape),
         readout_std=moments[:, column.MODEL_STD_R].reshape(shape),
         scores={name: mapped(laws.scores[:, 0, j]) for j, name in enumerate(SCORES)},
@@ -260,9 +249,7 @@ def _with_fit(evidence: Evidence, result: FitResult) -> Evidence:
 
 
 def _fitted(
-    counts: NDArray[Any],
-    origin: IntArray,
-    outside: FloatArray,
+    seen: PixelHistograms,
     wanted: NDArray[np.bool_],
     fit: FitSettings | None,
     near: PixelMaps | None,
@@ -271,11 +258,12 @@ def _fitted(
     start = None if near is None else near.columns
     # every sample counts here: what the tail guard would leave out is what is looked for
     settings = (fit or FitSettings()).model_copy(update={"tail_guard": 0.0, "errors": "information"})
-    result = fit_histograms(counts, origin, *outside.T.astype(np.int64), settings=settings, start=start)
+    outside = seen.outside.T.astype(np.int64)
+    result = fit_histograms(seen.counts, seen.origin, *outside, settings=settings, start=start)
     parameters = result.columns
     usable = wanted & ((result.fit_status & UNTRUSTWORTHY) == 0) & np.isfinite(parameters).all(axis=1)
     usable &= ~_without_steps(parameters[:, 1], usable)
-    return result, parameters, usable & _inside(counts, outside)
+    return result, parameters, usable & _inside(seen)
 
 
 def _without_steps(gain: FloatArray, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -298,9 +286,9 @@ def _without_steps(gain: FloatArray, usable: NDArray[np.bool_]) -> NDArray[np.bo
     return np.asarray(few & (step < min(_FINEST_STEP, _FAR_FINER * most)) & (most > _FINEST_STEP))
 
 
-def _inside(counts: NDArray[Any], outside: FloatArray) -> NDArray[np.bool_]:
+def _inside(seen: PixelHistograms) -> NDArray[np.bool_]:
     """Return which histograms hold nearly all samples of their pixel, (n,)."""
-    return np.asarray(outside.sum(axis=1) <= _MOST_OUTSIDE * counts.sum(axis=1))
+    return np.asarray(seen.outside.sum(axis=1) <= _MOST_OUTSIDE * seen.counts.sum(axis=1))
 
 
 def fitted_maps(frames: NDArray[np.unsignedinteger[Any]], exclude: NDArray[np.bool_]) -> PixelMaps:
@@ -310,16 +298,8 @@ def fitted_maps(frames: NDArray[np.unsignedinteger[Any]], exclude: NDArray[np.bo
         frames: codes (n, y, x), DN.
         exclude: pixels not to look at, (y, x).
     """
-    histograms = histogram_frames(frames)
-    counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
-    outside = np.stack([histograms.under.ravel(), histograms.over.ravel()], axis=1).astype(np.float64)
-    origin = histograms.origin.ravel().astype(np.int64)
-    _, parameters, usable = _fitted(counts, origin, outside, ~exclude.ravel(), None, None)
-    return _maps(np.where(usable[:, None], parameters, np.nan), usable.reshape(exclude.shape))
-
-
-def _maps(parameters: FloatArray, usable: NDArray[np.bool_]) -> PixelMaps:
-    return PixelMaps.known(parameters.T, usable)
+    _, parameters, usable = _fitted(PixelHistograms.of(frames), ~exclude.ravel(), None, None)
+    return PixelMaps.known(parameters.T, usable.reshape(exclude.shape))
 
 
 def _clusters(hits: IntArray, laws: PixelLaws, shape: tuple[int, ...]) -> float:
@@ -336,23 +316,8 @@ def _clusters(hits: IntArray, laws: PixelLaws, shape: tuple[int, ...]) -> float:
     return poisson(pairs, chance)
 
 
-def _log_alike(counts: NDArray[Any], outside: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Return the log of the chance that two samples of a pixel are equal, (y, x)."""
-    real = counts.astype(np.float32)
-    total = np.maximum(real.sum(axis=1) + outside.sum(axis=1), 1.0)
-    alike = np.einsum("ib,ib->i", real, real) / total**2
-    return np.asarray(np.log(np.maximum(alike, 1e-12)).reshape(shape), np.float64)
-
-
-def _chance_of_repeats(alike: FloatArray, consecutive: int) -> tuple[float, float]:
-    """Return how many frames and rows are expected to repeat the one before by chance."""
-    same = alike.sum(axis=1)
-    return consecutive * float(np.exp(min(same.sum(), 0.0))), consecutive * float(
-        np.exp(np.minimum(same, 0)).sum()
-    )
-
-
-def _time_series(view: FrameView, lags: FloatArray, n_run: int) -> TimeSeries:
+def _time_series(view: FrameView, lags: FloatArray, n_run: int, **others: Any) -> TimeSeries:
+    """Return what is kept along time; ``others``: its fields that are not of the view."""
     sums, pixels = view.sums, view.pixels
     usable = pixels.usable
     exposure, number = pixels.exposure, usable.astype(np.float64)
@@ -363,11 +328,9 @@ def _time_series(view: FrameView, lags: FloatArray, n_run: int) -> TimeSeries:
     def mapped(values: FloatArray) -> NDArray[np.float32]:
         return np.where(usable, values, np.nan).astype(np.float32)
 
-    k, r = sums.rows[:2].sum(axis=0), sums.rows[2:].sum(axis=0)
+    k, r = view.lines(0, 1), view.lines(1, 1)
     length = np.diff(view.edges)[:, None, None]
-    found = {
-        f"{axis}.{kind}": seen for axis in ("x", "y") for kind, seen in neighbour_sums(view, axis).items()
-    }
+    found = view.neighbours
     return TimeSeries(
         frames=view.numbers,
         n_run=n_run,
@@ -388,15 +351,12 @@ def _time_series(view: FrameView, lags: FloatArray, n_run: int) -> TimeSeries:
         lag_readout=mapped(lags[3:6]),
         lag_readout_charge=mapped(lags[6]),
         lag_charge_readout=mapped(lags[7]),
-        n_pairs=sums.n_pairs[0],
+        n_pairs=pairs_at_lags(view.edges)[0],
         neighbours={name: seen.correlation for name, seen in found.items()},
         neighbour_pairs={name: seen.products for name, seen in found.items()},
         neighbour_maps={name: seen.deviation.astype(np.float32) for name, seen in found.items()},
-        repeated=view.numbers[sums.repeated],
-        repeated_rows=sums.repeated_rows,
-        frame_noise=view.frame_noise,
-        hits=_numbered(sums.hits, view.numbers),
-        low_hits=_numbered(sums.low_hits, view.numbers),
+        **others,
+        frame_noise=view.series["noise"],
     )
 
 

@@ -11,23 +11,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
-from pchem_pipeline.discrepancy.observe.tables import pixel_laws
+from pchem_pipeline.discrepancy.observe.laws import FAR
+from pchem_pipeline.discrepancy.observe.sums import CHANNELS, code_ranges, pixel_statistics
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.model.histogram.count import histogram_frames
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-CHANNELS = ("charge", "readout")
 #: What pixels share: their row, their column, or only the frame (neither row nor column).
 MODES = ("row", "column", "frame")
 #: Lines are told apart by their number modulo this.
@@ -36,8 +36,6 @@ PERIOD = 32
 _CELLS = 64
 #: Of each table of sums of products: two channels and the counts, as gathered and as told.
 _COPIES = 9
-#: Samples count as no more than so many standard deviations: a track of a particle is no common mode.
-_CLIP = 6.0
 
 
 class FrameBlocks(Protocol):
@@ -63,31 +61,30 @@ class Stack:
 
     Attributes:
         frames: codes (n, y, x), DN.
+        chosen: positions of those that are meant; None: all.
+        together: successive ones of these that come in the same block.
     """
 
     frames: NDArray[np.unsignedinteger[Any]]
+    chosen: IntArray | None = None
+    together: int = 1
 
     @property
     def n_frames(self) -> int:
         """Number of frames."""
-        return int(self.frames.shape[0])
+        return int(self.frames.shape[0] if self.chosen is None else self.chosen.size)
 
     def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
-        """Yield at most so many successive frames at a time, (frame, y, x), DN."""
+        """Yield about so many successive frames at a time, (frame, y, x), DN."""
+        size = self.together * max(size // self.together, 1)
         for begin in range(0, self.n_frames, size):
-            yield self.frames[begin : begin + size]
+            some = slice(begin, begin + size)
+            yield self.frames[some if self.chosen is None else self.chosen[some]]
 
 
 def laws_of_frames(frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> PixelLaws:
     """Compare the histograms of frames (n, y, x) with the fit of their pixels."""
-    histograms = histogram_frames(frames)
-    return pixel_laws(
-        histograms.counts.reshape(-1, histograms.counts.shape[2]),
-        histograms.origin.ravel().astype(np.int64),
-        np.stack([histograms.under.ravel(), histograms.over.ravel()], axis=1).astype(np.float64),
-        maps.columns,
-        maps.usable.ravel(),
-    )
+    return pixel_laws(PixelHistograms.of(frames), maps.columns, maps.usable.ravel())
 
 
 @dataclass(frozen=True)
@@ -119,17 +116,16 @@ class Samples:
     @classmethod
     def by_laws(cls, frames: FrameBlocks, laws: PixelLaws, maps: PixelMaps) -> Samples:
         """Prepare frames by the laws of their pixels, made of all samples of the frames or of more."""
-        shape = (maps.usable.shape[0], maps.usable.shape[1])
-        pixels = pixel_statistics(laws, maps.quanta_exposure.ravel(), maps.conversion_gain.ravel(), shape)
+        pixels = pixel_statistics(laws, maps)
         usable = pixels.usable
-        first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T.astype(np.int32)
         codes = np.where(laws.good, laws.support[:, 1], 0)
         tables = laws.tables[: 1 + codes.sum()].T.copy()
         for channel, variance in enumerate((pixels.charge, pixels.readout)):
             deviation = np.sqrt(np.where(usable, variance, 1.0)).ravel().astype(np.float32)
             tables[channel, 1:] /= np.repeat(deviation, codes)
-        np.clip(tables, -_CLIP, _CLIP, out=tables)
-        first, last, start = (values.reshape(shape) for values in (first, first + length - 1, start))
+        # a track of a particle is no common mode
+        np.clip(tables, -FAR, FAR, out=tables)
+        first, last, start = code_ranges(laws, usable)
         return cls(frames, first, last, start, tables, usable)
 
     @property
@@ -161,11 +157,11 @@ class Samples:
             return np.zeros(self.n_frames)
         box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         inside = pixels[box].astype(np.float32)
-        found = [_energy(u * inside, mode) for (u,) in self.chunks((channel,), *box)]
+        found = [energies(u * inside, mode) for (u,) in self.chunks((channel,), *box)]
         return np.concatenate(found)
 
 
-def _energy(u: Float32Array, mode: str) -> FloatArray:
+def energies(u: Float32Array, mode: str) -> FloatArray:
     """Return the sum of the products of all pairs that share a mode, of frames (t, y, x)."""
     own = np.einsum("tyx,tyx->t", u, u, dtype=np.float64)
     rows, columns = (u.sum(axis=axis, dtype=np.float64) for axis in (2, 1))
@@ -237,10 +233,22 @@ def pairs_of(samples: Samples) -> list[dict[str, Pairs]]:
     for chunk in samples.chunks():
         for each, u in zip(gathered, chunk, strict=True):
             each.add(u)
-    n = samples.n_frames
-    counts = {mode: n * table for mode, table in counted.tables().items()}
-    numbers = {mode: tuple(n * each for each in every) for mode, every in counted.by_number().items()}
-    return [_told(each, counts, numbers) for each in gathered]
+    n, counts = samples.n_frames, counted.tables()
+    found = []
+    for each in gathered:
+        tables = each.tables()
+        found.append({
+            mode: Pairs(
+                mode,
+                tables[mode][0],
+                n * counts[mode][0],
+                tables[mode][1],
+                tuple(n * phases for phases in counts[mode][1]),
+                *each.edges(mode),
+            )
+            for mode in MODES
+        })  # fmt: skip
+    return found
 
 
 def pairs_bytes(shape: tuple[int, int]) -> int:
@@ -250,117 +258,103 @@ def pairs_bytes(shape: tuple[int, int]) -> int:
     return _COPIES * 8 * (y * x * (y + x) + (v * u) ** 2)
 
 
-class _Gathered:
-    """Sums of products of cells of rows, of columns and of frames, squares included.
+class _Lines:
+    """Sums of products of different pixels of a line, by cells across it.
 
     Attributes:
-        rows, columns: edges of the cells of lines; those of frames are every ``stride`` of them.
-        squares: (y, x).
-        of_rows, of_columns: (y, x, x) and (x, y, y).
-        of_frames: (y', x', y', x').
-        phases: of rows by the column's number, of columns by the row's, of frames by either.
-        own: squares and products within a line by the number of the column, of the row, (PERIOD,) each.
+        lines, across: edges of the cells.
+        products: of the pixels of all lines of a cell, (line, across, across).
+        phases: of pixels of a line, and of a frame in different columns, by the column's number.
+    """
+
+    def __init__(self, lines: IntArray, across: IntArray) -> None:
+        """Begin with nothing."""
+        self.lines, self.across = lines, across
+        self.products = np.zeros((lines.size - 1, across.size - 1, across.size - 1))
+        self.phases = np.zeros((2, PERIOD, PERIOD))
+
+    def add(self, u: Float32Array, square: FloatArray) -> None:
+        """Add frames (t, line, across), with the sums of their squares (line, across)."""
+        cells = np.add.reduceat(u, self.across[:-1], axis=2)
+        own = _summed(square, (self.lines[:-1], self.across[:-1]))
+        for i, (first, last) in enumerate(pairwise(self.lines)):
+            part = cells[:, first:last].reshape(-1, cells.shape[2])
+            self.products[i] += part.T @ part - np.diag(own[i])
+        totals = u.sum(axis=1, dtype=np.float64)
+        for phases, values, squares in zip(
+            self.phases, (u, totals), (square.sum(axis=0), (totals**2).sum(axis=0)), strict=True
+        ):
+            folded = _folded(values).reshape(-1, PERIOD)
+            phases += folded.T @ folded - np.diag(_by_number(squares))
+
+
+class _Gathered:
+    """Sums of products of different pixels of a row, of a column, and of all of a frame.
+
+    Attributes:
+        rows, columns: of lines, with their cells; those of frames are every ``stride`` of these.
+        of_frames: products of all pixels, (y', x', y', x') in two axes.
+        squares: of all pixels, (y', x').
     """
 
     def __init__(self, ny: int, nx: int) -> None:
         """Begin with nothing, for a sensor of ny rows and nx columns."""
-        self.rows, self.columns = (
-            np.unique(np.linspace(0, n, min(n, _CELLS) + 1).astype(np.int64)) for n in (ny, nx)
-        )
+        rows, columns = (np.unique(np.linspace(0, n, min(n, _CELLS) + 1).astype(np.int64)) for n in (ny, nx))
+        self.rows, self.columns = _Lines(rows, columns), _Lines(columns, rows)
         self.stride = tuple(2 if n > _CELLS // 2 else 1 for n in (ny, nx))
-        y, x = self.rows.size - 1, self.columns.size - 1
-        self.squares = np.zeros((y, x))
-        self.of_rows, self.of_columns = np.zeros((y, x, x)), np.zeros((x, y, y))
-        v, u = (-(-n // by) for n, by in zip((y, x), self.stride, strict=True))
-        self.of_frames = np.zeros((v * u, v * u))
-        self.phases = np.zeros((4, PERIOD, PERIOD))
-        self.own = np.zeros((4, PERIOD))
+        self.squares = np.zeros([each.size - 1 for each in self.edges("frame")])
+        self.of_frames = np.zeros((self.squares.size, self.squares.size))
+
+    def edges(self, mode: str) -> tuple[IntArray, IntArray]:
+        """Return the edges of the cells of rows and of columns, pixels."""
+        whole = self.rows.lines, self.rows.across
+        if mode != "frame":
+            return whole
+        rows, columns = (
+            np.append(each[:-1:step], each[-1]) for each, step in zip(whole, self.stride, strict=True)
+        )
+        return rows, columns
 
     def add(self, u: Float32Array) -> None:
         """Add frames (t, y, x)."""
         square = np.einsum("tyx,tyx->yx", u, u, dtype=np.float64)
-        self.squares += _summed(square, (self.rows[:-1], self.columns[:-1]))
-        turned = u.transpose(0, 2, 1)
-        self._add_lines(u, self.rows, self.columns, self.of_rows, 0)
-        self._add_lines(turned, self.columns, self.rows, self.of_columns, 1)
-        for which, (v, axis) in enumerate(((u, 0), (turned, 1))):
-            self.own[which] += _by_number(square.sum(axis=axis))
-            lines = v.sum(axis=1, dtype=np.float64)
-            self.own[2 + which] += _by_number((lines**2).sum(axis=0))
-            folded = _folded(lines)
-            self.phases[2 + which] += folded.T @ folded
-        rows, columns = self.rows[: -1 : self.stride[0]], self.columns[: -1 : self.stride[1]]
+        self.rows.add(u, square)
+        self.columns.add(u.transpose(0, 2, 1), square.T)
+        rows, columns = (each[:-1] for each in self.edges("frame"))
+        self.squares += _summed(square, (rows, columns))
         flat = np.add.reduceat(np.add.reduceat(u, rows, axis=1), columns, axis=2).reshape(u.shape[0], -1)
         self.of_frames += flat.T @ flat
 
-    def _add_lines(
-        self, u: Float32Array, lines: IntArray, across: IntArray, products: FloatArray, which: int
-    ) -> None:
-        """Add products of cells of the same line: frames (t, line, across)."""
-        cells = np.add.reduceat(u, across[:-1], axis=2)
-        for i in range(lines.size - 1):
-            part = cells[:, lines[i] : lines[i + 1]].reshape(-1, cells.shape[2])
-            products[i] += part.T @ part
-        folded = _folded(u).reshape(-1, PERIOD)
-        self.phases[which] += folded.T @ folded
+    def tables(self) -> dict[str, tuple[FloatArray, tuple[FloatArray, ...]]]:
+        """Return the sums of each mode, cumulative along the lines, and by numbers; see :class:`Pairs`.
 
-    def tables(self) -> dict[str, FloatArray]:
-        """Return the products of different pixels of a line, and of frames of different rows and columns.
-
-        Cumulative along the lines; see :class:`Pairs`.
+        Of frames those of pixels in different rows and columns.
         """
-        rows, columns = self.of_rows.copy(), self.of_columns.copy()
+        of_rows, of_columns = self.rows.products, self.columns.products
         by, bx = (
-            np.arange(0, size, step) for size, step in zip(self.squares.shape, self.stride, strict=True)
+            np.arange(0, size, step)
+            for size, step in zip((len(of_rows), len(of_columns)), self.stride, strict=True)
         )
-        v, u = by.size, bx.size
-        frames = self.of_frames.reshape(v, u, v, u).transpose(0, 2, 1, 3).copy()
-        i, j = np.arange(v), np.arange(u)
-        frames[i, i] -= _summed(rows, (by, bx, bx))
-        frames[:, :, j, j] -= _summed(columns, (bx, by, by)).transpose(1, 2, 0)
-        own = _summed(self.squares, (by, bx))
-        for a in range(v):
-            frames[a, a, j, j] += own[a]
-        for table, square in ((rows, self.squares), (columns, self.squares.T)):
-            index = np.arange(table.shape[1])
-            table[:, index, index] -= square
-        lines = {
-            mode: np.pad(table, ((1, 0), (0, 0), (0, 0))).cumsum(axis=0)
-            for mode, table in (("row", rows), ("column", columns))
+        i, j = np.arange(by.size), np.arange(bx.size)
+        frames = self.of_frames.reshape(*2 * self.squares.shape).transpose(0, 2, 1, 3).copy()
+        frames[i, i] -= _summed(of_rows, (by, bx, bx))
+        frames[:, :, j, j] -= _summed(of_columns, (bx, by, by)).transpose(1, 2, 0)
+        for a in i:
+            frames[a, a, j, j] -= self.squares[a]
+        both = self.rows.phases[1] - self.rows.phases[0], self.columns.phases[1] - self.columns.phases[0]
+        return {
+            "row": (_cumulative(of_rows, 1), (self.rows.phases[0],)),
+            "column": (_cumulative(of_columns, 1), (self.columns.phases[0],)),
+            "frame": (_cumulative(frames, 2), both),
         }
-        both = np.pad(frames, ((1, 0), (1, 0), (0, 0), (0, 0))).cumsum(axis=0).cumsum(axis=1)
-        return {**lines, "frame": both}
-
-    def by_number(self) -> dict[str, tuple[FloatArray, ...]]:
-        """Return the same by the number of the column or row modulo the period."""
-        rows, columns = (self.phases[i] - np.diag(self.own[i]) for i in (0, 1))
-        frames = tuple(
-            self.phases[2 + i] - np.diag(self.own[2 + i]) - each for i, each in ((0, rows), (1, columns))
-        )
-        return {"row": (rows,), "column": (columns,), "frame": frames}
 
 
-def _told(
-    gathered: _Gathered, counts: dict[str, FloatArray], numbers: dict[str, tuple[FloatArray, ...]]
-) -> dict[str, Pairs]:
-    """Return the sums by what pixels share, with the counts of the usable pixels in all frames."""
-    sums, phases = gathered.tables(), gathered.by_number()
-    whole = gathered.rows, gathered.columns
-    ends = gathered.rows[-1:], gathered.columns[-1:]
-    wide = tuple(
-        np.append(edges[:-1:step], end) for edges, end, step in zip(whole, ends, gathered.stride, strict=True)
-    )
-    return {
-        mode: Pairs(
-            mode,
-            sums[mode],
-            counts[mode],
-            phases[mode],
-            numbers[mode],
-            *(wide if mode == "frame" else whole),
-        )
-        for mode in MODES
-    }
+def _cumulative(table: FloatArray, axes: int) -> FloatArray:
+    """Return sums along the first axes, from nothing on."""
+    found = np.pad(table, [(1, 0)] * axes + [(0, 0)] * (table.ndim - axes))
+    for axis in range(axes):
+        found = found.cumsum(axis=axis)
+    return found
 
 
 def _by_number(values: FloatArray) -> FloatArray:

@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.observe.observe import MINIMUM_BLOCKS, observe
+from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.region import Region, Span, When
 from pchem_pipeline.effects.framework.registry import effect_classes
 
-#: Of a part that is looked at by itself.
-FEWEST_PIXELS, FEWEST_FRAMES = 16, 64
 _SAME = 0.8  # of two regions together, that one and the same has in common as two looks tell it
 _LEADING = 2  # statistics of a signature that are looked at
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.observe.sums import MOST_HITS
+from pchem_pipeline.discrepancy.observe.tables import analog_width
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
 FloatArray = NDArray[np.float64]
@@ -24,7 +24,6 @@ IntArray = NDArray[np.int64]
 #: Sets of samples that :func:`rare_samples` gives at most.
 N_SETS = 4
 _BY_CHANCE = 1.0  # of the rarer samples, in the whole stack
-_SMALLEST_WIDTH = 0.1  # DN
 _REACH, _FURTHER = 12.0, 15  # electron numbers about H, in its root and beside that
 _CHUNK = 256  # samples
 _SEED = 1
@@ -101,7 +100,7 @@ def expected_beyond(hits: IntArray, maps: PixelMaps, n_frames: int, *, above: bo
     for begin in range(0, len(hits), _CHUNK):
         part = hits[begin : begin + _CHUNK]
         exposure, gain, bias, sigma = (m[part[:, 1], part[:, 2]][:, None] for m in maps.maps)
-        width = np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, _SMALLEST_WIDTH**2))
+        width = analog_width(sigma)
         reach = np.ceil(_REACH * np.sqrt(exposure)) + _FURTHER
         electrons = np.maximum(np.floor(exposure) - reach, 0.0) + np.arange(2 * int(reach.max()) + 1)
         probability = special.xlogy(electrons, exposure) - exposure - special.gammaln(electrons + 1.0)

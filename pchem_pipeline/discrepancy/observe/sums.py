@@ -16,11 +16,17 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import sums_numba as kernel
 from pchem_pipeline.discrepancy.observe import tables_numba as columns_of
+from pchem_pipeline.discrepancy.observe.sums_numba import FrameSums
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+#: What a sample is split into: k and r.
+CHANNELS = ("charge", "readout")
+#: Blocks whose means are compared, and frames whose course along time is looked at, at least.
+MINIMUM_BLOCKS, FEWEST_FRAMES = 4, 64
 MOST_HITS = 20_000
 _NO_CODE = np.iinfo(np.int64).max  # above all
 _CHUNK_SAMPLES = 1 << 16
@@ -60,45 +66,6 @@ class PixelStatistics:
     square: FloatArray
 
 
-@dataclass(frozen=True)
-class FrameSums:
-    """Sums over a split of n frames in b blocks.
-
-    Attributes:
-        rows: k of the left and the right half, r of the left and the right half of each row, (4, n, y).
-        columns: k and r of each column, (2, n, x).
-        gain: relative deviation of the gain of each frame, (n,).
-        blocks: sums of k and r in each block, (b, 2, y, x).
-        lags: mean products after removal of the frames' common modes: kk and rr at lags 1, 2, 3, then r with
-            the k before, k with the r before, (8, y, x).
-        row_noise: weighted sums of r^2 of each row, less their means, (n, y).
-        column_noise: the same of each column, (n, x).
-        n_pairs: number of products behind lags 1, 2, 3.
-        next_column, next_row: mean products kk, rr and rk + kr with the next column or row, (3, y, x).
-        repeated: positions of frames equal to the one before.
-        repeated_rows: number of rows (of other frames) equal to those before.
-        consecutive: number of frames that directly follow another.
-        hits: samples above the support of their pixel: frame position, y, x, DN, (n_hits, 4).
-        low_hits: the same below it.
-    """
-
-    rows: FloatArray
-    columns: NDArray[np.float32]
-    gain: FloatArray
-    blocks: FloatArray
-    lags: FloatArray
-    row_noise: FloatArray
-    column_noise: FloatArray
-    n_pairs: tuple[int, int, int]
-    next_column: FloatArray
-    next_row: FloatArray
-    repeated: IntArray
-    repeated_rows: int
-    consecutive: int
-    hits: IntArray
-    low_hits: IntArray
-
-
 def blocks_of(numbers: IntArray, block_frames: int) -> IntArray:
     """Return the positions where blocks begin, and the number of frames, (b + 1,); no block spans a gap."""
     breaks = np.concatenate([[0], np.flatnonzero(np.diff(numbers) != 1) + 1, [numbers.size]])
@@ -106,11 +73,10 @@ def blocks_of(numbers: IntArray, block_frames: int) -> IntArray:
     return np.concatenate([*starts, [numbers.size]]).astype(np.int64)
 
 
-def pixel_statistics(
-    laws: PixelLaws, exposure: FloatArray, gain: FloatArray, shape: tuple[int, int]
-) -> PixelStatistics:
+def pixel_statistics(laws: PixelLaws, maps: PixelMaps) -> PixelStatistics:
     """Collect the moments of the channels; pixels in which one of them is constant do not count."""
-    moments = laws.moments
+    moments, shape = laws.moments, maps.usable.shape
+    exposure, gain = maps.quanta_exposure.ravel(), maps.conversion_gain.ravel()
     kk, rr, kr = (moments[:, c] for c in (columns_of.MEAN_KK, columns_of.MEAN_RR, columns_of.MEAN_KR))
     usable = laws.good & (kk > 1e-12) & (rr > 1e-12)
 
@@ -139,54 +105,56 @@ def pixel_statistics(
     )  # fmt: skip
 
 
-def sum_frames(
-    frames: NDArray[Any], numbers: IntArray, edges: IntArray, laws: PixelLaws, pixels: PixelStatistics
-) -> FrameSums:
+def sum_frames(frames: NDArray[Any], edges: IntArray, laws: PixelLaws, pixels: PixelStatistics) -> FrameSums:
     """Sum over the frames (n, y, x) of a split whose blocks begin at ``edges``."""
     n, ny, nx = frames.shape
     size = max(1, min(n, _CHUNK_SAMPLES // (ny * nx)))
     charge, readout = np.zeros((2, kernel.LAGS + size, ny, nx), np.float32)
-    rows, columns, gain = np.zeros((4, n, ny)), np.zeros((n, 2, nx), np.float32), np.zeros(n)
-    blocks = np.zeros((edges.size - 1, 2, ny, nx))
-    lags, next_column, next_row = np.zeros((8, ny, nx)), np.zeros((3, ny, nx)), np.zeros((3, ny, nx))
-    row_noise, column_noise = np.zeros((n, ny)), np.zeros((n, nx), np.float32)
+    sums = FrameSums(
+        rows=np.zeros((4, n, ny)),
+        columns=np.zeros((2, n, nx), np.float32),
+        gain=np.zeros(n),
+        blocks=np.zeros((edges.size - 1, 2, ny, nx)),
+        lags=np.zeros((8, ny, nx)),
+        row_noise=np.zeros((n, ny)),
+        column_noise=np.zeros((n, nx), np.float32),
+        next_column=np.zeros((3, ny, nx)),
+        next_row=np.zeros((3, ny, nx)),
+    )
     channels = kernel.Channels(
-        support=_packed_support(laws, pixels.usable),
+        support=np.ascontiguousarray(code_ranges(laws, pixels.usable).transpose(1, 0, 2)),
         tables=laws.tables,
         modes=np.stack([pixels.exposure, pixels.usable]).astype(np.float32),
         weights=np.stack([pixels.factor, pixels.shift, pixels.square]).astype(np.float32),
         norms=np.array([pixels.exposure.sum(), pixels.usable.sum()], np.float64),
     )
-    for b, (first, last) in enumerate(pairwise(edges)):
-        block = kernel.BlockSums(
-            rows[:, first:last], columns[first:last], gain[first:last], blocks[b], lags,
-            next_column, next_row, row_noise[first:last], column_noise[first:last],
-        )  # fmt: skip
-        kernel.sum_block(frames[first:last], channels, charge, readout, block)
+    for number, (first, last) in enumerate(pairwise(edges.tolist())):
+        kernel.sum_block(frames, (number, first, last), channels, charge, readout, sums)
+    return sums._replace(
+        gain=(sums.gain - pixels.gain_offset) / max(pixels.gain_norm, 1e-300),
+        lags=sums.lags / np.maximum(pairs_at_lags(edges), 1)[:, None, None],
+        row_noise=sums.row_noise - sums.row_noise.mean(axis=0),
+        column_noise=sums.column_noise - sums.column_noise.mean(axis=0, dtype=np.float64),
+        next_column=sums.next_column / n,
+        next_row=sums.next_row / n,
+    )
+
+
+def pairs_at_lags(edges: IntArray) -> list[int]:
+    """Return how many pairs of frames of a block each of the products of `FrameSums.lags` is made of."""
     lengths = np.diff(edges)
-    pairs = [int(np.maximum(lengths - lag, 0).sum()) for lag in (1, 2, 3)]
-    lags /= np.maximum([*pairs, *pairs, pairs[0], pairs[0]], 1)[:, None, None]
-    consecutive = np.concatenate([[False], np.diff(numbers) == 1])
-    repeated = np.zeros(n, np.bool_)
-    repeated_rows = kernel.count_repeats(frames, consecutive, repeated)
-    gain = (gain - pixels.gain_offset) / max(pixels.gain_norm, 1e-300)
-    return FrameSums(
-        rows, columns.transpose(1, 0, 2), gain, blocks, lags,
-        row_noise - row_noise.mean(axis=0), column_noise - column_noise.mean(axis=0, dtype=np.float64),
-        (pairs[0], pairs[1], pairs[2]), next_column / n, next_row / n, np.flatnonzero(repeated),
-        int(repeated_rows), int(consecutive.sum()),
-        _hits(frames, laws, pixels.usable, above=True), _hits(frames, laws, pixels.usable, above=False),
-    )  # fmt: skip
+    return [int(np.maximum(lengths - lag, 0).sum()) for lag in (1, 2, 3, 1, 2, 3, 1, 1)]
 
 
-def _packed_support(laws: PixelLaws, usable: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Return first code, last code and first table row as (y, 3, x); row 0 (zeros) for unusable pixels."""
+def code_ranges(laws: PixelLaws, usable: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Return first code, last code and first row of the tables, (3, y, x); row 0 (zeros) where not usable."""
     first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T
-    packed = np.stack([first, first + length - 1, start]).reshape(3, *usable.shape)
-    return np.ascontiguousarray(packed.transpose(1, 0, 2), np.int32)
+    return np.stack([first, first + length - 1, start]).reshape(3, *usable.shape).astype(np.int32)
 
 
-def _hits(frames: NDArray[Any], laws: PixelLaws, usable: NDArray[np.bool_], *, above: bool) -> IntArray:
+def samples_beyond(
+    frames: NDArray[Any], laws: PixelLaws, usable: NDArray[np.bool_], *, above: bool
+) -> IntArray:
     """Return the samples above or below the support of their pixel, by frame: position, y, x, DN."""
     column = columns_of.SEEN_HIGH if above else columns_of.SEEN_LOW
     seen = (laws.moments[:, column] > 0).reshape(usable.shape) & usable

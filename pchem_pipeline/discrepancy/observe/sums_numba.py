@@ -40,30 +40,30 @@ class Channels(NamedTuple):
     norms: FloatArray
 
 
-class BlockSums(NamedTuple):
-    """Sums of a block of consecutive frames.
+class FrameSums(NamedTuple):
+    """Sums over a split of n frames in b blocks; as the loops leave them, and in brackets as they are used.
 
     Attributes:
-        rows: k left, k right, r left, r right of each row, (4, frame, y); to fill.
-        columns: k and r of each column, (frame, 2, x); to add to, as the following.
-        gain: weighted sums of r k and r, (frame,).
-        pixels: k and r of each pixel, (2, y, x).
-        lags: products kk and rr at lags 1 to 3, then r k(-1), k r(-1), (8, y, x).
-        next_column: products kk, rr, rk + kr with the next column, (3, y, x).
-        next_row: the same with the next row.
-        row_noise: r^2 of each row, (frame, y); to fill.
-        column_noise: of each column, (frame, x).
+        rows: k of the left and the right half, r of the left and the right half of each row, (4, n, y).
+        columns: k and r of each column, (2, n, x).
+        gain: weighted sums of r k and r of each frame (relative deviation of the gain), (n,).
+        blocks: sums of k and r in each block, (b, 2, y, x).
+        lags: products (their means) after removal of the frames' common modes: kk and rr at lags 1, 2, 3,
+            then r with the k before, k with the r before, (8, y, x).
+        row_noise: weighted sums of r^2 of each row (less their means), (n, y).
+        column_noise: the same of each column, (n, x).
+        next_column, next_row: products (their means) kk, rr, rk + kr with the next column or row, (3, y, x).
     """
 
     rows: FloatArray
     columns: Float32Array
     gain: FloatArray
-    pixels: FloatArray
+    blocks: FloatArray
     lags: FloatArray
+    row_noise: FloatArray
+    column_noise: NDArray[Any]
     next_column: FloatArray
     next_row: FloatArray
-    row_noise: FloatArray
-    column_noise: Float32Array
 
 
 @kernel
@@ -72,7 +72,7 @@ def _look_up(
     support: NDArray[np.int32],
     tables: Float32Array,
     y: int,
-    done: int,
+    at: int,
     size: int,
     charge: Float32Array,
     readout: Float32Array,
@@ -81,10 +81,10 @@ def _look_up(
     for j in range(size):
         for x in range(frames.shape[2]):
             first = support[y, 0, x]
-            code = min(max(np.int32(frames[done + j, y, x]), first), support[y, 1, x])
-            at = support[y, 2, x] + (code - first)
-            charge[LAGS + j, y, x] = tables[at, 0]
-            readout[LAGS + j, y, x] = tables[at, 1]
+            code = min(max(np.int32(frames[at + j, y, x]), first), support[y, 1, x])
+            row = support[y, 2, x] + (code - first)
+            charge[LAGS + j, y, x] = tables[row, 0]
+            readout[LAGS + j, y, x] = tables[row, 1]
 
 
 @kernel
@@ -122,14 +122,14 @@ def _sum_rows(
     readout: Float32Array,
     weights: Float32Array,
     y: int,
-    done: int,
+    at: int,
     size: int,
     rows: FloatArray,
     gain: FloatArray,
 ) -> None:
     half, nx = charge.shape[2] // 2, charge.shape[2]
     for j in range(size):
-        t = done + j
+        t = at + j
         left = _sum_half(charge, readout, weights, LAGS + j, y, 0, half)
         right = _sum_half(charge, readout, weights, LAGS + j, y, half, nx)
         rows[0, t, y], rows[1, t, y] = left[0], right[0]
@@ -139,12 +139,18 @@ def _sum_rows(
 
 @kernel
 def _add(
-    values: Float32Array, channel: int, y: int, done: int, size: int, columns: Float32Array, block: FloatArray
+    values: Float32Array,
+    channel: int,
+    y: int,
+    at: int,
+    size: int,
+    columns: Float32Array,
+    block: FloatArray,
 ) -> None:
     """Add the rows of a chunk to the sums of columns, frame by frame, and of pixels."""
     for j in range(size):
         for x in range(values.shape[2]):
-            columns[done + j, channel, x] += values[LAGS + j, y, x]
+            columns[channel, at + j, x] += values[LAGS + j, y, x]
     for j in range(size):
         for x in range(values.shape[2]):
             block[channel, y, x] += values[LAGS + j, y, x]
@@ -179,7 +185,7 @@ def _add_squares(
     readout: Float32Array,
     weight: Float32Array,
     y: int,
-    done: int,
+    at: int,
     size: int,
     rows: FloatArray,
     columns: Float32Array,
@@ -189,9 +195,9 @@ def _add_squares(
         total = np.float32(0.0)
         for x in range(readout.shape[2]):
             square = weight[y, x] * readout[LAGS + j, y, x] * readout[LAGS + j, y, x]
-            columns[done + j, x] += square
+            columns[at + j, x] += square
             total += square
-        rows[done + j, y] = total
+        rows[at + j, y] = total
 
 
 @kernel
@@ -220,33 +226,40 @@ def _keep_last(values: Float32Array, size: int) -> None:
 
 @kernel
 def sum_block(
-    frames: NDArray[Any], channels: Channels, charge: Float32Array, readout: Float32Array, sums: BlockSums
+    frames: NDArray[Any],
+    block: tuple[int, int, int],
+    channels: Channels,
+    charge: Float32Array,
+    readout: Float32Array,
+    sums: FrameSums,
 ) -> None:
     """Add one block of consecutive frames to the sums.
 
     Args:
         frames: codes (frame, y, x).
+        block: its number, its first frame, and the one behind its last.
         channels: of the pixels.
         charge: workspace (LAGS + frames in a chunk, y, x).
         readout: the same.
-        sums: to fill or to add to.
+        sums: to add to.
     """
-    n, ny, _ = frames.shape
+    number, begin, end = block
+    ny = frames.shape[1]
     chunk = charge.shape[0] - LAGS
-    done = 0
-    while done < n:
-        size = min(chunk, n - done)
+    at = begin
+    while at < end:
+        size, done = min(chunk, end - at), at - begin
         for y in range(ny):
-            _look_up(frames, channels.support, channels.tables, y, done, size, charge, readout)
-            _sum_rows(charge, readout, channels.weights, y, done, size, sums.rows, sums.gain)
-            _add(charge, 0, y, done, size, sums.columns, sums.pixels)
-            _add(readout, 1, y, done, size, sums.columns, sums.pixels)
-            _add_squares(readout, channels.weights[2], y, done, size, sums.row_noise, sums.column_noise)
+            _look_up(frames, channels.support, channels.tables, y, at, size, charge, readout)
+            _sum_rows(charge, readout, channels.weights, y, at, size, sums.rows, sums.gain)
+            _add(charge, 0, y, at, size, sums.columns, sums.blocks[number])
+            _add(readout, 1, y, at, size, sums.columns, sums.blocks[number])
+            _add_squares(readout, channels.weights[2], y, at, size, sums.row_noise, sums.column_noise)
         for j in range(size):
             common_k = common_r = 0.0
             for y in range(ny):
-                common_k += sums.rows[0, done + j, y] + sums.rows[1, done + j, y]
-                common_r += sums.rows[2, done + j, y] + sums.rows[3, done + j, y]
+                common_k += sums.rows[0, at + j, y] + sums.rows[1, at + j, y]
+                common_r += sums.rows[2, at + j, y] + sums.rows[3, at + j, y]
             _subtract(charge, channels.modes[0], np.float32(common_k / channels.norms[0]), LAGS + j)
             _subtract(readout, channels.modes[1], np.float32(common_r / channels.norms[1]), LAGS + j)
         for y in range(ny):
@@ -258,36 +271,9 @@ def sum_block(
             _add_neighbours(charge, readout, y, 0, 1, size, sums.next_column)
             if y < ny - 1:
                 _add_neighbours(charge, readout, y, 1, 0, size, sums.next_row)
-        done += size
+        at += size
         _keep_last(charge, size)
         _keep_last(readout, size)
-
-
-@kernel
-def count_repeats(frames: NDArray[Any], consecutive: NDArray[np.bool_], repeated: NDArray[np.bool_]) -> int:
-    """Mark frames equal to the one before, and return the number of such rows in the other frames.
-
-    Args:
-        frames: codes (frame, y, x).
-        consecutive: whether a frame directly follows the one before it in the stack, (frame,).
-        repeated: to fill, (frame,).
-    """
-    n, ny, nx = frames.shape
-    found = 0
-    for t in range(1, n):
-        if not consecutive[t]:
-            continue
-        rows = 0
-        for y in range(ny):
-            x = 0
-            while x < nx and frames[t, y, x] == frames[t - 1, y, x]:
-                x += 1
-            rows += x == nx
-        if rows == ny:
-            repeated[t] = True
-        else:
-            found += rows
-    return found
 
 
 @kernel

@@ -23,13 +23,14 @@ from pchem_pipeline.discrepancy.observe.law_numba import (
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Columns of ``moments``, see :func:`_channels` for the first eight and the last.
-N_MOMENTS = 23
-MODEL_STD_K, MODEL_STD_R, MEAN_KK, MEAN_RR, MEAN_KR, MEAN_KRR, MEAN_KKRR, OFFSET_K = range(8)
+#: Columns of ``moments``, see :func:`_channels` for the first eight.
+N_MOMENTS = 22
+MODEL_STD_K, MODEL_STD_R, MEAN_KK, MEAN_RR, MEAN_KR, MEAN_KRR, MEAN_KKRR, MEAN_RRRR = range(8)
 CHI2, CHI2_MEAN, CHI2_VARIANCE, EXPECTED_LOW, EXPECTED_HIGH, SEEN_LOW, SEEN_HIGH = range(8, 15)
 EXPECTED_FAR_LOW, EXPECTED_FAR_HIGH, SEEN_FAR_LOW, SEEN_FAR_HIGH = range(15, 19)
-PEAKS_CHI2, PEAKS_MEAN, PEAKS_VARIANCE, MEAN_RRRR = range(19, 23)
-_FOLD = 16
+PEAKS_CHI2, PEAKS_MEAN, PEAKS_VARIANCE = range(19, 22)
+#: Codes are summed by their number modulo this.
+FOLD = 16
 
 
 class Fitted(NamedTuple):
@@ -154,8 +155,7 @@ def _channels(
     """Fill ``out`` with moments of the two channels, and centre their tables.
 
     0, 1: standard deviations of k and r by the law. 2 .. 7 with the samples (those beyond the support count
-    as its ends), k and r centred: means of k^2, r^2, k r, k r^2, k^2 r^2, and the mean of k before centring.
-    Last: that of r^4.
+    as its ends), k and r centred: means of k^2, r^2, k r, k r^2, k^2 r^2, r^4.
     """
     last = mass.size - 1
     total = mean_k = mean_r = square_k = square_r = 0.0
@@ -185,8 +185,7 @@ def _channels(
         out[4] += c * k * r / n
         out[5] += c * k * r * r / n
         out[6] += c * k * k * r * r / n
-        out[MEAN_RRRR] += c * r * r * r * r / n
-    out[7] = mean_k
+        out[7] += c * r * r * r * r / n
 
 
 @kernel
@@ -206,13 +205,13 @@ def _code_sums(
     Only the lower triangles of the covariances are filled.
     """
     size, origin, coarse = seen.size, sums.first, sums.coarse
-    folded = np.zeros((N_NUISANCE, _FOLD))
+    folded = np.zeros((N_NUISANCE, FOLD))
     begin = (first - origin) // coarse
     n_bins = (first + size - 1 - origin) // coarse - begin + 1
     binned = np.zeros((N_NUISANCE, n_bins))
     for x in range(size):
         residual = seen[x] - expected[x]
-        at, modulo = first + x - origin, (first + x) % _FOLD
+        at, modulo = first + x - origin, (first + x) % FOLD
         b = at // coarse
         used = 0.0
         for i in range(N_NUISANCE):
@@ -229,7 +228,7 @@ def _code_sums(
         sums.bins[2, b] += expected[x]
         sums.bin_covariance[b, b] += expected[x] * shift[x] ** 2
     for i in range(N_NUISANCE):
-        for a in range(_FOLD):
+        for a in range(FOLD):
             value = n * folded[i, a]
             for b in range(a + 1):
                 sums.fold_covariance[a, b] -= value * folded[i, b]

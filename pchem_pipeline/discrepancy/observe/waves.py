@@ -9,7 +9,7 @@ exponential number of mean 1, and their means over frames likewise (Fisher 1929)
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,9 @@ from scipy import fft, ndimage
 
 from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
+from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.vector import SHORTEST_PERIODOGRAM
 from pchem_pipeline.effects.framework.evidence import PixelMaps, Wave
 
 Float32Array = NDArray[np.float32]
@@ -27,7 +29,6 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 _MOST_SAMPLES = 1 << 22
-_FEWEST_FRAMES, _FEWEST_LINES = 64, 8
 _RAISED = 5.0  # standard errors by which the noise at some frequency must exceed white noise, to be no line
 _ALL_OF_IT = 0.7  # of the amplitude of a wave at any phase, for one whose phase runs on
 _FALSE_ALARM = 0.02  # probability of any wave where there is none
@@ -76,7 +77,7 @@ def waves_across(
     samples = Samples.by_laws(Stack(frames[: numbers.size]), laws, maps)
     samples = samples if inside is None else samples.without(~inside)
     pixels = int(np.count_nonzero(samples.usable))
-    if numbers.size < _FEWEST_FRAMES or min(ny, nx) < _FEWEST_LINES or not pixels:
+    if numbers.size < FEWEST_FRAMES or min(ny, nx) < SHORTEST_PERIODOGRAM or not pixels:
         return Waves((), {})
     u = np.concatenate([chunk for (chunk,) in samples.chunks((1,))])
     mean, ratio = _spectrum(u, numbers, pixels)
@@ -84,7 +85,7 @@ def waves_across(
         "space.sample.readout.line": laws_of.largest_power(ratio, 1),
         "space.sample.readout.spectrum": laws_of.largest_power(mean, numbers.size),
     }
-    steady, loose = _steady(u, numbers, ratio, (ny, nx)), _loose(u, mean)
+    steady, loose = _steady(u, numbers, ratio), _loose(u, mean)
     if steady is not None and loose is not None and steady.amplitude > _ALL_OF_IT * loose.amplitude:
         loose = None
     return Waves(tuple(wave for wave in (steady, loose) if wave is not None), z)
@@ -138,72 +139,34 @@ def _levels(power: Float32Array) -> list[Float32Array]:
     ]
 
 
-def _steady(u: Float32Array, numbers: IntArray, ratio: Float32Array, shape: tuple[int, int]) -> Wave | None:
+def _steady(u: Float32Array, numbers: IntArray, ratio: Float32Array) -> Wave | None:
     """Return the wave whose phase runs on from frame to frame, if one stands out."""
     place = np.unravel_index(int(ratio.argmax()), ratio.shape)
     excess = float(ratio[place]) - float(np.log(ratio.size))
     if excess < -np.log(_FALSE_ALARM):
         return None
-    start = (int(place[0]) / ratio.shape[0], (int(place[1]) + 1) / shape[0], (int(place[2]) + 1) / shape[1])
-    width = (1.0 / ratio.shape[0], 1.0 / shape[0], 1.0 / shape[1])
-    return _steady_wave(u, numbers, start, width, excess)
+    sizes = ratio.shape[0], *u.shape[1:]
+    # spectra along rows and columns begin behind the mean
+    start = [(int(at) + (axis > 0)) / size for axis, (at, size) in enumerate(zip(place, sizes, strict=True))]
+    places = {"t": numbers, "y": np.arange(u.shape[1]), "x": np.arange(u.shape[2])}
+    cycles, sums = _climbed(u, places, start, sizes)
+    best = complex(sums[0])
+    amplitude = _waves_of_sine(cycles) * abs(best) / (_pixels(u) * len(u))
+    return Wave(amplitude, cycles["t"], cycles["y"], cycles["x"], float(np.angle(best) + np.pi / 2.0), excess)
 
 
 def _loose(u: Float32Array, mean: Float32Array) -> Wave | None:
     """Return the wave whose phase is new in every frame, if one stands out of the noise around it."""
     n, *shape = u.shape
     around = ndimage.median_filter(mean, _AROUND, mode="nearest")
-    y, x = (int(i) for i in np.unravel_index(int((mean / around).argmax()), mean.shape))
-    noise = float(around[y, x])
-    sigma = (float(mean[y, x]) / noise - 1.0) * n**0.5
+    place = np.unravel_index(int((mean / around).argmax()), mean.shape)
+    noise = float(around[place])
+    sigma = (float(mean[place]) / noise - 1.0) * n**0.5
     excess = sigma**2 / 2.0 - float(np.log(mean.size))
     if sigma < 0.0 or excess < -np.log(_FALSE_ALARM):
         return None
-    start, width = ((y + 1) / shape[0], (x + 1) / shape[1]), (1.0 / shape[0], 1.0 / shape[1])
-    return _loose_wave(u, start, width, noise, excess)
-
-
-def _steady_wave(
-    u: Float32Array,
-    numbers: IntArray,
-    start: tuple[float, float, float],
-    width: tuple[float, float, float],
-    excess: float,
-) -> Wave:
-    """Return the wave near a peak of the spectrum whose phase runs on from frame to frame.
-
-    Args:
-        u: standardised residuals (frame, y, x), 0 where there are none.
-        numbers: of the frames, (frame,).
-        start: cycles per frame, row and column of the peak.
-        width: of the peak, likewise.
-        excess: see :class:`Wave`.
-    """
-    places = {"t": numbers, "y": np.arange(u.shape[1]), "x": np.arange(u.shape[2])}
-    cycles, sums = _climbed(u, places, start, width)
-    best = complex(sums[0])
-    amplitude = _waves_of_sine(cycles) * abs(best) / (_pixels(u) * len(u))
-    return Wave(amplitude, cycles["t"], cycles["y"], cycles["x"], float(np.angle(best) + np.pi / 2.0), excess)
-
-
-def _loose_wave(
-    u: Float32Array,
-    start: tuple[float, float],
-    width: tuple[float, float],
-    noise: float,
-    excess: float,
-) -> Wave:
-    """Return the wave near a peak of the mean spectrum of frames, in each of which its phase is another one.
-
-    Args:
-        u: standardised residuals (frame, y, x), 0 where there are none.
-        start: cycles per row and column of the peak.
-        width: of the peak, likewise.
-        noise: power around the peak, 1 where it is white.
-        excess: see :class:`Wave`.
-    """
-    places = {"y": np.arange(u.shape[1]), "x": np.arange(u.shape[2])}
-    cycles, sums = _climbed(u, places, start, width)
+    start = [(int(at) + 1) / size for at, size in zip(place, shape, strict=True)]
+    cycles, sums = _climbed(u, {"y": np.arange(shape[0]), "x": np.arange(shape[1])}, start, shape)
     power = float(np.mean(np.abs(sums) ** 2)) - noise * _pixels(u)
     amplitude = _waves_of_sine(cycles) * max(power, 0.0) ** 0.5 / _pixels(u)
     return Wave(amplitude, None, cycles["y"], cycles["x"], 0.0, excess)
@@ -217,17 +180,18 @@ def _waves_of_sine(cycles: Mapping[str, float]) -> float:
 def _climbed(
     u: Float32Array,
     places: Mapping[str, IntArray],
-    start: tuple[float, ...],
-    width: tuple[float, ...],
+    start: Sequence[float],
+    sizes: Sequence[int],
 ) -> tuple[dict[str, float], NDArray[np.complexfloating]]:
     """Return the frequencies near a peak, each in turn by ever finer steps, and the sums of samples there.
 
-    There is a sum for each place along an axis that is not in ``places``.
+    There is a sum for each place along an axis that is not in ``places``; a peak is as wide as one over the
+    size of its axis.
     """
     kept = "".join(letter for letter in "tyx" if letter not in places)
     steps = np.linspace(-1.0, 1.0, _STEPS)
     cycles = dict(zip(places, start, strict=True))
-    size = {letter: _NARROWER * each for letter, each in zip(places, width, strict=True)}
+    size = {letter: _NARROWER / each for letter, each in zip(places, sizes, strict=True)}
     best: NDArray[np.complexfloating] = np.zeros(1, np.complex128)
     for _, letter in itertools.product(range(_ROUNDS), places):
         others = [each for each in places if each != letter]

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere
+
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
 
@@ -199,7 +201,7 @@ def graded(checks: list[Check], gain: float, read_noise: float, model: Sequence[
     shown = {name for effect in model for name in effect.signature}
     found = []
     for check in checks:
-        p_global = -math.expm1(len(checks) * math.log1p(-min(check.p, 1.0 - 1e-16)))
+        p_global = look_elsewhere(check.p, len(checks))
         in_dn = check.unit == "DN"
         done = replace(
             check,

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe.laws import extreme, poisson
-from pchem_pipeline.discrepancy.observe.tables import pixel_laws
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import CHI2, CodeSums
 from pchem_pipeline.discrepancy.observe.vector import width_statistics
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
-from pchem_pipeline.discrepancy.quick.series import normal_p, of_many
+from pchem_pipeline.discrepancy.quick.series import normal_p
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 
@@ -99,7 +100,7 @@ def _sums(sample: CodeSample) -> CodeSums | None:
         found = np.stack([fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
     usable: NDArray[np.bool_] = np.asarray(np.isfinite(found).all(axis=1))
     for _ in range(2):  # of all pixels, then without those that may be at a wrong maximum
-        laws = pixel_laws(counts, origin, np.zeros((usable.size, 2)), found, usable)
+        laws = pixel_laws(PixelHistograms.alone(counts, origin), found, usable)
         if not laws.good.any():
             return None
         ratio = laws.moments[:, CHI2] / np.maximum(laws.moments[:, CHI2 + 1], 1.0)
@@ -130,7 +131,7 @@ def _widths(codes: CodeSums) -> Check | None:
     weight = chance**-2 / np.sum(chance**-2)
     excess = float(weight @ (rough**2 - chance)) / 1.5
     error = math.sqrt(float(weight**2 @ (4.0 * chance**2))) / 1.5
-    p_any = min(_CAUTION * of_many(p[worst], len(p)), 1.0)
+    p_any = min(_CAUTION * look_elsewhere(p[worst], len(p)), 1.0)
     size, limit = math.sqrt(max(excess, 0.0)), math.sqrt(5.4 * error)
     return check_of("codes", p_any, size, limit=limit, where=_WORDS[worst].format(code=code))
 

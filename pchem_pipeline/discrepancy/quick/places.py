@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.observe.laws import chi_square
+from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
+from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
 from pchem_pipeline.discrepancy.quick.sums import StackSums
-from pchem_pipeline.discrepancy.scan import scan_map
+from pchem_pipeline.discrepancy.scan import Suspect, scan_map
 from pchem_pipeline.effects.framework.region import Region
 
 FloatArray = NDArray[np.float64]
@@ -19,33 +20,10 @@ BoolArray = NDArray[np.bool_]
 
 #: Cells along an edge of the maps that are scanned; of a larger sensor pixels are taken together.
 _CELLS = 128
-_CLIP = 6.0
 #: Pixels that are looked at together.
 _AT_ONCE = 1 << 17
-_FEWEST_BLOCKS = 4
 #: Axis along which the values of a map are of a pixel and the next one.
 _NEXT_ALONG = {"next_x": 1, "next_y": 0}
-
-
-@dataclass(frozen=True)
-class SensorPlace:
-    """A part of the sensor whose map stands out.
-
-    Attributes:
-        region: the place.
-        p: probability of such a place by chance, anywhere on the sensor.
-        inside, outside: mean of the map there and elsewhere, standard deviations of a pixel.
-    """
-
-    region: Region
-    p: float
-    inside: float
-    outside: float
-
-    @property
-    def only_there(self) -> bool:
-        """Whether little of it is elsewhere."""
-        return abs(self.outside) < 0.25 * abs(self.inside)
 
 
 def block_deviations(sums: StackSums) -> FloatArray:
@@ -88,7 +66,7 @@ class CellMap:
     def add(self, values: FloatArray, first: int = 0) -> None:
         """Add rows of the map from the row ``first`` on, (y, x)."""
         some = np.isfinite(values)
-        kept = np.where(some, np.clip(values, -_CLIP, _CLIP), 0.0)
+        kept = np.where(some, np.clip(values, -FAR, FAR), 0.0)
         at = np.searchsorted(self.rows, np.arange(first, first + values.shape[0]), side="right") - 1
         for total, part in ((self.sums, kept), (self.counts, some.astype(np.float64))):
             np.add.at(total, at, np.add.reduceat(part, self.columns[:-1], axis=1))
@@ -117,20 +95,23 @@ def sensor_cells(sums: StackSums) -> dict[str, CellMap]:
             found["lag"].add(sums.lag[band] / v[band] * root, first)
         found["next_x"].add(np.pad(next_x, ((0, 0), (0, 1)), constant_values=np.nan), first)
         found["next_y"].add(next_y, first)
-    if sums.lengths.size >= _FEWEST_BLOCKS:
+    if sums.lengths.size >= MINIMUM_BLOCKS:
         with np.errstate(divide="ignore", invalid="ignore"):
             chi2 = (sums.lengths[:, None, None] * block_deviations(sums) ** 2).sum(axis=0) / v
         found["spread"] = CellMap.of(chi_square(chi2, sums.lengths.size - 1.0))
     return found
 
 
-def sensor_place(name: str, cells: CellMap, significance: float) -> SensorPlace | None:
+def sensor_place(name: str, cells: CellMap, significance: float) -> Suspect | None:
     """Return the part of the sensor where a map stands out most; None where it is everywhere alike.
 
     Args:
         name: of the map, as :func:`sensor_cells` calls it.
         cells: the map.
         significance: largest probability of a chance.
+
+    Returns:
+        A place whose means are those of the map, standard deviations of a pixel.
     """
     usable = cells.counts > 0
     # standard normal as the pixels are
@@ -144,4 +125,5 @@ def sensor_place(name: str, cells: CellMap, significance: float) -> SensorPlace 
     if not (usable[inside].any() and usable[~inside].any()):
         return None
     means = [float(cells.sums[part].sum() / cells.counts[part].sum()) for part in (inside, ~inside)]
-    return SensorPlace(Region.of_mask(cells.mask(inside)), places[0].p, means[0], means[1])
+    region = Region.of_mask(cells.mask(inside))
+    return replace(places[0], region=region, inside=means[0], outside=means[1])

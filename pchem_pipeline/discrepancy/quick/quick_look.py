@@ -24,18 +24,16 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import chi_square, without_skew
+from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
 from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLook, check_of, graded
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.levels import levels_check
-from pchem_pipeline.discrepancy.quick.places import (
-    SensorPlace,
-    block_deviations,
-    sensor_cells,
-    sensor_place,
-)
-from pchem_pipeline.discrepancy.quick.series import normal_p, of_many, series_checks
+from pchem_pipeline.discrepancy.quick.places import block_deviations, sensor_cells, sensor_place
+from pchem_pipeline.discrepancy.quick.series import normal_p, series_checks
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
+from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, frame_words, odd_words
 from pchem_pipeline.model.maps.ordered import median_of
 
@@ -54,7 +52,6 @@ _LARGEST_SQUARE = 25.0
 #: Standard deviations from which on a check fails for sure (19 of 20), with a dozen checks.
 _SURE = 5.4
 _FEWEST_LINES = 4
-_FEWEST_BLOCKS = 4
 _SHOWN = 6
 
 
@@ -133,7 +130,7 @@ def _wave(sums: StackSums) -> list[Check]:
     cycles = (f"{line[f'cycles_per_{of}']:+.3g} cycles per {of}" for of in ("column", "row"))
     # of so many means of exponential numbers the largest
     sure = (math.sqrt(2.0 * math.log(cells)) + 3.0) / math.sqrt(frames)
-    p = of_many(float(special.gammaincc(frames, frames * line["ratio"])), cells)
+    p = look_elsewhere(float(special.gammaincc(frames, frames * line["ratio"])), cells)
     limit, where = line["unit"] * math.sqrt(sure), ", ".join(cycles)
     return [check_of("wave", p, line["size"], limit=limit, where=where)]
 
@@ -152,12 +149,16 @@ class _Estimate:
 
     @property
     def z(self) -> float:
-        """Normal quantile: a sum of squares of so many degrees of freedom."""
-        deviation = self.value / self.error * math.sqrt(2.0 * self.freedom)
-        return float(chi_square(max(self.freedom + deviation, 0.0), self.freedom))
+        """Normal quantile of the deviation from 0."""
+        return float(_normal(np.array(self.value / self.error), self.freedom))
 
 
 _NOTHING = _Estimate(0.0, math.inf, 1.0)
+
+
+def _normal(z: FloatArray, freedom: float) -> FloatArray:
+    """Return normal quantiles of standardised sums of squares of so many degrees of freedom."""
+    return chi_square(np.maximum(freedom + z * math.sqrt(2.0 * freedom), 0.0), freedom)
 
 
 def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
@@ -171,10 +172,9 @@ def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
         checks.append(_noise_check("row_noise", rows.less(shared), sums.rows))
     if math.isfinite(columns.error):
         checks.append(_noise_check("column_noise", columns.less(shared), sums.columns, sums.shape[1]))
-    third = _third_moment(maps)
     checks += series_checks(_frame_means(sums))
     common = _Common(frame, rows, columns, sums)
-    checks += [*_lag_check(sums, common), *_neighbour_checks(sums, common), *_wandering(sums, maps, third)]
+    checks += [*_lag_check(sums, common), *_neighbour_checks(sums, common), *_wandering(sums, maps)]
     return _located(checks, sums)
 
 
@@ -221,11 +221,11 @@ def _told_once(checks: list[Check], noise: str, neighbours: str) -> list[Check]:
     ]
 
 
-def _placed(check: Check, place: SensorPlace, sums: StackSums) -> Check:
+def _placed(check: Check, place: Suspect, sums: StackSums) -> Check:
     """Return a check with its place; noise of lines has the size that it has there."""
     p, size = check.p, check.size
     if check.name in _LOCAL:
-        p = of_many(min(check.p, place.p), 2.0)
+        p = look_elsewhere(min(check.p, place.p), 2.0)
     if check.name in ("row_noise", "column_noise") and place.only_there:
         shared = sums.next_x if check.name == "row_noise" else sums.next_y
         inside = place.region.mask(sums.shape)
@@ -235,7 +235,7 @@ def _placed(check: Check, place: SensorPlace, sums: StackSums) -> Check:
     return replace(check, p=p, size=size, where=check.where or words, region=numbers)
 
 
-def _local_drift(sums: StackSums, place: SensorPlace | None) -> Check:
+def _local_drift(sums: StackSums, place: Suspect | None) -> Check:
     """Return whether a part of the sensor moves along the run, and the rest does not."""
     if place is None:
         return check_of("local_drift", 1.0, 0.0)
@@ -252,19 +252,24 @@ def _local_drift(sums: StackSums, place: SensorPlace | None) -> Check:
 
 def _of_lines(lines: Lines) -> _Estimate:
     """Return the mean covariance of the pixels of a line, a few odd lines not counted in full."""
-    value, error = lines.covariance
-    some = np.isfinite(error) & (lines.n_pairs > 0)
-    if some.sum() < _FEWEST_LINES:
+    some, z, centre, spread = _deviations(lines)
+    if some.size < _FEWEST_LINES:
         return _NOTHING
-    value, error = value[some], error[some]
-    z = value / error
-    centre = float(np.median(z))
-    reach = _CLIP * max(1.0, 1.4826 * float(np.median(np.abs(z - centre))))
-    value = np.clip(z, centre - reach, centre + reach) * error
+    error = lines.covariance[1][some]
+    value = np.clip(z, centre - _CLIP * spread, centre + _CLIP * spread) * error
     weight = error**-2
     total = float(weight.sum())
     effective = total**2 / float((weight**2).sum())
     return _Estimate(float(weight @ value) / total, total**-0.5, effective * lines.freedom)
+
+
+def _deviations(lines: Lines) -> tuple[NDArray[np.int64], FloatArray, float, float]:
+    """Return the lines with a covariance, it in standard errors, and the middle and spread of these."""
+    value, error = lines.covariance
+    some = np.flatnonzero(np.isfinite(error) & (lines.n_pairs > 0))
+    z = value[some] / error[some]
+    centre = float(np.median(z)) if some.size else 0.0
+    return some, z, centre, max(1.0, robust_sd(z, centre)) if some.size else 1.0
 
 
 def _quiet(sums: StackSums) -> NDArray[np.bool_]:
@@ -295,9 +300,8 @@ def _frame_covariance(sums: StackSums) -> tuple[_Estimate, _Estimate]:
     down = sums.next_y[quiet]
     neighbours = along * float(np.mean(down[np.isfinite(down)])) if np.isfinite(down).any() else 0.0
     pairs_all = pairs * nx
-    in_columns = columns.value if math.isfinite(columns.error) else 0.0
     others = pairs_all - pairs
-    estimate = (value - neighbours - (pairs - along) * in_columns) / others
+    estimate = (value - neighbours - (pairs - along) * _first_known(columns)) / others
     error = chance / others
     if math.isfinite(columns.error):
         error = math.hypot(error, pairs / others * columns.error)
@@ -309,22 +313,17 @@ def _noise_check(name: str, found: _Estimate, lines: Lines | None = None, width:
     p, where = normal_p(found.z), ""
     if lines is not None:
         single, where = _single_lines(lines, name.removesuffix("_noise"), width)
-        p = of_many(min(p, single), 2.0)
+        p = look_elsewhere(min(p, single), 2.0)
     size, limit = math.sqrt(max(found.value, 0.0)), math.sqrt(_SURE * found.error)
     return check_of(name, p, size, limit=limit, where=where)
 
 
 def _single_lines(lines: Lines, line: str, width: int) -> tuple[float, str]:
     """Return the probability of the line that stands out most, and those that stand out in words."""
-    value, error = lines.covariance
-    some = np.flatnonzero(np.isfinite(error) & (lines.n_pairs > 0))
+    some, z, centre, spread = _deviations(lines)
     if some.size < _FEWEST_LINES:
         return 1.0, ""
-    z = value[some] / error[some]
-    centre = float(np.median(z))
-    spread = max(1.0, 1.4826 * float(np.median(np.abs(z - centre))))
-    freedom = lines.freedom
-    normal = chi_square(np.maximum(freedom + (z - centre) / spread * np.sqrt(2.0 * freedom), 0.0), freedom)
+    normal = _normal((z - centre) / spread, lines.freedom)
     p = special.ndtr(-normal)
     out = some[p < 1e-3 / p.size]
     if width:
@@ -332,16 +331,7 @@ def _single_lines(lines: Lines, line: str, width: int) -> tuple[float, str]:
     shown = ", ".join(str(i) for i in out[:_SHOWN])
     more = f" and {out.size - _SHOWN} more" if out.size > _SHOWN else ""
     words = f"mainly in {line}{'s' if out.size > 1 else ''} {shown}{more}" if out.size else ""
-    return of_many(float(p.min()), p.size), words
-
-
-def _third_moment(maps: PixelMaps) -> FloatArray:
-    """Return the third central moment of each pixel's samples, H / g^3, 0 where it is not known, DN^3."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        third = maps.conversion_gain**3
-        np.divide(maps.quanta_exposure, third, out=third)
-    third[~maps.usable] = 0.0
-    return third
+    return look_elsewhere(float(p.min()), p.size), words
 
 
 def _frame_means(sums: StackSums) -> FloatArray:
@@ -364,16 +354,13 @@ class _Common:
     columns: _Estimate
     sums: StackSums
 
-    def _value(self, which: _Estimate) -> float:
-        return which.value if math.isfinite(which.error) else 0.0
-
     def of_row(self) -> float:
         """Covariance of pixels of a row, DN^2."""
-        return self._value(self.rows if math.isfinite(self.rows.error) else self.frame)
+        return _first_known(self.rows, self.frame)
 
     def of_column(self) -> float:
         """Covariance of pixels of a column, DN^2."""
-        return self._value(self.columns if math.isfinite(self.columns.error) else self.frame)
+        return _first_known(self.columns, self.frame)
 
     @cached_property
     def inflation(self) -> float:
@@ -381,9 +368,14 @@ class _Common:
         ny, nx = self.sums.shape
         variance = self.sums.variance
         typical = median_of(variance, ~(variance > 0))
-        frame = self._value(self.frame)
+        frame = _first_known(self.frame)
         row, column = self.of_row() - frame, self.of_column() - frame
         return 1.0 + (ny * nx * frame**2 + nx * row**2 + ny * column**2) / typical**2
+
+
+def _first_known(*estimates: _Estimate) -> float:
+    """Return the value of the first estimate that there is, else 0."""
+    return next((each.value for each in estimates if math.isfinite(each.error)), 0.0)
 
 
 def _resemblance(
@@ -447,22 +439,24 @@ def _neighbour_checks(sums: StackSums, common: _Common) -> list[Check]:
     return found
 
 
-def _wandering(sums: StackSums, maps: PixelMaps, third: FloatArray) -> list[Check]:
+def _wandering(sums: StackSums, maps: PixelMaps) -> list[Check]:
     """Return whether pixels change their level along the run, less what all pixels do."""
     lengths = sums.lengths
-    if lengths.size < _FEWEST_BLOCKS:
+    if lengths.size < MINIMUM_BLOCKS:
         return []
     means = sums.block_sum / lengths[:, None, None]
     means -= np.average(means, axis=0, weights=lengths)
     some = sums.variance > 0
     with np.errstate(divide="ignore", invalid="ignore"):
         charge = np.where(maps.usable, maps.quanta_exposure / maps.conversion_gain, 0.0)[some]
+        # the third central moment of the samples, H / g^3
+        third = np.where(maps.usable, maps.quanta_exposure / maps.conversion_gain**3, 0.0)[some]
     weight = 1.0 / sums.variance[some]
     values = means[:, some]
     basis = np.stack([np.ones(charge.size), charge])
     inner = (basis * weight) @ basis.T
     shared = np.linalg.lstsq(inner, (basis * weight) @ values.T, rcond=None)[0]
-    skewness = third[some] * weight**1.5
+    skewness = third * weight**1.5
     chi2 = np.zeros(charge.size)
     for n, mean, common in zip(lengths.tolist(), values, shared.T @ basis, strict=True):
         # block by block: each is as large as a map; the mean of few samples is as skewed as they are
@@ -472,5 +466,5 @@ def _wandering(sums: StackSums, maps: PixelMaps, third: FloatArray) -> list[Chec
     places = np.argwhere(some)[out[np.argsort(-chi2[out])][:3]]
     shown = ", ".join(f"({y}, {x})" for y, x in places)
     where = f"{out.size:,} pixels, mainly (y, x) {shown}" if out.size else ""
-    p_any, share = of_many(float(p.min()), p.size), out.size / p.size
+    p_any, share = look_elsewhere(float(p.min()), p.size), out.size / p.size
     return [check_of("wandering_pixels", p_any, share, limit=2.0 / p.size, where=where)]

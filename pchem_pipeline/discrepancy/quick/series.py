@@ -8,26 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.observe.laws import best, chi_square
+from pchem_pipeline.discrepancy.observe.laws import FAR, SLOWEST, best, chi_square
+from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 
 FloatArray = NDArray[np.float64]
 
-_SLOWEST = (2, 4, 8, 16, 32)
-_FEWEST_FRAMES = 64
 #: Frequencies on either side from which the noise around one is taken.
 _AROUND = 64
-_CLIP = 6.0
 
 
 def normal_p(z: float, *, two_sided: bool = False) -> float:
     """Return the probability that a normal deviate is larger (or larger in magnitude)."""
     return float(2.0 * special.ndtr(-abs(z)) if two_sided else special.ndtr(-z))
-
-
-def of_many(p: float, n: float) -> float:
-    """Return the probability that the smallest of n independent p-values is this small (Sidak)."""
-    return float(-np.expm1(n * np.log1p(-min(max(p, 0.0), 1.0 - 1e-16))))
 
 
 def series_checks(mean: FloatArray) -> list[Check]:
@@ -36,11 +30,11 @@ def series_checks(mean: FloatArray) -> list[Check]:
     White frame noise passes all of them.
     """
     n = mean.size
-    if n < _FEWEST_FRAMES:
+    if n < FEWEST_FRAMES:
         return []
     centre = float(np.median(mean))
-    spread = max(1.4826 * float(np.median(np.abs(mean - centre))), 1e-300)
-    series = np.clip(mean - centre, -_CLIP * spread, _CLIP * spread)
+    spread = max(robust_sd(mean, centre), 1e-300)
+    series = np.clip(mean - centre, -FAR * spread, FAR * spread)
     series -= series.mean()
     # of frames two apart: neither a drift nor a difference of even and odd frames adds to it
     noise = float(np.mean((series[2:] - series[:-2]) ** 2)) / 2.0
@@ -54,7 +48,7 @@ def series_checks(mean: FloatArray) -> list[Check]:
 def _drift(series: FloatArray, noise: float) -> tuple[FloatArray, Check]:
     """Compute the slow part of a series and test it (Neyman's smooth test, adaptive: Fan 1996)."""
     n = series.size
-    cuts = [k for k in _SLOWEST if k <= n // 16]
+    cuts = [k for k in SLOWEST if k <= n // 16]
     time = np.pi * (np.arange(n) + 0.5) / n
     waves = np.sqrt(2.0 / n) * np.cos(np.arange(1, cuts[-1] + 1)[:, None] * time)
     heights = waves @ series
@@ -85,7 +79,7 @@ def _period(series: FloatArray) -> Check:
     height = max(float(near.sum()) - near.size * float(around[at]), 0.0)
     words = f"period {n / (at + 1):.4g} frames" if freedom[at] == 2.0 else "even and odd frames differ"
     size = math.sqrt(freedom[at] * height) / n
-    return check_of("period", of_many(float(p[at]), power.size), size, where=words)
+    return check_of("period", look_elsewhere(float(p[at]), power.size), size, where=words)
 
 
 def _around(power: FloatArray) -> tuple[FloatArray, FloatArray]:

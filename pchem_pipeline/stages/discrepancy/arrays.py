@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import error_words
+from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.sums import CHANNELS
 from pchem_pipeline.discrepancy.where import PAIRS, pixel_maps
 from pchem_pipeline.effects.framework.evidence import SCORES
-from pchem_pipeline.model.arithmetic.robust import chi_square
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.context import EffectContext
@@ -34,6 +35,8 @@ _log = logging.getLogger(__name__)
 _SHOWN_FRAMES = 96
 #: Rows of the sensor, and frames at a time, from which the path of a named effect is computed.
 _PATH_ROWS, _PATH_FRAMES = 4, 256
+#: Maps that effects are given.
+_TRUTH = ("quanta_exposure", "conversion_gain", "bias", "analog_read_noise_e")
 
 
 def evidence_arrays(
@@ -101,13 +104,12 @@ def _time_arrays(evidence: Evidence, time: TimeSeries) -> dict[str, NDArray[Any]
         "frame_charge": np.asarray(time.frame_charge, dtype=np.float64),
         "frame_readout": np.asarray(time.frame_readout, dtype=np.float64),
         "frame_sd": np.where(np.isfinite(frame_sd), frame_sd, np.nan),
-        "lag1": _single(np.stack([time.lag_charge[0], time.lag_readout[0]]) * np.sqrt(time.n_pairs)),
-        "block_spread": _block_spread(evidence, time),
     }
     if time.frame_noise is not None:
         found["frame_noise"] = np.asarray(time.frame_noise, dtype=np.float64)
     maps = pixel_maps(evidence)
-    found["trend"] = _single(np.stack([maps["trend.charge"], maps["trend.readout"]]))
+    for name, short in (("lag1", "lag"), ("block_spread", "spread"), ("trend", "trend")):
+        found[name] = _single(np.stack([maps[f"{short}.{channel}"] for channel in CHANNELS]))
     if time.neighbour_maps:
         nothing = np.full(usable.shape, np.nan)
         found["neighbour"] = _single(np.stack([maps.get(name, nothing) for name in PAIRS]))
@@ -121,23 +123,6 @@ def _time_arrays(evidence: Evidence, time: TimeSeries) -> dict[str, NDArray[Any]
         found[f"{line}_rms"] = np.sqrt(np.mean(scaled.astype(np.float64) ** 2, axis=1))
         found[f"{line}_image"] = _single(scaled[:, :_SHOWN_FRAMES])
     return found
-
-
-def _block_spread(evidence: Evidence, time: TimeSeries) -> NDArray[np.float32]:
-    """Return the scatter of each pixel's block means as a normal quantile (Wilson and Hilferty 1931)."""
-    frames = np.diff(np.append(np.searchsorted(time.frames, time.block_start), time.frames.size))
-    weight = frames[:, None, None].astype(np.float64)
-    dof = max(frames.size - 1, 1)
-    found = []
-    for means, std in (
-        (time.block_charge, evidence.charge_std),
-        (time.block_readout, evidence.readout_std),
-    ):
-        centre = (weight * means).sum(axis=0) / max(float(frames.sum()), 1.0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            quantile = chi_square((weight * (means - centre) ** 2).sum(axis=0) / std**2, dof)
-        found.append(np.where(np.isfinite(quantile), quantile, np.nan))
-    return _single(np.stack(found))
 
 
 def path_arrays(
@@ -203,7 +188,8 @@ def _path(
 
     ny, nx = evidence.maps.usable.shape
     rows = np.unique(np.linspace(0, ny - 1, _PATH_ROWS).astype(np.int64))
-    truth = _filled(evidence, rows)
+    whole = truth_of(evidence.maps)
+    truth = {name: getattr(whole, name)[rows] for name in _TRUTH}
     parts = []
     for start in range(0, time.frames.size, _PATH_FRAMES):
         frames = np.asarray(time.frames[start : start + _PATH_FRAMES], dtype=np.int64)
@@ -219,21 +205,6 @@ def _path(
         )
         parts.append(_moved(effect, context))
     return np.concatenate(parts, axis=1)
-
-
-def _filled(evidence: Evidence, rows: NDArray[np.int64]) -> dict[str, FloatArray]:
-    """Return the fitted maps of some rows under the names of a truth, pixels without a fit filled in."""
-    maps = evidence.maps
-    found = {
-        "quanta_exposure": maps.quanta_exposure,
-        "conversion_gain": maps.conversion_gain,
-        "bias": maps.bias,
-        "analog_read_noise_e": maps.read_noise_dn * maps.conversion_gain,
-    }
-    return {
-        name: np.where(maps.usable, values, np.median(values[maps.usable]))[rows]
-        for name, values in found.items()
-    }
 
 
 def _moved(effect: Effect, context: EffectContext) -> FloatArray:

@@ -33,10 +33,10 @@ from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
-from pchem_pipeline.stages.discrepancy.clear import fewer_samples
 from pchem_pipeline.stages.discrepancy.survey import Survey, mean_codes, survey
 from pchem_pipeline.stages.discrepancy.window import (
     Window,
+    fewer_samples,
     other_window,
     read_window,
     within_memory,

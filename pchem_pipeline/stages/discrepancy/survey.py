@@ -21,11 +21,13 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.compute.memory import resident_bytes
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
-from pchem_pipeline.discrepancy.observe.pairs import CHANNELS, Samples, pairs_bytes
-from pchem_pipeline.discrepancy.observe.tables import pixel_laws
+from pchem_pipeline.discrepancy.observe.pairs import Samples, pairs_bytes
+from pchem_pipeline.discrepancy.observe.sums import CHANNELS
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
-from pchem_pipeline.discrepancy.quick.places import CellMap, SensorPlace, sensor_cells, sensor_place
+from pchem_pipeline.discrepancy.quick.places import CellMap, sensor_cells, sensor_place
+from pchem_pipeline.discrepancy.scan import SIGNIFICANCE, Suspect
 from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
 from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
 from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
@@ -45,9 +47,7 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Probability of a chance, in any map of a kind, below which a place decides where the window lies.
-_SIGNIFICANCE = 1e-3
-#: The same of shapes: they rest on fits, whose errors are not quite normal.
+#: Probability of a chance in any map of shapes: they rest on fits, whose errors are not quite normal.
 _SIGNIFICANCE_OF_SHAPES = 1e-6
 #: Codes of the tables of a band at most, and rows at least.
 _MOST_CODES, _FEWEST_ROWS = 1 << 26, 8
@@ -60,6 +60,7 @@ _MOST_AT_ONCE = 1 << 22
 #: Samples whose pairs are summed at most: some five minutes.
 _MOST_SAMPLES = 1 << 31
 _BLOCK = 64  # frames that are read at a time where not all are
+_WRITTEN = ("p", "inside", "outside")  # of a place, beside its region
 _FEWEST_SAMPLES = 50  # of a histogram that is compared with its law
 
 SUMS, SHAPES, PAIRS = (
@@ -79,7 +80,7 @@ class Survey:
         left_out: frames that are empty or far from the others: nothing is said of them.
     """
 
-    places: Mapping[str, SensorPlace] = field(default_factory=dict)
+    places: Mapping[str, Suspect] = field(default_factory=dict)
     shares: Mapping[str, float] = field(default_factory=dict)
     left_out: tuple[int, ...] = ()
 
@@ -92,16 +93,24 @@ class Survey:
     def numbers(self) -> dict[str, Any]:
         """Return it as JSON data, of which :meth:`of_numbers` makes it again."""
         places = {
-            name: {**vars(place), "region": place.region.numbers()} for name, place in self.places.items()
+            name: {"region": each.region.numbers()} | {key: getattr(each, key) for key in _WRITTEN}
+            for name, each in self.places.items()
         }
         return {"places": places, "shares": dict(self.shares), "left_out": list(self.left_out)}
 
     @classmethod
     def of_numbers(cls, numbers: Mapping[str, Any]) -> Survey:
-        """Return it as :meth:`numbers` gave it."""
+        """Return it as :meth:`numbers` gave it, its places without family and z."""
         places = {
-            name: SensorPlace(**{**place, "region": Region.model_validate(place["region"])})
-            for name, place in numbers["places"].items()
+            name: Suspect(
+                family="",
+                z=math.nan,
+                log_p=math.log(each["p"]),
+                inside=each["inside"],
+                outside=each["outside"],
+                region=Region.model_validate(each["region"]),
+            )
+            for name, each in numbers["places"].items()
         }
         return cls(places, numbers["shares"], tuple(numbers.get("left_out", ())))
 
@@ -156,7 +165,7 @@ def _complete(context: StageContext, stage: str) -> bool:
     return record is not None and len(context.tiles_done(stage)) >= record.keys
 
 
-def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, SensorPlace] | None:
+def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, Suspect] | None:
     """Return where the sums of the stage histogram stand out; None where there are none of this sensor.
 
     Args:
@@ -165,10 +174,10 @@ def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, 
     """
     if sums is None or sums.shape != shape or sums.freedom <= 0:
         return None
-    return _places(sensor_cells(sums), _SIGNIFICANCE)
+    return _places(sensor_cells(sums), SIGNIFICANCE)
 
 
-def _places(maps: Mapping[str, CellMap], significance: float) -> dict[str, SensorPlace]:
+def _places(maps: Mapping[str, CellMap], significance: float) -> dict[str, Suspect]:
     found = {name: sensor_place(name, cells, significance / len(maps)) for name, cells in maps.items()}
     return {name: place for name, place in found.items() if place is not None}
 
@@ -180,7 +189,7 @@ def places_of_bands(
     plain: bool = True,
     memory: int | None = None,
     left_out: IntArray | tuple[int, ...] = (),
-) -> tuple[dict[str, SensorPlace], dict[str, float]]:
+) -> tuple[dict[str, Suspect], dict[str, float]]:
     """Return where histograms and pairs of pixels stand out, and the share of the samples looked at.
 
     Args:
@@ -198,7 +207,7 @@ def places_of_bands(
     bands = [(first, min(first + rows, ny)) for first in range(0, ny, rows)]
     numbers = np.setdiff1d(_spread_frames(n, _MOST_SAMPLES // (ny * nx)), left_out)
     maps = {name: CellMap.empty((ny, nx)) for name in (*(f"score.{s}" for s in SCORES), "goodness")}
-    places: dict[str, SensorPlace] = {}
+    places: dict[str, Suspect] = {}
     for first, last in bands:
         fitted, laws = _laws(store, (first, last))
         for name, values in _shapes(laws, fitted.usable.shape).items():
@@ -208,16 +217,17 @@ def places_of_bands(
         samples = Samples.by_laws(_Band(source, (first, last), numbers), laws, fitted)
         samples = replace(samples, most=at_once)
         del laws
-        for each in scan_pairs(samples, significance=_SIGNIFICANCE / len(bands), most=1):
+        for each in scan_pairs(samples, significance=SIGNIFICANCE / len(bands), most=1):
             name = f"pairs.{each.mode}.{CHANNELS[each.channel]}"
             mask = np.zeros((ny, nx), np.bool_)
-            mask[first:last] = each.place.region.mask((last - first, nx))
+            mask[first:last] = each.region.mask((last - first, nx))
             root = math.sqrt(numbers.size)
-            place = SensorPlace(
-                Region.of_mask(mask),
-                min(1.0, each.place.p * len(bands)),
-                each.place.inside * root,
-                each.place.outside * root,
+            place = replace(
+                each,
+                region=Region.of_mask(mask),
+                log_p=min(0.0, each.log_p + math.log(len(bands))),
+                inside=each.inside * root,
+                outside=each.outside * root,
             )
             if name not in places or place.p < places[name].p:
                 places[name] = place
@@ -289,9 +299,11 @@ def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]
     usable &= counts.sum(axis=2) >= np.maximum(_FEWEST_SAMPLES, 100.0 * sum(outside))
     maps = PixelMaps(values[0], values[1], values[2], values[3], usable)
     laws = pixel_laws(
-        counts.reshape(-1, counts.shape[2]),
-        store.read("histogram/origin", part).ravel().astype(np.int64),
-        np.stack([each.ravel() for each in outside], axis=1).astype(np.float64),
+        PixelHistograms(
+            counts.reshape(-1, counts.shape[2]),
+            store.read("histogram/origin", part).ravel().astype(np.int64),
+            np.stack([each.ravel() for each in outside], axis=1).astype(np.float64),
+        ),
         np.stack([each.ravel() for each in values], axis=1),
         usable.ravel(),
     )

@@ -1,4 +1,7 @@
-"""Which part of a stack is looked at closely: where the summaries of all its samples disagree most."""
+"""Which part of a stack is looked at closely: where the summaries of all its samples disagree most.
+
+Where they disagree clearly few samples are enough to tell what makes it.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,21 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.discrepancy.quick.places import SensorPlace
+from pchem_pipeline.base.errors import ConfigError, PchEmError
+from pchem_pipeline.discrepancy.null import free_of_parameters
+from pchem_pipeline.discrepancy.observe.observe import observe
+from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
+
+if TYPE_CHECKING:
+    from pchem_pipeline.stages.discrepancy.survey import Survey
 
 # frames tell more than pixels about what happens in time; pixels more about what is rare
 _FRAMES_WANTED = 6000
@@ -26,6 +35,15 @@ _TRIED = 64
 _PROGRAM_BYTES, _SAMPLE_BYTES, _PIXEL_BYTES, _CODE_BYTES = 290 << 20, 8, 12 << 10, 75
 #: Pixels that a window has at least, and the steps in which it is made smaller.
 _FEWEST_PIXELS, _SMALLER = 256, 0.9
+#: Standard deviations of the largest statistic. Some poor sensors have as many without any effect (of 60 of
+#: all kinds none more than 20), as without simulations their statistics are not quite standard normal: of
+#: these less is compared, with simulations that tell.
+_CLEAR = 15.0
+#: Replicates that are enough where much is wrong, of the plain model and of one with effects.
+_REPLICATES, _EXTENDED = 24, 12
+#: Share of the pixels whose bias may be off by an electron, from which on only those statistics count that do
+#: not rest on the pixels' parameters.
+_DOUBTFUL = 0.1
 
 
 @dataclass(frozen=True)
@@ -55,7 +73,7 @@ def choose_window(
     shape: tuple[int, int, int],
     settings: DiscrepancySettings,
     roi: Sequence[int] | None = None,
-    places: Mapping[str, SensorPlace] | None = None,
+    places: Mapping[str, Suspect] | None = None,
     left_out: Sequence[int] = (),
 ) -> Window:
     """Return what to look at: everything if small enough, else a window and blocks over the whole run.
@@ -160,7 +178,7 @@ def within_memory(
     return settings
 
 
-def _worst(places: Mapping[str, SensorPlace], shape: tuple[int, int]) -> NDArray[np.bool_] | None:
+def _worst(places: Mapping[str, Suspect], shape: tuple[int, int]) -> NDArray[np.bool_] | None:
     """Return the most significant place as a mask, (y, x)."""
     if not places:
         return None
@@ -226,3 +244,59 @@ def frame_blocks(
         with FrameStream(source, [rows], size, frames=frames) as stream:
             for first, (block,) in stream:
                 yield int(part[0]) + first - frames[0], block
+
+
+def fewer_samples(
+    source: FrameSource,
+    settings: DiscrepancySettings,
+    roi: Sequence[int] | None,
+    seen: Survey,
+) -> DiscrepancySettings:
+    """Return the settings with as few samples to be compared as show the disagreement beyond any doubt.
+
+    Those of ``clear_samples``, or twice as many, and so on; and fewer replicates.
+
+    Args:
+        source: the frames.
+        settings: as configured, or as the memory allows.
+        roi: rows and columns that the user asked for.
+        seen: what the survey found.
+    """
+    most = seen.window(source.shape, settings, roi).share(source.shape)
+    samples = settings.clear_samples
+    while samples < settings.max_samples:
+        few = settings.model_copy(update={"max_samples": samples})
+        window = seen.window(source.shape, few, roi)
+        if window.share(source.shape) >= most:
+            break
+        length = block_length(window.numbers.size, settings.block_frames)
+        frames = read_window(source, window)
+        if is_clear(frames, window.numbers, n_run=source.shape[0], block_frames=length):
+            lower = {
+                "replicates": min(settings.replicates, _REPLICATES),
+                "extended_replicates": min(settings.extended_replicates, _EXTENDED),
+            }
+            return few.model_copy(update=lower)
+        samples *= 2
+    return settings
+
+
+def is_clear(
+    frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], *, n_run: int, block_frames: int
+) -> bool:
+    """Tell whether frames disagree with the plain model beyond any doubt, without simulating it.
+
+    Args:
+        frames: codes (frame, y, x), DN.
+        numbers: of the frames in the run, increasing, shape (frame,).
+        n_run: frames of the whole run.
+        block_frames: frames in a block.
+    """
+    try:
+        evidence = observe(frames, numbers, n_run=n_run, block_frames=block_frames)
+    except PchEmError:  # those who compare the frames say what is wrong with them
+        return False
+    z = np.abs(np.array(list(evidence.z.values())))
+    if evidence.ambiguous > _DOUBTFUL:
+        z = z[free_of_parameters(tuple(evidence.z), evidence.maps)]
+    return bool(z.max(initial=0.0) > _CLEAR)

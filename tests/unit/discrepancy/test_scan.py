@@ -1,4 +1,4 @@
-"""Scan statistics: places and frames that stand out, with probabilities that count all of them."""
+"""Scan statistics: places and frames that stand out, of values and of events; probabilities count all."""
 
 from __future__ import annotations
 
@@ -7,16 +7,26 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from pchem_pipeline.discrepancy.scan import affected_share, scan_map, scan_series, sharpest_range
-from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.discrepancy.scan import (
+    affected_share,
+    log_binomial_tail,
+    scan_event_frames,
+    scan_event_map,
+    scan_map,
+    scan_series,
+    sharpest_range,
+)
+from pchem_pipeline.effects.framework.region import Region, When
 
 Mask = np.ndarray[Any, np.dtype[np.bool_]]
-SHAPE = (48, 64)
+SHAPE, SQUARE, FRAMES = (48, 64), (32, 32), 1500
+EVERY = np.ones(SQUARE, np.bool_)
 
 
-def mask_of(**region: Any) -> Mask:
-    return Region.model_validate(region).mask(SHAPE)
+def mask_of(shape: tuple[int, int] = SHAPE, **region: Any) -> Mask:
+    return Region.model_validate(region).mask(shape)
 
 
 def disc() -> Mask:
@@ -160,3 +170,96 @@ def test_channels_side_by_side_are_a_sensor_of_one_row(shape: tuple[int, int]) -
     [found] = scan_map(values, np.ones(shape, bool), single=False)
     assert found.log_p < math.log(1e-3)
     assert found.region.mask(shape).sum() <= 30
+
+
+def test_ranges_of_frames_come_by_chance_as_often_as_told() -> None:
+    numbers = np.arange(600)
+    chances = [
+        found[0].p
+        for seed in range(200)
+        if (
+            found := scan_series(
+                np.random.default_rng(seed).standard_normal(600),
+                numbers,
+                significance=0.1,
+                most=1,
+                shortest=64,
+            )
+        )
+    ]
+    # binomial: three standard deviations above 0.1 (of 200) and, so that it is no mere bound, ten below
+    assert 4 <= len(chances) <= 33
+    rng = np.random.default_rng(999)
+    shifted = rng.standard_normal(600) + 0.75 * ((numbers >= 200) & (numbers < 264))
+    [one] = scan_series(shifted, numbers, significance=1e-3, shortest=64)
+    assert one.z < 7.5  # a count of all ranges would ask for 6.5 and more
+    assert one.when.range[0][0] == pytest.approx(200, abs=25)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        mask_of(SQUARE, columns=[12, 15]),
+        mask_of(SQUARE, rows=[4, 8]),
+        mask_of(SQUARE, taps={"every": 8, "which": 5}),
+        mask_of(SQUARE, rows=[10, 20], columns=[16, 26]),
+    ],
+)
+def test_events_of_a_place_are_found_there(place: Mask) -> None:
+    """Sixteen or so in a tenth of the pixels, and a dozen by chance anywhere."""
+    rng = np.random.default_rng(int(place.sum()))
+    seen = rng.random(SQUARE) < 0.01 + 0.2 * place
+    found = scan_event_map(seen, np.full(SQUARE, 0.01), EVERY)
+    assert len(found) == 1
+    assert found[0].region.overlap(Region.of_mask(place), SQUARE) > 0.6
+    assert found[0].only_there
+    # a rate between those of a binomial number five deviations off
+    assert abs(found[0].inside - 0.2) < 5.0 * np.sqrt(0.2 * 0.8 / place.sum()) + 0.04
+
+
+def test_events_have_no_place_by_chance_and_follow_the_share_of_each_pixel() -> None:
+    """Of 200 maps at 5 %, ten are allowed; five standard errors above that is 26."""
+    share = np.where(mask_of(SQUARE, columns=[0, 16]), 0.1, 0.005)
+    rng = np.random.default_rng(1)
+    drawn = [rng.random(SQUARE) < share for _ in range(200)]
+    assert sum(bool(scan_event_map(seen, share, EVERY, significance=0.05)) for seen in drawn) <= 26
+    # taken for alike, the pixels of either half are a place
+    assert sum(bool(scan_event_map(seen, np.ones(SQUARE), EVERY)) for seen in drawn[:20]) == 20
+
+
+def test_a_binomial_tail_is_that_of_the_law() -> None:
+    for k, n, share in ((3, 8, 0.09), (16, 16, 0.1), (1, 40, 0.5)):
+        assert log_binomial_tail(k, n, share) == pytest.approx(stats.binom.logsf(k - 1, n, share), rel=1e-9)
+
+
+def test_a_range_of_frames_with_events_is_found() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        happened = rng.random(FRAMES) < 0.004
+        happened[600:760] |= rng.random(160) < 0.15
+        numbers = np.arange(100, 100 + FRAMES)
+        found = scan_event_frames(np.flatnonzero(happened), numbers, expected=6.0, shortest=64)
+        assert found is not None
+        inside = found.when.frames(numbers)
+        wanted = np.zeros(FRAMES, np.bool_)
+        wanted[600:760] = True
+        # of 24 events the outermost lie seven frames from the ends on average
+        assert (inside & wanted).sum() > 0.6 * (inside | wanted).sum()
+        assert found.only_there
+
+
+def test_of_very_many_events_some_tell_the_range() -> None:
+    rng = np.random.default_rng(4)
+    happened = rng.random(50_000) < np.where((np.arange(50_000) // 5000) == 3, 0.4, 0.1)
+    found = scan_event_frames(np.flatnonzero(happened), np.arange(50_000), shortest=64)
+    assert found is not None
+    assert found.when.overlap(When(range=((15_000, 20_000),)), 50_000) > 0.8
+
+
+def test_events_have_no_range_by_chance() -> None:
+    """Of 300 series at 5 %, 15 are allowed; five standard errors above that is 34."""
+    rng = np.random.default_rng(3)
+    drawn = [np.sort(rng.choice(FRAMES, n, replace=False)) for n in rng.integers(3, 60, 300)]
+    found = [scan_event_frames(each, np.arange(FRAMES), significance=0.05, shortest=64) for each in drawn]
+    assert sum(each is not None for each in found) <= 34
+    assert scan_event_frames(np.array([5, 6]), np.arange(FRAMES), significance=1.0) is None

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.observe.digital.groups import MOST_PAIRED
 from pchem_pipeline.discrepancy.observe.digital.misplaced_numba import (
     N_PLACES,
     STEPS,
@@ -31,7 +32,6 @@ Lines = Literal["rows", "columns"]
 
 _LINES: tuple[Lines, Lines] = ("rows", "columns")
 
-_MOST_SAMPLES = 1 << 19
 _SHARE = 1e-3  # of the lines, for which the statistic is the best one
 _CHANCE = 4.0  # variance of the sum where hardly a line is likely anywhere else: one or two of them
 _CLEAR = 4.0  # standard deviations beyond which shares are looked for
@@ -62,7 +62,7 @@ def misplaced_lines(
     shares: dict[str, FloatArray] = {}
     if min(usable.shape) < 2:
         return z, shares
-    chosen = frames[:: max(1, -(-frames.size // _MOST_SAMPLES))]
+    chosen = frames[:: max(1, -(-frames.size // MOST_PAIRED))]
     for lines in _LINES:
         table = _Table.of(counts, origin, usable, lines)
         turned = _turned(chosen, lines)

@@ -289,13 +289,13 @@ def test_loops_are_the_same_uncompiled() -> None:
     results = []
     for sum_block in (sums_numba.sum_block, sums_numba.sum_block.py_func):
         charge, readout = np.zeros((2, 7, 2, 3), np.float32)
-        sums = sums_numba.BlockSums(
-            np.zeros((4, 10, 2)), np.zeros((10, 2, 3), np.float32), np.zeros(10), np.zeros((2, 2, 3)),
-            np.zeros((8, 2, 3)), np.zeros((3, 2, 3)), np.zeros((3, 2, 3)), np.zeros((10, 2)),
-            np.zeros((10, 3), np.float32),
+        sums = sums_numba.FrameSums(
+            np.zeros((4, 10, 2)), np.zeros((2, 10, 3), np.float32), np.zeros(10), np.zeros((1, 2, 2, 3)),
+            np.zeros((8, 2, 3)), np.zeros((10, 2)), np.zeros((10, 3), np.float32), np.zeros((3, 2, 3)),
+            np.zeros((3, 2, 3)),
         )  # fmt: skip
         channels = sums_numba.Channels(support, tables, modes, weights, np.array([9.0, 6.0]))
-        sum_block(frames[:10], channels, charge, readout, sums)
+        sum_block(frames, (0, 0, 10), channels, charge, readout, sums)
         results.append([charge, readout, *sums])
     for one, other in zip(*results, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)

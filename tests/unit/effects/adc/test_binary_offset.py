@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
 
-from pchem_pipeline.discrepancy.observe.digital.previous_bits import BITS, previous_bits
+from pchem_pipeline.discrepancy.observe.digital.groups import BITS, previous_bits
 from pchem_pipeline.effects.adc.binary_offset import BinaryOffset
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.mass import sample_mass

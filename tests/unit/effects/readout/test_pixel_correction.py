@@ -84,7 +84,7 @@ def test_threshold_and_share_are_found(effect, shape, n_frames, seed):
 
 
 def test_exchanged_predictions_count_the_same_as_a_loop():
-    from pchem_pipeline.discrepancy.observe.digital.predicted import predicted_samples
+    from pchem_pipeline.discrepancy.observe.digital.groups import predicted_samples
 
     frames = np.random.default_rng(3).integers(90, 140, (8, 5, 6)).astype(np.uint16)
     found = predicted_samples(frames, np.array([0, 8]), np.ones((5, 6), bool))["median"]

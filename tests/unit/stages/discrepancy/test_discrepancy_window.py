@@ -8,17 +8,18 @@ import pytest
 from helpers.discrepancy_material import verdict_of
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.discrepancy.quick.places import SensorPlace
+from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.verdict import Elsewhere, Verdict
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.stages.discrepancy import discrepancy
-from pchem_pipeline.stages.discrepancy.clear import fewer_samples, is_clear
 from pchem_pipeline.stages.discrepancy.survey import Survey
 from pchem_pipeline.stages.discrepancy.window import (
     Window,
     choose_window,
+    fewer_samples,
+    is_clear,
     other_window,
     read_window,
     search_bytes,
@@ -154,7 +155,8 @@ def test_frames_of_the_window_are_those_of_the_stack():
 
 
 def place(p=1e-9, **region):
-    return SensorPlace(Region.model_validate(region), p, 1.0, 0.0)
+    found = Region.model_validate(region)
+    return Suspect(family="", z=6.0, log_p=np.log(p), inside=1.0, outside=0.0, region=found)
 
 
 def test_the_window_lies_where_the_sensor_disagrees_half_of_it_outside():

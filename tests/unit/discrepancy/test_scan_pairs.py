@@ -1,4 +1,7 @@
-"""Pairs of pixels that share a row, a column or a frame: their sums, and places that stand out."""
+"""Pairs of pixels that share a row, a column or a frame: their sums, places that stand out, and their edges.
+
+Where cells hold several lines, the edges are told line by line.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,11 @@ import pytest
 from helpers.standardised import samples_of
 
 from pchem_pipeline.discrepancy.observe.pairs import PERIOD, pairs_of
-from pchem_pipeline.discrepancy.scan import scan_series
-from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
+from pchem_pipeline.discrepancy.scan_pairs import Side, scan_pairs, sharpened
 from pchem_pipeline.effects.framework.region import Region
 
 SHAPE, FRAMES = (32, 32), 1000
+WIDE, FEW = (64, 200), 200
 
 
 @pytest.mark.parametrize("shape", [(6, 9), (70, 40), (40, 33)])
@@ -75,9 +78,9 @@ def test_a_place_is_found_from_twelve_standard_errors_of_its_pairs_on(
     frames = rng.standard_normal((FRAMES, *SHAPE)) + mask * shared
     found = scan_pairs(samples_of(np.clip(frames, -6, 6)), significance=1e-3)
     assert found[0].mode == mode
-    assert found[0].place.region.overlap(region, SHAPE) > 0.7
+    assert found[0].region.overlap(region, SHAPE) > 0.7
     # the scatter of the noise put in and the root take up to half of it, the best of all places adds
-    assert 6.0 < found[0].place.z < 16.0
+    assert 6.0 < found[0].z < 16.0
 
 
 @pytest.mark.parametrize("mode", ["row", "column"])
@@ -93,7 +96,7 @@ def test_scattered_lines_are_one_place(mode: str, lines: list[tuple[int, int]]) 
     found = scan_pairs(samples_of(np.clip(frames, -6, 6)), significance=1e-3)
     # one guess of each channel is the same, since both are
     assert found[0].mode == mode
-    assert np.array_equal(found[0].place.region.mask(SHAPE), mask)
+    assert np.array_equal(found[0].region.mask(SHAPE), mask)
     assert len(found) == 1
 
 
@@ -114,25 +117,55 @@ def test_what_all_pixels_share_has_no_place_and_nothing_is_found_in_nothing() ->
         assert scan_pairs(samples_of(np.clip(frames, -6, 6)), significance=1e-3) == []
 
 
-def test_ranges_of_frames_come_by_chance_as_often_as_told() -> None:
-    numbers = np.arange(600)
-    chances = [
-        found[0].p
-        for seed in range(200)
-        if (
-            found := scan_series(
-                np.random.default_rng(seed).standard_normal(600),
-                numbers,
-                significance=0.1,
-                most=1,
-                shortest=64,
-            )
-        )
-    ]
-    # binomial: three standard deviations above 0.1 (of 200) and, so that it is no mere bound, ten below
-    assert 4 <= len(chances) <= 33
-    rng = np.random.default_rng(999)
-    shifted = rng.standard_normal(600) + 0.75 * ((numbers >= 200) & (numbers < 264))
-    [one] = scan_series(shifted, numbers, significance=1e-3, shortest=64)
-    assert one.z < 7.5  # a count of all ranges would ask for 6.5 and more
-    assert one.when.range[0][0] == pytest.approx(200, abs=25)
+def noisy(place: Region, axes: tuple[int, ...], size: float, seed: int = 1) -> np.ndarray:
+    """Return frames in which the pixels of a place share noise, standard deviations."""
+    rng = np.random.default_rng(seed)
+    frames = rng.standard_normal((FEW, *WIDE)) + place.mask(WIDE) * size * rng.standard_normal(axes)
+    return np.clip(frames, -6, 6)
+
+
+@pytest.mark.parametrize(
+    ("mode", "axes"),
+    [("row", (FEW, 64, 1)), ("column", (FEW, 1, 200)), ("frame", (FEW, 1, 1))],
+)
+@pytest.mark.parametrize(
+    "place",
+    [
+        {"rows": [7, 23], "columns": [11, 90]},
+        {"rows": [21, 27]},
+        {"columns": [133, 200]},
+        {"columns": [51, 58]},
+    ],
+)
+def test_edges_within_cells_are_found(mode: str, axes: tuple[int, ...], place: dict[str, Any]) -> None:
+    region = Region.model_validate(place)
+    found = scan_pairs(samples_of(noisy(region, axes, 0.5)), most=1)
+    assert found[0].mode == mode
+    assert found[0].region.overlap(region, WIDE) == 1.0
+
+
+def test_without_single_lines_the_edges_of_the_cells_would_be_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    region = Region.model_validate({"rows": [7, 23], "columns": [11, 90]})
+    samples = samples_of(noisy(region, (FEW, 1, 1), 0.5))
+    monkeypatch.setattr(Side, "exact", True)
+    found = scan_pairs(samples, most=1)
+    assert 0.8 < found[0].region.overlap(region, WIDE) < 1.0
+
+
+def test_dead_lines_at_an_edge_belong_to_nothing_and_do_not_end_a_place() -> None:
+    region = Region.model_validate({"rows": [9, 24]})
+    usable = np.ones(WIDE, np.bool_)
+    usable[[7, 8, 15, 24, 25]] = False
+    found = scan_pairs(samples_of(noisy(region, (FEW, 1, 1), 0.4), usable), most=1)
+    assert found[0].region.mask(WIDE)[usable].sum() == region.mask(WIDE)[usable].sum()
+    assert found[0].region.rows == ((9, 24),)
+
+
+def test_what_single_lines_hardly_show_leaves_the_edges_as_they_are() -> None:
+    edges, rng = np.arange(0, 65, 4), np.random.default_rng(2)
+    lines, across = Side.of(edges, (2, 6)), Side.of(np.array([0, 200]), (0, 1))
+    assert lines == Side(8, 24, 4, 28, (12, 20), sure=True)
+    assert across == Side(0, 200, 0, 200, (0, 200), sure=False)
+    samples = samples_of(np.clip(rng.standard_normal((FEW, *WIDE)), -6, 6))
+    for mode in ("row", "frame"):
+        assert sharpened(samples, 0, mode, lines, across) == ((8, 24), (0, 200))

@@ -1,0 +1,222 @@
+"""Samples of a few successive frames against each other: exchanging the frames says what chance does.
+
+Without an effect a sample is as independent of the others of its frame as of those of the next few frames,
+whatever the pixels' histograms are. So it is asked whether samples equal what their neighbours predict too
+often, or exceed it too seldom; whether they are nearer to the one before than to those of other frames; and
+whether they follow single bits of the sample read before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.discrepancy.observe import laws
+from pchem_pipeline.effects.estimators.prediction import PREDICTORS, predicted
+from pchem_pipeline.effects.framework.evidence import PixelMaps, PredictedSamples, PreviousBits
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+GROUP = 4  # frames whose predictions are exchanged
+#: Samples of all groups together, unless there is but one, where all frames of a group are compared with all,
+#: and where they are compared two by two.
+MOST_SAMPLES, MOST_PAIRED = 1 << 18, 1 << 19
+_MOST_THRESHOLDS = 96
+_FARTHEST = 4.0  # of the thresholds, standard deviations of the samples
+_TAIL = 3e-3  # of samples above the threshold that is tested
+_EQUAL = 3.0  # standard deviations by which samples equal a prediction too often for it to be looked into
+_WITHIN = (0.0, 0.15, 0.5, 1.5)  # read noises
+_INDEPENDENT = 2.5  # of these
+_FEWEST = 50.0  # pairs of which one agrees and another does not
+BITS = 8  # the lowest ones
+_SMALLEST = 1e-4  # variance of a bit that the value before leaves, relative: below it is that value
+
+
+def groups_of(edges: IntArray, samples_of_a_frame: int, most_samples: int = MOST_SAMPLES) -> IntArray:
+    """Return positions of the first frames of groups of successive ones, evenly spread, (n,).
+
+    Args:
+        edges: positions of the blocks, (b + 1,).
+        samples_of_a_frame: rows times columns.
+        most_samples: of all groups together, unless there is but one.
+    """
+    first = np.concatenate([np.arange(a, b - GROUP + 1, GROUP) for a, b in pairwise(edges)])
+    most = max(most_samples // (GROUP * samples_of_a_frame), 1)
+    chosen = first[:: max(-(-first.size // most), 1)]
+    return np.asarray(chosen, np.int64)
+
+
+def predicted_samples(
+    frames: NDArray[np.unsignedinteger[Any]], edges: IntArray, usable: NDArray[np.bool_]
+) -> dict[str, PredictedSamples]:
+    """Return how samples compare with their predictions, by kind; none where frames or pixels are too few.
+
+    Args:
+        frames: codes (frame, y, x), DN.
+        edges: positions of the blocks, (b + 1,).
+        usable: pixels that count, (y, x).
+    """
+    if min(usable.shape) < 3 or not usable[1:-1, 1:-1].any():
+        return {}
+    first = groups_of(edges, usable.size)
+    if not first.size:
+        return {}
+    chosen = frames[first[:, None] + np.arange(GROUP)].reshape(-1, *usable.shape)
+    inside = usable[1:-1, 1:-1]
+    samples = chosen[:, 1:-1, 1:-1][:, inside].astype(np.int32).reshape(first.size, GROUP, -1)
+    reach = _FARTHEST * float(samples.std(axis=(0, 1)).mean())
+    step = max(1, int(np.ceil(reach / _MOST_THRESHOLDS)))
+    found: dict[str, PredictedSamples] = {}
+    for kind in PREDICTORS:
+        own = predicted(chosen, kind)[:, inside].reshape(samples.shape)
+        found[kind] = _compared(samples, own, step * np.arange(_MOST_THRESHOLDS), always=kind == "median")
+    return found
+
+
+def _compared(
+    samples: NDArray[np.int32], prediction: NDArray[np.int32], thresholds: IntArray, *, always: bool
+) -> PredictedSamples:
+    """Compare samples (group, frame, pixel), DN, with the predictions of each frame of their group.
+
+    Above thresholds only what equals its prediction too often is looked at, unless ``always``.
+    """
+    own = samples - prediction
+    others = np.stack([samples - np.roll(prediction, shift, axis=1) for shift in range(1, GROUP)])
+    equal = np.count_nonzero(own == 0)
+    # as many pairs of a sample with itself as with each other frame, of which the mean is taken
+    chance = np.count_nonzero(others == 0) / (GROUP - 1)
+    z = float((equal - chance) / np.sqrt(max(chance, 1.0) * GROUP / (GROUP - 1)))
+    if not always and z < _EQUAL:
+        return PredictedSamples(z, thresholds[:0], np.zeros(0), np.zeros((GROUP - 1, 0)))
+    first, second, third = others
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    ordered = np.maximum(high, third), np.maximum(low, np.minimum(high, third)), np.minimum(low, third)
+    at_least = np.array([_above(part, thresholds) for part in ordered])
+    # of m of 3 above, one, two, three given ones are so in m, m (m - 1) / 2, ... of 3, 3, 1 choices
+    exactly = at_least - np.append(at_least[1:], np.zeros((1, thresholds.size)), axis=0)
+    moments = np.array([[1.0 / 3.0, 2.0 / 3.0, 1.0], [0.0, 1.0 / 3.0, 1.0], [0.0, 0.0, 1.0]])
+    return PredictedSamples(z, thresholds, _above(own, thresholds), moments @ exactly)
+
+
+def _above(deviations: NDArray[np.int32], thresholds: IntArray) -> FloatArray:
+    """Return how many deviations are above each of evenly spaced thresholds from 0 on."""
+    step = int(thresholds[1] - thresholds[0])
+    positive = deviations[deviations > 0]
+    # d > i step where i < ceil(d / step)
+    cells = np.minimum((positive + (step - 1)) // step, thresholds.size)
+    counts = np.bincount(cells, minlength=thresholds.size + 1)
+    return np.asarray(counts[::-1].cumsum()[::-1][1:], np.float64)
+
+
+def predicted_statistics(found: Mapping[str, PredictedSamples]) -> dict[str, float]:
+    """Return the statistics of samples that equal, or exceed, what their neighbours predict."""
+    if not found:
+        return {}
+    median = found["median"]
+    first, second, _ = median.above_chance
+    place = min(int(np.searchsorted(-first, -_TAIL * max(first[0], 1.0))), first.size - 1)
+    variance = max(first[place] - second[place], 1.0) * GROUP / (GROUP - 1)
+    return {
+        "space.predicted.equal": laws.best(*(each.equal_z for each in found.values())),
+        "space.predicted.above": float((median.above[place] - first[place]) / np.sqrt(variance)),
+    }
+
+
+def nearer_statistics(
+    frames: NDArray[np.unsignedinteger[Any]], edges: NDArray[np.int64], maps: PixelMaps
+) -> dict[str, float]:
+    """Return the statistic of samples that are nearer to the one before than chance makes them.
+
+    Whatever ties successive samples together, in proportion or not, changes how often they nearly agree. Of
+    two pairs of successive frames ``(x, y)`` and ``(x', y')`` the agreements of x with y and of x' with y'
+    are counted, less those of x with y' and of x' with y: what the law of either sample makes is in both, so
+    that without an effect the sum has mean 0, and for its variance the sum of the squares.
+
+    Args:
+        frames: codes (frame, y, x), DN.
+        edges: positions of the blocks, (b + 1,).
+        maps: parameters of the pixels.
+    """
+    first = groups_of(edges, maps.usable.size, MOST_PAIRED)
+    half = first.size // 2
+    if not half or not maps.usable.any():
+        return {}
+    # the second pair comes from far away in time
+    two = frames[np.stack([first[:half], first[half : 2 * half]])[..., None] + np.arange(4)][..., maps.usable]
+    (x, other_x), (y, other_y) = (two[:, :, when].astype(np.int32) for when in ((0, 2), (1, 3)))
+    apart = [np.abs(a - b) for a, b in ((x, y), (other_x, other_y), (x, other_y), (other_x, y))]
+    noise = float(np.median(maps.read_noise_dn[maps.usable]))
+    found = []
+    for within in sorted({int(part * noise) for part in _WITHIN}):
+        near = [(each <= within).view(np.int8) for each in apart]
+        excess = near[0] + near[1] - near[2] - near[3]
+        square = float(np.count_nonzero(excess)) + 3.0 * np.count_nonzero(np.abs(excess) == 2)
+        if square >= _FEWEST:
+            found.append(float(excess.sum(dtype=np.int64)) / np.sqrt(square))
+    if not found:
+        return {}
+    return {"time.nearer": laws.best(*found, independent=min(float(len(found)), _INDEPENDENT))}
+
+
+def previous_bits(
+    frames: NDArray[np.unsignedinteger[Any]],
+    edges: NDArray[np.int64],
+    usable: NDArray[np.bool_],
+    noise: FloatArray,
+) -> PreviousBits | None:
+    """Return the regression of samples on the bits of those before; None where there are too few.
+
+    What a sample has in common with the value of the one before is crosstalk of many kinds; what it has in
+    common with single bits of it, beyond that value, is only of the converter's making. Differences of
+    successive frames are regressed, so that nothing constant counts.
+
+    Args:
+        frames: codes (frame, y, x), DN.
+        edges: positions of the blocks, (b + 1,).
+        usable: pixels that count, (y, x).
+        noise: standard deviation of the samples of each pixel, DN, (y, x).
+    """
+    pairs = usable[:, 1:] & usable[:, :-1]
+    first = groups_of(edges, usable.size, MOST_PAIRED)
+    if not first.size or not pairs.any():
+        return None
+    # of each group two pairs of frames
+    later = (first[:, None] + np.array([1, 3])).ravel()
+    one, two = frames[later], frames[later - 1]
+    weight = np.where(pairs, 1.0 / noise[:, 1:], 0.0).astype(np.float32)
+    value = np.subtract(one, two, dtype=np.float32) if one.itemsize < 4 else one - two.astype(np.float64)
+    own = (value[:, :, 1:] * weight).ravel()
+    design = np.empty((1 + BITS, own.size), np.float32)
+    design[0] = (value[:, :, :-1] * weight).ravel()
+    low = [(part[:, :, :-1] & (2**BITS - 1)).astype(np.uint8) for part in (one, two)]
+    for bit in range(BITS):
+        changed = (low[0] >> bit & 1).view(np.int8) - (low[1] >> bit & 1).view(np.int8)
+        design[1 + bit] = (changed * weight).ravel()
+    square = (design @ design.T).astype(np.float64)
+    product = (design @ own).astype(np.float64)
+    if square[0, 0] <= 0.0:
+        return None
+    # what the value before explains is taken from the bits
+    slope = square[1:, 0] / square[0, 0]
+    left = square[1:, 1:] - np.outer(slope, square[0, 1:])
+    variance = float(own @ own) / (len(one) * int(pairs.sum()))
+    return PreviousBits(product[1:] - slope * product[0], left, variance)
+
+
+def bit_statistics(found: PreviousBits | None) -> dict[str, float]:
+    """Return the statistic of samples that follow bits of the one before."""
+    if found is None:
+        return {}
+    scale = np.sqrt(np.maximum(np.diag(found.square), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(found.square / np.outer(scale, scale))
+    kept = (eigenvalues > _SMALLEST * eigenvalues.max()) if eigenvalues.size else np.zeros(0, np.bool_)
+    if not kept.any():
+        return {}
+    projected = vectors.T[kept] @ (found.product / scale)
+    total = float(np.sum(projected**2 / eigenvalues[kept])) / max(found.variance, 1e-300)
+    return {"space.x.bits": float(laws.chi_square(total, float(kept.sum())))}
