@@ -17,16 +17,13 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     tolerance,
 )
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import noise_of_splits
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, lesser
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import ESTABLISHED, Refitted, lesser
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 
 FloatArray = NDArray[np.float64]
 
-# standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
-# than a single one would by chance
-_ESTABLISHED = 4.5
-_CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing was chosen by
+_CONFIRMED = 1.0  # standard errors of it in the final frames, half as many, which nothing was chosen by
 # the same of what is measured without a name, in either: few forms of it are tried, and only where the data
 # disagree with all that has one
 _MEASURED = 3.0
@@ -89,7 +86,7 @@ class Acceptance:
         change, stderr = correction(added.slopes, self.z.final - added.mean, allowed)
         measured = np.array([type(h.effect).measured_only for h in added.hypotheses])
         sure = measured | _overwhelming(added.parts, self.z.both - first.mean, first.std)
-        clear = np.exp(added.change) > np.where(sure, _MEASURED, _ESTABLISHED) * added.stderr
+        clear = np.exp(added.change) > np.where(sure, _MEASURED, ESTABLISHED) * added.stderr
         proven = 1.0 + change > np.where(measured, _MEASURED, _CONFIRMED) * stderr
         proven &= change > -LARGEST_DECREASE
         there = (clear & proven) | certain | (self._counted(added) & (change > -LARGEST_DECREASE))
@@ -104,7 +101,7 @@ class Acceptance:
         # of the same probability as so many standard errors of a strength, but of no effect, not of some
         seen, final = (
             np.array([first.p_values(each - rest, splits) for rest in others]) < 2.0 * special.ndtr(-limit)
-            for each, splits, limit in ((z.both, 2, _ESTABLISHED), (z.final, 1, _CONFIRMED))
+            for each, splits, limit in ((z.both, 2, ESTABLISHED), (z.final, 1, _CONFIRMED))
         )
         more = np.minimum(z.both, z.final) > first.mean + others
         made = (added.parts > 0.0) & first.moved_by(added.vectors) & (np.abs(added.rest) < _LEFT_OF_COUNT)

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, largest_pulls
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
-    Contender,
     Hypothesis,
     Noise,
     SetFit,
     fit_set,
     tolerance,
 )
-from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, unrelated
+from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, Contender, unrelated
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, misfits
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS

@@ -33,9 +33,12 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, compare
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import PixelLikelihood, Witness, is_told
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
+    HistogramLikelihood,
+    PixelLikelihood,
+    identifiable_from_histograms,
+)
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.sets.trials import leaves_nothing
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import (
@@ -274,7 +277,7 @@ class FrameExplainer:
         kept = self.accept.established(added)
         while len(kept) < len(added.hypotheses):
             if {h.tag for h in kept} <= held:
-                if not held and leaves_nothing(refitter, added):
+                if not held and refitter.passes_goodness_of_fit(added):
                     put = functools.partial(self.extended.put, found, added, explanation.hypotheses, null)
                     self.doubtful = functools.partial(put, certain=False)
                 return None
@@ -297,7 +300,7 @@ class FrameExplainer:
                 explanation.choice,
                 self.extended.last,
                 lambda best: self._left_by(best, refitter),
-                Witness(self._likelihood),
+                HistogramLikelihood(self._likelihood),
                 lambda: self._unexplained().explains_all(),
                 lambda unlisted: self._unexplained().clearest(unlisted),
             )
@@ -334,7 +337,7 @@ class FrameExplainer:
         if not all(effect.everywhere for effect in (*present, *effects)):
             return None
         # a law has all samples; others may have replaced some
-        key = pixels, present, tuple(effect for effect in effects if not is_told(effect))
+        key = pixels, present, tuple(effect for effect in effects if not identifiable_from_histograms(effect))
         if key not in self._likelihoods:
             if len(self._likelihoods) >= _LIKELIHOODS:
                 del self._likelihoods[next(iter(self._likelihoods))]
@@ -359,7 +362,7 @@ class FrameExplainer:
         gap = self.accept.gap_of(found)
         better = gap.interval[1] < _CLEARLY_LESS * left.value
         # effects that the final frames do not tell from the truth are known to leave something by the others
-        as_good = gap.at_floor and (not left.at_floor or unexplained.leaves_nothing(found))
+        as_good = gap.at_floor and (not left.at_floor or unexplained.refitter.passes_goodness_of_fit(found))
         return self.extended.put_measured(found) if better or as_good else None
 
     def probable(self) -> NullModel | None:

@@ -188,7 +188,8 @@ def test_the_right_one_of_three_is_named() -> None:
     choice = choose(hypotheses, (shifts[0], shifts[1]), noise)
     assert choice is not None
     assert choice.best.tags == {"frame_noise"}
-    assert choice.probability[0] > 0.99
+    others = [one for one in choice.tried if "frame_noise" not in one.tags]
+    assert all(one.score < choice.best.score - 5.0 for one in others)
 
 
 def test_two_at_once_are_both_named() -> None:
@@ -221,18 +222,6 @@ def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_senso
     assert all("row_noise" in one.tags for one in choice.tried)  # none is a second one alone
     keys = {h.effect.key for h in choice.best.hypotheses}
     assert len(keys) == 2
-
-
-def test_twins_are_ambiguous() -> None:
-    rng = np.random.default_rng(17)
-    print_ = rng.normal(size=40)
-    twin = print_ + 0.02 * rng.normal(size=40)
-    hypotheses = [_hypothesis("row_noise", print_), _hypothesis("frame_noise", twin)]
-    shifts = tuple(3.0 * print_ + rng.normal(size=40) for _ in range(2))
-    choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(UNIT, 0.1))
-    assert choice is not None
-    assert {r.hypothesis.tag for r in choice.rivals[0]} == {"row_noise", "frame_noise"}
-    assert max(choice.probability) < 0.98
 
 
 def test_nothing_is_chosen_where_nothing_is() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     FEW_PIXELS,
     PixelLikelihood,
-    is_told,
+    identifiable_from_histograms,
 )
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.places import Part
@@ -62,7 +62,11 @@ class Histograms:
         likely: dict[tuple[str, Part], list[Effect]] = {}
         for place, own in by_place.items():
             anywhere = {tag: [g.at_place(None) for g in there] for tag, there in own.items()}
-            told = {tag: there for tag, there in anywhere.items() if any(is_told(g) for g in there)}
+            told = {
+                tag: there
+                for tag, there in anywhere.items()
+                if any(identifiable_from_histograms(g) for g in there)
+            }
             by = self._of(place) if told else None
             for tag, effects in {} if by is None else _likeliest(by, told).items():
                 likely[tag, place] = [e.at_place(place.region, place.when) for e in effects]

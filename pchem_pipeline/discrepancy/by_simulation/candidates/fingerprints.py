@@ -5,15 +5,13 @@ science attributes warming (Hasselmann 1997; Allen and Tett 1999): ``y = sum_e c
 >= 0``. The noise has the covariance of the null replicates, and a relative error of each fingerprint on top,
 since the details of a real effect are never those of the library.
 
-Every set of up to three candidates is fitted on one split and scored on the other, both ways round. The
-scores, less a price for every effect, give each set a probability; an effect is named where the sets that
-hold it have nearly all of it, and what could as well stand in its place is listed with it where not.
+Every set of up to three candidates is fitted on one split and scored on the other, both ways round; the
+scores, less a price for every effect, say which sets are worth a refit of the pixels.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -127,12 +125,6 @@ class SetFit:
         parts = self.parts
         return log_density(shift - parts.sum(axis=0), noise.of(parts))
 
-    def distance(self, other: SetFit, noise: Noise) -> float:
-        """Return how far the predictions of two sets lie apart, in standard deviations of the statistics."""
-        mine, theirs = self.parts, other.parts
-        covariance = noise.of(np.concatenate([mine, theirs]) / np.sqrt(2.0))
-        return float(np.linalg.norm(covariance.white(mine.sum(axis=0) - theirs.sum(axis=0))))
-
 
 def correction(
     slopes: FloatArray, residual: FloatArray, covariance: Covariance, scatter: FloatArray | None = None
@@ -233,59 +225,27 @@ class ScoredSet:
         return tuple(h.times(float(c)) for h, c in zip(self.hypotheses, factors, strict=True))
 
     @property
-    def worth(self) -> float:
+    def penalised_log_likelihood(self) -> float:
         """Score less the price of its effects, nats."""
         return self.score - _PRICE - PRICE_OF_MORE * (len(self.hypotheses) - 1)
 
 
 @dataclass(frozen=True)
-class Contender:
-    """An effect that could stand in the place of a chosen one.
-
-    Attributes:
-        hypothesis: of the rival.
-        score: log score of the best set with it in that place, relative to the chosen set, nats.
-        stderr: of that score: how far the two predictions lie apart, nats.
-        probability: of such sets among all.
-    """
-
-    hypothesis: Hypothesis
-    score: float
-    stderr: float
-    probability: float
-
-
-@dataclass(frozen=True)
 class Choice:
-    """What the comparison came to.
+    """How sets of effects compare by their fingerprints.
 
     Attributes:
-        best: the likeliest set.
-        rivals: for each of its effects, who could stand in its place, itself first.
-        probability: of each of its effects.
-        tried: all sets, the likeliest first.
-        advantage: held-out log score of the best set over no effect at all, less its price, nats.
+        tried: all that improve on no effect at all, the best first.
+        advantage: held-out log score of the best one over no effect, less its price, nats.
     """
 
-    best: ScoredSet
-    rivals: tuple[tuple[Contender, ...], ...]
-    probability: tuple[float, ...]
     tried: tuple[ScoredSet, ...]
     advantage: float
 
-    def present(self, certainty: float) -> tuple[Hypothesis, ...]:
-        """Return the effects of the best set in whose place there is something, with that probability."""
-        kept = tuple(
-            hypothesis
-            for hypothesis, rivals in zip(self.best.hypotheses, self.rivals, strict=True)
-            if sum(rival.probability for rival in rivals) >= certainty
-        )
-        return kept or self.best.hypotheses[:1]
-
-    def rivals_of(self, tag: str) -> tuple[Contender, ...]:
-        """Return who could stand in the place of an effect of the best set."""
-        tags = [h.tag for h in self.best.hypotheses]
-        return self.rivals[tags.index(tag)]
+    @property
+    def best(self) -> ScoredSet:
+        """The best set."""
+        return self.tried[0]
 
 
 def score_set(
@@ -359,53 +319,11 @@ def choose(
                 if _all_needed(scored, shifts, noise):
                     sets.append(scored)
     base = sum(log_density(shift, noise.covariance) for shift in shifts)
-    sets = [s for s in sets if s.worth > base]
+    sets = [s for s in sets if s.penalised_log_likelihood > base]
     if not sets:
         return None
-    sets.sort(key=lambda s: s.worth, reverse=True)
-    weights = np.exp([s.worth - sets[0].worth for s in sets])
-    weights /= weights.sum() + np.exp(base - sets[0].worth)
-    best = sets[0]
-    rivals, probabilities = [], []
-    for hypothesis in best.hypotheses:
-        others = best.tags - {hypothesis.tag}
-        probabilities.append(
-            float(sum(w for s, w in zip(sets, weights, strict=True) if hypothesis.tag in s.tags))
-        )
-        rivals.append(_rivals(hypothesis, others, best, sets, weights, noise))
-    return Choice(best, tuple(rivals), tuple(probabilities), tuple(sets), best.worth - base)
-
-
-def _rivals(
-    hypothesis: Hypothesis,
-    others: frozenset[str],
-    best: ScoredSet,
-    sets: Sequence[ScoredSet],
-    weights: FloatArray,
-    noise: Noise,
-) -> tuple[Contender, ...]:
-    """Return what could stand in the place of a hypothesis of the best set, by probability."""
-    found: dict[str, Contender] = {}
-    for scored, weight in zip(sets, weights, strict=True):
-        new = scored.tags - others
-        if not new or (not others <= scored.tags and len(new) > len(best.tags)):
-            continue
-        for candidate in scored.hypotheses:
-            if candidate.tag not in new:
-                continue
-            if hypothesis.tag in new and candidate.tag != hypothesis.tag:
-                continue  # it joins the chosen one, it does not replace it
-            if candidate.tag in found:
-                old = found[candidate.tag]
-                found[candidate.tag] = Contender(
-                    old.hypothesis, old.score, old.stderr, old.probability + float(weight)
-                )
-            else:
-                apart = math.hypot(
-                    *(a.distance(b, noise) for a, b in zip(best.fits, scored.fits, strict=True))
-                )
-                found[candidate.tag] = Contender(candidate, scored.worth - best.worth, apart, float(weight))
-    return tuple(sorted(found.values(), key=lambda r: (-r.probability, -r.score)))
+    sets.sort(key=lambda s: s.penalised_log_likelihood, reverse=True)
+    return Choice(tuple(sets), sets[0].penalised_log_likelihood - base)
 
 
 def _shortlist(

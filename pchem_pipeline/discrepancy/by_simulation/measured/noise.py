@@ -16,12 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
-from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import Measurement, PartSamples, frames_apart
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, Lag, NoiseMode, Shared, spectrum
 from pchem_pipeline.effects.estimators.common_modes import mean_response
-from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.evidence import Evidence
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -69,38 +67,24 @@ class Covariances(NamedTuple):
     lines: Mapping[Shared, Line]
 
 
-def residual_covariances(
-    frames: NDArray[np.unsignedinteger],
-    numbers: IntArray,
-    laws: PixelLaws,
-    maps: PixelMaps,
-    inside: BoolArray,
-) -> Covariances:
-    """Measure how the readout residuals of near and far samples vary together.
-
-    Args:
-        frames: (frame, y, x), DN.
-        numbers: of the frames in the run, increasing, shape (frame,).
-        laws: of the pixels' samples in these frames.
-        maps: plain fit of these frames, or of more of the same pixels.
-        inside: pixels that are looked at, shape (y, x).
-    """
-    inside = inside & maps.usable
+def residual_covariances(samples: PartSamples) -> Covariances:
+    """Measure how the readout residuals of near and far samples vary together."""
+    inside = samples.inside & samples.maps.usable
     rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
     if not rows.size:
         return Covariances({}, {})
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    samples = Samples.by_laws(Stack(frames), laws, maps).without(~inside)
-    u = np.concatenate([chunk for (chunk,) in samples.chunks((1,), *box)])
+    u = samples.scores(1, inside, *box)
     found: dict[tuple[Shared, Lag], Covariance] = {}
     for step in range(_FARTHEST + 1):
-        later = np.searchsorted(numbers, numbers + step).clip(max=numbers.size - 1)
-        first = np.flatnonzero(numbers[later] == numbers + step)
+        first, later = frames_apart(samples.numbers, step)
         if first.size >= 2 * _GROUPS:
-            found |= _of_step(u[first], u[later[first]], inside[box], step)
+            found |= _of_step(u[first], u[later], inside[box], step)
     whole = np.zeros((len(u), *inside.shape), np.float32)
     whole[(slice(None), *box)] = u
-    return Covariances(found, {"row": _line(whole, inside), "column": _line(whole.swapaxes(1, 2), inside.T)})
+    turned = {"row": (whole, inside), "column": (whole.swapaxes(1, 2), inside.T)}
+    # the shape of a line beyond the window is not known
+    return Covariances(found, {of: _line(*turned[of]) for of in _LINES if of in samples.whole_lines})
 
 
 def _line(u: NDArray[np.float32], inside: BoolArray) -> Line:

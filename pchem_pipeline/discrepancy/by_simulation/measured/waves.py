@@ -5,13 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
-from pchem_pipeline.discrepancy.observe.waves import Waves
+from pchem_pipeline.discrepancy.by_simulation.measured.modes import MADE
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import Measurement, PartSamples
+from pchem_pipeline.discrepancy.observe.waves import Waves, waves_across
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode, root_mean_square
 from pchem_pipeline.effects.estimators.common_modes import mean_response
 from pchem_pipeline.effects.framework.evidence import Evidence
 
-_MADE = 0.5  # of the amplitude, from which on a model that makes a wave makes this
+
+def running_waves(samples: PartSamples) -> Waves:
+    """Measure the waves that run across rows, columns and frames."""
+    return waves_across(samples.frames, samples.numbers, samples.laws, samples.maps, samples.inside)
 
 
 def measured_wave(
@@ -26,7 +30,7 @@ def measured_wave(
         inside: pixels that were looked at, shape (y, x).
     """
     wave, made = data.steady, model.steady
-    if wave is None or (made is not None and made.amplitude > _MADE * wave.amplitude):
+    if wave is None or (made is not None and made.amplitude > MADE * wave.amplitude):
         return None
     per_frame, per_row, per_column = wave.per_frame or 0.0, wave.per_row, wave.per_column
     cycles = round(per_frame, 7), round(per_row, 6), round(per_column, 6)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import without_squares
+from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import without_squares
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     MANY_MISTAKEN,
     Refit,

@@ -1,4 +1,4 @@
-"""The likelihood of the pixels' histograms: a second witness where the statistics tell effects badly apart.
+"""The likelihood of the pixels' histograms, asked where the statistics tell effects badly apart.
 
 The statistics of a search are few, and two effects on the law of a sample (a wide tail, a skew) may differ
 little in them. The joint likelihood of the pixels' own parameters and all numbers of such effects holds all
@@ -132,8 +132,10 @@ class PixelLikelihood:
 
     def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         """Return the effects of a set at the numbers that are likeliest together, where a law tells them."""
-        told = [h.effect for h in hypotheses if is_told(h.effect)]
-        fit = self._fit_once(told, [h.effect for h in hypotheses if not is_told(h.effect)])
+        told = [h.effect for h in hypotheses if identifiable_from_histograms(h.effect)]
+        fit = self._fit_once(
+            told, [h.effect for h in hypotheses if not identifiable_from_histograms(h.effect)]
+        )
         if fit is None or any(member.at_limit for member in fit.members):
             return tuple(hypotheses)
         likely = {member.tag: member.effect for member in fit.members}
@@ -152,10 +154,13 @@ class PixelLikelihood:
 
         Args:
             one: effects.
-            other: the same but for those that `is_told`.
+            other: the same but for those that `identifiable_from_histograms`.
         """
-        besides = [e for e in one if not is_told(e)]
-        fits = [self._fit_once([e for e in each if is_told(e)], besides) for each in (one, other)]
+        besides = [e for e in one if not identifiable_from_histograms(e)]
+        fits = [
+            self._fit_once([e for e in each if identifiable_from_histograms(e)], besides)
+            for each in (one, other)
+        ]
         if fits[0] is None or fits[1] is None:
             return None
         rise, error = self._sets.difference(fits[0], fits[1])
@@ -195,7 +200,7 @@ class PixelLikelihood:
 
 
 @dataclass(frozen=True)
-class Witness:
+class HistogramLikelihood:
     """The likelihood of the pixels where one law holds for all their samples; by default it says nothing.
 
     Attributes:
@@ -209,7 +214,7 @@ class Witness:
 
         A number beside the strength stays as it is told here; a few pixels tell it badly.
         """
-        told = [h.effect for h in hypotheses if is_told(h.effect)]
+        told = [h.effect for h in hypotheses if identifiable_from_histograms(h.effect)]
         if not told:
             return tuple(hypotheses)
         number = MANY_PIXELS if any(len(Member.of(e).coordinates) > 1 for e in told) else FEW_PIXELS
@@ -240,7 +245,7 @@ class Witness:
         None also where they differ in what no law of a sample holds.
         """
         tags = {e.tag for e in one} ^ {e.tag for e in other}
-        if not all(is_told(e) for e in (*one, *other) if e.tag in tags):
+        if not all(identifiable_from_histograms(e) for e in (*one, *other) if e.tag in tags):
             return None
         pixels = self.of((*one, *other), number)
         return None if pixels is None else pixels.behind(one, other)
@@ -257,7 +262,7 @@ def _at(hypothesis: Hypothesis, effect: Effect) -> Hypothesis:
 
 def _starts(kind: type[Effect]) -> tuple[Effect, ...]:
     """Return what is typical of an effect and the same stronger; nothing where no law tells it."""
-    typical = next((e for e in kind.typical() if e.strength and is_told(e)), None)
+    typical = next((e for e in kind.typical() if e.strength and identifiable_from_histograms(e)), None)
     return () if typical is None else (typical, typical.scaled(_STRONG))
 
 
@@ -298,12 +303,12 @@ def _at_other_peaks(sets: SetComparison, fitted: FittedSet) -> FittedSet:
 
 def _has_law(effect: Effect) -> bool:
     """Tell whether a law of a sample, if only a rough one, has an effect that its histograms show first."""
-    return is_told(effect) or (
+    return identifiable_from_histograms(effect) or (
         effect.everywhere and type(effect).rough_law and leads_in_histograms(type(effect))
     )
 
 
-def is_told(effect: Effect) -> bool:
+def identifiable_from_histograms(effect: Effect) -> bool:
     """Tell whether the law of a sample holds all numbers of an effect that its histograms show first."""
     kind = type(effect)
     if not effect.everywhere or kind.rough_law or kind.erratic:

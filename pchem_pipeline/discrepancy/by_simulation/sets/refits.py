@@ -16,18 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    PRICE_OF_MORE,
     Hypothesis,
     Noise,
     correction,
     log_density,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError, Refit
-from pchem_pipeline.discrepancy.by_simulation.sets.steps import Steps
+from pchem_pipeline.discrepancy.by_simulation.sets.steps import Steps, broyden
 from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 
 FloatArray = NDArray[np.float64]
 
@@ -35,10 +37,14 @@ FloatArray = NDArray[np.float64]
 FEW = 6
 _ENOUGH = 12  # replicates that tell a scatter
 _MOST_STEPS = 5
-_STEPS_OF_DEAR = 2
+_STEPS_OF_EXPENSIVE = 2
+#: Standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
+#: than a single one would by chance.
+ESTABLISHED = 4.5
 _CLOSE = 0.05  # relative change of a factor that is not worth another simulation
 _CERTAIN = 3.5  # errors of a difference of means: less is chance
-_SMALLEST_SECANT = 0.05  # of the logarithm of a factor: shorter steps say nothing about the slope
+#: Of the logarithm of a factor: shorter steps say nothing about the slope.
+SMALLEST_SECANT = 0.05
 _TRIAL = 0.3  # step of the logarithm of a factor by which a slope is measured
 _STRONG = 10.0  # standard deviations by which an effect moves a statistic where its slope is
 _LARGEST_SHARE = 0.9  # of a factor that a correction takes away
@@ -50,6 +56,8 @@ _LEAST_GAIN = 0.5  # nats of a step, about a standard error of a strength: the n
 _SLIGHT = (
     0.15  # of what a set leaves beyond chance, gained by a step that leaves it behind another set: in vain
 )
+_LEFT = 0.02  # chance of what a complete set may leave, anywhere among the statistics
+_LITTLE = 0.03  # of what there is to explain, nats, that the details of effects may leave
 # nats, and share of what there is to explain, that a set must promise to leave for it not to be all there is;
 # the logarithm of a factor up to which its promise is believed
 _SHORT, _SHORT_SHARE, _BELIEVED = 100.0, 0.05, 0.75
@@ -100,6 +108,21 @@ class Refitted:
     def effects(self) -> tuple[Effect, ...]:
         """The effects."""
         return tuple(h.effect for h in self.hypotheses)
+
+    @property
+    def words(self) -> str:
+        """Tags of the effects."""
+        return " + ".join(h.tag for h in self.hypotheses)
+
+    @property
+    def price(self) -> float:
+        """Nats that the effects cost beyond the first one."""
+        return PRICE_OF_MORE * (len(self.hypotheses) - 1)
+
+    @property
+    def penalised_log_likelihood(self) -> float:
+        """Score less the price of the effects, nats."""
+        return self.score - self.price
 
     @property
     def mean(self) -> FloatArray:
@@ -163,10 +186,9 @@ class Refitter:
         Raises:
             NotFittedError: hardly a pixel can be fitted with the set at its guessed strengths.
         """
-        words = " + ".join(h.tag for h in hypotheses)
-        self.allow(words)
+        self.allow(words := " + ".join(h.tag for h in hypotheses))
         way = Steps.begin(self.simulated(tuple(hypotheses), None, replicates))
-        dear = is_dear(h.effect for h in hypotheses)
+        expensive = is_expensive(h.effect for h in hypotheses)
         for step_number in range(self.steps):
             best = way.best
             if best.settled or way.gained < _LEAST_GAIN:
@@ -175,7 +197,7 @@ class Refitter:
                 break
             if whole and self._explains_a_part(best):
                 return replace(best, short=True)
-            if dear and (step_number >= _STEPS_OF_DEAR or (step_number and best.score < rival)):
+            if expensive and (step_number >= _STEPS_OF_EXPENSIVE or (step_number and best.score < rival)):
                 break
             start, step = way.ahead()
             moved = _moved(start.hypotheses, step)
@@ -242,7 +264,7 @@ class Refitter:
         Replicates share their random numbers, whatever the strength: few of them show a slope.
         """
         strong = np.max(np.abs(one.parts) / self.null.std, axis=1) > _STRONG
-        if not strong.any() or is_dear(one.effects):
+        if not strong.any() or is_expensive(one.effects):
             return None
         ahead = np.diag(np.where(strong, np.copysign(_TRIAL, one.change), 0.0))
         found = [self._slope(one, place, ahead[place]) for place in range(strong.size)]
@@ -255,21 +277,44 @@ class Refitter:
         moved = _moved(one.hypotheses, ahead)
         if moved is None:
             return None
-        step = float(_step(one.effects, tuple(h.effect for h in moved))[place])
-        if abs(step) < _SMALLEST_SECANT:
+        effects = tuple(h.effect for h in moved)
+        step = float(_step(one.effects, effects)[place])
+        if abs(step) < SMALLEST_SECANT:
             return None
-        self.allow(" + ".join(sorted(one.tags)))
+        # a shift in proportion to the factor has this slope between the two
+        middle = np.exp(step / 2.0)
+        slope = self.measured_slope(one, effects, step, middle * one.slopes[place])
+        return None if slope is None else np.asarray(slope / middle)
+
+    def measured_slope(
+        self, one: Refitted, effects: tuple[Effect, ...], step: float, foreseen: FloatArray | float = 0.0
+    ) -> FloatArray | None:
+        """Measure how the statistics go with a number of a set, by a simulation; None: it cannot be fitted.
+
+        Args:
+            one: the set.
+            effects: the same with one number changed.
+            step: by how much the logarithm of it was changed.
+            foreseen: the slope where the measured one does not differ beyond chance, shape (m,).
+        """
+        self.allow(one.words)
         try:
-            _, vectors = self.draw(tuple(h.effect for h in moved), len(one.vectors))
+            _, vectors = self.draw(effects, len(one.vectors))
         except NotFittedError:
             return None
         apart = (vectors - one.vectors) / step
         error = apart.std(axis=0, ddof=1) / np.sqrt(len(apart))
-        # a shift in proportion to the factor has this slope between the two
-        middle = np.exp(step / 2.0)
-        foreseen = middle * one.slopes[place]
-        slope = foreseen + beyond_chance(apart.mean(axis=0) - foreseen, error)
-        return np.asarray(slope / middle)
+        return np.asarray(foreseen + beyond_chance(apart.mean(axis=0) - foreseen, error))
+
+    def passes_goodness_of_fit(self, one: Refitted) -> bool:
+        """Tell whether a set leaves no statistic beyond chance."""
+        p = float(self.null.p_of(one.rest, 2).min())
+        return look_elsewhere(p, self.null.effective_tests) > _LEFT
+
+    def residual_is_small(self, one: Refitted) -> bool:
+        """Tell whether a set leaves nothing, or so little of what there was that it may be its details."""
+        little = one.chance - one.score < _LITTLE * (one.chance - self.nothing)
+        return little or self.passes_goodness_of_fit(one)
 
     def kept(self, hypotheses: Sequence[Hypothesis]) -> NDArray[np.bool_]:
         """Return which statistics tell strengths.
@@ -363,11 +408,11 @@ class Refitter:
             return parts
         step = _step(before.effects, tuple(h.effect for h in hypotheses))
         length, old = float(step @ step), before.slopes
-        if length < _SMALLEST_SECANT**2:
+        if length < SMALLEST_SECANT**2:
             return old
         apart = vectors.mean(axis=0) - before.mean - step @ old
         error = _error_of_difference(vectors, before.vectors, np.sqrt(covariance.variances))
-        slope = old + np.outer(step, beyond_chance(apart, error) / length)
+        slope = broyden(old, step, beyond_chance(apart, error))
         # a secant holds between the two; a shift in proportion to the factor has its end's slope
         return np.asarray(slope * np.exp(step / 2.0)[:, None])
 
@@ -382,7 +427,7 @@ class Refitter:
         return null.covariance.scaled(ratio)
 
 
-def is_dear(effects: Iterable[Effect]) -> bool:
+def is_expensive(effects: Iterable[Effect]) -> bool:
     """Tell whether a refit with effects takes long: those look for levels or a path in every pixel."""
     return any(type(effect).erratic for effect in effects)
 

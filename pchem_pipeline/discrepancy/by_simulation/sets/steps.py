@@ -7,7 +7,7 @@ where the way on explains more, or do a fraction of what it promised, time after
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,48 @@ if TYPE_CHECKING:
     from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
 
 FloatArray = NDArray[np.float64]
+State = TypeVar("State")
 
-_LARGEST = np.log(4.0)  # of the logarithm of a factor
+#: Most that the logarithm of the factor of a strength changes in one step.
+LARGEST_STEP = float(np.log(4.0))
 _FURTHER = 2  # steps beyond one that explains less, where the data go on asking for the same
 # of a step, what the data ask for after it: too much for a good slope, and the most that is believed
 _SLOW, _SLOWEST = 0.5, 0.75
 _SHORTEST = 0.25  # of the step that the data ask for
+
+
+@dataclass
+class DampedSteps(Generic[State]):
+    """The best of several states, and the length of the next step, which a step in vain halves.
+
+    Attributes:
+        best: the state of the highest score so far.
+        score: its log score, nats.
+        length: of the next step, in what the data ask for.
+    """
+
+    best: State
+    score: float
+    length: float = 1.0
+
+    def judge(self, now: State | None, score: float = -np.inf) -> bool:
+        """Keep the better one, and tell whether it is the new one; None: the step led nowhere."""
+        if now is None or not score > self.score:
+            self.length *= 0.5
+            return False
+        self.best, self.score, self.length = now, score, 1.0
+        return True
+
+
+def broyden(slopes: FloatArray, step: FloatArray, unforeseen: FloatArray) -> FloatArray:
+    """Return slopes that account for what a step has done, too (Broyden 1965).
+
+    Args:
+        slopes: of the statistics with each coordinate, shape (e, m).
+        step: of the coordinates, shape (e,).
+        unforeseen: change of the statistics beyond that by these slopes, shape (m,).
+    """
+    return np.asarray(slopes + np.outer(step, unforeseen / float(step @ step)))
 
 
 @dataclass
@@ -59,8 +95,8 @@ class Steps:
         if self.further:
             change = self.now.change
             step = change * (np.linalg.norm(self.step) / max(float(np.linalg.norm(change)), 1e-12))
-            return self.now, np.clip(step, -_LARGEST, _LARGEST)
-        return self.best, np.clip(self.best.change * self.length, -_LARGEST, _LARGEST)
+            return self.now, np.clip(step, -LARGEST_STEP, LARGEST_STEP)
+        return self.best, np.clip(self.best.change * self.length, -LARGEST_STEP, LARGEST_STEP)
 
     def taken(self, step: FloatArray, now: Refitted | None) -> bool:
         """Take note of where a step led (None: nowhere), and tell whether there is another one to try."""

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.by_simulation.measured.electrons import electron_chances, measured_electrons
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import PartSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons
 from pchem_pipeline.model.law.mass import sample_mass
@@ -71,14 +71,7 @@ def codes(electrons: np.ndarray, seed: int) -> np.ndarray:
 def chances(frames: np.ndarray, inside: np.ndarray = EVERYWHERE) -> Any:
     """Return what is measured of frames."""
     evidence = observe(frames, np.arange(len(frames)), n_run=len(frames), block_frames=100)
-    return electron_chances(
-        frames,
-        np.arange(len(frames)),
-        laws_of_frames(frames, evidence.maps),
-        evidence.maps,
-        evidence,
-        inside,
-    )
+    return electron_chances(PartSamples(frames, np.arange(len(frames)), evidence.maps, evidence, inside))
 
 
 def drawn(fate: Fate, seed: int) -> np.ndarray:

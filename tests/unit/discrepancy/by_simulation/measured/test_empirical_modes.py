@@ -15,6 +15,7 @@ from pchem_pipeline.discrepancy.by_simulation.measured.modes import (
     common_scores,
     measured_mode,
 )
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import PartSamples
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.simulate.chain import simulate_block
@@ -41,9 +42,15 @@ def frames(
 
 def measured(stack: tuple[np.ndarray, PixelMaps], inside: np.ndarray = EVERYWHERE) -> EmpiricalNoise | None:
     """Return what is measured beside a model without common changes."""
-    data = common_scores(stack[0], np.arange(len(stack[0])), stack[1], inside)
+    data = scores(*stack, inside)
     found = measured_mode(data, nothing(data), stack[1], inside)
     return None if found is None else found.effect
+
+
+def scores(frames: np.ndarray, maps: PixelMaps, inside: np.ndarray = EVERYWHERE) -> dict[Any, Sums]:
+    """Return the sums of scores of frames."""
+    evidence: Any = None
+    return common_scores(PartSamples(frames, np.arange(len(frames)), maps, evidence, inside))
 
 
 def nothing(data: dict[Any, Sums]) -> dict[Any, Sums]:
@@ -188,7 +195,7 @@ def test_a_wave_of_gain_or_light_is_told_by_its_frequencies(
     told = mode.wave[0], mode.wave[2 if of == "column" else 1]
     known = told if np.sign(told[0]) == np.sign(per_frame) else (-told[0], -told[1])
     # of a sine of amplitude a in n values of which each holds the information i (Rife and Boorstyn 1974)
-    sums = common_scores(stack[0], np.arange(FRAMES), stack[1], EVERYWHERE)[of, changes]
+    sums = scores(*stack)[of, changes]
     error = np.sqrt(24.0 / (amplitude**2 * sums.information.sum() * FRAMES)) / (2.0 * np.pi)
     assert abs(known[0] - per_frame) < 4.0 * error / FRAMES
     assert abs(known[1] - per_line) < 4.0 * error / max(sums.information.size, 2)
@@ -201,12 +208,10 @@ def test_a_wave_that_a_model_makes_is_not_measured_again() -> None:
     """In frames simulated with it its phase is another, and chance is another."""
     frame, row, _ = np.ogrid[:FRAMES, : SHAPE[0], : SHAPE[1]]
     sine = [0.03 * np.sin(2.0 * np.pi * (0.163 * frame + 0.21 * row) + phase) for phase in (0.4, 2.0)]
-    scores = []
-    for seed, each in enumerate(sine):
-        values, maps = frames(20 + seed, gain=1.0 + each)
-        scores.append(common_scores(values, np.arange(FRAMES), maps, EVERYWHERE))
-    assert measured_mode(scores[0], nothing(scores[0]), maps, EVERYWHERE) is not None
-    assert measured_mode(scores[0], scores[1], maps, EVERYWHERE) is None
+    stacks = [frames(20 + seed, gain=1.0 + each) for seed, each in enumerate(sine)]
+    (data, model), maps = (scores(*stack) for stack in stacks), stacks[1][1]
+    assert measured_mode(data, nothing(data), maps, EVERYWHERE) is not None
+    assert measured_mode(data, model, maps, EVERYWHERE) is None
 
 
 @pytest.mark.parametrize("wave", [(0.163, 0.21, 0.0), (0.5, 0.5, 0.0)])
@@ -266,7 +271,7 @@ def test_an_offset_in_bursts_is_told_with_how_often_and_how_large() -> None:
 
 def test_what_a_model_makes_is_taken_off() -> None:
     stack = frames(6, gain=1.0 + 0.03 * drawn(FRAMES, 1, 1))
-    data = common_scores(stack[0], np.arange(FRAMES), stack[1], EVERYWHERE)
+    data = scores(*stack)
     assert measured_mode(data, data, stack[1], EVERYWHERE) is None
 
 

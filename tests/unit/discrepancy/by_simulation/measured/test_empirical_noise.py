@@ -17,8 +17,8 @@ from pchem_pipeline.discrepancy.by_simulation.measured.noise import (
     measured_noise,
     residual_covariances,
 )
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import PartSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode, spectrum
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -74,9 +74,7 @@ def measured(frames: np.ndarray, inside: np.ndarray | None = None) -> EmpiricalN
     numbers = np.arange(FRAMES)
     inside = np.ones(SHAPE, bool) if inside is None else inside
     evidence = observe(frames, numbers, n_run=FRAMES, block_frames=30)
-    found = residual_covariances(
-        frames, numbers, laws_of_frames(frames, evidence.maps), evidence.maps, inside
-    )
+    found = residual_covariances(PartSamples(frames, numbers, evidence.maps, evidence, inside))
     noise = measured_noise(found, NOTHING, evidence, inside)
     return None if noise is None else noise.effect
 
@@ -154,9 +152,7 @@ def test_what_a_model_makes_is_taken_off():
     frames = stack(6, of_whole_rows)
     evidence = observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=30)
     inside = np.ones(SHAPE, bool)
-    data = residual_covariances(
-        frames, np.arange(FRAMES), laws_of_frames(frames, evidence.maps), evidence.maps, inside
-    )
+    data = residual_covariances(PartSamples(frames, np.arange(FRAMES), evidence.maps, evidence, inside))
     assert measured_noise(data, data, evidence, inside) is None
     by_chance = {key: Covariance(2.0 * one.error, one.error) for key, one in data.pairs.items()}
     assert measured_noise(data, Covariances(by_chance, {}), evidence, inside) == measured_noise(

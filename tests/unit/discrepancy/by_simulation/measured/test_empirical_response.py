@@ -12,8 +12,8 @@ from pydantic import ValidationError
 from scipy import stats
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
 from pchem_pipeline.discrepancy.by_simulation.measured.response import measured_response, residual_responses
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import Measurement, PartSamples
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
@@ -101,9 +101,7 @@ def measured(frames: np.ndarray) -> Measurement | None:
     """Return what is measured of frames beside no effect."""
     numbers = np.arange(len(frames))
     evidence = observe(frames, numbers, n_run=len(frames), block_frames=100)
-    data = residual_responses(
-        frames, numbers, laws_of_frames(frames, evidence.maps), evidence.maps, EVERYWHERE
-    )
+    data = residual_responses(PartSamples(frames, numbers, evidence.maps, evidence, EVERYWHERE))
     return measured_response(data, None, evidence, EVERYWHERE)
 
 
@@ -199,7 +197,7 @@ def test_what_a_model_makes_is_not_measured_again() -> None:
     first, second = (drawn(distant, seed) for seed in (5, 6))
     evidence = [observe(f, numbers, n_run=FRAMES, block_frames=100) for f in (first, second)]
     data, model = (
-        residual_responses(frames, numbers, laws_of_frames(frames, each.maps), each.maps, EVERYWHERE)
+        residual_responses(PartSamples(frames, numbers, each.maps, each, EVERYWHERE))
         for frames, each in zip((first, second), evidence, strict=True)
     )
     assert measured_response(data, None, evidence[0], EVERYWHERE) is not None

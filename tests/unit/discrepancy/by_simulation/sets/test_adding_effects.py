@@ -33,15 +33,14 @@ from pchem_pipeline.discrepancy.by_simulation.sets.comparison import (
     Comparison,
     _all_seen,
     _asked_once,
-    _begun,
     _far_behind,
     _grown,
     compare,
     own_signature,
 )
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Witness
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials, of_kinds
+from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials, same_kinds
 from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import StatisticsGap
@@ -122,7 +121,7 @@ class World:
         held: Sequence[Hypothesis] = (),
         before: Any = None,
         beside: Sequence[Hypothesis] = (),
-        witness: Witness | None = None,
+        likelihood: HistogramLikelihood | None = None,
         unlisted: Callable[[], bool] = lambda: False,
         measured: Callable[[bool], Refitted | None] = lambda _: None,
     ) -> Comparison | None:
@@ -130,7 +129,15 @@ class World:
         assert choice is not None
         grown = (lambda one: self.choice(*beside, mean=one.mean)) if beside else (lambda _: None)
         return compare(
-            self.refitter(), held, hypotheses, choice, before, grown, witness or Witness(), unlisted, measured
+            self.refitter(),
+            held,
+            hypotheses,
+            choice,
+            before,
+            grown,
+            likelihood or HistogramLikelihood(),
+            unlisted,
+            measured,
         )
 
 
@@ -242,8 +249,8 @@ def test_a_part_that_stands_out_makes_no_effect_stronger_that_acts_everywhere(
     assert factors[False, 8.0] > 1.01 * factors[False, 0.0]
 
 
-def test_a_dear_refit_is_not_repeated_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.refits.is_dear", lambda _: True)
+def test_an_expensive_refit_is_not_repeated_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.refits.is_expensive", lambda _: True)
     world = World([effect("row_noise", 2.0)])
     found = world.refitter().refined([hypothesis("row_noise", 0.02)])
     assert world.drawn <= 3 * 6
@@ -355,7 +362,7 @@ def test_fewer_effects_are_tried_before_rivals_of_a_set_of_more(monkeypatch: pyt
     noise = world.refitter().noise(world.null.covariance, 40)
     shifts = (world.z.train - world.null.mean, world.z.test - world.null.mean)
     tried = tuple(score_set([row, frame, more], shifts, noise) for more in (drift, coupling))
-    choice = Choice(tried[0], ((),) * 3, (1.0,) * 3, tried, 100.0)
+    choice = Choice(tried, 100.0)
     found = compare(world.refitter(), [], [row, frame, drift, coupling], choice)
     assert found is not None
     assert found.chosen.tags == {"row_noise", "frame_noise"}
@@ -410,14 +417,18 @@ def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> No
     world = World([effect("row_noise", 0.5), effect("frame_noise", 0.3)])
     known = world.refitter().refined([hypothesis("row_noise"), hypothesis("frame_noise")])
     drift = hypothesis("exposure_drift")
-    first, second = _begun([hypothesis("row_noise"), drift], [known])
+
+    def begun(members: Sequence[Hypothesis], *tried: Refitted) -> tuple[Hypothesis, ...]:
+        return Trials(world.refitter(), (), HistogramLikelihood(), list(tried)).begun(members)
+
+    first, second = begun([hypothesis("row_noise"), drift], known)
     assert (first.effect, second) == (hypothesis("row_noise").effect, drift)  # one in common is not enough
     members = [hypothesis("row_noise"), drift, hypothesis("frame_noise")]
-    begun = _begun(members, [known])
-    assert {begun[0].effect, begun[2].effect} == set(known.effects)
-    assert begun[1] is drift
+    found = begun(members, known)
+    assert {found[0].effect, found[2].effect} == set(known.effects)
+    assert found[1] is drift
     alone = world.refitter().refined([hypothesis("row_noise")])
-    assert _begun(members[:2], [known, alone])[0].effect == alone.effects[0]
+    assert begun(members[:2], known, alone)[0].effect == alone.effects[0]
 
 
 def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
@@ -436,14 +447,14 @@ def test_a_second_witness_decides_between_effects_that_the_statistics_tell_badly
     row, column = TRUTH["row_noise"], TRUTH["frame_noise"]
     asked: list[tuple[str, str]] = []
 
-    class Decided(Witness):
+    class Decided(HistogramLikelihood):
         def behind(
             self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
         ) -> tuple[float, float] | None:
             asked.append((one[0].tag, other[0].tag))
             return (12.0, 4.0) if one[0].tag == "frame_noise" else (-12.0, 4.0)
 
-    class Undecided(Witness):
+    class Undecided(HistogramLikelihood):
         def behind(
             self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
         ) -> tuple[float, float] | None:
@@ -452,8 +463,8 @@ def test_a_second_witness_decides_between_effects_that_the_statistics_tell_badly
     TRUTH["frame_noise"] = (row[0] + 0.5 * np.eye(M)[1], row[1])
     try:
         plain = world.compare(hypothesis("row_noise", 0.5), twin)
-        found = world.compare(hypothesis("row_noise", 0.5), twin, witness=Decided())
-        open_ = world.compare(hypothesis("row_noise", 0.5), twin, witness=Undecided())
+        found = world.compare(hypothesis("row_noise", 0.5), twin, likelihood=Decided())
+        open_ = world.compare(hypothesis("row_noise", 0.5), twin, likelihood=Undecided())
     finally:
         TRUTH["frame_noise"] = column
     assert plain is not None
@@ -480,13 +491,13 @@ def test_what_the_histograms_rule_out_is_not_refitted(
     world = World([effect("row_noise", 0.5)])
     twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
 
-    class Sure(Witness):
+    class Sure(HistogramLikelihood):
         def behind(
             self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
         ) -> tuple[float, float] | None:
             return answer
 
-    found = world.compare(hypothesis("row_noise", 0.5), twin, witness=Sure())
+    found = world.compare(hypothesis("row_noise", 0.5), twin, likelihood=Sure())
     assert found is not None
     assert found.chosen.tags == {"row_noise"}
     assert ({"frame_noise"} in [one.tags for one in found.tried]) == refitted
@@ -531,9 +542,9 @@ def test_what_stands_out_beside_a_set_is_asked_once() -> None:
 def test_fewer_effects_beside_a_set_are_far_behind_by_more_than_their_fingerprints_may_err(
     behind: float, explained: float, far: bool
 ) -> None:
-    choice: Any = SimpleNamespace(best=SimpleNamespace(worth=explained), advantage=explained)
-    one: Any = SimpleNamespace(worth=explained - behind)
-    assert _far_behind(one, choice) is far
+    best, one = (SimpleNamespace(penalised_log_likelihood=explained - off) for off in (0.0, behind))
+    choice: Any = SimpleNamespace(best=best, advantage=explained)
+    assert _far_behind(one, choice) is far  # type: ignore[arg-type]
 
 
 def test_a_part_of_a_better_set_is_not_grown_again() -> None:
@@ -545,7 +556,7 @@ def test_a_part_of_a_better_set_is_not_grown_again() -> None:
 
     def begun(*sets: list[Hypothesis]) -> list[frozenset[str]]:
         asked: list[frozenset[str]] = []
-        trials = Trials(far, (), Witness(), [refitter.refined(one) for one in sets])
+        trials = Trials(far, (), HistogramLikelihood(), [refitter.refined(one) for one in sets])
         _grown(trials, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
         return asked
 
@@ -558,7 +569,7 @@ def test_a_set_with_more_in_vain_is_not_grown_beside_its_part() -> None:
     asked: list[frozenset[str]] = []
     alone = refitter.refined([hypothesis("row_noise")])
     more = refitter.refined([hypothesis("row_noise"), hypothesis("frame_noise")])
-    trials = Trials(refitter, (), Witness(), [alone, replace(more, score=alone.score)])
+    trials = Trials(refitter, (), HistogramLikelihood(), [alone, replace(more, score=alone.score)])
     _grown(trials, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
     assert asked == [{"row_noise"}]
 
@@ -585,7 +596,7 @@ def test_an_effect_that_its_set_lets_vanish_does_not_take_the_others_with_it() -
     noise = world.refitter().noise(world.null.covariance, 40)
     shifts = (world.z.train - world.null.mean, world.z.test - world.null.mean)
     tried = (score_set([row, frame, drift], shifts, noise),)
-    choice = Choice(tried[0], ((),) * 3, (1.0,) * 3, tried, 100.0)
+    choice = Choice(tried, 100.0)
     found = compare(world.refitter(), [], [row, frame, drift], choice)
     assert found is not None
     assert found.chosen.tags == {"row_noise", "frame_noise"}
@@ -686,7 +697,7 @@ def test_the_likeliest_effects_are_fitted_whatever_was_spent() -> None:
     noise = plain.noise(world.null.covariance, 40)
     shifts = (world.z.train - world.null.mean, world.z.test - world.null.mean)
     tried = tuple(score_set([h], shifts, noise) for h in (row, frame))
-    found = compare(world.refitter(), [], [row, frame], Choice(tried[0], ((),) * 2, (1.0,) * 2, tried, 100.0))
+    found = compare(world.refitter(), [], [row, frame], Choice(tried, 100.0))
     assert found is not None
     assert found.chosen.tags == {"frame_noise"}
 
@@ -706,9 +717,9 @@ def test_a_signature_is_asked_of_the_same_kind_of_the_others() -> None:
     guess = hypothesis("row_noise", 0.2)
     elsewhere = replace(guess, effect=guess.effect.at_place(Region.model_validate({"columns": "0:8"})))
     one = world.refitter().refined([guess])
-    assert of_kinds(one, [hypothesis("row_noise", 0.9)])
-    assert not of_kinds(one, [elsewhere])
-    assert not of_kinds(one, [hypothesis("row_noise", 0.2), hypothesis("frame_noise")])
+    assert same_kinds(one.hypotheses, [hypothesis("row_noise", 0.9)])
+    assert not same_kinds(one.hypotheses, [elsewhere])
+    assert not same_kinds(one.hypotheses, [hypothesis("row_noise", 0.2), hypothesis("frame_noise")])
 
 
 @pytest.mark.parametrize("second", ["columns=0:8", "columns=16:24"])
@@ -813,7 +824,7 @@ def test_a_set_is_fitted_again_with_the_kind_of_an_effect_that_does_better() -> 
     row, frame, other = (
         hypothesis("row_noise"), hypothesis("frame_noise"), hypothesis("frame_noise").effect
     )  # fmt: skip
-    trials = Trials(world.refitter(), (), Witness())
+    trials = Trials(world.refitter(), (), HistogramLikelihood())
     for members in ((row,), (frame,), (row, frame), (row, frame)):
         trials.refit(members)
     assert len(trials.tried) == 3
