@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, largest_pulls
+from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,
@@ -18,11 +19,10 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     tolerance,
 )
 from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, Contender, unrelated
-from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
-from pchem_pipeline.discrepancy.null import Measured, NullModel, misfits
+from pchem_pipeline.discrepancy.gap import Gap
+from pchem_pipeline.discrepancy.null import NullModel, misfits
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.places import Part
-from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.verdict import Candidate, Rival
 from pchem_pipeline.effects.framework.effect import Effect
 
@@ -72,17 +72,34 @@ class AddedRounds:
 
     Attributes:
         rounds: in their order.
-        gaps: in the statistics of the model before the first.
-        z: statistics of the data.
-        settings: the section ``discrepancy``.
-        allowed: relative error of what the effects do that is not held against them.
+        accept: measures gaps on the final frames, and says what is allowed to the details of effects.
     """
 
     rounds: Sequence[Round]
-    gaps: StatisticsGap
-    z: Measured
-    settings: DiscrepancySettings
-    allowed: float
+    accept: Acceptance
+
+    @property
+    def tolerance(self) -> FloatArray | float:
+        """What is not held against their effects, (m,): a fraction of what they do."""
+        if not self.rounds:
+            return 0.0
+        parts = np.concatenate([this.added.parts for this in self.rounds])
+        return tolerance(parts, self.accept.allowed, self.accept.first.events)
+
+    def left(self, last: NullModel) -> FloatArray:
+        """Return what the model with them leaves of each statistic, in what it may leave, (m,)."""
+        chance = last.std * np.sqrt(0.5 + 1.0 / last.n_replicates)
+        return np.asarray((self.accept.z.both - last.mean) / np.hypot(chance, self.tolerance))
+
+    def accounted(self, last: NullModel) -> tuple[Hypothesis, ...]:
+        """Return the effects of which the model accounts for what they move."""
+        rest = self.left(last)
+        return tuple(
+            h
+            for this in self.rounds
+            for h, part in zip(this.added.hypotheses, this.added.parts, strict=True)
+            if not unexplained_of_its_own(part, rest, this.null)
+        )
 
     def close(self, before: Gap, last: NullModel, still: bool) -> Added:
         """Return the added effects, the weightiest of a round first, and what is left.
@@ -92,9 +109,9 @@ class AddedRounds:
             last: null of the final model.
             still: whether the data disagree with that.
         """
-        after = self._gap(last)
+        after = self.accept.gap(last)
         unfinished = not after.at_floor and (still or after.too_wide(before.value))
-        rest = left_of(self.rounds, last, self.z, self.allowed) if unfinished and self.rounds else None
+        rest = self.left(last) if unfinished and self.rounds else None
         additions: list[Addition] = []
         gap = before
         for index, this in enumerate(self.rounds):
@@ -104,9 +121,9 @@ class AddedRounds:
             for place, member in enumerate(order):
                 mean = mean + parts[member]
                 if place < len(order) - 1:
-                    now = self.gaps.gap(self.z.final, mean, this.null.replicates)
+                    now = self.accept.gap_at(mean, this.null.replicates)
                 elif index < len(self.rounds) - 1:
-                    now = self._gap(this.extended)
+                    now = self.accept.gap(this.extended)
                 else:
                     now = after
                 effect = this.added.hypotheses[member].effect
@@ -124,9 +141,6 @@ class AddedRounds:
             additions = [without_better_reason(additions[0])]
         return Added(tuple(additions), after, unfinished)
 
-    def _gap(self, null: NullModel) -> Gap:
-        return self.gaps.gap(self.z.final, null.mean, null.replicates, null.strengths)
-
     def _against(self, this: Round, member: int, still: bool) -> str:
         """Return in words why an effect is not in the data, whatever is there besides; empty: nothing.
 
@@ -135,8 +149,9 @@ class AddedRounds:
         agrees, with every effect in it, is not judged a second time by fewer statistics.
         """
         added, parts = this.added.hypotheses[member], this.added.parts
-        allowed = tolerance(parts, self.allowed, this.null.events)
-        wrong = still and misfits(this.extended, self.z, parts[member], self.settings.significance, allowed)
+        allowed = tolerance(parts, self.accept.allowed, this.null.events)
+        significance = self.accept.settings.significance
+        wrong = still and misfits(this.extended, self.accept.z, parts[member], significance, allowed)
         return added.effect.stuck_words() or ("it does not account for what it moves itself" if wrong else "")
 
     def _addition(
@@ -145,7 +160,7 @@ class AddedRounds:
         """Return an effect of a round; ``later`` is what those of it do that come after, shape (m,)."""
         added = this.added.hypotheses[member]
         rivals = this.compared.rivals_of(added.tag)
-        kept = _ambiguous_set(rivals, self.settings.certainty)
+        kept = _ambiguous_set(rivals, self.accept.settings.certainty)
         described = type(added.effect).measured_only
         against = "" if described else against
         named = len(kept) == 1 and not against and not described
@@ -170,8 +185,8 @@ class AddedRounds:
             pulls=largest_pulls(
                 this.null.names,
                 added.fingerprint / this.null.std,
-                this.null.pulls(self.z.both, 2),
-                this.extended.pulls(self.z.both, 2),
+                this.null.pulls(self.accept.z.both, 2),
+                this.extended.pulls(self.accept.z.both, 2),
             ),
             moved=this.moved,
             certain=this.certain,
@@ -189,8 +204,8 @@ class AddedRounds:
                 behind, error = compared.witnessed.get(one.tags, (one.score - compared.chosen.score, None))
                 other = _Other(hypothesis.effect, behind, one.mean, one.rest, True, error)
                 found.setdefault(hypothesis.tag, other)
-        noise = Noise(this.null.covariance.times(0.5), self.settings.model_error)
-        shift = self.z.both - this.null.mean
+        noise = Noise(this.null.covariance.times(0.5), self.accept.settings.model_error)
+        shift = self.accept.z.both - this.null.mean
         best = fit_set(this.added.hypotheses, shift, noise).log_score(shift, noise)
         refitted = {*compared.chosen.tags, *found}
         for hypothesis in this.hypotheses:
@@ -198,7 +213,7 @@ class AddedRounds:
                 continue
             fit = fit_set([*kept, hypothesis], shift, noise)
             mean = this.null.mean + fit.parts.sum(axis=0)
-            rest = (self.z.both - mean) / np.sqrt(noise.of(fit.parts).variances)
+            rest = (self.accept.z.both - mean) / np.sqrt(noise.of(fit.parts).variances)
             behind = fit.log_score(shift, noise) - best
             if hypothesis.tag not in found or behind > found[hypothesis.tag].behind:
                 closes = bool(fit.factors[-1] > 0.0)
@@ -211,13 +226,13 @@ class AddedRounds:
         It was fitted beside all others of the round; its gap stands beside that of the effect in whose place
         it is, which is measured without those that come later.
         """
-        gap = self.gaps.gap(self.z.final, other.mean - later, this.null.replicates)
+        gap = self.accept.gap_at(other.mean - later, this.null.replicates)
         worst = int(np.argmax(np.abs(other.rest)))
         if not other.closes:
             why = "at no strength does it explain anything"
         elif abs(other.rest[worst]) > _LEFT:
             # in the unit in which the statistic is told elsewhere
-            left = this.null.shifted(other.mean - this.null.mean).pulls(self.z.both, 2)[worst]
+            left = this.null.shifted(other.mean - this.null.mean).pulls(self.accept.z.both, 2)[worst]
             why = f"with it in the model {STATISTICS[this.null.names[worst]].says(left)} ({left:+.1f} sd)"
         elif other.error is not None:
             why = f"fits the histograms of the pixels worse, by {-other.behind:.1f} +- {other.error:.1f} nats"
@@ -275,21 +290,6 @@ def without_company(additions: Sequence[Addition]) -> list[Addition]:
         else each
         for i, each in enumerate(additions)
     ]
-
-
-def left_of(rounds: Sequence[Round], last: NullModel, z: Measured, allowed: float) -> FloatArray:
-    """Return what a model with the effects of rounds leaves of each statistic, in what it may leave, (m,).
-
-    Args:
-        rounds: one or more.
-        last: null of the model with them.
-        z: statistics of the data.
-        allowed: see :class:`AddedRounds`.
-    """
-    parts = np.concatenate([this.added.parts for this in rounds])
-    of_effects = tolerance(parts, allowed, last.events)
-    chance = last.std * np.sqrt(0.5 + 1.0 / last.n_replicates)
-    return np.asarray((z.both - last.mean) / np.hypot(chance, of_effects))
 
 
 def unexplained_of_its_own(part: FloatArray, rest: FloatArray, null: NullModel) -> str:

@@ -56,7 +56,6 @@ class Simulations:
         mapper: runs the simulated stacks.
         seed: root of all random numbers.
         effort: counts the work.
-        done: parts of simulated stacks so far.
         lost: share of the pixels that the plain fit mistakes; None: not learnt yet.
         known: the models that were mapped of late.
     """
@@ -65,7 +64,6 @@ class Simulations:
     mapper: Mapper
     seed: int
     effort: Effort
-    done: int = 0
     lost: float | None = None
     known: dict[tuple[Effect, ...], Mapped] = field(default_factory=dict)
 
@@ -159,7 +157,7 @@ class Simulations:
         seed = self.seed_of(purpose)
         taken = replace(self.frames.acquisition(), numbers=self.frames.seen_numbers)
         one = Replicate(purpose, sensor.draw(seed), model, seed, taken)
-        self.done += 1
+        self.effort.replicates += 1
         self.effort.simulate(one.samples, one.maps.usable.size, one.fits)
         return one
 
@@ -183,12 +181,12 @@ class Simulations:
             if isinstance(result, Exception):
                 raise result
             vectors += by_part(result)
-        self.done += len(vectors) - len(tasks)
+        self.effort.replicates += len(vectors) - len(tasks)
         return vectors
 
     def counted(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:
         """Return the statistics of replicates, or what they raised; count the work."""
-        self.done += len(replicates)
+        self.effort.replicates += len(replicates)
         for each in replicates:
             self.effort.simulate(each.samples, each.maps.usable.size, each.fits)
         return self.mapper(replicates)

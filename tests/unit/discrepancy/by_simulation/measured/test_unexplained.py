@@ -17,6 +17,7 @@ from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.discrepancy.skeleton import Prepared
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode
 from pchem_pipeline.effects.analog.empirical_response import EmpiricalResponse, ResponseTerm
 from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons
@@ -233,7 +234,8 @@ def explainer(judge: Any, put: Callable[[Any], Any]) -> FrameExplainer:
     work: Any = SimpleNamespace(effort=Effort(None))
     grown: Any = SimpleNamespace(rounds=[], put_measured=put)
     nothing: Any = None
-    return FrameExplainer(DiscrepancySettings(), nothing, work, nothing, judge, grown)
+    data = Prepared(DiscrepancySettings(), "frames", nothing, nothing, nothing, nothing, work.effort, 3, {})
+    return FrameExplainer(data, nothing, work, nothing, judge, grown)
 
 
 @pytest.mark.parametrize(
@@ -256,7 +258,7 @@ def test_what_closes_the_gap_in_fewest_forms_describes(
     def found(name: str, how: Any) -> Any:
         modes = (NoiseMode(of="row", share=1.0), NoiseMode(of="frame", share=1.0))
         effects = [] if how is None else [EmpiricalNoise(noise_dn=1.0, modes=modes[: how[1]])]
-        return None if how is None else SimpleNamespace(name=name, effects=effects, closes=how[0])
+        return None if how is None else SimpleNamespace(name=name, effects=effects, mean=how[0], vectors=None)
 
     known = {0: found("alone", alone), 1: found("beside", beside)}
     measures = SimpleNamespace(measured=lambda kept: known[len(kept)], by_itself=lambda: None)
@@ -264,11 +266,11 @@ def test_what_closes_the_gap_in_fewest_forms_describes(
     part = Gap(0.2, 0.01, (0.1, 0.3), {})
     judge = SimpleNamespace(
         gap=lambda _: wide,
-        gap_of=lambda one: closed if one.closes else part,
-        accounted=lambda *_: held,
+        gap_at=lambda *one: closed if one[0] else part,
     )
     search = explainer(judge, lambda one: one.name)
     monkeypatch.setattr(search, "_unexplained", lambda: measures)
+    monkeypatch.setattr(FrameExplainer, "_added", SimpleNamespace(accounted=lambda _: held))
     named = SimpleNamespace(additions=[SimpleNamespace(named=True)])
     monkeypatch.setattr(search, "close", lambda *_, **__: named)
     nothing: Any = None
@@ -280,10 +282,12 @@ def test_what_is_measured_need_not_do_better_than_effects_that_get_no_name(
     monkeypatch: pytest.MonkeyPatch, named: bool, chosen: str | None
 ) -> None:
     wide, part = Gap(1.0, 0.01, (0.9, 1.1), {}), Gap(0.2, 0.01, (0.1, 0.3), {})
-    judge = SimpleNamespace(gap=lambda _: part, gap_of=lambda _: part, accounted=lambda *_: ())
-    found = SimpleNamespace(effects=[EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))])
+    judge = SimpleNamespace(gap=lambda _: part, gap_at=lambda *_: part)
+    effects = [EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))]
+    found = SimpleNamespace(effects=effects, mean=None, vectors=None)
     measures = SimpleNamespace(measured=lambda _: found, by_itself=lambda: None)
     search = explainer(judge, lambda _: "measured")
+    monkeypatch.setattr(FrameExplainer, "_added", SimpleNamespace(accounted=lambda _: ()))
     monkeypatch.setattr(search, "_unexplained", lambda: measures)
     additions = [SimpleNamespace(named=named)]
     monkeypatch.setattr(search, "close", lambda *_, **__: SimpleNamespace(additions=additions))
@@ -309,9 +313,9 @@ def test_what_leaves_clearly_less_replaces_effects_with_a_name(
         "part": Gap(0.2, 0.01, (0.1, 0.3), {}),
         "closed": Gap(0.0, 0.01, (-0.01, 0.01), {}),
     }
-    judge = SimpleNamespace(gap=lambda _: gaps[left], gap_of=lambda _: gaps[found])
-    search = explainer(judge, lambda one: one)
-    measures = SimpleNamespace(by_itself=lambda: "one", refitter=Goodness(passes=nothing))
+    judge = SimpleNamespace(gap=lambda _: gaps[left], gap_at=lambda *_: gaps[found])
+    search, one = explainer(judge, lambda one: one), SimpleNamespace(mean=None, vectors=None)
+    measures = SimpleNamespace(by_itself=lambda: one, refitter=Goodness(passes=nothing))
     monkeypatch.setattr(search, "_unexplained", lambda: measures)
     unused: Any = None
-    assert search.replaced(unused) == ("one" if replaced else None)
+    assert search.replaced(unused) == (one if replaced else None)

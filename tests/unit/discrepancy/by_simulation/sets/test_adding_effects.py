@@ -15,6 +15,7 @@ from scipy import stats
 from pchem_pipeline.discrepancy.build_verdict import Findings
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
 from pchem_pipeline.discrepancy.by_simulation.additions import (
+    AddedRounds,
     unexplained_of_its_kind,
     unexplained_of_its_own,
 )
@@ -48,6 +49,7 @@ from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.discrepancy.skeleton import Prepared
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
@@ -901,8 +903,9 @@ def add(
     work: Any = SimpleNamespace(mapped=mapped, forget=lambda _: None, effort=Effort(None))
     unused: Any = None
     settings = DiscrepancySettings()
-    judge = Acceptance(world.null, z, StatisticsGap(world.null, 100_000), settings.model_error)
-    search = FrameExplainer(settings, unused, work, unused, judge, ExtendedModel(work, world.null, (), ()))
+    judge = Acceptance(world.null, z, StatisticsGap(world.null, 100_000), settings)
+    prepared = Prepared(settings, "frames", unused, unused, world.null, z, work.effort, 3, {})
+    search = FrameExplainer(prepared, unused, work, unused, judge, ExtendedModel(work, world.null, (), ()))
     monkeypatch.setattr(search, "_refitter", lambda: world.refitter())
     monkeypatch.setattr(search, "_left_by", lambda *_: None)
     monkeypatch.setattr(search, "_likelihood", lambda *_: None)
@@ -992,12 +995,11 @@ def test_only_effects_that_account_for_what_they_move_are_kept_beside_what_is_me
 ) -> None:
     world = World([effect("row_noise", 0.5)])
     search, extended = add(world, monkeypatch, hypothesis("row_noise"))
-    assert [h.tag for h in search.accept.accounted(search.extended.rounds, extended)] == ["row_noise"]
     elsewhere, own = np.eye(M)[5] * 60.0, np.eye(M)[0] * 60.0
-    assert [h.tag for h in search.accept.accounted(search.extended.rounds, extended.shifted(elsewhere))] == [
-        "row_noise"
-    ]
-    assert search.accept.accounted(search.extended.rounds, extended.shifted(own)) == ()
+    rounds = AddedRounds(search.extended.rounds, search.accept)
+    for model in (extended, extended.shifted(elsewhere)):
+        assert [h.tag for h in rounds.accounted(model)] == ["row_noise"]
+    assert rounds.accounted(extended.shifted(own)) == ()
 
 
 @pytest.mark.parametrize(
@@ -1031,7 +1033,8 @@ def test_what_gets_no_name_needs_fewer_errors_and_more_of_them_in_the_final_fram
             rest=np.zeros(M),
         )
         final = world.null.mean + np.eye(M)[0] * in_final
-        accept = Acceptance(world.null, Measured(final, final, final), unused, 0.0)
+        settings = DiscrepancySettings(model_error=0.0)
+        accept = Acceptance(world.null, Measured(final, final, final), unused, settings)
         assert bool(accept.established(added)) is there
 
 
@@ -1050,7 +1053,9 @@ def test_an_effect_that_moves_nothing_is_not_there() -> None:
         covariance=Covariance(np.ones(M), np.zeros((0, M))),
         rest=np.zeros(M),
     )
-    assert not Acceptance(world.null, world.z, unused, 0.0).established(added)
+    assert not Acceptance(world.null, world.z, unused, DiscrepancySettings(model_error=0.0)).established(
+        added
+    )
 
 
 @pytest.mark.parametrize(
@@ -1075,7 +1080,7 @@ def test_an_effect_beyond_doubt_is_there_though_few_frames_know_its_strength_bad
         covariance=Covariance(np.ones(M), np.zeros((0, M))),
         rest=np.zeros(M),
     )
-    accept = Acceptance(world.null, Measured(seen, seen, seen), unused, 0.0)
+    accept = Acceptance(world.null, Measured(seen, seen, seen), unused, DiscrepancySettings(model_error=0.0))
     assert ("row_noise" in {h.tag for h in accept.established(added)}) is there
 
 
@@ -1112,7 +1117,9 @@ def test_a_few_events_are_an_effect_though_they_hardly_tell_its_strength(
         rest=(seen - made) * first / error,
     )
     z = null.mean + seen * first
-    accept = Acceptance(null, Measured(z, z, null.mean + final * first), unused, 0.0)
+    accept = Acceptance(
+        null, Measured(z, z, null.mean + final * first), unused, DiscrepancySettings(model_error=0.0)
+    )
     assert bool(accept.established(added)) is there
 
 
@@ -1135,7 +1142,7 @@ def test_strong_effects_need_not_add_up_to_be_there() -> None:
         covariance=Covariance(np.ones(M), np.zeros((0, M))),
         rest=np.zeros(M),
     )
-    accept = Acceptance(world.null, Measured(seen, seen, seen), unused, 0.0)
+    accept = Acceptance(world.null, Measured(seen, seen, seen), unused, DiscrepancySettings(model_error=0.0))
     assert {h.tag for h in accept.established(added)} == {"row_noise", "frame_noise"}
 
 
