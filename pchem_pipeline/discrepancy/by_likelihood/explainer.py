@@ -20,7 +20,7 @@ from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, find_members
 from pchem_pipeline.discrepancy.by_likelihood.observed import ObservedHistograms, SampleHistograms
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, explain
-from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
+from pchem_pipeline.discrepancy.by_likelihood.sets import SIGMAS, FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap
@@ -40,7 +40,6 @@ IntArray = NDArray[np.int64]
 
 _FEWEST_REPLICATES = 40
 _SPURIOUS = SpuriousCharge.model_fields["tag"].default
-_SIGMAS, _PRICE = 3.0, 3.0  # standard errors, and nats, by which a set must improve the score
 
 
 def find_in_histograms(
@@ -79,10 +78,11 @@ def find_in_histograms(
     times = [sample.integration_time for sample in samples]
     tell("drawing the fitted model")
     found = search(HistogramExplainer.begin(observed, settings, classes, tuple(model), times, rng), tell)
-    n, n_lit = samples[0].counts.shape[0], sum(not sample.bias for sample in samples)
+    n, n_illuminated = samples[0].counts.shape[0], sum(not sample.bias for sample in samples)
     row = width or n
     shape = n // row, row
-    verdict = found.verdict.on_sensor(shape, (0, shape[0]), (0, row), lambda _, x: divmod(x // n_lit, row))
+    whole = (0, shape[0]), (0, row)
+    verdict = found.verdict.on_sensor(shape, *whole, lambda _, x: divmod(x // n_illuminated, row))
     return replace(found, verdict=verdict)
 
 
@@ -228,7 +228,7 @@ class HistogramExplainer(Explainer[Explanation]):
         defects |= self.sets.failed | found.sets.failed
         if not disagrees:
             rise, error = found.sets.difference(found.judged, found.sets.fit(()))
-            if not found.named or rise < max(CONVINCING, _SIGMAS * error):
+            if not found.named or rise < max(CONVINCING, SIGMAS * error):
                 return None
         self.found = found
         return found if found.named else None
@@ -273,17 +273,16 @@ def _on_a_line(
     That tells the charge, which does not grow with time, from dark current.
     """
     dark = free.samples.dark
-    lit = [time for time, is_dark in zip(times, dark, strict=True) if not is_dark]
+    illuminated = [time for time, is_dark in zip(times, dark, strict=True) if not is_dark]
     wanted = settings.candidates is None or _SPURIOUS in settings.candidates
-    if None in lit or len(set(lit)) < 2 or not wanted or _SPURIOUS in settings.exclude:
+    if None in illuminated or len(set(illuminated)) < 2 or not wanted or _SPURIOUS in settings.exclude:
         return None
     if _SPURIOUS in {effect.tag for effect in free.present}:
         return None
     line = Samples(dark, tuple(time or 0.0 for time in times))
     straight = replace(free, samples=line, failed={}, _known={})
     best = straight.fit([Member.of(SpuriousCharge.typical()[0])])
-    rise, error = free.difference(free.fit(()), best)
-    return None if rise > max(_PRICE, _SIGMAS * error) else straight
+    return None if free.beats(free.fit(()), best) else straight
 
 
 def _with_effects(found: Explanation) -> FloatArray:

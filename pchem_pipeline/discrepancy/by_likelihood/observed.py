@@ -153,9 +153,9 @@ def _fitted_together(counts: IntArray, origin: IntArray, layout: Samples) -> Flo
 
 def _observe(counts: IntArray, origin: IntArray, layout: Samples, parameters: FloatArray | None) -> Evidence:
     """Observe the rows with electrons; the others say nothing about how electrons come and are read."""
-    lit = np.tile(~np.array(layout.dark), origin.size // layout.n)
-    known = None if parameters is None else parameters[lit]
-    return observe_histograms(counts[lit].astype(np.uint32), origin[lit], parameters=known)
+    illuminated = np.tile(~np.array(layout.dark), origin.size // layout.n)
+    known = None if parameters is None else parameters[illuminated]
+    return observe_histograms(counts[illuminated].astype(np.uint32), origin[illuminated], parameters=known)
 
 
 def _rows(samples: Sequence[SampleHistograms]) -> tuple[IntArray, IntArray]:

@@ -1,9 +1,9 @@
-"""The effects that rounds of simulation added: each with its gap, its rivals, and whether it stands."""
+"""The model as rounds of a search add effects to it: each with its gap, its rivals, and whether it stands."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,12 +18,16 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     fit_set,
     tolerance,
 )
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
+from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, Contender, unrelated
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, lesser
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import NullModel, misfits
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.verdict import Candidate, Rival
+from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 
 FloatArray = NDArray[np.float64]
@@ -33,6 +37,7 @@ _LEFT = 4.0  # deviations that are left of a statistic
 _MOVED = 2.0  # standard deviations by which an effect moves it
 _OF_SIGNATURE = 0.1  # of what an effect does to all statistics, in a family where its signature stands
 _MOST_RIVALS = 3
+_NEAR = 0.1  # relative: so little is not worth another simulation, but can be corrected without one
 _AS_GOOD = 0.5  # of what an effect closes, from which on an unrelated one does about as well
 
 
@@ -64,6 +69,107 @@ class Round:
         old = zip(self.added.hypotheses, self.added.stderr, strict=True)
         stderr = np.array([errors.get(h.tag, error) for h, error in old])
         return replace(self, added=replace(self.added, hypotheses=new, stderr=stderr))
+
+
+@dataclass
+class ExtendedModel:
+    """Effects, and how they came.
+
+    Attributes:
+        work: fits the pixels with them.
+        first: null of the model before anything was added.
+        given: effects that it had then.
+        effects: those that it has now.
+        rounds: in which the others were added.
+        last: the set that was added last, at its best fit; None: nothing was.
+    """
+
+    work: Simulations
+    first: NullModel
+    given: tuple[Effect, ...]
+    effects: tuple[Effect, ...]
+    rounds: list[Round] = field(default_factory=list)
+    last: Refitted | None = None
+
+    @property
+    def added(self) -> tuple[Hypothesis, ...]:
+        """The effects of all rounds."""
+        return tuple(h for this in self.rounds for h in this.added.hypotheses)
+
+    @property
+    def present(self) -> tuple[Effect, ...]:
+        """The effects beside which those of the rounds are fitted."""
+        return self._without(self.added)
+
+    def _without(self, gone: tuple[Hypothesis, ...]) -> tuple[Effect, ...]:
+        """Return its effects without some, whatever their strengths are now."""
+        keys = {h.effect.key for h in gone}
+        return tuple(e for e in self.effects if e.key not in keys)
+
+    def put(
+        self,
+        found: Comparison,
+        added: Refitted,
+        hypotheses: tuple[Hypothesis, ...],
+        null: NullModel,
+        *,
+        certain: bool = True,
+    ) -> NullModel:
+        """Put a set into the model, at the strengths to which its replicates correct it; return the null.
+
+        Args:
+            found: how it was chosen.
+            added: the set with many replicates.
+            hypotheses: all candidates of the round.
+            null: of the model before it.
+            certain: whether its effects are beyond doubt.
+        """
+        # within a standard error the steps end, too
+        near = np.abs(added.change) < np.maximum(_NEAR, added.stderr)
+        change = np.where(near, np.expm1(added.change), 0.0)
+        try:
+            corrected = self._take(added, change)
+        except NotFittedError:  # a step too far
+            change = np.zeros_like(change)
+            corrected = self._take(added, change)
+        self.last = added
+        extended = NullModel.from_replicates(self.first.names, added.vectors, self.first)
+        slopes = lesser(added.slopes, added.parts)
+        extended = extended.shifted(np.sum(slopes * change[:, None], axis=0))
+        fitted = np.array([bool(h.effect.strength) for h in added.hypotheses])
+        extended = replace(extended, strengths=slopes * (added.stderr * fitted)[:, None])
+        errors = dict(zip((h.tag for h in corrected), added.stderr, strict=True))
+        now = {h.tag: h for h in corrected}
+        self.rounds = [this.updated(now, errors) for this in self.rounds]
+        before = {h.tag for h in self.added}
+        new = tuple(h for h in corrected if h.tag not in before)
+        fit = SetFit(
+            new, np.ones(len(new)), np.array([errors[h.tag] for h in new]), np.zeros(len(new), np.bool_)
+        )
+        moved = self.work.mapped(self.effects).fit.moved
+        self.rounds.append(Round(found, fit, hypotheses, null, extended, moved, certain))
+        return extended
+
+    def put_measured(self, found: Refitted) -> NullModel:
+        """Put what was measured into the model, without effects that are not beside it, and their rounds."""
+        gone = {h.tag for h in self.added} - found.tags
+        self.effects = self._without(tuple(h for h in self.added if h.tag in gone))
+        changed = [i for i, this in enumerate(self.rounds) if gone & {h.tag for h in this.added.hypotheses}]
+        self.rounds = self.rounds[: min(changed, default=len(self.rounds))]
+        null = self.rounds[-1].extended if self.rounds else self.first
+        return self.put(Comparison(found, (found,)), found, (), null)
+
+    def _take(self, added: Refitted, change: FloatArray) -> tuple[Hypothesis, ...]:
+        """Take a set into the model, its factors changed by shares, and return it.
+
+        Raises:
+            NotFittedError: no pixels can be fitted with that.
+        """
+        taken = tuple(h.times(1.0 + float(c)) for h, c in zip(added.hypotheses, change, strict=True))
+        effects = along_chain(self._without(taken), [h.effect for h in taken])
+        self.work.mapped(effects)
+        self.effects = effects
+        return taken
 
 
 @dataclass(frozen=True)

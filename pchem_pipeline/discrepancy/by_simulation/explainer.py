@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
-from pchem_pipeline.discrepancy.by_simulation.additions import AddedRounds
+from pchem_pipeline.discrepancy.by_simulation.additions import AddedRounds, ExtendedModel
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper, candidate_classes, serial
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Choice, Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screening, noise_of_splits
-from pchem_pipeline.discrepancy.by_simulation.extended_model import ExtendedModel
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.measured.unexplained import Unexplained

@@ -23,7 +23,7 @@ from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     identifiable_from_histograms,
     note_defect,
 )
-from pchem_pipeline.discrepancy.by_simulation.sets.steps import DampedSteps
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import DampedSteps
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.compose import along_chain

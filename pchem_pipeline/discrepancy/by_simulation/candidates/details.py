@@ -22,12 +22,14 @@ from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     note_defect,
 )
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import (
+    LARGEST_STEP,
     SMALLEST_SECANT,
+    DampedSteps,
     Refitted,
     Refitter,
     beyond_chance,
+    broyden,
 )
-from pchem_pipeline.discrepancy.by_simulation.sets.steps import LARGEST_STEP, DampedSteps, broyden
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.candidates.by_histograms import Histograms
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import (
     MOST_HYPOTHESES,
     ReplicateSimulator,
@@ -25,6 +24,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import expected_codes
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Histograms
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence

@@ -4,7 +4,8 @@ The readout residuals of pairs of samples are multiplied, and their mean product
 near samples, of samples far apart in one row, far apart in one column, and far apart in both. What the model
 makes of such pairs is measured in frames simulated with it, and taken off. What is left beyond chance is the
 covariance of a Gaussian noise. Its variance is known where whole rows, columns or frames share it; that of
-single samples is read noise as well, so there it is the least with which the others are a covariance.
+single samples is read noise as well, so there it is the least with which the others are a covariance. An
+offset may also run as a wave across rows, columns and frames.
 """
 
 from __future__ import annotations
@@ -16,8 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from pchem_pipeline.discrepancy.by_simulation.measured.modes import MADE
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import Measurement, PartSamples, frames_apart
-from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, Lag, NoiseMode, Shared, spectrum
+from pchem_pipeline.discrepancy.observe.waves import Waves, waves_across
+from pchem_pipeline.effects.analog.empirical_noise import (
+    EmpiricalNoise,
+    Lag,
+    NoiseMode,
+    Shared,
+    root_mean_square,
+    spectrum,
+)
 from pchem_pipeline.effects.estimators.common_modes import mean_response
 from pchem_pipeline.effects.framework.evidence import Evidence
 
@@ -317,3 +327,27 @@ def _profile(of: Shared, data: Covariances, model: Covariances, response: FloatA
     if clear < _CLEAR_SHAPE or clear**2 < _BETTER * alike**2 + _CLEAR_SHAPE**2 / 2.0:
         return None
     return _Profile(np.linalg.lstsq(hats, shape, rcond=None)[0], shape, found, clear)
+
+
+def running_waves(samples: PartSamples) -> Waves:
+    """Measure the waves that run across rows, columns and frames."""
+    return waves_across(samples.frames, samples.numbers, samples.laws, samples.maps, samples.inside)
+
+
+def measured_wave(data: Waves, model: Waves, evidence: Evidence, inside: BoolArray) -> Measurement | None:
+    """Return the wave whose phase runs on, beyond a model's; None where there is none.
+
+    Args:
+        data: of the frames.
+        model: of frames simulated with it.
+        evidence: of the frames.
+        inside: pixels that were looked at, shape (y, x).
+    """
+    wave, made = data.steady, model.steady
+    if wave is None or (made is not None and made.amplitude > MADE * wave.amplitude):
+        return None
+    per_frame, per_row, per_column = wave.per_frame or 0.0, wave.per_row, wave.per_column
+    cycles = round(per_frame, 7), round(per_row, 6), round(per_column, 6)
+    size = wave.amplitude * root_mean_square(cycles) / mean_response(evidence, inside)
+    mode = NoiseMode(of="sample", share=1.0, wave=cycles)
+    return Measurement(EmpiricalNoise(noise_dn=size, modes=(mode,)), wave.excess)

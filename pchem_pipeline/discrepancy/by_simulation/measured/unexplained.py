@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -16,10 +16,14 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hyp
 from pchem_pipeline.discrepancy.by_simulation.measured.electrons import electron_chances, measured_electrons
 from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import measured_mixture_shifts
 from pchem_pipeline.discrepancy.by_simulation.measured.modes import common_scores, measured_mode
-from pchem_pipeline.discrepancy.by_simulation.measured.noise import measured_noise, residual_covariances
+from pchem_pipeline.discrepancy.by_simulation.measured.noise import (
+    measured_noise,
+    measured_wave,
+    residual_covariances,
+    running_waves,
+)
 from pchem_pipeline.discrepancy.by_simulation.measured.response import measured_response, residual_responses
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import Measurement, PartSamples
-from pchem_pipeline.discrepancy.by_simulation.measured.waves import measured_wave, running_waves
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import simulate_frames
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import FEW, Refitted, Refitter
@@ -93,23 +97,12 @@ class Unexplained:
 
     def by_itself(self) -> Refitted | None:
         """Return what no known effect makes, where it leaves little by itself; None where it does not."""
-        if self.instead is not None:
-            return self.instead
-        best: Refitted | None = None
-        for number, likely in enumerate(self._of_all):
-            clear = likely.measured.gain > _WORTHWHILE * self._of_all[0].measured.gain
-            if clear and likely.measured.unlisted:
-                found = self._alone(number)
-                if (
-                    found is None
-                    or not found.effects[0].unlisted
-                    or not self.refitter.residual_is_small(found)
-                ):
-                    continue
-                if best is None or found.score > best.score:
-                    best = found
-                if self.refitter.passes_goodness_of_fit(best):
-                    break
+        best = self.instead
+        for found in () if best is not None else self._small_alone(_WORTHWHILE, unlisted=True):
+            if found.effects[0].unlisted and (best is None or found.score > best.score):
+                best = found
+            if best is not None and self.refitter.passes_goodness_of_fit(best):
+                break
         self.instead = best
         return best
 
@@ -128,15 +121,24 @@ class Unexplained:
         Args:
             unlisted: only what no known effect makes.
         """
+        return next(self._small_alone(_AS_CLEAR, unlisted=unlisted, parts=1), None)
+
+    def _small_alone(self, share: float, *, unlisted: bool, parts: float = np.inf) -> Iterator[Refitted]:
+        """Yield what leaves little by itself at its best fit, the clearest first.
+
+        Args:
+            share: of the nats of the clearest, that one must have more than.
+            unlisted: only what no known effect makes.
+            parts: the most that one consists of.
+        """
         for number, likely in enumerate(self._of_all):
-            one, effect = likely.measured, likely.measured.effect
-            as_clear = one.gain > _AS_CLEAR * self._of_all[0].measured.gain
-            if not as_clear or effect.measured_parts > 1 or (unlisted and not one.unlisted):
+            one = likely.measured
+            clear = one.gain > share * self._of_all[0].measured.gain
+            if not clear or one.effect.measured_parts > parts or (unlisted and not one.unlisted):
                 continue
             found = self._alone(number)
             if found is not None and self.refitter.residual_is_small(found):
-                return found
-        return None
+                yield found
 
     def _alone(self, number: int) -> Refitted | None:
         """Return one of what explains most without any effect, at its best fit; it is fitted once."""

@@ -32,7 +32,8 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
 
-_UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
+#: Of the parameters of a pixel, in their order.
+UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
 
 _LEAST_LEFT = 0.2  # of the fitted exposure, or variance of the read noise, without what effects add to it
 _FEWEST_CODES = 3  # that a pixel must have shown
@@ -152,7 +153,7 @@ def refit_maps(
     inside = good & acted_on
     moved = {
         name: _change(after[inside] - before[inside], error[inside], unit)
-        for (name, unit), before, after, error in zip(_UNITS.items(), flat, new, stderr, strict=True)
+        for (name, unit), before, after, error in zip(UNITS.items(), flat, new, stderr, strict=True)
     }
     new_maps = PixelMaps.known(new, good.reshape(shape))
     covariance = fit.covariance[:, :4, :4].reshape(*shape, 4, 4)

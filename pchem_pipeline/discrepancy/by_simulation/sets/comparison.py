@@ -9,6 +9,7 @@ for where the set leaves nothing.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -152,7 +153,7 @@ def compare(
         EffortSpentError: the work is at its limit.
     """
     trials = Trials(refitter, tuple(held), likelihood)
-    tried, beside = trials.tried, _asked_once(beside)
+    tried, beside = trials.tried, functools.cache(beside)
     singles = likelihood.ranked(_singles(hypotheses, choice))
     # what the likeliest set is made of, then that set: it may leave no others worth a refit
     first = len(choice.best.hypotheses)
@@ -358,20 +359,6 @@ def _look_alikes(choice: Choice) -> list[Hypothesis]:
     singles = [one.hypotheses[0] for one in choice.tried if len(one.hypotheses) == 1]
     others = (h for h in singles if h.tag != best[0].tag and not unrelated(h.effect, best[0].effect))
     return [h for h in others if not is_expensive([h.effect])][:_MOST_ALIKE]
-
-
-def _asked_once(beside: Callable[[Refitted], Choice | None]) -> Callable[[Refitted], Choice | None]:
-    """Return the same, which remembers its answers."""
-    known: list[tuple[Refitted, Choice | None]] = []
-
-    def answer(one: Refitted) -> Choice | None:
-        found = [choice for asked, choice in known if asked is one]
-        if not found:
-            found = [beside(one)]
-            known.append((one, found[0]))
-        return found[0]
-
-    return answer
 
 
 def _forward_select(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> None:

@@ -107,7 +107,6 @@ def measured(move: Any, seed: int) -> Empirical | None:
 @pytest.mark.parametrize(("share", "shift"), [(0.004, -8), (0.02, 4)])
 def test_shifts_are_measured(share: float, shift: int) -> None:
     found = measured(shifted(share, shift), 3)
-    assert found is not None
     samples = FRAMES * SHAPE[0] * SHAPE[1]
     mean = float(found.shares() @ np.array([move.shift_dn for move in found.moves]))
     # neighbouring shifts of the grid stand for one another: their mean is what is known well
@@ -126,7 +125,6 @@ def test_shifts_are_measured(share: float, shift: int) -> None:
 )
 def test_what_depends_on_a_neighbour_is_measured(move: Any, share: float, wanted: MixtureShift) -> None:
     found = measured(move, 5)
-    assert found is not None
     main = max(found.moves, key=lambda one: one.weight)
     assert main.model_copy(update={"weight": 1.0}) == wanted
     assert found.together == "sample"
@@ -137,7 +135,6 @@ def test_what_depends_on_a_neighbour_is_measured(move: Any, share: float, wanted
 
 def test_squares_that_come_as_their_mean_are_measured_where_they_begin() -> None:
     found = measured(merged, 6)
-    assert found is not None
     assert found.squares == (1, 0)
     assert found.share == pytest.approx(0.05, rel=0.1)
     assert "from odd rows and even columns on" in found.words()

@@ -101,8 +101,6 @@ def test_what_happens_to_electrons_is_told_with_its_chance(
     plain: Any, fate: Fate, told: str, place: tuple[int, int, int], chance: float
 ) -> None:
     found = measured_electrons(chances(drawn(fate, 2)), plain)
-    assert found is not None
-    assert isinstance(found.effect, EmpiricalElectrons)
     (mode,) = found.effect.modes
     assert (mode.fate, mode.place) == (told, place)
     # to first order in the chance; refits make it exact

@@ -69,7 +69,6 @@ def drawn(*shape: int) -> np.ndarray:
 )
 def test_a_gain_that_moves_is_told_by_what_shares_it(of: str, shape: tuple[int, ...]) -> None:
     found = measured(frames(1, gain=1.0 + 0.02 * drawn(*shape)))
-    assert found is not None
     (mode,) = found.modes
     assert (mode.of, mode.changes, mode.burst, mode.shape) == (of, "gain", None, ())
     # its own variance is known to sqrt(2 / n); the scores see a little less where the peaks overlap
@@ -84,7 +83,6 @@ def test_light_in_bursts_in_a_corner_is_told_with_its_place() -> None:
     corner[:4, :5] = 1.0
     burst = np.random.default_rng(3).random((FRAMES, 1, 1)) < 0.05
     found = measured(frames(2, light=1.0 + 1.5 * burst * corner))
-    assert found is not None
     (mode,) = found.modes
     assert (mode.of, mode.changes) == ("frame", "light")
     assert mode.burst == pytest.approx(burst.mean(), rel=0.3)
@@ -98,7 +96,6 @@ def test_light_in_bursts_in_a_corner_is_told_with_its_place() -> None:
 def test_frames_that_are_noisier_are_told_with_how_many_they_are() -> None:
     some = np.random.default_rng(3).random((FRAMES, 1, 1)) < 0.05
     found = measured(frames(7, loud=1.0 + 0.5 * some))
-    assert found is not None
     (mode,) = found.modes
     assert (mode.of, mode.changes, mode.negative) == ("frame", "noise", False)
     # of one frame the size is known to sqrt(1 / (2 * 320)) of itself: hardly any is taken for another
@@ -124,7 +121,6 @@ def test_bursts_are_told_however_strong_they_are(size: float) -> None:
         )
     }
     found = measured_mode(data, nothing(data), frames(1)[1], EVERYWHERE)
-    assert found is not None
     assert found.effect.modes[0].burst == pytest.approx(some.mean(), rel=0.2)
 
 
@@ -132,7 +128,6 @@ def test_a_strong_gaussian_change_is_no_burst() -> None:
     sums = np.random.default_rng(8).standard_normal((FRAMES, 1))
     data = {("frame", "noise"): Sums(80.0 * sums, np.full(1, 100.0), np.arange(FRAMES))}
     found = measured_mode(data, nothing(data), frames(1)[1], EVERYWHERE)
-    assert found is not None
     assert found.effect.modes[0].burst is None
 
 
@@ -153,7 +148,6 @@ def test_noise_of_changing_size_has_the_law_that_is_simulated() -> None:
 def test_a_change_that_has_a_memory_is_told_with_it() -> None:
     white = drawn(FRAMES + 1, 1, 1)
     found = measured(frames(4, gain=1.0 + 0.03 * (white[1:] + 0.7 * white[:-1])))
-    assert found is not None
     assert found.modes[0].lags == ((1, 0, 0),)
     # 0.7 / (1 + 0.7^2) = 0.47, within five errors of 1 / sqrt(1500)
     assert found.modes[0].correlation[0] == pytest.approx(0.47, abs=0.13)
@@ -168,7 +162,6 @@ def test_frames_that_are_left_out_are_no_neighbours() -> None:
     for numbers, known in ((seen, True), (np.arange(seen.size), False)):  # and as if none were missing
         data = {("frame", "gain"): Sums(sums[seen], np.full(1, 100.0), numbers)}
         found = measured_mode(data, nothing(data), frames(1)[1], EVERYWHERE)
-        assert found is not None
         [correlation] = found.effect.modes[0].correlation
         # half of the pairs that are taken for neighbours without the numbers are none
         assert bool(abs(correlation - 0.47) < 4 / np.sqrt(seen.size / 2)) is known
@@ -187,7 +180,6 @@ def test_a_wave_of_gain_or_light_is_told_by_its_frequencies(
     sine = amplitude * np.sin(2.0 * np.pi * (per_frame * frame + per_line * line) + 0.4)
     stack = frames(11, gain=1.0 + sine) if changes == "gain" else frames(11, light=1.0 + sine)
     found = measured(stack)
-    assert found is not None
     assert found.unlisted
     (mode,) = found.modes
     assert (mode.of, mode.changes, mode.lags, mode.burst) == (of, changes, (), None)
@@ -260,7 +252,6 @@ def test_neither_nothing_nor_an_offset_is_taken_for_gain_or_light() -> None:
 def test_an_offset_in_bursts_is_told_with_how_often_and_how_large() -> None:
     some = np.random.default_rng(4).random((FRAMES, 1, 1)) < 0.05
     found = measured(frames(12, offset=1.5 * some))
-    assert found is not None
     (mode,) = found.modes
     assert (mode.of, mode.changes, mode.negative) == ("frame", "offset", False)
     assert mode.burst == pytest.approx(some.mean(), rel=0.05)  # a frame of 320 samples tells it
@@ -324,8 +315,6 @@ def test_a_hit_by_a_particle_needs_no_tables_of_its_codes_and_outweighs_no_other
     length = codes_within_reach(maps, pixels, first, last.ravel().astype(np.int64))
     assert int(stack.max() - stack.min()) <= length < 1000
     found, usual = measured((hit, maps)), measured((stack, maps))
-    assert found is not None
-    assert usual is not None
     assert found.modes[0].changes == usual.modes[0].changes
     assert found.noise_dn == pytest.approx(usual.noise_dn, rel=0.1)
 

@@ -89,7 +89,6 @@ def measured(frames: np.ndarray, inside: np.ndarray | None = None) -> EmpiricalN
 )
 def test_what_samples_share_is_measured_by_distance(noise, of, lag, covariance):
     found = measured(stack(4, noise))
-    assert found is not None
     (mode,) = found.modes
     assert (mode.of, mode.lags) == (of, (lag,))
     # pairs at that distance, each with a product of standard deviation 1, of residuals that follow half of it
@@ -119,7 +118,6 @@ def test_the_shape_of_what_lines_share_is_measured(axis):
         return rng.standard_normal((FRAMES, 1, COLUMNS)) * slope[:, None]
 
     found = measured(stack(7, tilted))
-    assert found is not None
     (mode,) = found.modes  # near samples share it, and nothing else
     assert mode.of == ("row" if axis == 2 else "column")
     shape = mode.along(np.linspace(0.0, 1.0, slope.size))
@@ -143,7 +141,6 @@ def test_only_a_part_is_looked_at():
     left = np.zeros(SHAPE, bool)
     left[:, : COLUMNS // 2] = True
     found = measured(frames, left)
-    assert found is not None
     assert found.noise_dn**2 == pytest.approx(POWER, rel=0.25)
     assert measured(frames, ~left) is None
 

@@ -118,8 +118,6 @@ def test_what_samples_follow_is_told_with_its_part(
     response: Response, source: str, place: tuple[int, int, int], part: float, noise: float
 ) -> None:
     found = measured(drawn(response, 2, noise))
-    assert found is not None
-    assert isinstance(found.effect, EmpiricalResponse)
     (term,) = found.effect.terms
     assert (term.of, term.place, term.columns) == (source, place, None)
     # to first order; refits make it exact
@@ -129,8 +127,6 @@ def test_what_samples_follow_is_told_with_its_part(
 
 def test_what_only_large_charge_does_is_told_with_how_large() -> None:
     found = measured(drawn(ghost, 3))
-    assert found is not None
-    assert isinstance(found.effect, EmpiricalResponse)
     (term,) = found.effect.terms
     assert (term.of, term.place, term.above) == ("sample", (-1, 0, 0), 3.0)
     assert found.effect.response * term.weight == pytest.approx(-0.05, rel=0.3)
@@ -139,8 +135,6 @@ def test_what_only_large_charge_does_is_told_with_how_large() -> None:
 
 def test_what_follows_its_mirror_image_is_told_in_one() -> None:
     found = measured(drawn(opposite, 4))
-    assert found is not None
-    assert isinstance(found.effect, EmpiricalResponse)
     (term,) = found.effect.terms
     assert (term.of, term.place, term.mirrored) == ("sample", (0, 0, 0), ("rows",))
     assert term.columns == (SHAPE[1] // 2, SHAPE[1])
@@ -177,8 +171,6 @@ def test_the_excess_of_poisson_counts_has_its_moments(above: float) -> None:
 
 def test_what_only_some_columns_follow_is_told_with_these() -> None:
     found = measured(drawn(settling, 3))
-    assert found is not None
-    assert isinstance(found.effect, EmpiricalResponse)
     first, second = found.effect.terms
     last = SHAPE[1] - 1
     # at the first distance the sensor has one pair of columns only
@@ -212,7 +204,6 @@ def test_sums_by_distance_are_those_of_all_pairs(axes: tuple[int, ...]) -> None:
     inside = np.ones((5, 6), bool)
     inside[1, 2] = False
     plain = FollowingSamples.of(frames, edges, laws, evidence.maps, inside)
-    assert plain is not None
     found = plain.by_distance([(1,), (2,), (1, 2), (), axes])[-1]
     prepared = replace(plain, mirrored=axes)
     residual, charge = (np.concatenate(parts).astype(float) for parts in zip(*prepared.chunks(), strict=True))
@@ -292,7 +283,6 @@ def test_its_size_is_that_of_all_the_sensor() -> None:
     maps = PixelMaps.known((np.full(SHAPE, v) for v in (2.1, 1 / STEP, 100.0, 4.0)), EVERYWHERE)
     effect = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(0, 0, -SHAPE[1] + 1)),))
     size = size_of(effect, maps, FRAMES)
-    assert size is not None
     assert size.samples == pytest.approx(1 / SHAPE[1], rel=0.1)  # of the last column only
     assert size.electrons == pytest.approx(0.1 * 2.1**0.5, rel=0.1)
 
@@ -301,7 +291,6 @@ def test_its_size_in_a_place_is_that_of_the_place() -> None:
     maps = PixelMaps.known((np.full(SHAPE, v) for v in (2.1, 1 / STEP, 100.0, 4.0)), EVERYWHERE)
     term, place = ResponseTerm(place=(0, 0, -1), columns=(7, 8)), Region(columns=((6, 8),))
     size = size_of(EmpiricalResponse(response=0.1, terms=(term,), region=place), maps, FRAMES)
-    assert size is not None
     assert size.samples == pytest.approx(0.5, abs=0.02)
     assert size.electrons == pytest.approx(0.1 * (2.1 / 2) ** 0.5, rel=0.1)
 

@@ -170,12 +170,10 @@ def test_the_clearer_of_noise_and_gain_is_told_and_a_wave_first(
         monkeypatch.setattr(f"{Unexplained.__module__}.measured_{name}", measured)
     for gains["mode"], gains["noise"], best in ((3.0, 9.0, 9.0), (9.0, 3.0, 9.0), (None, 3.0, 3.0)):
         found = unexplained._noise(Part(), (), ())
-        assert found is not None
         assert found.gain == best
     # a wave is in the covariances of all distances: it is tried first, however many nats these have
     gains["wave"] = 2.0
     found = unexplained._noise(Part(), (), ())
-    assert found is not None
     assert (found.gain, len(found.others)) == (3.0, 1)
     gains.update(mode=None, noise=None, wave=None)
     assert unexplained._noise(Part(), (), ()) is None
@@ -194,7 +192,6 @@ def test_of_what_leaves_little_by_itself_the_better_one_stays(monkeypatch: pytes
 
     monkeypatch.setattr(unexplained, "_tried", described)
     found = unexplained.by_itself()
-    assert found is not None
     assert found.effects == (effects[1],)
 
 
