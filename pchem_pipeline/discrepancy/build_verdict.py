@@ -47,12 +47,15 @@ FloatArray = NDArray[np.float64]
 
 #: Share of the gap that effects may leave, where it is above its floor, and still explain it.
 LARGEST_REST = 0.2
+#: Rivals of an effect that are fitted in its place and told.
+MOST_RIVALS = 3
 _MOST_UNEXPLAINED = 8
 _MOST_RESIDUALS = 3
 _DECIDED = 3.0  # standard errors of a difference of scores that tells two effects apart
 _MOST_LONGER = 30.0  # times the samples that anyone will take
-_NO_CHANCE = 0.05  # of any statistic as far from the model, below which one is told beside the farthest
-_NO_CHANCE = 1e-6  # of any statistic, with which nothing is called consistent
+# chance of any statistic as far from the model, below which nothing is called consistent, and one is told
+# beside the farthest
+_NO_CHANCE = 1e-6
 _RARE = 0.02  # a chance that is worth telling though it is no disagreement
 # nats per sample from which on a plain fit may be far off: six of seven hidden effects that left so much had
 # moved the gain of 19 to 100 % of the pixels by a fifth or more

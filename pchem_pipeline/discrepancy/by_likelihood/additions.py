@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.build_verdict import LARGEST_REST, Added, Addition, largest_pulls
+from pchem_pipeline.discrepancy.build_verdict import LARGEST_REST, MOST_RIVALS, Added, Addition, largest_pulls
 from pchem_pipeline.discrepancy.by_likelihood.comb import electrons_of, find_residuals, set_aside_residual
 from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap, carried_over
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
-from pchem_pipeline.discrepancy.by_likelihood.sets import MOST_RIVALS, FittedSet
+from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import UNITS
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel

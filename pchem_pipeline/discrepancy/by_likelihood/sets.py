@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.base.errors import error_words
+from pchem_pipeline.discrepancy.build_verdict import MOST_RIVALS
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.effect import Effect
@@ -25,8 +26,6 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Rivals of an effect that are fitted and told.
-MOST_RIVALS = 3
 #: Standard errors of a difference of scores that is no chance.
 SIGMAS = 3.0
 #: Nats by which an effect must improve the score at least.

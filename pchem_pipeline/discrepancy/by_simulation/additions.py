@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.build_verdict import Added, Addition, largest_pulls
+from pchem_pipeline.discrepancy.build_verdict import MOST_RIVALS, Added, Addition, largest_pulls
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    MOVED,
+    STANDS_OUT,
     Hypothesis,
     Noise,
     SetFit,
@@ -33,10 +35,7 @@ from pchem_pipeline.effects.framework.effect import Effect
 FloatArray = NDArray[np.float64]
 
 _CLEAR_MARGIN = 50.0  # nats
-_LEFT = 4.0  # deviations that are left of a statistic
-_MOVED = 2.0  # standard deviations by which an effect moves it
 _OF_SIGNATURE = 0.1  # of what an effect does to all statistics, in a family where its signature stands
-_MOST_RIVALS = 3
 _NEAR = 0.1  # relative: so little is not worth another simulation, but can be corrected without one
 _AS_GOOD = 0.5  # of what an effect closes, from which on an unrelated one does about as well
 
@@ -275,7 +274,7 @@ class AddedRounds:
             for r in (rivals if named else kept)
         ]
         others = self._others(this, member)
-        ranked = others[:_MOST_RIVALS]
+        ranked = others[:MOST_RIVALS]
         placebo = next((o for o in others[1:] if o.closes and unrelated(o.effect, added.effect)), None)
         return Addition(
             effect=added.effect if named else compared[0][0],
@@ -336,7 +335,7 @@ class AddedRounds:
         worst = int(np.argmax(np.abs(other.rest)))
         if not other.closes:
             why = "at no strength does it explain anything"
-        elif abs(other.rest[worst]) > _LEFT:
+        elif abs(other.rest[worst]) > STANDS_OUT:
             # in the unit in which the statistic is told elsewhere
             left = this.null.shifted(other.mean - this.null.mean).pulls(self.accept.z.both, 2)[worst]
             why = f"with it in the model {STATISTICS[this.null.names[worst]].says(left)} ({left:+.1f} sd)"
@@ -406,7 +405,7 @@ def unexplained_of_its_own(part: FloatArray, rest: FloatArray, null: NullModel) 
         rest: what the model leaves of them, in what it may leave, shape (m,).
         null: of the model before it.
     """
-    return _worst_words(np.abs(part) > _MOVED * null.std, rest, null)
+    return _worst_words(np.abs(part) > MOVED * null.std, rest, null)
 
 
 def unexplained_of_its_kind(effect: Effect, part: FloatArray, rest: FloatArray, null: NullModel) -> str:
@@ -419,13 +418,13 @@ def unexplained_of_its_kind(effect: Effect, part: FloatArray, rest: FloatArray, 
     weight = (part / null.std) ** 2
     families = np.array([STATISTICS[name].family for name in null.names])
     own = [f for f in set(families) if weight[families == f].sum() > _OF_SIGNATURE * weight.sum()]
-    return _worst_words(np.isin(families, own) | beside | (weight > _MOVED**2), rest, null)
+    return _worst_words(np.isin(families, own) | beside | (weight > MOVED**2), rest, null)
 
 
 def _worst_words(looked_at: NDArray[np.bool_], rest: FloatArray, null: NullModel) -> str:
     left = np.where(looked_at, np.abs(rest), 0.0)
     worst = int(np.argmax(left))
-    if left[worst] <= _LEFT:
+    if left[worst] <= STANDS_OUT:
         return ""
     return f"with it in the model {STATISTICS[null.names[worst]].says(float(rest[worst]))}"
 

@@ -60,9 +60,8 @@ from pchem_pipeline.effects.framework.registry import effect_classes
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_CLEARLY_LESS = 0.5  # of the gap that named effects leave, the most that may stay with another form
+_CLEARLY_LESS = 0.5  # of the gap that is left without, the most that may stay with what is measured
 _LIKELIHOODS = 6  # that are remembered
-_DESCRIBED = 0.5  # of the gap, the most that a measured component may leave to be worth telling
 
 
 def find_discrepancies(
@@ -368,7 +367,7 @@ class FrameExplainer(Explainer[Explanation]):
                 continue
             gap = self.accept.gap_at(found.mean, found.vectors)
             # beside effects that get no name there is nothing to leave less than
-            most = _DESCRIBED * (left.value if kept or named else before.value)
+            most = _CLEARLY_LESS * (left.value if kept or named else before.value)
             forms = sum(e.measured_parts for e in found.effects)
             rank = (not gap.at_floor, float(forms) if gap.at_floor else gap.value)
             if (gap.at_floor or gap.value < most) and (best is None or rank <= best[0]):

@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    FAR,
+    FAR_SHARE_OF_PART,
+    LARGEST_FACTOR,
     PRICE_OF_MORE,
+    STANDS_OUT,
     Hypothesis,
     Noise,
     fit_set,
@@ -40,13 +44,9 @@ MOST_HYPOTHESES = 6  # of one effect
 _MOST_IN_A_PART = 2
 # times as many hypotheses of all effects in all parts: each is a simulation, and most are in vain
 _MOST_IN_PARTS = 6
-_LEFT = 4.0  # deviations that the model leaves of a leading statistic for its effect to be asked for
 _REFINED = 12  # hypotheses of which the strength is refined by a second simulation
-# nats behind the best, and share of what that explains, from which on an effect is not worth more by itself
-_FAR, _FAR_SHARE = 40.0, 0.5
 _STEPS = 2  # that refine a strength
 _CLOSE = 0.15  # relative: a strength known so well is not simulated again
-_LARGEST_STEP = 30.0
 REPEATS = 3  # simulations of the hypotheses that sets are made of
 # standard deviations of what a single simulation may show by chance, below and above which it is nothing or
 # all of it; of the mean of several, in its own standard errors
@@ -172,7 +172,7 @@ class ReplicateSimulator:
                 continue
             try:
                 guessed = next(filter(None, (list(effect.estimate(e)) for e in (*known, *evidence))), [])
-                if not guessed and known and known[0].strongest(*effect.signature[:2]) > _LEFT:
+                if not guessed and known and known[0].strongest(*effect.signature[:2]) > STANDS_OUT:
                     guessed = list(effect.typical())
                 for each in guessed[:1]:
                     identifiable_from_histograms(
@@ -256,7 +256,7 @@ class ReplicateSimulator:
         fits = [fit_set([h], shift, noise) for h in hypotheses]
         scores = np.array([fit.log_score(shift, noise) for fit in fits])
         order = np.argsort(-scores, kind="stable")
-        near = scores.max() - _FAR - _FAR_SHARE * (scores.max() - log_density(shift, noise.covariance))
+        near = scores.max() - FAR - FAR_SHARE_OF_PART * (scores.max() - log_density(shift, noise.covariance))
         best = hypotheses[int(order[0])]
 
         def promising(i: int) -> bool:
@@ -323,7 +323,7 @@ def _proposal(way: DampedSteps[Hypothesis], shift: FloatArray, noise: Noise) -> 
     fit = fit_set([way.best], shift, noise)
     if fit.settled(_CLOSE):
         return None
-    factor = np.clip(fit.factors[0], 1.0 / _LARGEST_STEP, _LARGEST_STEP) ** way.length
+    factor = np.clip(fit.factors[0], 1.0 / LARGEST_FACTOR, LARGEST_FACTOR) ** way.length
     effect = way.best.rescaled(float(factor))
     return None if effect == way.best.effect else effect
 

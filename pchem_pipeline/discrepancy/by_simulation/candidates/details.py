@@ -15,7 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, log_density
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    STANDS_OUT,
+    Hypothesis,
+    log_density,
+)
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     identifiable_from_histograms,
@@ -42,7 +46,6 @@ _USUAL_ERROR = 0.5  # of the logarithm of a number as it is guessed
 _LARGEST_STEP = LARGEST_STEP / 2.0  # of a number: it bends what an effect does, and a strength scales it
 _FARTHEST = LARGEST_STEP  # from the guess: beyond, it is another hypothesis
 _WORTHWHILE = 5.0  # nats that a step must promise
-_SEEN = 4.0  # deviations that a set leaves of a statistic
 _MOVED = 1.0  # by which an effect must move it for its numbers to matter there
 _ELSEWHERE = 0.5  # of the squares of what is left, the most where its effects move nothing
 
@@ -73,7 +76,7 @@ def may_be_tuned(refitter: Refitter, one: Refitted) -> bool:
     if not places:
         return False
     scatter = refitter.scatter(one.covariance, len(one.vectors))
-    left = np.where(np.abs(one.rest) > _SEEN, one.rest**2, 0.0)
+    left = np.where(np.abs(one.rest) > STANDS_OUT, one.rest**2, 0.0)
     moved = np.abs(one.parts[places]).max(axis=0) > _MOVED * scatter
     return bool(left.sum() > 0.0 and left[~moved].sum() < _ELSEWHERE * left.sum())
 

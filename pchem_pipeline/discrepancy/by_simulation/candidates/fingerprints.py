@@ -33,7 +33,15 @@ _LARGEST_SET = 3
 _SHORTLIST = 9
 _SMALLEST_FACTOR = 2.0  # standard errors: less of an effect is none
 _SEEN = 3.5  # standard deviations by which some statistic must ask for an effect among others
-_MOVED = 2.0  # standard deviations by which the effect itself must move it
+#: Standard deviations by which the effect itself must move it.
+MOVED = 2.0
+#: Deviations that a model leaves of a statistic for it to stand out.
+STANDS_OUT = 4.0
+#: Nats behind from which on a fingerprint is no rival of a right set, and share of what there is to explain,
+#: in addition, for a set that leaves something.
+FAR, FAR_SHARE_OF_PART = 40.0, 0.5
+#: Factor of a fingerprint beyond which it says nothing, and is another hypothesis.
+LARGEST_FACTOR = 30.0
 _BLUR = 2.0  # model errors of the others that are added to chance there
 
 
@@ -391,4 +399,4 @@ def seen_among(part: FloatArray, others: FloatArray, shift: FloatArray, noise: N
     blur = _BLUR * tolerance(others, noise.model_error, noise.events)
     scale = np.sqrt(noise.covariance.variances + blur**2)
     left, own = (shift - others.sum(axis=0)) / scale, part / scale
-    return bool(np.any((np.abs(left) > _SEEN) & (np.abs(own) > _MOVED) & (left * own > 0.0)))
+    return bool(np.any((np.abs(left) > _SEEN) & (np.abs(own) > MOVED) & (left * own > 0.0)))

@@ -50,7 +50,6 @@ _CHANCE = 7  # frames between a sample and the one that stands for a neighbour b
 _OF_CHANCE = 3.0  # times what that one explains, that a neighbour must
 _TOGETHER: tuple[Together, ...] = ("row", "column", "frame")
 _ROWS_TOGETHER = 4  # neighbouring rows
-_RARE = 1e-6  # least mass of a code: what is rarer has other reasons
 _SURE = 30.0  # nats, the most that a sample says
 _ALIGNED = 3.0  # times as many equal squares of one parity as of the others
 _FIRST_SHARE, _STEPS = 0.02, 60

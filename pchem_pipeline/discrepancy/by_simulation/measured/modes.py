@@ -17,7 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import shares_of
-from pchem_pipeline.discrepancy.by_simulation.measured.samples import Measurement, PartSamples, frames_apart
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
+    FARTHEST,
+    Measurement,
+    PartSamples,
+    frames_apart,
+)
 from pchem_pipeline.effects.analog.empirical_noise import (
     Changed,
     Cycles,
@@ -41,7 +46,6 @@ _NEARLY = 0.5  # of the nats of the clearest change: another one may be it as we
 _OF_GAUSSIAN, _BURST = 0.3, 10.0
 _REACH = 20.0  # widths of the highest peak from it, up to where scores are told apart
 _CHUNK = 256  # frames at once
-_FARTHEST = 3  # frames
 _MOST_BLOCKS, _SMALLEST_BLOCK = 8, 4  # along an axis; px
 _UNEVEN = 5.0  # standard errors of its power by which a shape must be clearer than the same everywhere
 _OF_ERROR = 2.0  # standard errors: blocks of less have none
@@ -346,7 +350,7 @@ def _correlation(one: Sums, power: float) -> tuple[tuple[Lag, ...], tuple[float,
     scaled = one.sums / np.maximum(one.information, np.finfo(np.float64).tiny)
     lags: list[Lag] = []
     found: list[float] = []
-    for step in range(1, _FARTHEST + 1):
+    for step in range(1, FARTHEST + 1):
         first, later = frames_apart(one.numbers, step)
         if not first.size:
             continue

@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from pchem_pipeline.discrepancy.by_simulation.measured.modes import MADE
-from pchem_pipeline.discrepancy.by_simulation.measured.samples import Measurement, PartSamples, frames_apart
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
+    CERTAIN,
+    FARTHEST,
+    Measurement,
+    PartSamples,
+    frames_apart,
+)
 from pchem_pipeline.discrepancy.observe.waves import Waves, waves_across
 from pchem_pipeline.effects.analog.empirical_noise import (
     EmpiricalNoise,
@@ -37,10 +43,8 @@ BoolArray = NDArray[np.bool_]
 
 _SHARED: tuple[Shared, ...] = ("frame", "row", "column", "sample")
 _LINES: tuple[Shared, ...] = ("row", "column")
-_FARTHEST = 3  # frames, rows and columns
 _GROUPS = 60  # of frames, whose scatter tells the error
 _CLEAR = 4.0  # standard errors that a covariance must have; a fit to all statistics comes behind
-_CERTAIN = 3.0  # of a model's, in simulated frames: less is taken for none
 _MOST_LAGS = 64
 # of the variance of single samples, over the least: a spectrum that vanishes needs a long moving average
 _OVER_LEAST = 1.15
@@ -86,7 +90,7 @@ def residual_covariances(samples: PartSamples) -> Covariances:
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     u = samples.scores(1, inside, *box)
     found: dict[tuple[Shared, Lag], Covariance] = {}
-    for step in range(_FARTHEST + 1):
+    for step in range(FARTHEST + 1):
         first, later = frames_apart(samples.numbers, step)
         if first.size >= 2 * _GROUPS:
             found |= _of_step(u[first], u[later], inside[box], step)
@@ -110,7 +114,7 @@ def _of_step(
     one: NDArray[np.float32], two: NDArray[np.float32], inside: BoolArray, step: int
 ) -> dict[tuple[Shared, Lag], Covariance]:
     """Return the covariances of frames with those ``step`` later."""
-    far_y, far_x = (min(_FARTHEST, (size - 1) // 4) for size in inside.shape)
+    far_y, far_x = (min(FARTHEST, (size - 1) // 4) for size in inside.shape)
     down, right = range(-far_y, far_y + 1), range(-far_x, far_x + 1)
     pixels = inside[None].astype(np.float32)
     starts = np.arange(_GROUPS) * len(one) // _GROUPS
@@ -186,7 +190,7 @@ class _Pairs(NamedTuple):
 def _products(one: NDArray[Any], two: NDArray[Any], starts: IntArray) -> FloatArray:
     """Return ``sum one[n, i] two[n, i + d]`` of groups of n by distance d, negative ones from the end."""
     axes = tuple(range(1, one.ndim))
-    size = [n + _FARTHEST for n in one.shape[1:]]
+    size = [n + FARTHEST for n in one.shape[1:]]
     products = np.conj(fft.rfftn(one, size, axes)) * fft.rfftn(two, size, axes)
     return np.asarray(fft.irfftn(np.add.reduceat(products, starts, axis=0), size, axes), np.float64)
 
@@ -203,7 +207,7 @@ def measured_noise(
         inside: pixels that were looked at, shape (y, x).
     """
     inside = inside & evidence.maps.usable
-    own = {key: one for key, one in model.pairs.items() if abs(one.value) > _CERTAIN * one.error}
+    own = {key: one for key, one in model.pairs.items() if abs(one.value) > CERTAIN * one.error}
     none = Covariance(0.0, 0.0)
     left = {key: one.value - own.get(key, none).value for key, one in data.pairs.items()}
     error = {key: np.hypot(one.error, own.get(key, none).error) for key, one in data.pairs.items()}
@@ -271,7 +275,7 @@ class _Profile(NamedTuple):
         for key in list(left):
             if key[0] == of:
                 left[key] = 0.0
-        for far in range(1, _FARTHEST + 1):
+        for far in range(1, FARTHEST + 1):
             near: Lag = (0, 0, far) if of == "row" else (0, far, 0)
             if ("sample", near) in left:
                 made = self.power * response**2 * float(np.mean(self.shape[:-far] * self.shape[far:]))
@@ -302,7 +306,7 @@ def _profile(of: Shared, data: Covariances, model: Covariances, response: FloatA
     unit = np.where(known, response, 0.0).sum(axis=axis) / np.maximum(known.sum(axis=axis), 1)
     size = unit.size
     n_points = min(_MOST_POINTS, size // 4)
-    one, two = np.nonzero(np.triu((counts > 0) & (np.outer(unit, unit) > 0), _FARTHEST + 1))
+    one, two = np.nonzero(np.triu((counts > 0) & (np.outer(unit, unit) > 0), FARTHEST + 1))
     if n_points < _FEWEST_POINTS or one.size < 4 * n_points**2:
         return None
     scale = unit[one] * unit[two]

@@ -15,7 +15,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.measured.samples import Distance, Measurement, PartSamples
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
+    CERTAIN,
+    Distance,
+    Measurement,
+    PartSamples,
+)
 from pchem_pipeline.discrepancy.observe.digital.predicted import GROUP
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples, Follows
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
@@ -35,7 +40,6 @@ Mirrored = tuple[Axis, ...]
 
 _MIRRORED: tuple[Mirrored, ...] = ((), ("rows",), ("columns",), ("rows", "columns"))
 _CLEAR = 20.0  # nats that a term must be worth beyond the number of those that are tried
-_CERTAIN = 3.0  # standard errors of a model's, in simulated frames: less is taken for none
 _DETAIL = 1e-3  # of the nats of the first term: less may be how the pixels differ in it
 _MOST_TERMS = 16
 _NEARLY_ALL = 0.7  # of the columns
@@ -161,7 +165,7 @@ class _Left:
         """Return what is left of the products of the data beyond those of a model that are certain."""
         products = data.products.copy()
         if model is not None:
-            sure = np.abs(np.nan_to_num(model.z("sample"))) > _CERTAIN
+            sure = np.abs(np.nan_to_num(model.z("sample"))) > CERTAIN
             products -= np.where(sure, model.products / np.maximum(model.pairs, 1.0) * data.pairs, 0.0)
         return cls(products, data.pairs, data.wider)
 

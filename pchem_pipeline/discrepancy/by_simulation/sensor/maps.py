@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.discrepancy.by_simulation.sensor.population import (
+    MANY_MISTAKEN,
     Posterior,
     clipped_mean,
     lost_variance,
@@ -37,8 +38,6 @@ UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "rea
 
 _LEAST_LEFT = 0.2  # of the fitted exposure, or variance of the read noise, without what effects add to it
 _FEWEST_CODES = 3  # that a pixel must have shown
-#: Share of pixels with a mistaken bias from which what is learnt does not rest on their maxima.
-MANY_MISTAKEN = 0.3
 _MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
 # near their plain fit pixels arrive in some ten evaluations, or hardly ever; a fit within 0.005 of its error
 _SEARCHED = FitSettings(max_iterations=60, tolerance=1e-5)

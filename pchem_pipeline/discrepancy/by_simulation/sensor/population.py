@@ -44,8 +44,9 @@ _LARGEST_STEP = np.array([0.7, 0.15, 0.5, 0.8])  # of theta at once; of mu in DN
 # scatters below which pixels are alike for all purposes: of log H, log 1/g, mu (DN), log sigma_R^2
 _LEAST_SCATTER = np.array([2e-3, 2e-4, 5e-3, 2e-3])
 _LOWEST_LOG_EXPOSURE, _LOWEST_LOG_VARIANCE = float(np.log(1e-5)), float(np.log(1e-4))
-# share of mistaken pixels up to which the fits are nearly the truth, and beyond which they are no start
-_HARDLY_ANY, _MANY = 0.003, 0.3
+_HARDLY_ANY = 0.003  # share of mistaken pixels up to which the fits are nearly the truth
+#: The same beyond which they are no start, and what is learnt does not rest on the pixels' maxima.
+MANY_MISTAKEN = 0.3
 _SHIFTS = (0, 1, -1)  # electrons by which a bias may be mistaken
 _ALIKE = np.array([0.3, 0.02, 0.5, 0.15])  # scatter of theta of pixels that are much alike
 _WIDEST_DRAW = 1.5  # of log H and log sigma_R^2 from the maximum
@@ -56,7 +57,8 @@ _USUAL_NOISE, _NOISE_RANGE = 0.3, 0.2  # e-^2: squared read noise where peaks ar
 _MOST_NOISE = 12.0  # of 1/g over what it were without read noise
 _ITERATIONS = 30
 _MOST_DRAWN_AGAIN = 500  # pixels behind what is learnt too low
-_REACH = 7.0  # standard deviations of the samples: their histograms reach no further
+#: Standard deviations of samples: their histograms reach no further.
+REACH = 7.0
 _LEAST_ELECTRONS = 0.01  # that a pixel is begun with
 _OUTLYING = 15.0  # median deviations of a cumulant beyond which a pixel is not asked
 
@@ -200,8 +202,8 @@ def lost_variance(posterior: Posterior, totals: NDArray[np.integer], law: Sample
     own = (law or SampleLaw()).of(some)
     reach = np.sqrt(drawn[:, 0]) / drawn[:, 1] + drawn[:, 3]
     centre = drawn[:, 2] + drawn[:, 0] / drawn[:, 1]
-    first = np.floor(centre - _REACH * reach).astype(np.int64)
-    width = int(2.0 * _REACH * np.quantile(reach, 0.99)) + 1
+    first = np.floor(centre - REACH * reach).astype(np.int64)
+    width = int(2.0 * REACH * np.quantile(reach, 0.99)) + 1
     codes = first[:, None] + np.arange(width)
     mass = np.maximum(sample_mass(own, [np.ascontiguousarray(column) for column in drawn.T], codes), 0.0)
     counts = rng.multinomial(totals[some].astype(np.int64), mass / mass.sum(axis=1, keepdims=True))
@@ -462,7 +464,7 @@ def _beginnings(
     start = np.tile(centre, (mean.size, 1))
     start[:, 2] = mean - np.exp(centre[0] + centre[1])
     found: list[tuple[FloatArray, Population]] = []
-    resolved = mistaken <= _MANY
+    resolved = mistaken <= MANY_MISTAKEN
     if known.any() and (resolved or not pixels.law.neutral or pixels.replaced is not None):
         fits = np.where(known[:, None], to_theta(np.where(known[:, None], parameters, 1.0)), start)
         found.append((fits, _first_guess(fits[known])))

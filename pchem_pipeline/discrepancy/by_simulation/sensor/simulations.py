@@ -18,12 +18,12 @@ from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameSta
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import without_squares
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
-    MANY_MISTAKEN,
     Refit,
     Sensor,
     learn_sensor,
     refit_maps,
 )
+from pchem_pipeline.discrepancy.by_simulation.sensor.population import MANY_MISTAKEN
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Replicate, by_part
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.digital.misplaced import own_lines

@@ -20,6 +20,8 @@ from scipy import special
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    FAR,
+    STANDS_OUT,
     Choice,
     Hypothesis,
     ScoredSet,
@@ -33,7 +35,6 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood, note_defect
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_expensive
 from pchem_pipeline.discrepancy.by_simulation.sets.trials import (
-    FAR,
     LOOSE,
     PENALISED,
     Trials,
@@ -53,8 +54,7 @@ _MOST_SETS = 5
 # a seed; how many of these sets are refitted, by how many effects they have besides
 _MOST_SEEDS, _REACH_SHARE = 2, 0.05
 _MOST_GROWN = {1: 2, 2: 1}
-_SEEN = 4.0  # deviations that the others leave of a statistic for it to ask for an effect
-_MOVED = 3.0  # by which that effect must move it
+_MOVED = 3.0  # deviations by which an effect must move a statistic that stands out without it
 _UNTOUCHED = 0.5  # of that, the most by which the others may move it
 _NO_WORSE = 10.0  # nats by which fewer replicates may make a set look worse
 _MOST_ALIKE = 3  # look-alikes of a single effect that are refitted before anything beside it
@@ -337,7 +337,7 @@ def own_signature(own: FloatArray, others: FloatArray, left: FloatArray, noise: 
     """
     touched = np.abs(others).max(axis=0, initial=0.0)
     mine = (np.abs(own) > _MOVED * noise) & (touched < _UNTOUCHED * np.abs(own))
-    return bool(np.any(mine & (np.abs(left) > _SEEN) & (left * own > 0.0)))
+    return bool(np.any(mine & (np.abs(left) > STANDS_OUT) & (left * own > 0.0)))
 
 
 def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesis]:

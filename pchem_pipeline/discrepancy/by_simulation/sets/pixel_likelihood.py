@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError, error_words
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, leads_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
-from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import LARGEST_FACTOR, Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, at_other_peaks, off_by
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.places import Part
@@ -39,7 +39,6 @@ _MOST_STARTS = 3  # of one effect
 # nats that an effect for which no estimator speaks must explain, and times as strong as is typical, where a
 # plain fit is led astray
 _SPEAKS, _STRONG = 15.0, 5.0
-_FARTHEST = 30.0  # factor of a fingerprint: beyond, it is another hypothesis
 _PROBED = 64  # pixels
 _SILENT = 0.5  # nats of so many pixels: an effect that explains less is not in more of them
 _REMEMBERED = 12  # fits: each holds the masses of all codes
@@ -357,7 +356,7 @@ def _at(hypothesis: Hypothesis, effect: Effect) -> Hypothesis:
     """Return a hypothesis with its effect at other numbers, its fingerprint in proportion to the strength."""
     old, new = (float(getattr(e, e.strength)) for e in (hypothesis.effect, effect))
     factor = max(new / old, 0.0) ** effect.power if old else 0.0
-    if not 1.0 / _FARTHEST < factor < _FARTHEST:
+    if not 1.0 / LARGEST_FACTOR < factor < LARGEST_FACTOR:
         return hypothesis
     return replace(hypothesis, effect=effect, fingerprint=hypothesis.fingerprint * factor)
 

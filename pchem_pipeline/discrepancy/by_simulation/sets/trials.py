@@ -10,6 +10,9 @@ import numpy as np
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers, may_be_tuned, tuned
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    FAR,
+    FAR_SHARE_OF_PART,
+    STANDS_OUT,
     Hypothesis,
     fit_set,
     meets_itself,
@@ -29,11 +32,7 @@ _MOST_EXPENSIVE = 4  # sets whose refit takes long
 #: Relative error of a fingerprint before its refit.
 LOOSE = 0.1
 _HARDLY = 0.1  # of a deviation, what effects may move the statistic by that cannot account for it
-#: Nats behind from which on a fingerprint is no rival of a right set.
-FAR = 40.0
-_FAR_SHARE = 0.25  # of what there is to explain, the same in addition
-_FAR_SHARE_OF_PART = 0.5  # the same of a set that leaves something
-_SEEN = 4.0  # deviations that a set leaves of a statistic for it to stand out
+_FAR_SHARE = 0.25  # of what there is to explain, beside `FAR`, for a set that leaves nothing
 _CLEARLY = 5.0  # standard errors of a difference of likelihoods
 #: What sets are sorted by.
 PENALISED = operator.attrgetter("penalised_log_likelihood")
@@ -252,13 +251,13 @@ def _beaten(refitter: Refitter, members: Sequence[Hypothesis], best: Refitted) -
     statistic that stands out and that they hardly move says enough: a refit does not change them so much.
     """
     complete = refitter.passes_goodness_of_fit(best)
-    trust = _FAR_SHARE if complete and len(members) >= len(best.hypotheses) else _FAR_SHARE_OF_PART
+    trust = _FAR_SHARE if complete and len(members) >= len(best.hypotheses) else FAR_SHARE_OF_PART
     shift = refitter.target - refitter.null.mean
     noise = replace(refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=LOOSE)
     fit = fit_set(members, shift, noise)
     parts = fit.parts
     left = np.abs(shift - parts.sum(axis=0)) / np.sqrt(noise.of(parts).variances)
-    if complete and np.any((left > _SEEN) & (np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift))):
+    if complete and np.any((left > STANDS_OUT) & (np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift))):
         return True
     score = fit.log_score(shift, noise)
     return score < best.score - FAR - trust * (best.score - refitter.nothing)
