@@ -16,7 +16,6 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     STANDS_OUT,
     Hypothesis,
     Noise,
-    SetFit,
     fit_set,
     tolerance,
 )
@@ -46,7 +45,8 @@ class Round:
 
     Attributes:
         compared: the sets at their best fit.
-        added: the new effects of the chosen one.
+        added: the new effects of the chosen one, with what each has moved of the statistics.
+        stderr: relative standard errors of their factors, shape (e,).
         hypotheses: all candidates of the round.
         null: of the model before it.
         extended: of the model after it.
@@ -55,19 +55,24 @@ class Round:
     """
 
     compared: Comparison
-    added: SetFit
+    added: tuple[Hypothesis, ...]
+    stderr: FloatArray
     hypotheses: tuple[Hypothesis, ...]
     null: NullModel
     extended: NullModel
     moved: Mapping[str, Mapping[str, Any]]
     certain: bool = True
 
+    @property
+    def parts(self) -> FloatArray:
+        """Shift of the statistics by each of them, shape (e, m)."""
+        return np.array([h.fingerprint for h in self.added])
+
     def updated(self, now: Mapping[str, Hypothesis], errors: Mapping[str, float]) -> Round:
         """Return it with its effects as a later round has fitted them anew, and relative standard errors."""
-        new = tuple(now.get(h.tag, h) for h in self.added.hypotheses)
-        old = zip(self.added.hypotheses, self.added.stderr, strict=True)
-        stderr = np.array([errors.get(h.tag, error) for h, error in old])
-        return replace(self, added=replace(self.added, hypotheses=new, stderr=stderr))
+        new = tuple(now.get(h.tag, h) for h in self.added)
+        stderr = [errors.get(h.tag, error) for h, error in zip(self.added, self.stderr, strict=True)]
+        return replace(self, added=new, stderr=np.array(stderr))
 
 
 @dataclass
@@ -93,7 +98,7 @@ class ExtendedModel:
     @property
     def added(self) -> tuple[Hypothesis, ...]:
         """The effects of all rounds."""
-        return tuple(h for this in self.rounds for h in this.added.hypotheses)
+        return tuple(h for this in self.rounds for h in this.added)
 
     @property
     def present(self) -> tuple[Effect, ...]:
@@ -142,18 +147,16 @@ class ExtendedModel:
         self.rounds = [this.updated(now, errors) for this in self.rounds]
         before = {h.tag for h in self.added}
         new = tuple(h for h in corrected if h.tag not in before)
-        fit = SetFit(
-            new, np.ones(len(new)), np.array([errors[h.tag] for h in new]), np.zeros(len(new), np.bool_)
-        )
+        stderr = np.array([errors[h.tag] for h in new])
         moved = self.work.mapped(self.effects).fit.moved
-        self.rounds.append(Round(found, fit, hypotheses, null, extended, moved, certain))
+        self.rounds.append(Round(found, new, stderr, hypotheses, null, extended, moved, certain))
         return extended
 
     def put_measured(self, found: Refitted) -> NullModel:
         """Put what was measured into the model, without effects that are not beside it, and their rounds."""
         gone = {h.tag for h in self.added} - found.tags
         self.effects = self._without(tuple(h for h in self.added if h.tag in gone))
-        changed = [i for i, this in enumerate(self.rounds) if gone & {h.tag for h in this.added.hypotheses}]
+        changed = [i for i, this in enumerate(self.rounds) if gone & {h.tag for h in this.added}]
         self.rounds = self.rounds[: min(changed, default=len(self.rounds))]
         null = self.rounds[-1].extended if self.rounds else self.first
         return self.put(Comparison(found, (found,)), found, (), null)
@@ -188,7 +191,7 @@ class AddedRounds:
         """What is not held against their effects, (m,): a fraction of what they do."""
         if not self.rounds:
             return 0.0
-        parts = np.concatenate([this.added.parts for this in self.rounds])
+        parts = np.concatenate([this.parts for this in self.rounds])
         return tolerance(parts, self.accept.allowed, self.accept.first.events)
 
     def left(self, last: NullModel) -> FloatArray:
@@ -202,8 +205,8 @@ class AddedRounds:
         return tuple(
             h
             for this in self.rounds
-            for h, part in zip(this.added.hypotheses, this.added.parts, strict=True)
-            if not unexplained_of_its_own(part, rest, this.null)
+            for h in this.added
+            if not unexplained_of_its_own(h.fingerprint, rest, this.null)
         )
 
     def close(self, before: Gap, last: NullModel, still: bool) -> Added:
@@ -220,7 +223,7 @@ class AddedRounds:
         additions: list[Addition] = []
         gap = before
         for index, this in enumerate(self.rounds):
-            parts, mean = this.added.parts, this.null.mean
+            parts, mean = this.parts, this.null.mean
             of_round: list[Addition] = []
             order = np.argsort([-_weight(part, this.null) for part in parts])
             for place, member in enumerate(order):
@@ -231,7 +234,7 @@ class AddedRounds:
                     now = self.accept.gap(this.extended)
                 else:
                     now = after
-                effect = this.added.hypotheses[member].effect
+                effect = this.added[member].effect
                 against = (
                     "" if rest is None else unexplained_of_its_kind(effect, parts[member], rest, this.null)
                 )
@@ -253,7 +256,7 @@ class AddedRounds:
         accounts for all that it moves. That is asked where the data disagree with the whole model: one that
         agrees, with every effect in it, is not judged a second time by fewer statistics.
         """
-        added, parts = this.added.hypotheses[member], this.added.parts
+        added, parts = this.added[member], this.parts
         allowed = tolerance(parts, self.accept.allowed, this.null.events)
         significance = self.accept.settings.significance
         wrong = still and misfits(this.extended, self.accept.z, parts[member], significance, allowed)
@@ -263,7 +266,7 @@ class AddedRounds:
         self, this: Round, member: int, gaps: tuple[Gap, Gap], against: str, later: FloatArray
     ) -> Addition:
         """Return an effect of a round; ``later`` is what those of it do that come after, shape (m,)."""
-        added = this.added.hypotheses[member]
+        added = this.added[member]
         rivals = this.compared.rivals_of(added.tag)
         kept = _ambiguous_set(rivals, self.accept.settings.certainty)
         described = type(added.effect).measured_only
@@ -282,7 +285,7 @@ class AddedRounds:
             against=against,
             described=described,
             candidates=tuple(Candidate.of(e, r.score, r.stderr, r.probability) for e, r in compared),
-            strength_stderr=_stderr(added, float(this.added.stderr[member])),
+            strength_stderr=_stderr(added, float(this.stderr[member])),
             before=gaps[0],
             after=gaps[1],
             rivals=tuple(self._rival(this, one, later) for one in ranked),
@@ -299,8 +302,8 @@ class AddedRounds:
 
     def _others(self, this: Round, member: int) -> list[_Other]:
         """Return all that could stand in the place of a member of the chosen set, the best first."""
-        compared, added = this.compared, this.added.hypotheses[member]
-        kept = [h for i, h in enumerate(this.added.hypotheses) if i != member]
+        compared, added = this.compared, this.added[member]
+        kept = [h for h in this.added if h is not added]
         found: dict[str, _Other] = {}
         for one in compared.tried:
             new = one.tags - compared.chosen.tags
@@ -311,7 +314,7 @@ class AddedRounds:
                 found.setdefault(hypothesis.tag, other)
         noise = Noise(this.null.covariance.times(0.5), self.accept.settings.model_error)
         shift = self.accept.z.both - this.null.mean
-        best = fit_set(this.added.hypotheses, shift, noise).log_score(shift, noise)
+        best = fit_set(this.added, shift, noise).log_score(shift, noise)
         refitted = {*compared.chosen.tags, *found}
         for hypothesis in this.hypotheses:
             if hypothesis.tag in refitted or hypothesis.effect.tag == added.effect.tag:

@@ -45,7 +45,7 @@ LARGEST_FACTOR = 30.0
 _BLUR = 2.0  # model errors of the others that are added to chance there
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Hypothesis:
     """An effect with parameters, and what it would do to the statistics.
 
@@ -316,13 +316,12 @@ def choose(
         shifts: measured statistics minus null mean of the two splits, shape (m,) each.
         noise: covariance of a shift.
     """
-    shortlist, alone = _shortlist(hypotheses, shifts, noise), firsts(hypotheses)
+    shortlist, alone = _shortlist(hypotheses, shifts, noise), set(firsts(hypotheses))
     sets = []
     for size in range(1, _LARGEST_SET + 1):
         for members in itertools.combinations(shortlist, size):
             once = len({h.tag for h in members}) == size and not meets_itself(members)
-            led = all(any(h is one for one in alone) for h in firsts(members))
-            if once and led and not share_place(h.effect for h in members):
+            if once and alone.issuperset(firsts(members)) and not share_place(h.effect for h in members):
                 scored = score_set(members, shifts, noise)
                 if _all_needed(scored, shifts, noise):
                     sets.append(scored)
@@ -344,7 +343,7 @@ def _shortlist(
     def take(count: int, others: Sequence[Hypothesis]) -> None:
         scored = []
         for hypothesis in alone:
-            if any(hypothesis is h for h in chosen) or hypothesis.tag in {h.tag for h in others}:
+            if hypothesis in chosen or hypothesis.tag in {h.tag for h in others}:
                 continue
             scored.append((score_set([*others, hypothesis], shifts, noise).score, hypothesis))
         scored.sort(key=lambda pair: pair[0], reverse=True)
@@ -363,7 +362,7 @@ def _shortlist(
             take(_SHORTLIST - len(chosen), (best, second))
     # an effect that does well in one region may do so in others at once
     kept = {h.effect.tag for h in chosen if h.effect.region is not None}
-    return chosen + [h for h in hypotheses if h.effect.tag in kept and not any(h is one for one in alone)]
+    return chosen + [h for h in hypotheses if h.effect.tag in kept and h not in alone]
 
 
 def _all_needed(scored: ScoredSet, shifts: tuple[FloatArray, FloatArray], noise: Noise) -> bool:

@@ -346,7 +346,7 @@ def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesi
     for hypothesis in firsts(hypotheses):
         same = sum(h.tag == hypothesis.tag for h in chosen)
         most = 1 if type(hypothesis.effect).erratic else _MOST_OF_ONE
-        if same < most and len(chosen) < _MOST_SINGLES and all(hypothesis is not h for h in chosen):
+        if same < most and len(chosen) < _MOST_SINGLES and hypothesis not in chosen:
             chosen.append(hypothesis)
     return chosen
 
