@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.charge_material import a_uniform_sensor
+from helpers.charge_material import simulated as simulated_frames
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings, _sentence
@@ -24,11 +26,9 @@ from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.readout.empirical import Empirical, MixtureShift, neighbour_words
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.simulate.chain import simulate_block
-from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.truth import TruthMaps
 
 SHAPE, FRAMES, STEP = (10, 12), 1500, 12.0
+SENSOR = a_uniform_sensor(SHAPE, 1.0, 1 / STEP, 100.0, 0.25)
 
 
 def sensor(seed: int) -> tuple[np.ndarray, np.random.Generator, PixelMaps]:
@@ -184,11 +184,8 @@ def test_moves_of_which_none_is_needed_are_not_measured(monkeypatch: pytest.Monk
 
 def simulated(effect: Empirical, n_frames: int) -> tuple[np.ndarray, np.ndarray]:
     """Return simulated frames with and without an effect."""
-    values = (1.0, 1 / STEP, 100.0, 0.25)
-    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
-    how = SimulateSettings(shape=SHAPE, n_frames=n_frames, seed=4, bit_depth=12)
-    with_it = how.model_copy(update={"effects": (effect,)})
-    return tuple(simulate_block(truth, each, (0, n_frames))[0].astype(int) for each in (with_it, how))
+    both = (simulated_frames(SENSOR, *each, n_frames=n_frames, seed=4)[0] for each in ((effect,), ()))
+    return tuple(frames.astype(int) for frames in both)
 
 
 def test_samples_are_moved_by_their_shares() -> None:
@@ -232,11 +229,11 @@ def test_what_is_moved_together_comes_from_one_side(together: Any, axes: Any) ->
 def test_the_same_frames_at_every_division() -> None:
     moves = (MixtureShift(towards=(-1, 0, 0), part=0.5), MixtureShift(towards=(0, 1, 0)))
     effect = Empirical(share=0.4, moves=moves)
-    values = (1.0, 1 / STEP, 100.0, 0.25)
-    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
-    how = SimulateSettings(shape=SHAPE, n_frames=30, seed=4, bit_depth=12, effects=(effect,))
-    whole = simulate_block(truth, how, (0, 30))[0]
-    np.testing.assert_array_equal(simulate_block(truth, how, (9, 22), (3, 6))[0], whole[9:22, 3:6])
+    whole, part = (
+        simulated_frames(SENSOR, effect, n_frames=30, seed=4, frames=some, rows=rows)[0]
+        for some, rows in ((None, None), ((9, 22), (3, 6)))
+    )
+    np.testing.assert_array_equal(part, whole[9:22, 3:6])
 
 
 def test_it_competes_with_nothing_and_refuses_half_a_table() -> None:

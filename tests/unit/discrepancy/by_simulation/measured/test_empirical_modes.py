@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.charge_material import a_uniform_sensor
+from helpers.charge_material import simulated as simulated_frames
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.by_simulation.measured.modes import (
@@ -18,9 +20,6 @@ from pchem_pipeline.discrepancy.by_simulation.measured.modes import (
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import PartSamples
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.simulate.chain import simulate_block
-from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.truth import TruthMaps
 
 SHAPE, FRAMES, STEP = (16, 20), 1500, 14.0
 SIGNAL = 1.5 * STEP
@@ -268,11 +267,9 @@ def test_what_a_model_makes_is_taken_off() -> None:
 
 def simulated(mode: NoiseMode, noise_dn: float, read_noise: float = 1e-6, light: float = 4.0) -> np.ndarray:
     """Return frames of a sensor, with next to no read noise (e-), in which something is shared."""
-    values = (light, 1 / STEP, 100.0, read_noise)
-    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
+    sensor = a_uniform_sensor(SHAPE, light, 1 / STEP, 100.0, read_noise)
     effect = EmpiricalNoise(noise_dn=noise_dn, modes=(mode,))
-    how = SimulateSettings(shape=SHAPE, n_frames=FRAMES, seed=5, bit_depth=14, effects=(effect,))
-    return simulate_block(truth, how, (0, FRAMES))[0] - 100.0
+    return simulated_frames(sensor, effect, n_frames=FRAMES, seed=5)[0] - 100.0
 
 
 @pytest.mark.parametrize("on", ["gain", "light"])

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.charge_material import a_uniform_sensor
+from helpers.charge_material import simulated as simulated_frames
 from pydantic import ValidationError
 
 from pchem_pipeline.config.load import parse_config
@@ -24,9 +26,6 @@ from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseM
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.simulate.chain import simulate_block
-from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.truth import TruthMaps
 
 ROWS, COLUMNS, FRAMES, STEP = 16, 18, 900, 12.0
 SHAPE = (ROWS, COLUMNS)
@@ -159,13 +158,9 @@ def test_what_a_model_makes_is_taken_off():
 
 def simulated(effect: EmpiricalNoise, n_frames: int = 600) -> np.ndarray:
     """Return the noise, DN, of a sensor of no other noise and no light, in steps of a hundredth."""
-    maps = {"quanta_exposure": 1e-9, "conversion_gain": 1.0, "bias": 30000.0, "analog_read_noise_e": 1e-6}
-    values = {name: np.full(SHAPE, value) for name, value in maps.items()}
-    truth = TruthMaps(**values, defect=np.zeros(SHAPE, np.uint8))
-    sensor = SimulateSettings(
-        shape=SHAPE, n_frames=n_frames, seed=5, bit_depth=16, effects=(effect.scaled(100.0),)
-    )
-    return (simulate_block(truth, sensor, (0, n_frames))[0] - 30000.0) / 100.0
+    sensor = a_uniform_sensor(SHAPE, 1e-9, 1.0, 30000.0, 1e-6)
+    frames, _ = simulated_frames(sensor, effect.scaled(100.0), n_frames=n_frames, seed=5, bit_depth=16)
+    return (frames - 30000.0) / 100.0
 
 
 @pytest.mark.parametrize(
@@ -201,12 +196,11 @@ def test_the_same_frames_at_every_division():
         NoiseMode(of="row", share=0.5, lags=((0, 2, 0),), correlation=(-0.4,)),
     )
     effect = EmpiricalNoise(noise_dn=3.0, modes=modes)
-    sensor = SimulateSettings(shape=SHAPE, n_frames=20, seed=8, effects=(effect,))
-    truth = TruthMaps(
-        *(np.full(SHAPE, value) for value in (1.0, 0.1, 100.0, 0.2)), defect=np.zeros(SHAPE, np.uint8)
+    sensor = a_uniform_sensor(SHAPE, 1.0, 0.1, 100.0, 0.2)
+    whole, part = (
+        simulated_frames(sensor, effect, n_frames=20, seed=8, frames=some, rows=rows)[0]
+        for some, rows in ((None, None), ((7, 12), (5, 9)))
     )
-    whole = simulate_block(truth, sensor, (0, 20))[0]
-    part = simulate_block(truth, sensor, (7, 12), (5, 9))[0]
     np.testing.assert_array_equal(part, whole[7:12, 5:9])
 
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.charge_material import a_uniform_sensor
+from helpers.charge_material import simulated as simulated_frames
 from pydantic import ValidationError
 from scipy import stats
 
@@ -27,9 +29,6 @@ from pchem_pipeline.effects.analog.empirical_response import (
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
-from pchem_pipeline.simulate.chain import simulate_block
-from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.truth import TruthMaps
 
 SHAPE, FRAMES, STEP, NOISE = (14, 18), 1200, 14.0, 0.25
 EVERYWHERE = np.ones(SHAPE, bool)
@@ -227,11 +226,9 @@ def test_sums_by_distance_are_those_of_all_pairs(axes: tuple[int, ...]) -> None:
 
 def simulated(*terms: ResponseTerm, response: float, region: Any = None) -> np.ndarray:
     """Return signals of a sensor of next to no read noise under the effect, e-."""
-    values = (2.0, 1 / STEP, 100.0, 1e-6)
-    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
+    sensor = a_uniform_sensor(SHAPE, 2.0, 1 / STEP, 100.0, 1e-6)
     effect = EmpiricalResponse(response=response, terms=terms, region=region)
-    how = SimulateSettings(shape=SHAPE, n_frames=400, seed=5, bit_depth=14, effects=(effect,))
-    return (simulate_block(truth, how, (0, 400))[0] - 100.0) / STEP
+    return (simulated_frames(sensor, effect, n_frames=400, seed=5)[0] - 100.0) / STEP
 
 
 @pytest.mark.parametrize(

@@ -444,32 +444,35 @@ def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
     assert found.rivals_of("row_noise")[0].hypothesis.tag == "row_noise"
 
 
-def test_a_second_witness_decides_between_effects_that_the_statistics_tell_badly_apart() -> None:
+def likelihood_of(behind: Callable[[str, str], tuple[float, float] | None]) -> HistogramLikelihood:
+    """Return a likelihood that says so of the first effects of two sets."""
+
+    class Told(HistogramLikelihood):
+        def behind(
+            self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
+        ) -> tuple[float, float] | None:
+            return behind(one[0].tag, other[0].tag)
+
+    return Told()
+
+
+def test_histograms_decide_between_effects_that_the_statistics_tell_badly_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     world = World([effect("row_noise", 0.5)])
     twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
-    row, column = TRUTH["row_noise"], TRUTH["frame_noise"]
-    asked: list[tuple[str, str]] = []
+    row, asked = TRUTH["row_noise"], []
 
-    class Decided(HistogramLikelihood):
-        def behind(
-            self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
-        ) -> tuple[float, float] | None:
-            asked.append((one[0].tag, other[0].tag))
-            return (12.0, 4.0) if one[0].tag == "frame_noise" else (-12.0, 4.0)
+    def decided(one: str, other: str) -> tuple[float, float]:
+        asked.append((one, other))
+        return (12.0, 4.0) if one == "frame_noise" else (-12.0, 4.0)
 
-    class Undecided(HistogramLikelihood):
-        def behind(
-            self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
-        ) -> tuple[float, float] | None:
-            return -3.0, 4.0
-
-    TRUTH["frame_noise"] = (row[0] + 0.5 * np.eye(M)[1], row[1])
-    try:
-        plain = world.compare(hypothesis("row_noise", 0.5), twin)
-        found = world.compare(hypothesis("row_noise", 0.5), twin, likelihood=Decided())
-        open_ = world.compare(hypothesis("row_noise", 0.5), twin, likelihood=Undecided())
-    finally:
-        TRUTH["frame_noise"] = column
+    monkeypatch.setitem(TRUTH, "frame_noise", (row[0] + 0.5 * np.eye(M)[1], row[1]))
+    plain: Any = world.compare(hypothesis("row_noise", 0.5), twin)
+    found: Any = world.compare(hypothesis("row_noise", 0.5), twin, likelihood=likelihood_of(decided))
+    open_: Any = world.compare(
+        hypothesis("row_noise", 0.5), twin, likelihood=likelihood_of(lambda *_: (-3.0, 4.0))
+    )
     assert plain.chosen.tags == open_.chosen.tags == {"row_noise"}
     assert found.chosen.tags == {"frame_noise"}
     # once whether its refit is in vain
@@ -490,14 +493,7 @@ def test_what_the_histograms_rule_out_is_not_refitted(
     """A look-alike's fingerprint may promise all; its refits cost what a second effect would need."""
     world = World([effect("row_noise", 0.5)])
     twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
-
-    class Sure(HistogramLikelihood):
-        def behind(
-            self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
-        ) -> tuple[float, float] | None:
-            return answer
-
-    found = world.compare(hypothesis("row_noise", 0.5), twin, likelihood=Sure())
+    found = world.compare(hypothesis("row_noise", 0.5), twin, likelihood=likelihood_of(lambda *_: answer))
     assert found.chosen.tags == {"row_noise"}
     assert ({"frame_noise"} in [one.tags for one in found.tried]) == refitted
 
