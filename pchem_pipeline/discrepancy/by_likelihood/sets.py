@@ -278,9 +278,9 @@ class SetComparison:
         """Return candidates, each moved by a first-order step, by the rise that this step promises."""
         problem = self.problem(base.members)
         theta = self.samples.theta(base.fit.parameters)
-        tangent = Tangent.at(problem, theta, base.fit.shared)
-        seen = np.where(self.kept, self.train, 0).astype(np.float64)
-        weights = tangent.masses * seen.sum(axis=1)[:, None]
+        tangent, still = Tangent.at(problem, theta, base.fit.shared), np.zeros(theta.shape[0])
+        # of the candidate's strength and the pixels' own parameters; what is in the set stays
+        alone = replace(problem, bounds=np.array([[-np.inf, np.inf]]))
         ranked = []
         for member in candidates:
             if any(member.excludes(m) for m in base.members) or member.tag in self.failed:
@@ -291,11 +291,11 @@ class SetComparison:
             except Exception as error:
                 self.failed[member.tag] = error_words(error)
                 continue
-            d = np.concatenate([tangent.derivatives, slope[:, None, :]], axis=1)
-            information = (d * weights[:, None, :]) @ d.transpose(0, 2, 1)
-            score = np.einsum("nab,nb->na", d, seen)
-            information, score = self.samples.by_pixel(information, score)
-            rise, length = _one_step(information, score, theta.shape[1])
+            derivatives = np.concatenate([tangent.derivatives[:, :4], slope[:, None, :]], axis=1)
+            slopes = Tangent(alone, tangent.log_masses, derivatives, np.zeros(1)).slopes(self.train)
+            variance = float(slopes.covariance()[1][0, 0])
+            length = float(slopes.step(still)[1][0]) if variance > 0.0 else 0.0
+            rise = 0.5 * length**2 / variance if variance > 0.0 else 0.0
             if not member.coordinates:
                 ranked.append((np.inf, member))
             elif length * step > 0 or member.coordinates[0].bounds[0] < 0:
@@ -315,19 +315,6 @@ class SetComparison:
         problem = self.problem((*base.members, member))
         moved = problem.log_masses(theta, np.concatenate([base.fit.shared, shared]))
         return (moved - log_masses) / step, step
-
-
-def _one_step(information: FloatArray, score: FloatArray, n_own: int) -> tuple[float, float]:
-    """Return the rise that the last parameter (shared) promises, the pixels' own free, and its step."""
-    # a pixel none of whose samples count says nothing
-    some = np.einsum("naa->n", information[:, :n_own, :n_own]) > 0.0
-    information, score = information[some], score[some]
-    own = information[:, :n_own, :n_own]
-    own = own + 1e-9 * np.einsum("naa->na", own)[:, :, None] * np.eye(n_own)
-    through = np.linalg.solve(own, information[:, :n_own, -1:])[:, :, 0]
-    left = float((information[:, -1, -1] - (information[:, :n_own, -1] * through).sum(axis=1)).sum())
-    right = float((score[:, -1] - (score[:, :n_own] * through).sum(axis=1)).sum())
-    return (0.5 * right**2 / left, right / left) if left > 0 else (0.0, 0.0)
 
 
 def _placed(member: Member, length: float) -> Member:
