@@ -27,7 +27,6 @@ from pchem_pipeline.discrepancy.by_simulation.measured.unexplained import Unexpl
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     NotFittedError,
     Refit,
-    expected_codes,
     refit_maps,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
@@ -136,7 +135,6 @@ class FrameExplainer(Explainer[Explanation]):
         screening: asks the candidates what they would do.
         accept: tells by the statistics of the data what is accepted.
         extended: the model, with the rounds of the search.
-        unexplained: what measures what no effect explains, once it is asked for.
         doubtful: puts effects into the model that leave nothing but are not certain; None: there are none.
     """
 
@@ -146,7 +144,6 @@ class FrameExplainer(Explainer[Explanation]):
     screening: Screening
     accept: Acceptance
     extended: ExtendedModel
-    unexplained: Unexplained | None = None
     doubtful: Callable[[], NullModel] | None = None
     _likelihoods: dict[tuple[int, tuple[Effect, ...], tuple[Effect, ...]], PixelLikelihood] = field(
         default_factory=dict, repr=False
@@ -262,8 +259,8 @@ class FrameExplainer(Explainer[Explanation]):
                 self.extended.last,
                 lambda best: self._left_by(best, refitter),
                 HistogramLikelihood(self._likelihood),
-                lambda: self._unexplained().explains_all(),
-                lambda unlisted: self._unexplained().clearest(unlisted),
+                lambda: self._unexplained.explains_all(),
+                lambda unlisted: self._unexplained.clearest(unlisted),
             )
         except EffortSpentError as spent:
             tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
@@ -317,7 +314,7 @@ class FrameExplainer(Explainer[Explanation]):
         Raises:
             EffortSpentError: the work is at its limit; nothing was added.
         """
-        unexplained, left = self._unexplained(), self.gap(null)
+        unexplained, left = self._unexplained, self.gap(null)
         found = unexplained.by_itself()
         if found is None:
             return None
@@ -353,7 +350,7 @@ class FrameExplainer(Explainer[Explanation]):
         additions = self.close(before, null, disagrees=True).additions
         if instead is not None or (left.at_floor and any(each.fits for each in additions)):
             return instead
-        unexplained, sure = self._unexplained(), self._added.accounted(null)
+        unexplained, sure = self._unexplained, self._added.accounted(null)
         named = any(each.named for each in additions)
         best: tuple[tuple[bool, float], Refitted] | None = None
         for kept in ((), sure) if sure else ((),):
@@ -376,17 +373,12 @@ class FrameExplainer(Explainer[Explanation]):
                 break
         return None if best is None else self.extended.put_measured(best[1])
 
+    @functools.cached_property
     def _unexplained(self) -> Unexplained:
-        """Return what measures beside effects that the model had before the search; always the same."""
-        if self.unexplained is None:
-            self.unexplained = Unexplained(
-                self.work,
-                self._refitter(),
-                self.accept.established,
-                self.prepared.settings.extended_replicates,
-                self.prepared.defects,
-            )
-        return self.unexplained
+        """What measures beside effects that the model had before the search; always the same."""
+        data, proven = self.prepared, self.accept.established
+        replicates = data.settings.extended_replicates
+        return Unexplained(self.work, self._refitter(), proven, replicates, data.defects)
 
     @property
     def _added(self) -> AddedRounds:
@@ -408,14 +400,11 @@ class FrameExplainer(Explainer[Explanation]):
         drawn anew.
         """
         frames, plain, expected = self.observed.frames, self.observed.plain, None
-        fit = self.work.mapped(self.model).fit
-        maps = fit.maps
+        maps = self.work.mapped(self.model).fit.maps
         assert plain.covariance is not None
         if self.extended.rounds:
-            code = self.prepared.evidence.code
-            codes = code.first + np.arange(code.observed.size)
             train = frames.numbers[frames.splits.train]
-            expected = expected_codes(maps, frames.effects(self.model), codes, train, fit.added)
+            expected = self.work.expected(self.model, self.prepared.evidence, train)
         model = frames.effects(model)
         try:
             added = added_exposures(model, frames.stack, frames.numbers, plain.maps)

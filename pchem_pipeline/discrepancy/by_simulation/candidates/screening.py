@@ -22,7 +22,6 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import expected_codes
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Histograms
 from pchem_pipeline.discrepancy.null import Measured, NullModel
@@ -175,9 +174,8 @@ class Screening:
         """
         if not model:
             return None
-        frames, plain, fit = self.observed.frames, self.observed.plain, self.work.mapped(model).fit
-        codes = plain.code.first + np.arange(plain.code.observed.size)
-        expected = expected_codes(fit.maps, frames.effects(model), codes, frames.seen_numbers, fit.added)
+        plain = self.observed.plain
+        expected = self.work.expected(model, plain, self.observed.frames.seen_numbers)
         code = plain.code if expected is None else replace(plain.code, expected=expected)
         left = dict(zip(null.names, null.pulls(self.z.both, 2).tolist(), strict=True))
         return replace(plain, code=code, z=left)

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.by_simulation.sensor.population_numba import solve_parabolas
 from pchem_pipeline.model.arithmetic.robust import robust_sd
+from pchem_pipeline.model.fit.shared import to_parameters, to_theta
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -130,23 +131,6 @@ class Posterior:
         return to_parameters(theta)
 
 
-def to_parameters(theta: FloatArray) -> FloatArray:
-    """Return (H, g, mu, sigma with quantisation) of theta, shape (..., 4)."""
-    found = np.empty_like(theta)
-    found[..., 0] = np.exp(theta[..., 0])
-    found[..., 1] = np.exp(-theta[..., 1])
-    found[..., 2] = theta[..., 2]
-    found[..., 3] = np.sqrt(np.exp(theta[..., 3]) + QUANTISATION_VARIANCE)
-    return found
-
-
-def to_theta(parameters: FloatArray) -> FloatArray:
-    """Return theta of (H, g, mu, sigma), shape (..., 4)."""
-    h, g, mu, sigma = np.moveaxis(parameters, -1, 0)
-    analog = np.maximum(sigma**2 - QUANTISATION_VARIANCE, 0.05 * sigma**2)
-    return np.stack([np.log(h), -np.log(g), mu, np.log(analog)], axis=-1)
-
-
 def posterior_of(
     counts: NDArray[np.integer],
     origin: IntArray,
@@ -174,7 +158,7 @@ def posterior_of(
         some = np.sort(np.random.default_rng(seed).choice(some, _MOST_LEARNT_FROM, replace=False))
     shifts = (0,) if mistaken <= _HARDLY_ANY else _SHIFTS
     best, most = None, -np.inf
-    for start, population in _beginnings(pixels, parameters, mistaken):
+    for start, population in _seeds(pixels, parameters, mistaken):
         starts = np.stack([_shifted(start, each) for each in shifts])
         if replaced is not None:
             starts = np.concatenate([starts, _usual(pixels, population)[None]])
@@ -186,7 +170,7 @@ def posterior_of(
     return _climb(pixels, *best, _LAST_STEPS).posterior(best[1])
 
 
-def lost_variance(posterior: Posterior, totals: NDArray[np.integer], law: SampleLaw | None = None) -> float:
+def shrinkage_bias(posterior: Posterior, totals: NDArray[np.integer], law: SampleLaw | None = None) -> float:
     """Return by how much log sigma_R^2 is learnt too low: where peaks overlap some noise is taken for signal.
 
     Histograms are drawn from what was learnt, and learnt from again (parametric bootstrap: Efron 1979).
@@ -314,12 +298,13 @@ class _Maxima:
     def _parabolas(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         return self.theta, self.value, self.score, self.information
 
+    def _among(self, kinds: NDArray[np.bool_] | slice, pixels: NDArray[np.intp] | slice) -> _Maxima:
+        theta, value, score, information = (each[kinds][:, pixels] for each in self._parabolas)
+        return _Maxima(theta, value, score, information, self.widening[pixels])
+
     def of(self, some: NDArray[np.intp]) -> _Maxima:
         """Return those of some pixels."""
-        theta, value, score, information = self._parabolas
-        return _Maxima(
-            theta[:, some], value[:, some], score[:, some], information[:, some], self.widening[some]
-        )
+        return self._among(slice(None), some)
 
     def with_those(self, found: _Maxima, some: NDArray[np.intp]) -> _Maxima:
         """Return it with what was found for some pixels, if that has all kinds of maxima; changes it."""
@@ -332,9 +317,7 @@ class _Maxima:
     def likely(self, population: Population) -> _Maxima:
         """Return the maxima without those kinds that hardly a pixel has."""
         share = self.solve(population)[2].mean(axis=1)
-        some = (share > _RARE) | (np.arange(share.size) == 0)
-        theta, value, score, information = self._parabolas
-        return _Maxima(theta[some], value[some], score[some], information[some], self.widening)
+        return self._among((share > _RARE) | (np.arange(share.size) == 0), slice(None))
 
     def posterior(self, population: Population) -> Posterior:
         """Return the posterior under a population."""
@@ -445,9 +428,7 @@ def _inside(theta: FloatArray) -> FloatArray:
     return found
 
 
-def _beginnings(
-    pixels: _Pixels, parameters: FloatArray, mistaken: float
-) -> list[tuple[FloatArray, Population]]:
+def _seeds(pixels: _Pixels, parameters: FloatArray, mistaken: float) -> list[tuple[FloatArray, Population]]:
     """Return starts of theta (n, 4) and of the population: from the fits, or from all pixels' cumulants.
 
     Where peaks are hardly resolved the fits of single pixels lead far from the truth, all to the same side.

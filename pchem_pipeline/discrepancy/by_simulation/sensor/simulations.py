@@ -20,6 +20,7 @@ from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import wit
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     Refit,
     Sensor,
+    expected_codes,
     learn_sensor,
     refit_maps,
 )
@@ -95,6 +96,13 @@ class Simulations:
         tags = (effect.tag for effect in model)
         self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags, learnt=fit.learnt)
         return fit
+
+    def expected(
+        self, model: tuple[Effect, ...], evidence: Evidence, numbers: NDArray[np.int64]
+    ) -> NDArray[np.float64] | None:
+        """Return the samples that a model expects at each code of some evidence; see `expected_codes`."""
+        fit, codes = self.mapped(model).fit, evidence.code.first + np.arange(evidence.code.observed.size)
+        return expected_codes(fit.maps, self.frames.effects(model), codes, numbers, fit.added)
 
     def own_samples(self, model: tuple[Effect, ...]) -> NDArray[np.unsignedinteger]:
         """Return the seen frames without the samples that effects likely gave to other pixels."""

@@ -19,7 +19,7 @@ from pchem_pipeline.base.errors import ConfigError, error_words
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, leads_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import LARGEST_FACTOR, Hypothesis
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, at_other_peaks, off_by
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, multistart, shift_bias_by_electrons
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.framework.effect import Effect, tag_of
@@ -192,7 +192,7 @@ class PixelLikelihood:
             if without is None:
                 without = float(sets.fit(()).fit.log_likelihood.sum())
                 self._without[sets.present] = without
-            fitted = _at_other_peaks(sets, fitted)
+            fitted = _multistart(sets, fitted)
             if fitted.fit.log_likelihood.sum() - without > _ASTRAY * len(fitted.fit.log_likelihood):
                 for electrons in (-1.0, 1.0):
                     fitted = _electrons_off(sets, fitted, electrons)
@@ -375,9 +375,9 @@ def _electrons_off(sets: SetComparison, fitted: FittedSet, electrons: float) -> 
     if len(sets.train) > 2 * _PROBED:
         few = sets.of(slice(None, None, len(sets.train) // _PROBED), fitted.fit.parameters)
         probe = few.fit(fitted.members)
-        if not _likelier(few.fit(fitted.members, off_by(few.start, electrons)), probe).any():
+        if not _likelier(few.fit(fitted.members, shift_bias_by_electrons(few.start, electrons)), probe).any():
             return fitted
-    other = sets.fit(fitted.members, off_by(fitted.fit.parameters, electrons))
+    other = sets.fit(fitted.members, shift_bias_by_electrons(fitted.fit.parameters, electrons))
     better = _likelier(other, fitted)
     if not better.any():
         return fitted
@@ -391,11 +391,11 @@ def _likelier(one: FittedSet, other: FittedSet) -> NDArray[np.bool_]:
     return np.asarray(one.fit.log_likelihood > other.fit.log_likelihood + CLEARLY)
 
 
-def _at_other_peaks(sets: SetComparison, fitted: FittedSet) -> FittedSet:
+def _multistart(sets: SetComparison, fitted: FittedSet) -> FittedSet:
     """Return a fit with the pixels that samples below all others led astray put right, or as it is."""
     parameters, shared = fitted.fit.parameters, fitted.fit.shared
     law = law_of(sets.present, fitted.members, shared, parameters, sets.samples)
-    moved, start = at_other_peaks(sets.train, sets.origin, law, parameters)
+    moved, start = multistart(sets.train, sets.origin, law, parameters)
     if not moved.size:
         return fitted
     other = sets.fit(fitted.members, start)

@@ -266,7 +266,7 @@ def test_what_closes_the_gap_in_fewest_forms_describes(
         gap_at=lambda *one: closed if one[0] else part,
     )
     search = explainer(judge, lambda one: one.name)
-    monkeypatch.setattr(search, "_unexplained", lambda: measures)
+    monkeypatch.setattr(FrameExplainer, "_unexplained", measures)
     monkeypatch.setattr(FrameExplainer, "_added", SimpleNamespace(accounted=lambda _: held))
     named = SimpleNamespace(additions=[SimpleNamespace(named=True)])
     monkeypatch.setattr(search, "close", lambda *_, **__: named)
@@ -285,7 +285,7 @@ def test_what_is_measured_need_not_do_better_than_effects_that_get_no_name(
     measures = SimpleNamespace(measured=lambda _: found, by_itself=lambda: None)
     search = explainer(judge, lambda _: "measured")
     monkeypatch.setattr(FrameExplainer, "_added", SimpleNamespace(accounted=lambda _: ()))
-    monkeypatch.setattr(search, "_unexplained", lambda: measures)
+    monkeypatch.setattr(FrameExplainer, "_unexplained", measures)
     additions = [SimpleNamespace(named=named)]
     monkeypatch.setattr(search, "close", lambda *_, **__: SimpleNamespace(additions=additions))
     nothing: Any = None
@@ -313,6 +313,6 @@ def test_what_leaves_clearly_less_replaces_effects_with_a_name(
     judge = SimpleNamespace(gap=lambda _: gaps[left], gap_at=lambda *_: gaps[found])
     search, one = explainer(judge, lambda one: one), SimpleNamespace(mean=None, vectors=None)
     measures = SimpleNamespace(by_itself=lambda: one, refitter=Goodness(passes=nothing))
-    monkeypatch.setattr(search, "_unexplained", lambda: measures)
+    monkeypatch.setattr(FrameExplainer, "_unexplained", measures)
     unused: Any = None
     assert search.replaced(unused) == (one if replaced else None)

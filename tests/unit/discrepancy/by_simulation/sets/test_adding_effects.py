@@ -873,11 +873,8 @@ def add(
     monkeypatch.setattr(search, "_refitter", lambda: world.refitter())
     monkeypatch.setattr(search, "_left_by", lambda *_: None)
     monkeypatch.setattr(search, "_likelihood", lambda *_: None)
-    monkeypatch.setattr(
-        search,
-        "_unexplained",
-        lambda: SimpleNamespace(explains_all=lambda: False, clearest=lambda unlisted: None),
-    )
+    nothing = SimpleNamespace(explains_all=lambda: False, clearest=lambda unlisted: None)
+    monkeypatch.setattr(FrameExplainer, "_unexplained", nothing)
     shifts = (z.train - world.null.mean, z.test - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
     assert choice is not None
@@ -940,7 +937,7 @@ def test_what_explains_all_but_is_not_certain_is_told_without_a_name(
     left = rest * np.eye(M)[5]
     world.z = Measured(world.z.train + left, world.z.test + left, world.z.final)
     unlisted = SimpleNamespace(explains_all=lambda: False)
-    monkeypatch.setattr(FrameExplainer, "_unexplained", lambda _: unlisted)
+    monkeypatch.setattr(FrameExplainer, "_unexplained", unlisted)
     search, extended = add(world, monkeypatch, hypothesis("row_noise"))
     assert extended is None
     told = search.probable()
