@@ -309,7 +309,9 @@ class AddedRounds:
             new = one.tags - compared.chosen.tags
             if len(new) == 1 and one.tags == (compared.chosen.tags - {added.tag}) | new:
                 hypothesis = next(h for h in one.hypotheses if h.tag in new)
-                behind, error = compared.witnessed.get(one.tags, (one.score - compared.chosen.score, None))
+                behind, error = compared.by_histograms.get(
+                    one.tags, (one.score - compared.chosen.score, None)
+                )
                 other = _Other(hypothesis.effect, behind, one.mean, one.rest, True, error)
                 found.setdefault(hypothesis.tag, other)
         noise = Noise(this.null.covariance.times(0.5), self.accept.settings.model_error)

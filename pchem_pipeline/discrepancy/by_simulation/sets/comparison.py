@@ -85,13 +85,13 @@ class Comparison:
     Attributes:
         chosen: the best.
         tried: all, the best first.
-        witnessed: by their tags, how far other sets are behind the chosen one by the likelihood of the
+        by_histograms: by their tags, how far other sets are behind the chosen one by the likelihood of the
             pixels' histograms, nats, and the error of that.
     """
 
     chosen: Refitted
     tried: tuple[Refitted, ...]
-    witnessed: Mapping[frozenset[str], tuple[float, float]] = field(default_factory=dict)
+    by_histograms: Mapping[frozenset[str], tuple[float, float]] = field(default_factory=dict)
 
     def rivals_of(self, tag: str) -> tuple[Contender, ...]:
         """Return what could stand in the place of an effect of the chosen set, itself first."""
@@ -105,8 +105,8 @@ class Comparison:
             hypothesis = next(h for h in one.hypotheses if h.tag == name)
             if name != tag and hypothesis.effect.tag == tag.partition(" ")[0]:
                 continue  # the same effect elsewhere
-            if one.tags in self.witnessed:
-                behind, error = self.witnessed[one.tags]
+            if one.tags in self.by_histograms:
+                behind, error = self.by_histograms[one.tags]
                 # neither need be the very law of the samples
                 probability = float(special.ndtr(behind / max(error, 1e-9)))
             else:
@@ -219,15 +219,15 @@ def _concluded(
         one = trials.measured or _within(lambda: measured(False))
         if one is not None and one.penalised_log_likelihood > chosen.penalised_log_likelihood:
             return None
-    witnessed = _witnessed(chosen, tried, likelihood)
-    best = max(tried, key=lambda one: witnessed.get(one.tags, (0.0, 0.0))[0])
-    if witnessed.get(best.tags, (0.0, 0.0))[0] > 0.0 and _all_seen(to_choose, best, tried):
-        chosen, witnessed = best, _witnessed(best, tried, likelihood)
+    by_histograms = _by_histograms(chosen, tried, likelihood)
+    best = max(tried, key=lambda one: by_histograms.get(one.tags, (0.0, 0.0))[0])
+    if by_histograms.get(best.tags, (0.0, 0.0))[0] > 0.0 and _all_seen(to_choose, best, tried):
+        chosen, by_histograms = best, _by_histograms(best, tried, likelihood)
     known = {h.tag for h in trials.held}
     for member in chosen.hypotheses:
         if member.tag not in known:
             tried += _placebo(trials, hypotheses, chosen, member)
-    return Comparison(chosen, tuple(tried), witnessed)
+    return Comparison(chosen, tuple(tried), by_histograms)
 
 
 def _within(asked: Callable[[], Answer]) -> Answer | None:
@@ -265,7 +265,7 @@ def _chosen(refitter: Refitter, tried: list[Refitted], before: Sequence[Refitted
             tried[i] = refitter.refined(tried[i].hypotheses, chosen.score)
 
 
-def _witnessed(
+def _by_histograms(
     chosen: Refitted, tried: Sequence[Refitted], likelihood: HistogramLikelihood
 ) -> dict[frozenset[str], tuple[float, float]]:
     """Ask about the sets nearly as good as the chosen one that have another effect in the place of one."""
