@@ -64,7 +64,7 @@ class Prepared:
 class Explainer(ABC, Generic[Explanation]):
     """A way to tell effects apart in one kind of data; it keeps the model and the rounds of the search.
 
-    What is not asked of it by others: to measure what no effect explains, and to allow for its details.
+    The last five methods are for one that measures what no effect explains; others leave them as they are.
     """
 
     prepared: Prepared

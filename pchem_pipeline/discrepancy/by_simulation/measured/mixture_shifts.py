@@ -411,9 +411,9 @@ def _together(
     best = float(np.logaddexp(np.log1p(-single), np.log(single) + ratio).sum()) + _CLEAR
     found: tuple[Together, float] = ("sample", 0.0)
     for together in _TOGETHER:
-        share, likelihood = shares_of(_of_groups(ratio, samples.place, together, shape)[None], single)
+        share, likelihood = share_of(_of_groups(ratio, samples.place, together, shape), single)
         if likelihood > best:
-            best, found = likelihood, (together, float(share[0]))
+            best, found = likelihood, (together, share)
     return found
 
 
@@ -429,21 +429,16 @@ def _of_groups(ratio: FloatArray, place: IntArray, together: Together, shape: tu
     return np.where(known, np.bincount(group, ratio, count), -np.inf)
 
 
-def shares_of(ratio: FloatArray, first: float = _FIRST_SHARE) -> tuple[FloatArray, float]:
-    """Return the shares of groups that are moved in each of several ways, and what they gain, nats.
-
-    By expectation and maximisation.
+def share_of(ratio: FloatArray, first: float = _FIRST_SHARE) -> tuple[float, float]:
+    """Return the share of groups that are moved, and what it gains, nats, by expectation and maximisation.
 
     Args:
-        ratio: log likelihood of each group moved, over that of the group as it should be, shape (ways, n).
-        first: share of each from which the steps begin.
+        ratio: log likelihood of each group moved, over that of the group as it should be, shape (n,).
+        first: share from which the steps begin.
     """
-    ratio = ratio[:, np.isfinite(ratio).any(axis=0)]
-    every = np.concatenate([np.zeros((1, ratio.shape[1])), ratio])
-    share = np.full(len(every), first)
-    share[0] -= share.sum() - 1.0
-    for _ in range(_STEPS):
-        log = every + np.log(np.maximum(share, _NOTHING))[:, None]
-        share = special.softmax(log, axis=0).mean(axis=1) if ratio.size else share
-    total = special.logsumexp(every + np.log(np.maximum(share, _NOTHING))[:, None], axis=0)
-    return share[1:], float(total.sum())
+    ratio, share = ratio[np.isfinite(ratio)], first
+    for _ in range(_STEPS if ratio.size else 0):
+        share = float(special.expit(ratio + special.logit(share)).mean())
+    with np.errstate(divide="ignore"):
+        gain = np.logaddexp(np.log1p(-share), np.log(share) + ratio).sum()
+    return share, float(gain)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import shares_of
+from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import share_of
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
     FARTHEST,
     Measurement,
@@ -378,9 +378,9 @@ def _bursts(one: Sums, gaussian: float) -> tuple[float | None, float]:
 
     def try_sizes(sizes: Iterable[float]) -> None:
         for size in sizes:
-            shares, gain = shares_of((size * sums - 0.5 * size**2 * information)[None])
-            if shares[0] < _MOST_IN_BURSTS:
-                found.append((gain, float(shares[0]), size))
+            share, gain = share_of(size * sums - 0.5 * size**2 * information)
+            if share < _MOST_IN_BURSTS:
+                found.append((gain, share, size))
 
     try_sizes(sign * size for sign in (1.0, -1.0) for size in _SIZES)
     if found:
