@@ -139,7 +139,6 @@ def posterior_of(
     replaced: ReplacedSamples | None = None,
     *,
     mistaken: float = 1.0,
-    seed: int = 0,
 ) -> Posterior:
     """Learn the population of the pixels from their histograms, and where each of them may lie.
 
@@ -150,12 +149,11 @@ def posterior_of(
         law: of the samples; the PCD if None.
         replaced: what becomes of them, at the codes of the histograms; None: nothing.
         mistaken: share of pixels whose bias may be off by an electron: says what starts are worth a try.
-        seed: of the choice of pixels to learn from.
     """
     pixels = _Pixels(counts, np.asarray(origin, np.int64), law or SampleLaw(), replaced)
     some = np.arange(len(counts))
     if some.size > _MOST_LEARNT_FROM:
-        some = np.sort(np.random.default_rng(seed).choice(some, _MOST_LEARNT_FROM, replace=False))
+        some = np.sort(np.random.default_rng(0).choice(some, _MOST_LEARNT_FROM, replace=False))
     shifts = (0,) if mistaken <= _HARDLY_ANY else _SHIFTS
     best, most = None, -np.inf
     for start, population in _seeds(pixels, parameters, mistaken):

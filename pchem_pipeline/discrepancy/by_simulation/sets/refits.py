@@ -33,6 +33,7 @@ from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 
 FloatArray = NDArray[np.float64]
 
+_SPLITS = 2  # train and test frames, whose mean is explained
 #: Replicates at each strength on the way.
 FEW = 6
 _ENOUGH = 12  # replicates that tell a scatter
@@ -260,10 +261,9 @@ class Refitter:
         draw: refits the pixels with effects beside those of the model, and returns the fit and the statistics
             of so many replicates of it, which share their random numbers whatever the effects.
         null: of the model without them.
-        target: mean of the statistics of ``splits`` parts of the data, shape (m,).
+        target: mean of the statistics of train and test frames, shape (m,).
         events: see :class:`~pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints.Noise`.
         present: effects that the model has besides.
-        splits: number of parts.
         steps: corrections of the strengths, at most.
         allow: hears which effects are simulated next, and raises an error where the work is at its limit.
         defects: effects that failed, and why; more come to them.
@@ -274,7 +274,6 @@ class Refitter:
     target: FloatArray
     events: FloatArray
     present: tuple[Effect, ...] = ()
-    splits: int = 2
     steps: int = _MOST_STEPS
     allow: Callable[[str], None] = lambda _: None
     defects: dict[str, str] = field(default_factory=dict)
@@ -420,7 +419,7 @@ class Refitter:
 
     def passes_goodness_of_fit(self, one: Refitted) -> bool:
         """Tell whether a set leaves no statistic beyond chance."""
-        p = float(self.null.p_of(one.rest, 2).min())
+        p = float(self.null.p_of(one.rest, _SPLITS).min())
         return look_elsewhere(p, self.null.effective_tests) > _LEFT
 
     def residual_is_small(self, one: Refitted) -> bool:
@@ -438,7 +437,7 @@ class Refitter:
 
     def noise(self, covariance: Covariance, replicates: int) -> Noise:
         """Return the noise of the data less the mean of so many replicates."""
-        return Noise(covariance.times(1.0 / self.splits + 1.0 / replicates), _FINE_ERROR, self.events)
+        return Noise(covariance.times(1.0 / _SPLITS + 1.0 / replicates), _FINE_ERROR, self.events)
 
     def scatter(self, covariance: Covariance, replicates: int) -> FloatArray:
         """Return standard deviations of the same, by chance alone, shape (m,)."""
@@ -463,7 +462,7 @@ class Refitter:
         scaling = np.array([bool(h.effect.strength) for h in hypotheses])
         scatter = None
         if replicates >= _ENOUGH:
-            scatter = (vectors - mean) * np.sqrt(1.0 / self.splits + 1.0 / replicates)
+            scatter = (vectors - mean) * np.sqrt(1.0 / _SPLITS + 1.0 / replicates)
         kept = self.kept(hypotheses)
         change, stderr = correction(
             slopes[:, kept],
