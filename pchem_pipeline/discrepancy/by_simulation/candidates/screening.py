@@ -83,20 +83,19 @@ class Screening:
             self.observed.frames.effects(model),
             self.work.effort,
             self.observed.frames.samples_of,
-            simulator.defects,
+            self.defects,
         )
         guesses = histograms.with_numbers(self._guesses(simulator, model, null, evidence, MOST_HYPOTHESES))
         parts = self.observed.frames.parts
         suggested = self._apart(model, histograms.suggested(self.classes, parts, guesses))
         guesses += suggested
-        hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses, simulator)])
+        hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses)])
         shift = self.z.both - null.mean
         noise = noise_of_splits(null, 2, self.model_error)
         hypotheses = simulator.refined(hypotheses, shift, noise, histograms.told)
         # what they do to pixels that are led astray says little about them: others do not go before them
         hypotheses.sort(key=lambda h: all(h.effect is not each for each in suggested))
         hypotheses += seconds(hypotheses)
-        self.defects.update(simulator.defects)
         return tuple(hypotheses), self._compared(hypotheses, null)
 
     def beside(
@@ -112,17 +111,14 @@ class Screening:
         """
         simulator = self._simulator(model, null, number, "/".join([str(number), *(e.tag for e in model)]))
         guesses = self._guesses(simulator, model, null, (), _MOST_BESIDE)
-        hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses, simulator)])
-        self.defects.update(simulator.defects)
+        hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses)])
         return self._compared(hypotheses, null, _DOUBT * slopes)
 
-    def _placebo(
-        self, model: tuple[Effect, ...], guesses: Sequence[Effect], simulator: ReplicateSimulator
-    ) -> list[Effect]:
+    def _placebo(self, model: tuple[Effect, ...], guesses: Sequence[Effect]) -> list[Effect]:
         """Return an effect that the model does not have and for which nothing speaks."""
         have = {effect.tag for effect in model}
         others = {tag: kind for tag, kind in self.classes.items() if tag not in have}
-        return placebo_for(guesses, others, simulator.defects)
+        return placebo_for(guesses, others, self.defects)
 
     def _compared(
         self, hypotheses: Sequence[Hypothesis], null: NullModel, doubt: FloatArray | None = None
@@ -145,7 +141,7 @@ class Screening:
             self.work.counted,
             f"r{number}",
             self.work.seed_of(f"fingerprint/{purpose}"),
-            dict(self.defects),
+            self.defects,
         )
 
     def _guesses(
