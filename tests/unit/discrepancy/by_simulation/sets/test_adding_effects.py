@@ -528,31 +528,29 @@ def test_fewer_effects_beside_a_set_are_far_behind_by_more_than_their_fingerprin
     assert _far_behind(one, choice) is far  # type: ignore[arg-type]
 
 
+def seeds(refitter: Refitter, *tried: Refitted) -> list[frozenset[str]]:
+    """Return the sets, of those that were tried, beside which others are asked for."""
+    asked: list[frozenset[str]] = []
+    trials = Trials(refitter, (), HistogramLikelihood(), list(tried))
+    _grown(trials, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
+    return asked
+
+
 def test_a_part_of_a_better_set_is_not_grown_again() -> None:
-    world = World([effect(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift")])
-    refitter = world.refitter()
+    refitter = World([effect(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift")]).refitter()
     row, frame, drift = (hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift"))
     # of all that there is to explain each explains nearly as much
     far = replace(refitter, null=replace(refitter.null, mean=refitter.null.mean - 1e4 * np.eye(M)[0]))
-
-    def begun(*sets: list[Hypothesis]) -> list[frozenset[str]]:
-        asked: list[frozenset[str]] = []
-        trials = Trials(far, (), HistogramLikelihood(), [refitter.refined(one) for one in sets])
-        _grown(trials, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
-        return asked
-
-    assert begun([row], [row, frame]) == [{"row_noise", "frame_noise"}]
-    assert len(begun([row, drift], [row, frame])) == 2
+    alone, both, other = (refitter.refined(one) for one in ([row], [row, frame], [row, drift]))
+    assert seeds(far, alone, both) == [{"row_noise", "frame_noise"}]
+    assert len(seeds(far, other, both)) == 2
 
 
 def test_a_set_with_more_in_vain_is_not_grown_beside_its_part() -> None:
     refitter = World([effect("row_noise", 0.3), effect("exposure_drift", 0.3)]).refitter()
-    asked: list[frozenset[str]] = []
     alone = refitter.refined([hypothesis("row_noise")])
     more = refitter.refined([hypothesis("row_noise"), hypothesis("frame_noise")])
-    trials = Trials(refitter, (), HistogramLikelihood(), [alone, replace(more, score=alone.score)])
-    _grown(trials, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
-    assert asked == [{"row_noise"}]
+    assert seeds(refitter, alone, replace(more, score=alone.score)) == [{"row_noise"}]
 
 
 def test_what_stands_out_beside_a_set_that_leaves_little_is_fitted_before_others_in_its_place(
@@ -670,14 +668,6 @@ def test_the_likeliest_effects_are_fitted_whatever_was_spent() -> None:
     world.refitter = lambda: replace(plain, allow=allow)  # type: ignore[method-assign]
     found = compare(world.refitter(), [], [row, frame], world.tried([row], [frame]))
     assert found.chosen.tags == {"frame_noise"}
-
-
-def test_a_set_that_leaves_less_than_what_is_measured_stays() -> None:
-    world = World([effect("row_noise", 0.3), effect("frame_noise", 0.3)])
-    poor = world.refitter().refined([hypothesis("row_noise")])
-    both = hypothesis("row_noise"), hypothesis("frame_noise")
-    found = world.compare(*both, measured=lambda _: poor)
-    assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
 def test_a_signature_is_asked_of_the_same_kind_of_the_others() -> None:
