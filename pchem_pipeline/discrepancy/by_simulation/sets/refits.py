@@ -184,32 +184,28 @@ def broyden(slopes: FloatArray, step: FloatArray, unforeseen: FloatArray) -> Flo
 
 
 @dataclass
-class Steps:
+class Steps(DampedSteps[Refitted]):
     """A way to the strengths of a set that explain the data best, as far as it was gone.
 
     Slopes are those of the last step, and what a set leaves is a matter of chance, too: a step may explain
     less where the way on explains more, or do a fraction of what it promised, time after time.
 
     Attributes:
-        best: the set at its best strengths so far.
-        now: at the last ones.
+        now: the set at its last strengths.
         step: that led there, logarithms of factors, shape (e,).
         gained: by the last step to something better, nats.
-        length: of the next step, in what the data ask for.
         further: steps that were gone on after one that explains less.
     """
 
-    best: Refitted
-    now: Refitted
-    step: FloatArray
+    now: Refitted = field(kw_only=True)
+    step: FloatArray = field(kw_only=True)
     gained: float = np.inf
-    length: float = 1.0
     further: int = 0
 
     @classmethod
     def begin(cls, one: Refitted) -> Steps:
         """Begin at the guessed strengths."""
-        return cls(one, one, one.change)
+        return cls(one, one.score, now=one, step=one.change)
 
     @property
     def kept_its_promise(self) -> bool:
@@ -226,16 +222,14 @@ class Steps:
 
     def taken(self, step: FloatArray, now: Refitted | None) -> bool:
         """Take note of where a step led (None: nowhere), and tell whether there is another one to try."""
-        self.step = step
-        if now is not None and now.score > self.best.score:
-            self.gained, self.best, self.now = now.score - self.best.score, now, now
-            self.length, self.further = _lengthened(now.change, step), 0
-        elif now is not None and self._goes_on(now):
+        self.step, before = step, self.score
+        if now is not None and not now.score > before and self._goes_on(now):
             self.now, self.further = now, self.further + 1
-        elif self.length > _SHORTEST:
-            self.length, self.further = min(self.length, 2.0) / 2.0, 0
-        else:
-            return False
+            return True
+        another, self.length, self.further = self.length > _SHORTEST, min(self.length, 2.0), 0
+        if not self.judge(now, -np.inf if now is None else now.score) or now is None:
+            return another
+        self.gained, self.now, self.length = self.score - before, now, _lengthened(now.change, step)
         return True
 
     def _goes_on(self, now: Refitted) -> bool:
