@@ -169,12 +169,7 @@ class AddedSets:
 
     def _candidates(self, named: Named, effect: Effect) -> tuple[Candidate, ...]:
         """Return the effect and what could stand in its place, with held-out scores."""
-        judged = self.found.judged
-        scored = [(effect, 0.0, 0.0)]
-        for rival in named.rivals:
-            rise, error = self.found.sets.difference(rival, judged)
-            if (other := rival.new(judged)) is not None:
-                scored.append((other.effect, rise, error))
+        scored = [(effect, 0.0, 0.0), *((other.effect, score, error) for other, score, error in named.rivals)]
         weights = np.exp([min(score, 0.0) for _, score, _ in scored])
         weights /= weights.sum()
         return tuple(
@@ -185,16 +180,14 @@ class AddedSets:
     def _rivals(self, named: Named, members: tuple[Member, ...], chance: float) -> tuple[Rival, ...]:
         """Return what could stand in the place of an effect, refitted, with its gap, the best first."""
         others = tuple(m for m in members if m.tag != named.member.tag)
-        judged, found = self.found.judged, []
-        for set_with in named.rivals:
-            other = set_with.new(judged)
-            if other is None or any(other.excludes(m) for m in others):
+        found = []
+        for other, behind, error in named.rivals:
+            if any(other.excludes(m) for m in others):
                 continue
             try:
                 fitted = self._refit((*others, other))
             except ValueError:
                 continue
-            behind, error = self.found.sets.difference(set_with, judged)
             gap = self.gaps.value(self.sets.problem(fitted.members), fitted.fit, chance)
             why = f"predicts samples that it was not fitted to worse, by {-behind:.3g} +- {error:.2g} nats"
             if other.tag in named.equals:

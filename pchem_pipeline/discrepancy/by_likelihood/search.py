@@ -44,14 +44,15 @@ class Named:
     Attributes:
         member: as fitted.
         apart: by how much its strength differs when fewer codes are compared.
-        rivals: sets with another effect in its place, the best first.
+        rivals: effects that could stand in its place, the best first, with how far the set with each is
+            behind the judged one, nats, and the standard error.
         equals: rivals (tags) that do as well within three standard errors.
         weight: what it adds to the score, nats.
     """
 
     member: Member
     apart: float
-    rivals: tuple[FittedSet, ...]
+    rivals: tuple[tuple[Member, float, float], ...]
     equals: tuple[str, ...]
     weight: float
 
@@ -242,14 +243,12 @@ def _alike(one: Member, other: Member) -> bool:
 
 def _named(sets: SetComparison, best: FittedSet, member: Member, candidates: Sequence[Member]) -> Named:
     """Compare a member of a set with what could stand in its place."""
-    without, rivals = find_rivals(sets, best, member, candidates)
-    equals = []
-    for rival in rivals:
-        rise, error = sets.difference(best, rival)
-        if rise < SIGMAS * error:
-            equals += [tag for tag in rival.tags - best.tags if tag not in equals]
-    weight = sets.rise(best, without) if without else 0.0
-    return Named(member, 0.0, tuple(rivals), tuple(equals), weight)
+    without, found = find_rivals(sets, best, member, candidates)
+    rivals = tuple(
+        (other, *sets.difference(rival, best)) for rival in found if (other := rival.new(best)) is not None
+    )
+    equals = tuple(other.tag for other, behind, error in rivals if -behind < SIGMAS * error)
+    return Named(member, 0.0, rivals, equals, sets.rise(best, without) if without else 0.0)
 
 
 def _sorted(named: Sequence[Named]) -> tuple[Named, ...]:
