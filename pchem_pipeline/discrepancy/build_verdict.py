@@ -49,6 +49,8 @@ FloatArray = NDArray[np.float64]
 
 #: Largest share of a gap above its floor that may remain with effects that explain it.
 LARGEST_REST = 0.2
+#: Rivals of an effect that are fitted in its place and told.
+MOST_RIVALS = 3
 _MOST_UNEXPLAINED = 8
 _MOST_RESIDUALS = 3
 _DECIDED = 3.0  # standard errors of a difference of log-likelihoods that decides between two effects

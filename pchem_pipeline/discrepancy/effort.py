@@ -61,6 +61,7 @@ class Effort:
         for_fits: the least that is left for fits of candidates once they are compared.
         tried: tags of all effects with which the pixels were fitted.
         ambiguous: share of the pixels whose bias may be off by an electron.
+        replicates: parts of simulated stacks, or sets of histograms, drawn so far.
     """
 
     share: float | None
@@ -70,6 +71,7 @@ class Effort:
     for_fits: float = 0.0
     tried: set[str] = field(default_factory=set)
     ambiguous: float = 0.0
+    replicates: int = 0
 
     def begin(self) -> None:
         """Set the limit, now that the null distribution has been paid."""

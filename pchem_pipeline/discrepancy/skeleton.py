@@ -10,14 +10,16 @@ histograms they are parameters of the exact likelihood (:mod:`.by_likelihood`). 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Protocol, TypeVar
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Findings, Fitted, build_verdict
-from pchem_pipeline.discrepancy.effort import EffortSpentError
+from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel, disagrees
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
@@ -29,116 +31,96 @@ from pchem_pipeline.effects.framework.evidence import Evidence
 Explanation = TypeVar("Explanation")
 
 
-class Explainer(Protocol[Explanation]):
-    """A way to tell effects apart in one kind of data; it keeps the model and the rounds of the search.
-
-    It begins with the samples split into train, test and final part, and with replicates of the model.
+@dataclass(frozen=True)
+class Prepared:
+    """Data that are split into train, test and final part, and the model that they are compared with.
 
     Attributes:
         settings: the section ``discrepancy``.
         samples: what the data are, for the verdict's sentence ("frames", "histograms").
-        defects: candidates that failed, and why.
+        evidence: of the train part.
+        examined: what is looked at.
+        first: statistics of the model before anything is added, from its replicates.
+        z: statistics of the data.
+        effort: counts the work.
+        most_rounds: of explaining and adding.
+        untestable: effects that such data cannot show, and why.
+        doubt: why the pixels are not identified and what would help; empty where they are.
+        defects: candidates that failed, and why; more come to them.
     """
 
     settings: DiscrepancySettings
     samples: str
-    defects: dict[str, str]
+    evidence: Evidence
+    examined: Examined
+    first: NullModel
+    z: Measured
+    effort: Effort
+    most_rounds: int
+    untestable: dict[str, str]
+    doubt: str = ""
+    defects: dict[str, str] = field(default_factory=dict)
+
+
+class Explainer(ABC, Generic[Explanation]):
+    """A way to tell effects apart in one kind of data; it keeps the model and the rounds of the search.
+
+    The last five methods are for one that measures what no effect explains; others leave them as they are.
+    """
+
+    prepared: Prepared
 
     @property
-    def evidence(self) -> Evidence:
-        """Of the train part."""
-        ...
-
-    @property
-    def examined(self) -> Examined:
-        """What was looked at."""
-        ...
-
-    @property
-    def first(self) -> NullModel:
-        """Statistics of the model before anything was added, from its replicates."""
-        ...
-
-    @property
-    def z(self) -> Measured:
-        """Statistics of the data."""
-        ...
-
-    @property
+    @abstractmethod
     def model(self) -> tuple[Effect, ...]:
         """Effects: those that were there before, and those added since."""
-        ...
 
-    @property
-    def most_rounds(self) -> int:
-        """Of explaining and adding."""
-        ...
-
-    @property
-    def untestable(self) -> dict[str, str]:
-        """Effects that such data cannot show, and why."""
-        ...
-
-    @property
-    def n_replicates(self) -> int:
-        """Replicates drawn so far."""
-        ...
-
-    @property
-    def spent(self) -> float:
-        """CPU seconds so far, by count."""
-        ...
-
-    def doubt(self) -> str:
-        """Say why the pixels are not identified and what would help; empty where they are."""
-        ...
-
+    @abstractmethod
     def gap(self, null: NullModel) -> Gap:
         """Measure the gap of the model on the final part."""
-        ...
 
+    @abstractmethod
     def suspects(self, null: NullModel) -> bool:
         """Tell whether candidates are worth asking although no statistic deviates beyond chance."""
-        ...
 
+    @abstractmethod
     def explain(self, null: NullModel, disagrees: bool) -> Explanation | None:
         """Compare the candidates on train and test part; None where none explains anything."""
-        ...
 
+    @abstractmethod
     def add(self, explanation: Explanation, null: NullModel) -> NullModel | None:
         """Put effects into the model and draw replicates of it; None where no effect is established."""
-        ...
+
+    @abstractmethod
+    def close(self, before: Gap, null: NullModel, disagrees: bool) -> Added:
+        """Measure the gap on the final part with each added effect, and with rivals in its place."""
+
+    @abstractmethod
+    def fitted(self, model: tuple[Effect, ...]) -> Fitted:
+        """Return the parameters of the pixels under the model that the verdict leaves."""
 
     def replaced(self, null: NullModel) -> NullModel | None:
         """Put what no effect with a name makes in the place of all that were added, if it leaves less."""
-        ...
+        return None
 
     def probable(self) -> NullModel | None:
         """Put effects into the model that explain the data but are not certain; None: there are none.
 
         They are told, and leave the model again with the verdict.
         """
-        ...
+        return None
 
     def unfinished(self, before: Gap, null: NullModel) -> bool:
         """Tell whether so much of the gap is left that what was added gets no name, though the data agree."""
-        ...
+        return False
 
     def describe(self, before: Gap, null: NullModel) -> NullModel | None:
         """Put what no effect explains into the model as it is measured; None where that does not help."""
-        ...
+        return None
 
     def tolerance(self) -> NDArray[np.float64] | float:
         """Return the deviations that are not held against the added effects, shape (m,)."""
-        ...
-
-    def close(self, before: Gap, null: NullModel, disagrees: bool) -> Added:
-        """Measure the gap on the final part with each added effect, and with rivals in its place."""
-        ...
-
-    def fitted(self, model: tuple[Effect, ...]) -> Fitted:
-        """Return the parameters of the pixels under the model that the verdict leaves."""
-        ...
+        return 0.0
 
 
 def silent(_: str) -> None:
@@ -152,17 +134,16 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
         by: tells effects apart; it has drawn the model.
         tell: hears what is done next.
     """
-    significance, present = by.settings.significance, by.model
-    first, z = by.first, by.z
+    data, present = by.prepared, by.model
+    first, z, significance = data.first, data.z, data.settings.significance
     tell("measuring the gap of the model")
     before = by.gap(first)
-    places = locate(by.evidence, first, z.both, significance)
+    places = locate(data.evidence, first, z.both, significance)
     null, rounds = first, 0
-    doubt = by.doubt()
     still = disagreed = disagrees(null, z, significance)
-    wanted = still or (not doubt and by.suspects(null))
+    wanted = still or (not data.doubt and by.suspects(null))
     limit, instead = "", None
-    while wanted and rounds < by.most_rounds:
+    while wanted and rounds < data.most_rounds:
         try:
             extended = _round(by, null, still, tell)
         except EffortSpentError as spent:
@@ -190,17 +171,17 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
     if not disagreed and before.at_floor and not any(each.named for each in added.additions):
         # data that agree with the model are not made doubtful by what they do not confirm
         null, still, added = first, False, Added((), before)
-    found = Findings(by.samples, z, first, null, before, places, still, added, doubt, limit)
+    found = Findings(data.samples, z, first, null, before, places, still, added, data.doubt, limit)
     model = found.model(present, by.model)
     return build_verdict(
         found,
         model,
         by.fitted(model),
-        (by.evidence, by.examined),
-        untestable=by.untestable,
-        defects=by.defects,
-        n_replicates=by.n_replicates,
-        work=by.spent,
+        (data.evidence, data.examined),
+        untestable=data.untestable,
+        defects=data.defects,
+        n_replicates=data.effort.replicates,
+        work=data.effort.spent,
     )
 
 

@@ -73,7 +73,7 @@ def judged_sensor(seed: int) -> dict[str, Any]:
         explainer = FrameExplainer.begin(observed, settings, classes, (), serial)
     except PchEmError as error:
         return {"seed": seed, "refused": str(error)}
-    null, data = explainer.first, explainer.z
+    null, data = explainer.prepared.first, explainer.prepared.z
     found: dict[str, list[float]] = defaultdict(list)
     alarms = {"simulated": 0, OWN: int(disagrees(null, data, SIGNIFICANCE))}
     for kind, p in _by_kind(null.names, null.p_values(data.both, 2)):

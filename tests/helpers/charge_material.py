@@ -26,10 +26,16 @@ def a_sensor(shape=(24, 24), seed=5, exposure=(0.5, 4.0)):
     )
 
 
-def simulated(truth, *effects, n_frames, seed=1, frames=None, rows=None, of_run=None):
+def a_uniform_sensor(shape, exposure, gain, bias, noise):
+    """Return maps of a sensor of pixels that are all alike: e-, e-/DN, DN and read noise, e-."""
+    values = (np.full(shape, value) for value in (exposure, gain, bias, noise))
+    return TruthMaps(*values, defect=np.zeros(shape, np.uint8))
+
+
+def simulated(truth, *effects, n_frames, seed=1, frames=None, rows=None, of_run=None, bit_depth=14):
     """Return frames (frame, y, x), DN, and electron numbers of a sensor with effects."""
     settings = SimulateSettings(
-        shape=truth.shape, n_frames=of_run or n_frames, seed=seed, effects=effects, bit_depth=14
+        shape=truth.shape, n_frames=of_run or n_frames, seed=seed, effects=effects, bit_depth=bit_depth
     )
     return simulate_block(truth, settings, frames or (0, n_frames), rows)
 

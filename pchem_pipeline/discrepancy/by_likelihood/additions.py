@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.build_verdict import (
     LARGEST_REST,
     LEAVES_TOO_MUCH,
+    MOST_RIVALS,
     Added,
     Addition,
     largest_pulls,
@@ -21,6 +22,7 @@ from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap, carried_
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import UNITS
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival
@@ -29,9 +31,6 @@ from pchem_pipeline.effects.framework.evidence import Evidence
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-_MOST_RIVALS = 3
-_UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
 
 
 @dataclass
@@ -121,8 +120,8 @@ class AddedSets:
     def codes(self, fitted: FittedSet, evidence: Evidence) -> FloatArray | None:
         """Return the samples expected at each code of the evidence, or None if it holds other pixels too."""
         code = evidence.code
-        lit = np.tile(~np.array(self.sets.samples.dark), self.both.shape[0] // self.sets.samples.n)
-        expected, origin = self._expected(fitted)[lit], self.sets.origin[lit]
+        illuminated = np.tile(~np.array(self.sets.samples.dark), self.both.shape[0] // self.sets.samples.n)
+        expected, origin = self._expected(fitted)[illuminated], self.sets.origin[illuminated]
         if evidence.maps.usable.sum() != expected.shape[0]:
             return None
         found = np.zeros(code.observed.size)
@@ -130,7 +129,7 @@ class AddedSets:
             at = first + np.arange(row.size)
             within = (at >= 0) & (at < found.size)
             np.add.at(found, at[within], row[within])
-        return np.asarray(found * code.observed.sum() / max(float(self.both[lit].sum()), 1.0))
+        return np.asarray(found * code.observed.sum() / max(float(self.both[illuminated].sum()), 1.0))
 
     def _expected(self, fitted: FittedSet) -> FloatArray:
         """Return the samples of train and test expected at each code given those in codes that are kept."""
@@ -151,7 +150,8 @@ class AddedSets:
     ) -> Addition:
         """Return an effect with the gaps and the fits without and with it, and with rivals in its place."""
         extended = fits[1]
-        member = next(m for m in extended.members if m.tag == named.member.tag)
+        member = extended.member(named.member.tag)
+        assert member is not None  # it was just fitted
         candidates = self._candidates(named, member.effect)
         if named.equals:
             candidates = tuple(c for c in candidates if c.effect in (member.tag, *named.equals))
@@ -166,7 +166,7 @@ class AddedSets:
             strength_stderr=_stderr(extended, member, named.apart),
             before=gaps[0],
             after=gaps[1],
-            rivals=rivals[:_MOST_RIVALS],
+            rivals=rivals[:MOST_RIVALS],
             placebo=next((r for r in rivals[1:] if r.effect not in kin), None),
             pulls=(),
             moved=_moved(*fits),
@@ -174,13 +174,7 @@ class AddedSets:
 
     def _candidates(self, named: Named, effect: Effect) -> tuple[Candidate, ...]:
         """Return the effect and what could stand in its place, with held-out scores."""
-        judged = self.found.judged
-        scored = [(effect, 0.0, 0.0)]
-        for rival in named.rivals:
-            rise, error = self.found.sets.difference(rival, judged)
-            other = next((m.effect for m in rival.members if m.tag not in judged.tags), None)
-            if other is not None:
-                scored.append((other, rise, error))
+        scored = [(effect, 0.0, 0.0), *((other.effect, score, error) for other, score, error in named.rivals)]
         weights = np.exp([min(score, 0.0) for _, score, _ in scored])
         weights /= weights.sum()
         return tuple(
@@ -191,16 +185,14 @@ class AddedSets:
     def _rivals(self, named: Named, members: tuple[Member, ...], chance: float) -> tuple[Rival, ...]:
         """Return what could stand in the place of an effect, refitted, with its gap, the best first."""
         others = tuple(m for m in members if m.tag != named.member.tag)
-        judged, found = self.found.judged, []
-        for set_with in named.rivals:
-            other = next((m for m in set_with.members if m.tag not in judged.tags), None)
-            if other is None or any(other.excludes(m) for m in others):
+        found = []
+        for other, behind, error in named.rivals:
+            if any(other.excludes(m) for m in others):
                 continue
             try:
                 fitted = self._refit((*others, other))
             except ValueError:
                 continue
-            behind, error = self.found.sets.difference(set_with, judged)
             gap = self.gaps.value(self.sets.problem(fitted.members), fitted.fit, chance)
             why = f"it predicts unseen samples worse, by {-behind:.3g} +- {error:.2g}"
             if other.tag in named.equals:
@@ -231,5 +223,5 @@ def _moved(before: FittedSet, after: FittedSet) -> dict[str, dict[str, Any]]:
             "in_stderr": float(np.nanmedian(ratio[:, i])),
             "unit": unit,
         }
-        for i, (name, unit) in enumerate(_UNITS.items())
+        for i, (name, unit) in enumerate(UNITS.items())
     }

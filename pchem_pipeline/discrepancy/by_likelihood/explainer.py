@@ -20,19 +20,18 @@ from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, find_members
 from pchem_pipeline.discrepancy.by_likelihood.observed import ObservedHistograms, SampleHistograms
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, explain
-from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
+from pchem_pipeline.discrepancy.by_likelihood.sets import SIGMAS, FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import CONVINCING, Measured, NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.discrepancy.skeleton import search, silent
-from pchem_pipeline.discrepancy.verdict import Discrepancy, Examined
+from pchem_pipeline.discrepancy.skeleton import Explainer, Prepared, search, silent
+from pchem_pipeline.discrepancy.verdict import Discrepancy
 from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.fit.shared import Samples
 
@@ -41,7 +40,6 @@ IntArray = NDArray[np.int64]
 
 _FEWEST_REPLICATES = 40
 _SPURIOUS = SpuriousCharge.model_fields["tag"].default
-_SIGMAS, _PRICE = 3.0, 3.0  # standard errors, and nats, by which a set must improve the score
 
 
 def find_in_histograms(
@@ -80,10 +78,11 @@ def find_in_histograms(
     times = [sample.integration_time for sample in samples]
     tell("simulating the fitted model")
     found = search(HistogramExplainer.begin(observed, settings, classes, tuple(model), times, rng), tell)
-    n, n_lit = samples[0].counts.shape[0], sum(not sample.bias for sample in samples)
+    n, n_illuminated = samples[0].counts.shape[0], sum(not sample.bias for sample in samples)
     row = width or n
     shape = n // row, row
-    verdict = found.verdict.on_sensor(shape, (0, shape[0]), (0, row), lambda _, x: divmod(x // n_lit, row))
+    whole = (0, shape[0]), (0, row)
+    verdict = found.verdict.on_sensor(shape, *whole, lambda _, x: divmod(x // n_illuminated, row))
     return replace(found, verdict=verdict)
 
 
@@ -97,7 +96,6 @@ class HistogramReplicates:
         count: of the replicates of a law.
         rng: all random numbers of the search.
         effort: counts the work.
-        done: replicates so far.
     """
 
     observed: ObservedHistograms
@@ -105,7 +103,6 @@ class HistogramReplicates:
     count: int
     rng: np.random.Generator
     effort: Effort
-    done: int = 0
 
     def statistics(self, counts: IntArray) -> Mapping[str, float]:
         """Return the statistics of histograms of the rows, fitted with the PCD alone."""
@@ -117,48 +114,38 @@ class HistogramReplicates:
         mass = np.exp(log_masses)
         mass /= mass.sum(axis=1, keepdims=True)
         total = self.observed.parts[0].sum(axis=1)
-        self.done += self.count
+        self.effort.replicates += self.count
         self.effort.simulate(0, total.size, self.count)
         return [self.statistics(self.rng.multinomial(total, mass)) for _ in range(self.count)]
 
 
 @dataclass
-class HistogramExplainer:
-    """Tells effects apart in histograms; see :class:`~pchem_pipeline.discrepancy.skeleton.Explainer`.
+class HistogramExplainer(Explainer[Explanation]):
+    """Tells effects apart in histograms.
 
     Attributes:
-        settings: the section ``discrepancy``.
+        prepared: the histograms, split, and the model, drawn.
         observed: the rows that are looked at.
         replicates: draws replicates of them.
         sets: fits and scores sets of effects.
         plain: the fit without them to train and test part.
-        first: null of the model.
-        z: statistics of the data.
         members: the candidates.
-        model: effects; those that were there before, and those added since.
-        untestable: effects that such data cannot show, and why.
-        defects: candidates that failed, and why.
-        found: what the search came to; None: nothing.
+        effects: of the model; those that were there before, and those added since.
         final: the fit of the final model to train and test part.
+        found: what the search came to; None: nothing.
         code: samples that it expects at each code of the evidence; None: without effects.
     """
 
-    settings: DiscrepancySettings
+    prepared: Prepared
     observed: ObservedHistograms
     replicates: HistogramReplicates
     sets: SetComparison
     plain: FittedSet
-    first: NullModel
-    z: Measured
     members: Sequence[Member]
-    model: tuple[Effect, ...]
-    untestable: dict[str, str]
-    defects: dict[str, str]
+    effects: tuple[Effect, ...]
     final: FittedSet
     found: Explanation | None = None
     code: FloatArray | None = None
-    samples: str = "histograms"
-    most_rounds: int = 1
 
     @classmethod
     def begin(
@@ -197,44 +184,18 @@ class HistogramExplainer:
         names = tuple(name for name in STATISTICS if name in common)
         both = sets.fit((), plain.fit.parameters, observed.both)
         effort.begin()
-        return cls(
-            settings,
-            observed,
-            replicates,
-            sets,
-            both,
-            NullModel.from_replicates(names, as_matrix(names, vectors), effects=bool(model)),
-            Measured(*(as_matrix(names, [row])[0] for row in own)),
-            members,
-            model,
-            dict(sorted((found | untestable).items())),
-            defects,
-            final=both,
-        )
+        first = NullModel.from_replicates(names, as_matrix(names, vectors), effects=bool(model))
+        z = Measured(*(as_matrix(names, [row])[0] for row in own))
+        untestable = dict(sorted((found | untestable).items()))
+        data = observed.evidence, observed.examined(), first, z, effort
+        # what the parameters bend is no evidence against them: each candidate is fitted with them
+        prepared = Prepared(settings, "histograms", *data, 1, untestable, defects=defects)
+        return cls(prepared, observed, replicates, sets, both, members, model, both)
 
     @property
-    def evidence(self) -> Evidence:
-        """Of the train part."""
-        return self.observed.evidence
-
-    @property
-    def examined(self) -> Examined:
-        """What is looked at."""
-        return self.observed.examined()
-
-    @property
-    def n_replicates(self) -> int:
-        """Drawn so far."""
-        return self.replicates.done
-
-    @property
-    def spent(self) -> float:
-        """CPU seconds so far, by count."""
-        return self.replicates.effort.spent
-
-    def doubt(self) -> str:
-        """Return nothing: each candidate is fitted with the parameters, so what they bend is no evidence."""
-        return ""
+    def model(self) -> tuple[Effect, ...]:
+        """The effects that are in the model now."""
+        return self.effects
 
     def gap(self, null: NullModel) -> Gap:
         """Measure the gap of the likelihood on the final part."""
@@ -263,10 +224,11 @@ class HistogramExplainer:
         except EffortSpentError as spent:
             tags = dict.fromkeys(m.tag for m in self.members)
             raise EffortSpentError(spent.doing, (t for t in tags if t not in tried)) from spent
-        self.defects |= self.sets.failed | found.sets.failed
+        defects = self.prepared.defects
+        defects |= self.sets.failed | found.sets.failed
         if not disagrees:
             rise, error = found.sets.difference(found.judged, found.sets.fit(()))
-            if not found.named or rise < max(CONVINCING, _SIGMAS * error):
+            if not found.named or rise < max(CONVINCING, SIGMAS * error):
                 return None
         self.found = found
         return found if found.named else None
@@ -276,34 +238,14 @@ class HistogramExplainer:
         vectors = self.replicates.drawn(_with_effects(explanation))
         return NullModel.from_replicates(null.names, as_matrix(null.names, vectors), effects=True)
 
-    def replaced(self, null: NullModel) -> NullModel | None:
-        """Leave what was added: nothing is measured of anything else here."""
-        return None
-
-    def probable(self) -> NullModel | None:
-        """Return nothing: what the likelihood of the test part does not prefer is not compared further."""
-        return None
-
-    def unfinished(self, before: Gap, null: NullModel) -> bool:
-        """Return False: nothing is measured here of what no effect explains."""
-        return False
-
-    def describe(self, before: Gap, null: NullModel) -> NullModel | None:
-        """Leave what no effect explains to the codes that are told: nothing is measured of it here."""
-        return None
-
-    def tolerance(self) -> float:
-        """Return 0: the likelihood fits the effects themselves."""
-        return 0.0
-
     def close(self, before: Gap, null: NullModel, disagrees: bool) -> Added:
         """Fit train and test part together with each effect, and measure the gap on the final part."""
         if self.found is None:
             return Added((), before)
         closing = AddedSets(self.observed.parts, self.found, self.plain, self._count, self.replicates.rng)
-        added, self.final = closing.close(before, (self.first, null), self.z, disagrees)
-        self.code = closing.codes(self.final, self.evidence)
-        self.model = along_chain(self.sets.present, [each.effect for each in added.additions])
+        added, self.final = closing.close(before, (self.prepared.first, null), self.prepared.z, disagrees)
+        self.code = closing.codes(self.final, self.observed.evidence)
+        self.effects = along_chain(self.sets.present, [each.effect for each in added.additions])
         return added
 
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
@@ -312,7 +254,7 @@ class HistogramExplainer:
 
     @property
     def _count(self) -> int:
-        return max(self.settings.extended_replicates, _FEWEST_REPLICATES)
+        return max(self.prepared.settings.extended_replicates, _FEWEST_REPLICATES)
 
 
 def _sets(observed: ObservedHistograms, present: tuple[Effect, ...], effort: Effort) -> SetComparison:
@@ -331,17 +273,16 @@ def _on_a_line(
     That tells the charge, which does not grow with time, from dark current.
     """
     dark = free.samples.dark
-    lit = [time for time, is_dark in zip(times, dark, strict=True) if not is_dark]
+    illuminated = [time for time, is_dark in zip(times, dark, strict=True) if not is_dark]
     wanted = settings.candidates is None or _SPURIOUS in settings.candidates
-    if None in lit or len(set(lit)) < 2 or not wanted or _SPURIOUS in settings.exclude:
+    if None in illuminated or len(set(illuminated)) < 2 or not wanted or _SPURIOUS in settings.exclude:
         return None
     if _SPURIOUS in {effect.tag for effect in free.present}:
         return None
     line = Samples(dark, tuple(time or 0.0 for time in times))
     straight = replace(free, samples=line, failed={}, _known={})
     best = straight.fit([Member.of(SpuriousCharge.typical()[0])])
-    rise, error = free.difference(free.fit(()), best)
-    return None if rise > max(_PRICE, _SIGMAS * error) else straight
+    return None if free.beats(free.fit(()), best) else straight
 
 
 def _with_effects(found: Explanation) -> FloatArray:

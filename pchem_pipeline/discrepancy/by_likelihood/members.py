@@ -182,8 +182,8 @@ def law_of(
         at += n
     law = sample_law(effects, pixel_maps(list(own.T), np.ones(own.shape[0], np.bool_)))
     if any(samples.dark) and law.added_exposure.any():
-        lit = ~np.tile(np.array(samples.dark), own.shape[0] // samples.n)
-        law = replace(law, added_exposure=np.where(lit[:, None], law.added_exposure, 0.0))
+        illuminated = ~np.tile(np.array(samples.dark), own.shape[0] // samples.n)
+        law = replace(law, added_exposure=np.where(illuminated[:, None], law.added_exposure, 0.0))
     return law
 
 
@@ -256,12 +256,9 @@ def _changes(effect: Effect, evidence: Evidence) -> bool:
 
 def _limits(effect: type[Effect], name: str) -> tuple[float, float]:
     """Return the limits that a field states, infinite where it states none."""
-    low, high = -np.inf, np.inf
-    for limit in effect.model_fields[name].metadata:
-        for key in ("ge", "gt"):
-            low = max(low, float(getattr(limit, key, low) if getattr(limit, key, None) is not None else low))
-        for key in ("le", "lt"):
-            high = min(
-                high, float(getattr(limit, key, high) if getattr(limit, key, None) is not None else high)
-            )
-    return low, high
+    limits = effect.model_fields[name].metadata
+    low, high = (
+        [float(value) for limit in limits for key in keys if (value := getattr(limit, key, None)) is not None]
+        for keys in (("ge", "gt"), ("le", "lt"))
+    )
+    return max(low, default=-np.inf), min(high, default=np.inf)

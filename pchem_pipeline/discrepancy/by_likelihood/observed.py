@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.by_likelihood.sets import split_samples
+from pchem_pipeline.discrepancy.by_simulation.sensor.population import REACH
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY, observe_histograms
 from pchem_pipeline.discrepancy.verdict import Examined
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
@@ -22,7 +23,6 @@ IntArray = NDArray[np.int64]
 _FEWEST_SAMPLES = 300  # of a pixel
 _MOST_PIXELS = 256  # looked at; more add nothing about what all have in common
 _LARGEST_TOTAL = 10**9 - 1  # samples of a pixel that can be split at random
-_REACH = 7.0  # standard deviations: the law reaches no further
 
 
 @dataclass(frozen=True)
@@ -152,9 +152,9 @@ def _fitted_together(counts: IntArray, origin: IntArray, layout: Samples) -> Flo
 
 def _observe(counts: IntArray, origin: IntArray, layout: Samples, parameters: FloatArray | None) -> Evidence:
     """Observe the rows with electrons; the others say nothing about how electrons come and are read."""
-    lit = np.tile(~np.array(layout.dark), origin.size // layout.n)
-    known = None if parameters is None else parameters[lit]
-    return observe_histograms(counts[lit].astype(np.uint32), origin[lit], parameters=known)
+    illuminated = np.tile(~np.array(layout.dark), origin.size // layout.n)
+    known = None if parameters is None else parameters[illuminated]
+    return observe_histograms(counts[illuminated].astype(np.uint32), origin[illuminated], parameters=known)
 
 
 def _rows(samples: Sequence[SampleHistograms]) -> tuple[IntArray, IntArray]:
@@ -177,8 +177,8 @@ def _widened(
     """
     h, g, mu, sigma = parameters.T
     last = origin + parts[0].shape[1] - 1
-    low = np.nanmax(origin - (mu - _REACH * sigma))
-    high = np.nanmax(mu + (h + _REACH * (np.sqrt(h) + 1.0)) / g + _REACH * sigma - last)
+    low = np.nanmax(origin - (mu - REACH * sigma))
+    high = np.nanmax(mu + (h + REACH * (np.sqrt(h) + 1.0)) / g + REACH * sigma - last)
     left, right = (max(int(np.ceil(more)), 0) for more in (low, high))
     return tuple(np.pad(part, ((0, 0), (left, right))) for part in parts), origin - left
 

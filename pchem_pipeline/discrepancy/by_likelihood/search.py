@@ -19,6 +19,7 @@ from pchem_pipeline.discrepancy.by_likelihood.comb import (
 from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.sets import (
+    SIGMAS,
     SWAPPED,
     Choice,
     FittedSet,
@@ -29,8 +30,6 @@ from pchem_pipeline.discrepancy.by_likelihood.sets import (
 )
 
 FloatArray = NDArray[np.float64]
-
-_SIGMAS = 3.0
 
 _PAYS = 0.5  # of the gap: more must go with a peak that is set aside
 _PEAKS_TRIED = 3
@@ -45,16 +44,15 @@ class Named:
     Attributes:
         member: as fitted.
         apart: by how much its strength differs when fewer codes are compared.
-        rivals: sets with another effect in its place, the best first.
-        without: the set without it.
+        rivals: effects that could stand in its place, the best first, with how far the set with each is
+            behind the judged one, nats, and the standard error.
         equals: rivals (tags) that do as well within three standard errors.
         weight: what it adds to the score, nats.
     """
 
     member: Member
     apart: float
-    rivals: tuple[FittedSet, ...]
-    without: FittedSet | None
+    rivals: tuple[tuple[Member, float, float], ...]
     equals: tuple[str, ...]
     weight: float
 
@@ -164,9 +162,11 @@ def _narrowed(
         best = best if fitted is None else of_best_kind(wide, fitted, candidates)
         there = view.attempt(best.members, start)
         for member in best.members:
-            found = _named(view, choice.best, _member(choice.best, member.tag), candidates)
-            apart = 0.0 if there is None else _apart(member, _member(there, member.tag))
-            named.append(replace(found, member=member, apart=apart))
+            told, apart = choice.best.member(member.tag), 0.0
+            assert told is not None  # another kind of it at most
+            if there is not None and (other := there.member(member.tag)) is not None:
+                apart = _apart(member, other)
+            named.append(replace(_named(view, choice.best, told, candidates), member=member, apart=apart))
     return Explanation(
         view, wide.kept, peak, plain, best, choice.best, _sorted(named), tuple(unsteady), nearest, rest
     )
@@ -183,10 +183,6 @@ def _cut_peak(
         if left < best:
             best, found = left, interval
     return () if found is None else (found,)
-
-
-def _member(fitted: FittedSet, tag: str) -> Member:
-    return next(m for m in fitted.members if m.tag == tag)
 
 
 def _apart(member: Member, there: Member) -> float:
@@ -210,13 +206,13 @@ def _steady(
     steady: list[Member] = []
     unsteady: list[Member] = []
     for member in best.members:
-        other = next((m for m in fitted.members if m.tag == member.tag), None)
+        other = fitted.member(member.tag)
         if other is None or other.at_limit or member.at_limit or not _alike(member, other):
             unsteady.append(member)
             continue
-        without = wide.attempt(tuple(m for m in fitted.members if m.tag != member.tag), fitted.fit.parameters)
-        rise, error = wide.difference(fitted, without) if without else (0.0, 0.0)
-        (steady if rise > _SIGMAS * error else unsteady).append(other)
+        without = wide.attempt_without(fitted, member)
+        better = without is not None and wide.beats(fitted, without, 0.0)
+        (steady if better else unsteady).append(other)
     return steady, unsteady
 
 
@@ -225,15 +221,13 @@ def _exchanged(wide: SetComparison, fitted: FittedSet, candidates: Sequence[Memb
     plain = wide.fit((), fitted.fit.parameters)
     for _ in fitted.members:
         offers = []
-        whole = wide.difference(fitted, plain)[0]
+        whole = wide.rise(fitted, plain)
         for member in fitted.members:
-            others = tuple(m for m in fitted.members if m.tag != member.tag)
-            base = wide.attempt(others, fitted.fit.parameters)
-            if base is not None and wide.difference(fitted, base)[0] < SWAPPED * whole:
+            base = wide.attempt_without(fitted, member)
+            if base is not None and wide.rise(fitted, base) < SWAPPED * whole:
                 offers += find_rivals(wide, fitted, member, candidates)[1][:1]
         best = max(offers, key=lambda s: s.score, default=fitted)
-        rise, error = wide.difference(best, fitted)
-        if rise <= _SIGMAS * error:
+        if not wide.beats(best, fitted, 0.0):
             break
         fitted = best
     return fitted
@@ -249,14 +243,12 @@ def _alike(one: Member, other: Member) -> bool:
 
 def _named(sets: SetComparison, best: FittedSet, member: Member, candidates: Sequence[Member]) -> Named:
     """Compare a member of a set with what could stand in its place."""
-    without, rivals = find_rivals(sets, best, member, candidates)
-    equals = []
-    for rival in rivals:
-        rise, error = sets.difference(best, rival)
-        if rise < _SIGMAS * error:
-            equals += [tag for tag in rival.tags - best.tags if tag not in equals]
-    weight = sets.difference(best, without)[0] if without else 0.0
-    return Named(member, 0.0, tuple(rivals), without, tuple(equals), weight)
+    without, found = find_rivals(sets, best, member, candidates)
+    rivals = tuple(
+        (other, *sets.difference(rival, best)) for rival in found if (other := rival.new(best)) is not None
+    )
+    equals = tuple(other.tag for other, behind, error in rivals if -behind < SIGMAS * error)
+    return Named(member, 0.0, rivals, equals, sets.rise(best, without) if without else 0.0)
 
 
 def _sorted(named: Sequence[Named]) -> tuple[Named, ...]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.base.errors import error_words
+from pchem_pipeline.discrepancy.build_verdict import MOST_RIVALS
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.effect import Effect
@@ -25,10 +26,10 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_RIVALS_SHOWN = 3
-
-_SIGMAS = 3.0  # standard errors by which an effect must improve the score, and a set must beat a rival
-_PRICE = 3.0  # nats: and by so much at least
+#: Standard errors of a difference of scores that is no chance.
+SIGMAS = 3.0
+#: Nats by which an effect must improve the score at least.
+PRICE = 3.0
 _LARGEST_SET = 4
 _FITTED = 3  # candidates fitted in full, of those that a first-order step promises most of
 _TOLERANCE = 0.02  # nats; of a misfit more, since it is known no better
@@ -107,6 +108,18 @@ class FittedSet:
     def tags(self) -> frozenset[str]:
         """Their tags."""
         return frozenset(m.tag for m in self.members)
+
+    def without(self, tag: str) -> tuple[Member, ...]:
+        """Return the members but one."""
+        return tuple(m for m in self.members if m.tag != tag)
+
+    def member(self, tag: str) -> Member | None:
+        """Return a member; None: it has none of that tag."""
+        return next((m for m in self.members if m.tag == tag), None)
+
+    def new(self, other: FittedSet) -> Member | None:
+        """Return the member that another set does not have; None: it has all."""
+        return next((m for m in self.members if m.tag not in other.tags), None)
 
     def coordinates(self, tag: str) -> tuple[FloatArray, FloatArray]:
         """Return coordinates of a member and their standard errors."""
@@ -230,6 +243,19 @@ class SetComparison:
             self.failed[members[-1].tag] = error_words(error)
             return None
 
+    def attempt_without(self, found: FittedSet, member: Member) -> FittedSet | None:
+        """Fit a set without one of its members, from where it is; None where that cannot be done."""
+        return self.attempt(found.without(member.tag), found.fit.parameters)
+
+    def beats(self, one: FittedSet, other: FittedSet, least: float = PRICE) -> bool:
+        """Tell whether a set predicts better than another one, beyond chance and by so many nats at least."""
+        rise, error = self.difference(one, other)
+        return rise > max(SIGMAS * error, least)
+
+    def rise(self, one: FittedSet, other: FittedSet) -> float:
+        """Return the score of one above that of the other, nats."""
+        return self.difference(one, other)[0]
+
     def difference(self, one: FittedSet, other: FittedSet) -> tuple[float, float]:
         """Return the score of one above that of the other, nats, and its standard error."""
         apart = one.log_masses - other.log_masses
@@ -252,9 +278,9 @@ class SetComparison:
         """Return candidates, each moved by a first-order step, by the rise that this step promises."""
         problem = self.problem(base.members)
         theta = self.samples.theta(base.fit.parameters)
-        tangent = Tangent.at(problem, theta, base.fit.shared)
-        seen = np.where(self.kept, self.train, 0).astype(np.float64)
-        weights = tangent.masses * seen.sum(axis=1)[:, None]
+        tangent, still = Tangent.at(problem, theta, base.fit.shared), np.zeros(theta.shape[0])
+        # of the candidate's strength and the pixels' own parameters; what is in the set stays
+        alone = replace(problem, bounds=np.array([[-np.inf, np.inf]]))
         ranked = []
         for member in candidates:
             if any(member.excludes(m) for m in base.members) or member.tag in self.failed:
@@ -265,11 +291,11 @@ class SetComparison:
             except Exception as error:
                 self.failed[member.tag] = error_words(error)
                 continue
-            d = np.concatenate([tangent.derivatives, slope[:, None, :]], axis=1)
-            information = (d * weights[:, None, :]) @ d.transpose(0, 2, 1)
-            score = np.einsum("nab,nb->na", d, seen)
-            information, score = self.samples.by_pixel(information, score)
-            rise, length = _one_step(information, score, theta.shape[1])
+            derivatives = np.concatenate([tangent.derivatives[:, :4], slope[:, None, :]], axis=1)
+            slopes = Tangent(alone, tangent.log_masses, derivatives, np.zeros(1)).slopes(self.train)
+            variance = float(slopes.covariance()[1][0, 0])
+            length = float(slopes.step(still)[1][0]) if variance > 0.0 else 0.0
+            rise = 0.5 * length**2 / variance if variance > 0.0 else 0.0
             if not member.coordinates:
                 ranked.append((np.inf, member))
             elif length * step > 0 or member.coordinates[0].bounds[0] < 0:
@@ -289,19 +315,6 @@ class SetComparison:
         problem = self.problem((*base.members, member))
         moved = problem.log_masses(theta, np.concatenate([base.fit.shared, shared]))
         return (moved - log_masses) / step, step
-
-
-def _one_step(information: FloatArray, score: FloatArray, n_own: int) -> tuple[float, float]:
-    """Return the rise that the last parameter (shared) promises, the pixels' own free, and its step."""
-    # a pixel none of whose samples count says nothing
-    some = np.einsum("naa->n", information[:, :n_own, :n_own]) > 0.0
-    information, score = information[some], score[some]
-    own = information[:, :n_own, :n_own]
-    own = own + 1e-9 * np.einsum("naa->na", own)[:, :, None] * np.eye(n_own)
-    through = np.linalg.solve(own, information[:, :n_own, -1:])[:, :, 0]
-    left = float((information[:, -1, -1] - (information[:, :n_own, -1] * through).sum(axis=1)).sum())
-    right = float((score[:, -1] - (score[:, :n_own] * through).sum(axis=1)).sum())
-    return (0.5 * right**2 / left, right / left) if left > 0 else (0.0, 0.0)
 
 
 def _placed(member: Member, length: float) -> Member:
@@ -334,7 +347,7 @@ class Choice:
 def compare_sets(
     sets: SetComparison, candidates: Sequence[Member], *, largest: int = _LARGEST_SET, coarse: bool = False
 ) -> Choice:
-    """Grow the set of effects greedily, with swaps, while the score improves by more than chance.
+    """Select effects forward while the score improves by more than chance, with swaps, then eliminate them.
 
     Effects that leave most of the gap are not what is missing: nothing is put on top of them.
 
@@ -351,12 +364,12 @@ def compare_sets(
         extended = _additions(sets, best, candidates)
         if best is plain:
             first = extended
-        if not extended or not _better(sets, extended[0], best):
+        if not extended or not sets.beats(extended[0], best):
             break
         best = _swapped(sets, extended[0], plain, candidates)
         if sets.gap(best) > _HOPELESS[len(best.members)] * at_first:
             break
-    return Choice(plain, of_best_kind(sets, _pruned(sets, best, plain), candidates), first)
+    return Choice(plain, of_best_kind(sets, _backward_eliminate(sets, best, plain), candidates), first)
 
 
 def _additions(
@@ -374,22 +387,17 @@ def _additions(
     return sorted(found.values(), key=lambda s: -s.score)
 
 
-def _better(sets: SetComparison, one: FittedSet, other: FittedSet) -> bool:
-    rise, error = sets.difference(one, other)
-    return rise > max(_SIGMAS * error, _PRICE)
-
-
 def _swapped(
     sets: SetComparison, best: FittedSet, plain: FittedSet, candidates: Sequence[Member]
 ) -> FittedSet:
     """Exchange earlier members that have come to matter little for others, where that is better."""
-    whole = sets.difference(best, plain)[0]
+    whole = sets.rise(best, plain)
     for member in best.members[:-1]:
-        base = sets.attempt(tuple(m for m in best.members if m.tag != member.tag), best.fit.parameters)
-        if base is None or sets.difference(best, base)[0] > SWAPPED * whole:
+        base = sets.attempt_without(best, member)
+        if base is None or sets.rise(best, base) > SWAPPED * whole:
             continue
         for fitted in _additions(sets, base, candidates, 2)[:1]:
-            if member.tag not in fitted.tags and _better(sets, fitted, best):
+            if member.tag not in fitted.tags and sets.beats(fitted, best):
                 return fitted
     return best
 
@@ -399,25 +407,24 @@ def of_best_kind(sets: SetComparison, best: FittedSet, candidates: Sequence[Memb
     for member in best.members:
         kinds = {c.kind: c for c in candidates if c.tag == member.tag and c.kind != member.kind}
         for other in list(kinds.values())[:_FITTED]:
-            members = tuple(m for m in best.members if m.tag != member.tag)
-            fitted = sets.attempt((*members, other), best.fit.parameters)
+            fitted = sets.attempt((*best.without(member.tag), other), best.fit.parameters)
             if fitted is not None and fitted.score > best.score:
                 best = fitted
     return best
 
 
-def _pruned(sets: SetComparison, best: FittedSet, plain: FittedSet) -> FittedSet:
+def _backward_eliminate(sets: SetComparison, best: FittedSet, plain: FittedSet) -> FittedSet:
     """Leave out members that the set does as well without."""
-    whole = sets.difference(best, plain)[0]
+    whole = sets.rise(best, plain)
     for member in reversed(best.members):
         if len(best.members) < 2:
             break
-        without = sets.attempt(tuple(m for m in best.members if m.tag != member.tag), best.fit.parameters)
+        without = sets.attempt_without(best, member)
         if without is None:
             continue
         misfits = sets.gap(best) > _HARDLY * sets.gap(plain)
-        small = misfits and sets.difference(best, without)[0] < _HARDLY * whole
-        if small or not _better(sets, best, without):
+        small = misfits and sets.rise(best, without) < _HARDLY * whole
+        if small or not sets.beats(best, without):
             best = without
     return best
 
@@ -426,9 +433,8 @@ def find_rivals(
     sets: SetComparison, best: FittedSet, member: Member, candidates: Sequence[Member]
 ) -> tuple[FittedSet | None, list[FittedSet]]:
     """Return the set without a member, and sets with another effect in its place, the best first."""
-    others = tuple(m for m in best.members if m.tag != member.tag)
-    base = sets.attempt(others, best.fit.parameters)
+    base = sets.attempt_without(best, member)
     if base is None:
         return None, []
     wanted = [c for c in candidates if c.tag != member.tag]
-    return base, _additions(sets, base, wanted, _RIVALS_SHOWN)
+    return base, _additions(sets, base, wanted, MOST_RIVALS)

@@ -8,25 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.by_simulation.additions import Round, left_of, unexplained_of_its_own
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     LARGEST_DECREASE,
     Hypothesis,
     Noise,
     correction,
-    tolerance,
 )
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import noise_of_splits
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, lesser
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import ESTABLISHED, Refitted, lesser
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 
 FloatArray = NDArray[np.float64]
 
-# standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
-# than a single one would by chance
-_ESTABLISHED = 4.5
-_CONFIRMED = 1.0  # the same in the final frames, half as many, which nothing was chosen by
+_CONFIRMED = 1.0  # standard errors of it in the final frames, half as many, which nothing was chosen by
 # the same of what is measured without a name, in either: few forms of it are tried, and only where the data
 # disagree with all that has one
 _MEASURED = 3.0
@@ -44,32 +40,32 @@ class Acceptance:
         first: null of the model before anything was added.
         z: statistics of the data.
         gaps: measured with these, on the final frames.
-        model_error: relative error of a fingerprint.
+        settings: the section ``discrepancy``.
     """
 
     first: NullModel
     z: Measured
     gaps: StatisticsGap
-    model_error: float
+    settings: DiscrepancySettings
 
     @property
     def allowed(self) -> float:
         """Relative error of what effects do at their best fit: their details are never quite the sensor's."""
-        return self.model_error / 2.0
+        return self.settings.model_error / 2.0
 
     def gap(self, null: NullModel) -> Gap:
         """Return the gap of a model."""
         return self.gaps.gap(self.z.final, null.mean, null.replicates, null.strengths)
 
-    def gap_of(self, found: Refitted) -> Gap:
-        """Return the gap of a set."""
-        return self.gaps.gap(self.z.final, found.mean, found.vectors)
+    def gap_at(self, mean: FloatArray, replicates: FloatArray) -> Gap:
+        """Return the gap of a model that gives a mean, (m,), and scatters as replicates do, (b, m)."""
+        return self.gaps.gap(self.z.final, mean, replicates)
 
     def widens(self, added: Refitted, null: NullModel) -> bool:
         """Tell whether a set, its strengths as the data ask for, leaves a wider gap than a model without."""
         mean = added.mean + np.expm1(added.change) @ added.parts
-        before = self.gaps.gap(self.z.final, null.mean, null.replicates)
-        return self.gaps.gap(self.z.final, mean, added.vectors).interval[0] > before.value
+        before = self.gap_at(null.mean, null.replicates)
+        return self.gap_at(mean, added.vectors).interval[0] > before.value
 
     def established(self, added: Refitted) -> tuple[Hypothesis, ...]:
         """Return the effects of which the data have certainly some, the final frames too.
@@ -80,16 +76,16 @@ class Acceptance:
         however strong it is: where that is beyond doubt 3 of these are enough. Likewise a strength by a dozen
         events, where chance makes one, is known to a third: there it counts how far from chance they are.
         """
-        first, n = self.first, len(added.vectors)
-        certain = _certain(added, self.z.both - first.mean, noise_of_splits(first, 2, self.model_error))
-        noise = noise_of_splits(first, 1, self.model_error)
+        first, n, model_error = self.first, len(added.vectors), self.settings.model_error
+        certain = _certain(added, self.z.both - first.mean, noise_of_splits(first, 2, model_error))
+        noise = noise_of_splits(first, 1, model_error)
         noise = replace(noise, covariance=added.covariance.times(1.0 + 1.0 / n))
         # about the set at its best fit: strong effects do not add up to what they do together
         allowed = noise.of(lesser(added.slopes, added.parts))
         change, stderr = correction(added.slopes, self.z.final - added.mean, allowed)
         measured = np.array([type(h.effect).empirical for h in added.hypotheses])
         sure = measured | _overwhelming(added.parts, self.z.both - first.mean, first.std)
-        clear = np.exp(added.change) > np.where(sure, _MEASURED, _ESTABLISHED) * added.stderr
+        clear = np.exp(added.change) > np.where(sure, _MEASURED, ESTABLISHED) * added.stderr
         proven = 1.0 + change > np.where(measured, _MEASURED, _CONFIRMED) * stderr
         proven &= change > -LARGEST_DECREASE
         there = (clear & proven) | certain | (self._counted(added) & (change > -LARGEST_DECREASE))
@@ -104,30 +100,11 @@ class Acceptance:
         # of the same probability as so many standard errors of a strength, but of no effect, not of some
         seen, final = (
             np.array([first.p_values(each - rest, splits) for rest in others]) < 2.0 * special.ndtr(-limit)
-            for each, splits, limit in ((z.both, 2, _ESTABLISHED), (z.final, 1, _CONFIRMED))
+            for each, splits, limit in ((z.both, 2, ESTABLISHED), (z.final, 1, _CONFIRMED))
         )
         more = np.minimum(z.both, z.final) > first.mean + others
         made = (added.parts > 0.0) & first.moved_by(added.vectors) & (np.abs(added.rest) < _LEFT_OF_COUNT)
         return np.asarray((seen & final & more & made & first.counts).any(axis=1))
-
-    def accounted(self, rounds: list[Round], null: NullModel) -> tuple[Hypothesis, ...]:
-        """Return the effects that rounds added of which the model accounts for what they move."""
-        if not rounds:
-            return ()
-        rest = left_of(rounds, null, self.z, self.allowed)
-        return tuple(
-            h
-            for this in rounds
-            for h, part in zip(this.added.hypotheses, this.added.parts, strict=True)
-            if not unexplained_of_its_own(part, rest, this.null)
-        )
-
-    def tolerance(self, rounds: list[Round]) -> FloatArray | float:
-        """Return what is not held against effects that rounds added, (m,): a fraction of what they do."""
-        if not rounds:
-            return 0.0
-        parts = np.concatenate([this.added.parts for this in rounds])
-        return tolerance(parts, self.allowed, self.first.events)
 
 
 def _overwhelming(parts: FloatArray, shift: FloatArray, scatter: FloatArray) -> NDArray[np.bool_]:

@@ -17,25 +17,26 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
-from pchem_pipeline.discrepancy.by_simulation.additions import AddedRounds
+from pchem_pipeline.discrepancy.by_simulation.additions import AddedRounds, ExtendedModel
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper, candidate_classes, serial
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Choice, Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screening, noise_of_splits
-from pchem_pipeline.discrepancy.by_simulation.extended_model import ExtendedModel
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.measured.unexplained import Unexplained
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     NotFittedError,
     Refit,
-    expected_codes,
     refit_maps,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, compare
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import PixelLikelihood, Witness, is_told
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
+    HistogramLikelihood,
+    PixelLikelihood,
+    identifiable_from_histograms,
+)
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.sets.trials import leaves_nothing
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import (
@@ -48,20 +49,18 @@ from pchem_pipeline.discrepancy.null import (
 )
 from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.discrepancy.skeleton import search, silent
-from pchem_pipeline.discrepancy.verdict import Discrepancy, Examined
+from pchem_pipeline.discrepancy.skeleton import Explainer, Prepared, search, silent
+from pchem_pipeline.discrepancy.verdict import Discrepancy
 from pchem_pipeline.effects.framework.added_exposure import added_exposures
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.framework.registry import effect_classes
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_CLEARLY_LESS = 0.5  # of the gap that named effects leave, the most that may stay with another form
+_CLEARLY_LESS = 0.5  # of the gap that is left without, the most that may stay with what is measured
 _LIKELIHOODS = 6  # that are remembered
-_DESCRIBED = 0.5  # of the gap, the most that a measured component may leave to be worth telling
 
 
 def find_discrepancies(
@@ -126,31 +125,25 @@ class Explanation:
 
 
 @dataclass
-class FrameExplainer:
-    """Tells effects apart in frames; see :class:`~pchem_pipeline.discrepancy.skeleton.Explainer`.
+class FrameExplainer(Explainer[Explanation]):
+    """Tells effects apart in frames.
 
     Attributes:
-        settings: the section ``discrepancy``.
+        prepared: the frames, split, and the model, drawn.
         observed: the frames.
         work: fits and simulates them.
         screening: asks the candidates what they would do.
         accept: tells by the statistics of the data what is accepted.
         extended: the model, with the rounds of the search.
-        samples: what the data are, in words.
-        defects: candidates that failed, and why.
-        unexplained: what measures what no effect explains, once it is asked for.
         doubtful: puts effects into the model that leave nothing but are not certain; None: there are none.
     """
 
-    settings: DiscrepancySettings
+    prepared: Prepared
     observed: ObservedFrames
     work: Simulations
     screening: Screening
     accept: Acceptance
     extended: ExtendedModel
-    samples: str = "frames"
-    defects: dict[str, str] = field(default_factory=dict)
-    unexplained: Unexplained | None = None
     doubtful: Callable[[], NullModel] | None = None
     _likelihoods: dict[tuple[int, tuple[Effect, ...], tuple[Effect, ...]], PixelLikelihood] = field(
         default_factory=dict, repr=False
@@ -173,65 +166,33 @@ class FrameExplainer:
         names = observed.names([*own, *vectors])
         first = NullModel.from_replicates(names, as_matrix(names, vectors), effects=bool(model))
         effort.begin()
-        z, defects = Measured(*as_matrix(names, own)), dict[str, str]()
-        return cls(
+        untestable = {tag: c.untestable for tag, c in effect_classes().items() if c.untestable}
+        z = Measured(*as_matrix(names, own))
+        prepared = Prepared(
             settings,
+            "frames",
+            observed.parts[0],
+            observed.examined(),
+            first,
+            z,
+            effort,
+            settings.max_rounds,
+            untestable,
+            observed.doubt(),
+        )
+        return cls(
+            prepared,
             observed,
             work,
-            Screening(observed, work, z, classes, model, settings.model_error, defects),
-            Acceptance(first, z, StatisticsGap(first, observed.final_samples), settings.model_error),
+            Screening(observed, work, z, classes, model, settings.model_error, prepared.defects),
+            Acceptance(first, z, StatisticsGap(first, observed.final_samples), settings),
             ExtendedModel(work, first, model, model),
-            defects=defects,
         )
-
-    @property
-    def evidence(self) -> Evidence:
-        """Of the train frames."""
-        return self.observed.parts[0]
-
-    @property
-    def examined(self) -> Examined:
-        """What was looked at."""
-        return self.observed.examined()
-
-    @property
-    def first(self) -> NullModel:
-        """The null of the model before anything was added."""
-        return self.accept.first
-
-    @property
-    def z(self) -> Measured:
-        """Statistics of the data."""
-        return self.accept.z
 
     @property
     def model(self) -> tuple[Effect, ...]:
         """The effects that are in the model now."""
         return self.extended.effects
-
-    @property
-    def most_rounds(self) -> int:
-        """Of explaining and adding."""
-        return self.settings.max_rounds
-
-    @property
-    def untestable(self) -> dict[str, str]:
-        """Effects that no frames can show, and why."""
-        return {tag: c.untestable for tag, c in effect_classes().items() if c.untestable}
-
-    @property
-    def n_replicates(self) -> int:
-        """Parts of simulated stacks so far."""
-        return self.work.done
-
-    @property
-    def spent(self) -> float:
-        """CPU seconds so far, by count."""
-        return self.work.effort.spent
-
-    def doubt(self) -> str:
-        """Say which share of the pixels is not identified, and what would help; empty below a half."""
-        return self.observed.doubt()
 
     def gap(self, null: NullModel) -> Gap:
         """Measure the gap in the statistics of the final frames."""
@@ -239,7 +200,7 @@ class FrameExplainer:
 
     def suspects(self, null: NullModel) -> bool:
         """Tell whether some statistic deviates so far that a candidate may explain it with others."""
-        return suspicious(null, self.z)
+        return suspicious(null, self.prepared.z)
 
     def explain(self, null: NullModel, disagrees: bool) -> Explanation | None:
         """Simulate what candidates would do, and choose the set that best predicts held-out frames."""
@@ -269,12 +230,12 @@ class FrameExplainer:
             return None
         # what was chosen is not lost for the little that is left to do: no limit
         refitter = replace(refitter, allow=lambda _: None)
-        count, held = self.settings.extended_replicates, {h.tag for h in self.extended.added}
+        count, held = self.prepared.settings.extended_replicates, {h.tag for h in self.extended.added}
         added = refitter.sharpened(found.chosen, count)
         kept = self.accept.established(added)
         while len(kept) < len(added.hypotheses):
             if {h.tag for h in kept} <= held:
-                if not held and leaves_nothing(refitter, added):
+                if not held and refitter.passes_goodness_of_fit(added):
                     put = functools.partial(self.extended.put, found, added, explanation.hypotheses, null)
                     self.doubtful = functools.partial(put, certain=False)
                 return None
@@ -297,9 +258,9 @@ class FrameExplainer:
                 explanation.choice,
                 self.extended.last,
                 lambda best: self._left_by(best, refitter),
-                Witness(self._likelihood),
-                lambda: self._unexplained().explains_all(),
-                lambda unlisted: self._unexplained().clearest(unlisted),
+                HistogramLikelihood(self._likelihood),
+                lambda: self._unexplained.explains_all(),
+                lambda unlisted: self._unexplained.clearest(unlisted),
             )
         except EffortSpentError as spent:
             tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
@@ -308,7 +269,8 @@ class FrameExplainer:
 
     def _refitter(self) -> Refitter:
         """Return what fits effects beside those that the model had before the search."""
-        present, first = self.extended.present, self.first
+        present, data = self.extended.present, self.prepared
+        first = data.first
 
         def draw(effects: tuple[Effect, ...], count: int) -> tuple[Refit, FloatArray]:
             fit, vectors = self.work.drawn(along_chain(present, effects), count)
@@ -317,12 +279,12 @@ class FrameExplainer:
         def allow(words: str) -> None:
             self.work.effort.check(f"{words} was fitted")
 
-        events = np.asarray(noise_of_splits(first, 2, self.settings.model_error).events)
-        return Refitter(draw, first, self.z.both, events, present, allow=allow, defects=self.defects)
+        events = np.asarray(noise_of_splits(first, 2, data.settings.model_error).events)
+        return Refitter(draw, first, data.z.both, events, present, allow=allow, defects=data.defects)
 
     def _left_by(self, best: Refitted, refitter: Refitter) -> Choice | None:
         """Compare what candidates would do beside a refitted set: what that hid stands out there."""
-        null = NullModel.from_replicates(self.first.names, best.vectors, self.first)
+        null = NullModel.from_replicates(self.prepared.first.names, best.vectors, self.prepared.first)
         null = null.shifted(np.expm1(best.change) @ best.slopes)
         model, number = refitter.model(best.effects), len(self.extended.rounds)
         return self.screening.beside(model, null, best.slopes, number)
@@ -334,13 +296,13 @@ class FrameExplainer:
         if not all(effect.everywhere for effect in (*present, *effects)):
             return None
         # a law has all samples; others may have replaced some
-        key = pixels, present, tuple(effect for effect in effects if not is_told(effect))
+        key = pixels, present, tuple(effect for effect in effects if not identifiable_from_histograms(effect))
         if key not in self._likelihoods:
             if len(self._likelihoods) >= _LIKELIHOODS:
                 del self._likelihoods[next(iter(self._likelihoods))]
             samples = self.work.own_samples((*present, *effects))
             self._likelihoods[key] = PixelLikelihood(
-                samples, self.observed.plain.maps, present, self.work.effort, pixels, self.defects
+                samples, self.observed.plain.maps, present, self.work.effort, pixels, self.prepared.defects
             )
         return self._likelihoods[key]
 
@@ -352,14 +314,14 @@ class FrameExplainer:
         Raises:
             EffortSpentError: the work is at its limit; nothing was added.
         """
-        unexplained, left = self._unexplained(), self.gap(null)
+        unexplained, left = self._unexplained, self.gap(null)
         found = unexplained.by_itself()
         if found is None:
             return None
-        gap = self.accept.gap_of(found)
+        gap = self.accept.gap_at(found.mean, found.vectors)
         better = gap.interval[1] < _CLEARLY_LESS * left.value
         # effects that the final frames do not tell from the truth are known to leave something by the others
-        as_good = gap.at_floor and (not left.at_floor or unexplained.leaves_nothing(found))
+        as_good = gap.at_floor and (not left.at_floor or unexplained.refitter.passes_goodness_of_fit(found))
         return self.extended.put_measured(found) if better or as_good else None
 
     def probable(self) -> NullModel | None:
@@ -388,7 +350,7 @@ class FrameExplainer:
         additions = self.close(before, null, disagrees=True).additions
         if instead is not None or (left.at_floor and any(each.fits for each in additions)):
             return instead
-        unexplained, sure = self._unexplained(), self.accept.accounted(self.extended.rounds, null)
+        unexplained, sure = self._unexplained, self._added.accounted(null)
         named = any(each.named for each in additions)
         best: tuple[tuple[bool, float], Refitted] | None = None
         for kept in ((), sure) if sure else ((),):
@@ -400,9 +362,9 @@ class FrameExplainer:
                 break
             if found is None:
                 continue
-            gap = self.accept.gap_of(found)
+            gap = self.accept.gap_at(found.mean, found.vectors)
             # beside effects that get no name there is nothing to leave less than
-            most = _DESCRIBED * (left.value if kept or named else before.value)
+            most = _CLEARLY_LESS * (left.value if kept or named else before.value)
             forms = sum(e.measured_parts for e in found.effects)
             rank = (not gap.at_floor, float(forms) if gap.at_floor else gap.value)
             if (gap.at_floor or gap.value < most) and (best is None or rank <= best[0]):
@@ -411,27 +373,24 @@ class FrameExplainer:
                 break
         return None if best is None else self.extended.put_measured(best[1])
 
+    @functools.cached_property
     def _unexplained(self) -> Unexplained:
-        """Return what measures beside effects that the model had before the search; always the same."""
-        if self.unexplained is None:
-            self.unexplained = Unexplained(
-                self.work,
-                self._refitter(),
-                self.accept.established,
-                self.settings.extended_replicates,
-                self.defects,
-            )
-        return self.unexplained
+        """What measures beside effects that the model had before the search; always the same."""
+        data, proven = self.prepared, self.accept.established
+        replicates = data.settings.extended_replicates
+        return Unexplained(self.work, self._refitter(), proven, replicates, data.defects)
+
+    @property
+    def _added(self) -> AddedRounds:
+        return AddedRounds(self.extended.rounds, self.accept)
 
     def tolerance(self) -> FloatArray | float:
         """Return what is not held against effects that were added: a fraction of what they do."""
-        return self.accept.tolerance(self.extended.rounds)
+        return self._added.tolerance
 
     def close(self, before: Gap, null: NullModel, disagrees: bool) -> Added:
         """Measure the gap on the final frames after each effect, and with rivals in its place."""
-        accept = self.accept
-        rounds = AddedRounds(self.extended.rounds, accept.gaps, self.z, self.settings, accept.allowed)
-        return rounds.close(before, null, disagrees)
+        return self._added.close(before, null, disagrees)
 
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
         """Return the maps under the model, with that taken out of H which effects add to single pixels.
@@ -440,24 +399,17 @@ class FrameExplainer:
         it. The replicates of the search are simulated with the pixels' mean exposure: which ones blink is
         drawn anew.
         """
-        frames, plain, fit, expected = (
-            self.observed.frames,
-            self.observed.plain,
-            self.work.mapped(self.model).fit,
-            None,
-        )
-        maps = fit.maps
+        frames, plain, expected = self.observed.frames, self.observed.plain, None
+        maps = self.work.mapped(self.model).fit.maps
         assert plain.covariance is not None
         if self.extended.rounds:
-            code = self.evidence.code
-            codes = code.first + np.arange(code.observed.size)
             train = frames.numbers[frames.splits.train]
-            expected = expected_codes(maps, frames.effects(self.model), codes, train, fit.added)
+            expected = self.work.expected(self.model, self.prepared.evidence, train)
         model = frames.effects(model)
         try:
             added = added_exposures(model, frames.stack, frames.numbers, plain.maps)
         except ConfigError as error:
-            self.defects["added exposure"] = str(error)
+            self.prepared.defects["added exposure"] = str(error)
             added = None
         if added is not None:
             own = frames.seen_stack, plain.maps, model, plain.covariance, added, frames.seen_numbers

@@ -37,7 +37,7 @@ _DEPTH = 4  # frames through which a move towards an earlier frame is followed
 _MOST_TOLD = 4
 
 
-class Move(Section):
+class MixtureShift(Section):
     """A change of a sample: by a number of DN, or towards a neighbour.
 
     Towards a neighbour: by ``shift_dn`` where that is given, else by ``part`` of the difference, rounded down
@@ -104,7 +104,7 @@ class Empirical(Effect):
     strength: ClassVar[str] = "share"
     empirical: ClassVar[bool] = True
     share: Ratio = Field(ge=0, le=1, description="share of shifted samples, no unit")
-    moves: tuple[Move, ...] = Field(min_length=1, max_length=16, description="how; one of them each")
+    moves: tuple[MixtureShift, ...] = Field(min_length=1, max_length=16, description="how; one of them each")
     together: Together = Field(
         default="sample", description="what is moved alike: each sample by itself, a row, a column or a frame"
     )
@@ -115,13 +115,13 @@ class Empirical(Effect):
     )
 
     #: a hundredth of the samples 8 DN too low
-    typical_values = ({"share": 0.01, "moves": (Move(shift_dn=-8),)},)
+    typical_values = ({"share": 0.01, "moves": (MixtureShift(shift_dn=-8),)},)
 
     @model_validator(mode="after")
     def _has_moves(self) -> Self:
         if not sum(move.weight for move in self.moves) > 0:
             raise ValueError("empirical: give at least one of moves a weight above 0")
-        if self.squares and (self.together != "sample" or self.moves != (Move(),)):
+        if self.squares and (self.together != "sample" or self.moves != (MixtureShift(),)):
             raise ValueError(
                 "empirical: squares come as their mean and are not moved: leave moves at one of nothing"
             )

@@ -97,7 +97,7 @@ class Samples:
 
     def theta(self, parameters: FloatArray) -> FloatArray:
         """Return own parameters (n, P) of (H, g, mu, sigma), (n J, 4); g, mu, sigma of the first sample."""
-        rows = _to_theta(parameters)
+        rows = to_theta(parameters)
         if self == Samples():
             return rows
         by_sample = rows.reshape(-1, self.n, 4)
@@ -161,7 +161,7 @@ class SharedProblem:
 
     def masses(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
         """Return the mass of every code, those left out included, shape (n, B)."""
-        own = _to_parameters(self.samples.rows(theta))
+        own = to_parameters(self.samples.rows(theta))
         codes = self.origin[:, None] + np.arange(self.counts.shape[1])
         return sample_mass(self.law(shared, own), list(own.T), codes, far_tails=False)
 
@@ -211,7 +211,7 @@ class SharedFit:
     @property
     def parameters(self) -> FloatArray:
         """(H, g, mu, sigma) of the rows, shape (n J, 4); e-, e-/DN, DN, DN."""
-        return _to_parameters(self.row_theta)
+        return to_parameters(self.row_theta)
 
     @property
     def row_variance(self) -> FloatArray:
@@ -223,13 +223,13 @@ class SharedFit:
         return np.asarray(found.reshape(-1, 4))
 
 
-def _to_parameters(theta: FloatArray) -> FloatArray:
+def to_parameters(theta: FloatArray) -> FloatArray:
     """Return (H, g, mu, sigma), shape (n, 4), of (log H, log 1/g, mu, log sigma_R^2)."""
     variance = np.exp(theta[:, 3]) + QUANTISATION_VARIANCE
     return np.stack([np.exp(theta[:, 0]), np.exp(-theta[:, 1]), theta[:, 2], np.sqrt(variance)], axis=1)
 
 
-def _to_theta(parameters: FloatArray) -> FloatArray:
+def to_theta(parameters: FloatArray) -> FloatArray:
     """Return (log H, log 1/g, mu, log sigma_R^2), shape (n, 4), of (H, g, mu, sigma)."""
     h, g, mu, sigma = parameters.T
     analog = np.maximum(sigma**2 - QUANTISATION_VARIANCE, 0.05 * sigma**2)
@@ -419,7 +419,7 @@ def _differences(
     """Return the derivatives of the log masses of the rows, own parameters first, shape (n, 4 + d, B)."""
     n, width = base.shape
     slopes = np.zeros((n, 4 + problem.n_shared, width))
-    own = _to_parameters(problem.samples.rows(theta))
+    own = to_parameters(problem.samples.rows(theta))
     mass, found = sample_slopes(problem.law(shared, own), list(own.T), problem.origin, width)
     found[:, 1] /= own[:, 1:2]  # of the logarithm of 1/g
     kept = problem.kept[:, None, :]

@@ -186,9 +186,9 @@ def test_the_right_one_of_three_is_named() -> None:
     noise = Noise(UNIT, 0.1)
     shifts = tuple(3.0 * prints["frame_noise"] + rng.normal(size=40) for _ in range(2))
     choice = choose(hypotheses, (shifts[0], shifts[1]), noise)
-    assert choice is not None
     assert choice.best.tags == {"frame_noise"}
-    assert choice.probability[0] > 0.99
+    others = [one for one in choice.tried if "frame_noise" not in one.tags]
+    assert all(one.score < choice.best.score - 5.0 for one in others)
 
 
 def test_two_at_once_are_both_named() -> None:
@@ -198,7 +198,6 @@ def test_two_at_once_are_both_named() -> None:
     mean = 3.0 * prints["row_noise"] + 2.0 * prints["exposure_drift"]
     shifts = tuple(mean + rng.normal(size=40) for _ in range(2))
     choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(UNIT, 0.05))
-    assert choice is not None
     assert choice.best.tags == {"row_noise", "exposure_drift"}
 
 
@@ -215,24 +214,11 @@ def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_senso
     assert [h.tag for h in hypotheses] == ["row_noise", "row_noise", "row_noise", "row_noise 2"]
     shifts = tuple(3.0 * left + 2.0 * right + rng.normal(size=40) for _ in range(2))
     choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(UNIT, 0.05))
-    assert choice is not None
     assert [h.effect.region for h in choice.best.hypotheses] == regions
     assert all(not meets_itself(one.hypotheses) for one in choice.tried)
     assert all("row_noise" in one.tags for one in choice.tried)  # none is a second one alone
     keys = {h.effect.key for h in choice.best.hypotheses}
     assert len(keys) == 2
-
-
-def test_twins_are_ambiguous() -> None:
-    rng = np.random.default_rng(17)
-    print_ = rng.normal(size=40)
-    twin = print_ + 0.02 * rng.normal(size=40)
-    hypotheses = [_hypothesis("row_noise", print_), _hypothesis("frame_noise", twin)]
-    shifts = tuple(3.0 * print_ + rng.normal(size=40) for _ in range(2))
-    choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(UNIT, 0.1))
-    assert choice is not None
-    assert {r.hypothesis.tag for r in choice.rivals[0]} == {"row_noise", "frame_noise"}
-    assert max(choice.probability) < 0.98
 
 
 def test_nothing_is_chosen_where_nothing_is() -> None:
@@ -394,7 +380,6 @@ def test_expected_codes_are_those_of_the_mixture_of_every_usable_pixel() -> None
     assert found is not None
     np.testing.assert_allclose(found, by_hand, rtol=1e-8, atol=1e-9)
     one = expected_codes(PixelMaps(h, g, mu, sigma, np.array([[True, False]])), [], codes, np.arange(300))
-    assert one is not None
     assert one.sum() == pytest.approx(300, rel=1e-6)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from pchem_pipeline.discrepancy import skeleton
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings
+from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -28,10 +29,12 @@ def state_of(before: float, after: float, pull: float, monkeypatch: pytest.Monke
     addition = Addition(effect, True, "", (), 0.01, gaps[0], gaps[1], (), None, ())
     monkeypatch.setattr(skeleton, "locate", lambda *_: [])
     monkeypatch.setattr(skeleton, "build_verdict", lambda found, *_, **__: found)
+    unused: Any = None
+    data = skeleton.Prepared(
+        DiscrepancySettings(), "frames", unused, unused, NULL, Measured(z, z, z), Effort(None), 1, {}
+    )
     by: Any = SimpleNamespace(
-        settings=DiscrepancySettings(), model=(), first=NULL, z=Measured(z, z, z), samples="frames",
-        most_rounds=1, evidence=None, examined=None, untestable={}, defects={}, n_replicates=60, spent=12.0,
-        gap=lambda _: gaps[0], doubt=lambda: "", suspects=lambda _: True, explain=lambda *_: True,
+        prepared=data, model=(), gap=lambda _: gaps[0], suspects=lambda _: True, explain=lambda *_: True,
         add=lambda *_: NULL, replaced=lambda _: None, unfinished=lambda *_: False,
         describe=lambda *_: None, probable=lambda: None, tolerance=lambda: 0.0,
         close=lambda *_: Added((addition,), gaps[1]), fitted=lambda _: None,

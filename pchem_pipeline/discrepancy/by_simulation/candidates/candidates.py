@@ -12,15 +12,22 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    FAR,
+    FAR_SHARE_OF_PART,
+    LARGEST_FACTOR,
     PRICE_OF_MORE,
+    STANDS_OUT,
     Hypothesis,
     Noise,
-    SetFit,
     fit_set,
     log_density,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Acquisition, Replicate
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import is_told, note_defect
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
+    identifiable_from_histograms,
+    note_defect,
+)
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import DampedSteps
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.compose import along_chain
@@ -37,12 +44,9 @@ MOST_HYPOTHESES = 6  # of one effect
 _MOST_IN_A_PART = 2
 # times as many hypotheses of all effects in all parts: each is a simulation, and most are in vain
 _MOST_IN_PARTS = 6
-_LEFT = 4.0  # deviations that the model leaves of a leading statistic for its effect to be asked for
 _REFINED = 12  # hypotheses of which the strength is refined by a second simulation
-# nats behind the best, and share of what that explains, from which on an effect is not worth more by itself
-_FAR, _FAR_SHARE = 40.0, 0.5
+_STEPS = 2  # that refine a strength
 _CLOSE = 0.15  # relative: a strength known so well is not simulated again
-_LARGEST_STEP = 30.0
 REPEATS = 3  # simulations of the hypotheses that sets are made of
 # standard deviations of what a single simulation may show by chance, below and above which it is nothing or
 # all of it; of the mean of several, in its own standard errors
@@ -168,10 +172,12 @@ class ReplicateSimulator:
                 continue
             try:
                 guessed = next(filter(None, (list(effect.estimate(e)) for e in (*known, *evidence))), [])
-                if not guessed and known and known[0].strongest(*effect.signature[:2]) > _LEFT:
+                if not guessed and known and known[0].strongest(*effect.signature[:2]) > STANDS_OUT:
                     guessed = list(effect.typical())
                 for each in guessed[:1]:
-                    is_told(each)  # it is asked of each later: a defect shows here, where it is noted
+                    identifiable_from_histograms(
+                        each
+                    )  # it is asked of each later: a defect shows here, where it is noted
                 found += [] if taken else [window.found(each) for each in guessed[:most]]
                 for part, own in parts:
                     clear = own.strongest(*effect.signature[:2])
@@ -250,7 +256,7 @@ class ReplicateSimulator:
         fits = [fit_set([h], shift, noise) for h in hypotheses]
         scores = np.array([fit.log_score(shift, noise) for fit in fits])
         order = np.argsort(-scores, kind="stable")
-        near = scores.max() - _FAR - _FAR_SHARE * (scores.max() - log_density(shift, noise.covariance))
+        near = scores.max() - FAR - FAR_SHARE_OF_PART * (scores.max() - log_density(shift, noise.covariance))
         best = hypotheses[int(order[0])]
 
         def promising(i: int) -> bool:
@@ -262,44 +268,26 @@ class ReplicateSimulator:
 
         chosen = [int(i) for i in order if fits[i].factors[0] > 0.0 and promising(int(i))][:_REFINED]
         free = [i for i in chosen if not any(hypotheses[i].effect is effect for effect in told)]
-        tuned = self.tuned([(hypotheses[i],) for i in free], shift, noise, steps=2, close=_CLOSE)
-        best_of = {i: hypotheses[i] for i in chosen} | {i: one for i, (one,) in zip(free, tuned, strict=True)}
+        tuned = self._tuned([hypotheses[i] for i in free], shift, noise)
+        best_of = {i: hypotheses[i] for i in chosen} | dict(zip(free, tuned, strict=True))
         sharp = {id(h.effect): h for h in self.fingerprints([h.effect for h in best_of.values()], REPEATS)}
         better = {i: sharp.get(id(one.effect), one) for i, one in best_of.items()}
         return [better.get(int(i), hypotheses[i]) for i in order]
 
-    def tuned(
-        self,
-        sets: Sequence[tuple[Hypothesis, ...]],
-        shift: FloatArray,
-        noise: Noise,
-        *,
-        steps: int,
-        close: float,
-        repeats: int = 1,
-    ) -> list[tuple[Hypothesis, ...]]:
-        """Tune the strengths within each set, by simulation; a step that predicts worse is halved.
+    def _tuned(self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[Hypothesis]:
+        """Tune the strength of each by simulation; a step that predicts worse is halved.
 
         Extrapolation alone is not enough: a line that drowns, or a clipped tail, is far from any power law.
-
-        Args:
-            sets: of hypotheses whose effects are in the data together.
-            shift: what they shall explain, shape (m,).
-            noise: of the shift.
-            steps: simulations of each hypothesis, at most.
-            close: relative change of a strength that is not worth a simulation.
-            repeats: simulations of each at each strength.
         """
-        states = [_Tuning(one, _as_simulated(one, shift, noise)) for one in sets]
-        for _ in range(steps):
-            proposals = [state.proposal(shift, noise, close) for state in states]
-            effects = [effect for proposal in proposals for effect in proposal]
-            simulated = {id(h.effect): h for h in self.fingerprints(effects, repeats)}
-            for state, proposal in zip(states, proposals, strict=True):
-                new = tuple(simulated[id(e)] for e in proposal if id(e) in simulated)
-                if new and len(new) == len(proposal):
-                    state.judge(new, _as_simulated(new, shift, noise))
-        return [state.best for state in states]
+        ways = [DampedSteps(h, _as_simulated(h, shift, noise)) for h in hypotheses]
+        for _ in range(_STEPS):
+            proposals = [_proposal(way, shift, noise) for way in ways]
+            effects = [effect for effect in proposals if effect is not None]
+            simulated = {id(h.effect): h for h in self.fingerprints(effects)}
+            for way, proposal in zip(ways, proposals, strict=True):
+                if (new := simulated.get(id(proposal))) is not None:
+                    way.judge(new, _as_simulated(new, shift, noise))
+        return [way.best for way in ways]
 
     def _replicate(self, effect: Effect | None, repeat: int) -> Replicate:
         effects = self.model if effect is None else along_chain(self.model, (effect,))
@@ -330,38 +318,17 @@ def _without_chance(shifts: FloatArray) -> FloatArray:
     return np.asarray(mean * weight)
 
 
-@dataclass
-class _Tuning:
-    """A set whose strengths are being tuned.
-
-    Attributes:
-        best: the set that predicts best so far, at simulated strengths.
-        score: its log score.
-        refused: steps from it that predicted worse.
-    """
-
-    best: tuple[Hypothesis, ...]
-    score: float
-    refused: int = 0
-
-    def proposal(self, shift: FloatArray, noise: Noise, close: float) -> tuple[Effect, ...]:
-        """Return the effects at the strengths to try next; none where they are what the data ask for."""
-        fit = fit_set(self.best, shift, noise)
-        if fit.settled(close) or not any(h.effect.strength for h in self.best):
-            return ()
-        factors = np.clip(fit.factors, 1.0 / _LARGEST_STEP, _LARGEST_STEP) ** (0.5**self.refused)
-        effects = tuple(h.rescaled(float(c)) for h, c in zip(self.best, factors, strict=True))
-        return () if all(e == h.effect for e, h in zip(effects, self.best, strict=True)) else effects
-
-    def judge(self, new: tuple[Hypothesis, ...], score: float) -> None:
-        """Keep the better one."""
-        if score > self.score:
-            self.best, self.score, self.refused = new, score, 0
-        else:
-            self.refused += 1
+def _proposal(way: DampedSteps[Hypothesis], shift: FloatArray, noise: Noise) -> Effect | None:
+    """Return the effect at the strength to try next; None where it is what the data ask for."""
+    fit = fit_set([way.best], shift, noise)
+    if fit.settled(_CLOSE):
+        return None
+    factor = np.clip(fit.factors[0], 1.0 / LARGEST_FACTOR, LARGEST_FACTOR) ** way.length
+    effect = way.best.rescaled(float(factor))
+    return None if effect == way.best.effect else effect
 
 
-def _as_simulated(hypotheses: tuple[Hypothesis, ...], shift: FloatArray, noise: Noise) -> float:
-    """Return the log score of a set at the very strengths that were simulated."""
-    n = len(hypotheses)
-    return SetFit(hypotheses, np.ones(n), np.zeros(n), np.zeros(n, np.bool_)).log_score(shift, noise)
+def _as_simulated(hypothesis: Hypothesis, shift: FloatArray, noise: Noise) -> float:
+    """Return the log score of an effect at the very strength that was simulated."""
+    part = hypothesis.fingerprint[None]
+    return log_density(shift - part[0], noise.of(part))

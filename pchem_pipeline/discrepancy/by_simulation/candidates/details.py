@@ -15,24 +15,37 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, log_density
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    STANDS_OUT,
+    Hypothesis,
+    log_density,
+)
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import is_told, note_defect
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, beyond_chance
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
+    identifiable_from_histograms,
+    note_defect,
+)
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import (
+    LARGEST_STEP,
+    SMALLEST_SECANT,
+    DampedSteps,
+    Refitted,
+    Refitter,
+    beyond_chance,
+    broyden,
+)
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
 
 FloatArray = NDArray[np.float64]
 
 _TRIAL = 0.25  # step of the logarithm of a number by which its slope is measured
-_SMALLEST = 0.05  # of such a step: shorter ones say nothing about the slope
 _MOST = 6  # numbers of a set
 _STEPS = 4
 _USUAL_ERROR = 0.5  # of the logarithm of a number as it is guessed
-_LARGEST_STEP, _LARGEST_OF_STRENGTH = np.log(2.0), np.log(4.0)
-_FARTHEST = np.log(4.0)  # from the guess: beyond, it is another hypothesis
+_LARGEST_STEP = LARGEST_STEP / 2.0  # of a number: it bends what an effect does, and a strength scales it
+_FARTHEST = LARGEST_STEP  # from the guess: beyond, it is another hypothesis
 _WORTHWHILE = 5.0  # nats that a step must promise
-_SEEN = 4.0  # deviations that a set leaves of a statistic
 _MOVED = 1.0  # by which an effect must move it for its numbers to matter there
 _ELSEWHERE = 0.5  # of the squares of what is left, the most where its effects move nothing
 
@@ -63,7 +76,7 @@ def may_be_tuned(refitter: Refitter, one: Refitted) -> bool:
     if not places:
         return False
     scatter = refitter.scatter(one.covariance, len(one.vectors))
-    left = np.where(np.abs(one.rest) > _SEEN, one.rest**2, 0.0)
+    left = np.where(np.abs(one.rest) > STANDS_OUT, one.rest**2, 0.0)
     moved = np.abs(one.parts[places]).max(axis=0) > _MOVED * scatter
     return bool(left.sum() > 0.0 and left[~moved].sum() < _ELSEWHERE * left.sum())
 
@@ -74,32 +87,29 @@ def tuned(refitter: Refitter, one: Refitted) -> Refitted:
     Raises:
         EffortSpentError: the work is at its limit, and nothing was tuned.
     """
-    words = " + ".join(h.tag for h in one.hypotheses)
     measured = [_measured(refitter, one, place, name) for place, name in _numbers(refitter, one.hypotheses)]
     details = [detail for detail in measured if detail is not None]
     if not details:
         return one
-    best, length = one, 1.0
+    way = DampedSteps(one, one.score)
     for _ in range(_STEPS):
+        best = way.best
         step, promise = _correction(refitter, best, details)
-        moved, taken = _moved(best, one, details, length * step)
-        if promise - best.score < _WORTHWHILE or np.abs(taken).max() < _SMALLEST:
+        moved, taken = _moved(best, one, details, way.length * step)
+        if promise - best.score < _WORTHWHILE or np.abs(taken).max() < SMALLEST_SECANT:
             break
         try:
-            refitter.allow(words)
+            refitter.allow(one.words)
             now = refitter.simulated(moved, None, len(best.vectors))
         except NotFittedError:  # a step too far
-            length *= 0.5
+            way.judge(None)
             continue
         except EffortSpentError:
-            return best
+            break
         # a step in vain tells how the statistics go, too
         details = _secant(best, now, details, taken)
-        if now.score > best.score:
-            best, length = replace(now, tuned=True), 1.0
-        else:
-            length *= 0.5
-    return best
+        way.judge(replace(now, tuned=True), now.score)
+    return way.best
 
 
 def _numbers(refitter: Refitter, hypotheses: Sequence[Hypothesis]) -> list[tuple[int, str]]:
@@ -111,7 +121,9 @@ def _numbers(refitter: Refitter, hypotheses: Sequence[Hypothesis]) -> list[tuple
     for place, h in enumerate(hypotheses):
         # whatever a stranger's effect raises must not stop the others
         try:
-            tuned = h.effect.details() if h.effect.strength and not is_told(h.effect) else ()
+            tuned = (
+                h.effect.details() if h.effect.strength and not identifiable_from_histograms(h.effect) else ()
+            )
             named = [(name, getattr(h.effect, name)) for name in tuned]
         except Exception as error:
             note_defect(refitter.defects, h.tag, error)
@@ -126,17 +138,11 @@ def _measured(refitter: Refitter, one: Refitted, place: int, name: str) -> _Deta
         effects = list(one.effects)
         effects[place] = effects[place].times(name, float(np.exp(ahead)))
         step = _logarithm(one.effects[place], effects[place], name)
-        if abs(step) < _SMALLEST:
+        if abs(step) < SMALLEST_SECANT:
             continue
-        refitter.allow(" + ".join(h.tag for h in one.hypotheses))
-        try:
-            _, vectors = refitter.draw(tuple(effects), len(one.vectors))
-        except NotFittedError:
-            continue
-        apart = (vectors - one.vectors) / step
-        error = apart.std(axis=0, ddof=1) / np.sqrt(len(apart))
-        slope = beyond_chance(apart.mean(axis=0), error)
-        return _Detail(place, name, slope) if slope.any() else None
+        slope = refitter.measured_slope(one, tuple(effects), step)
+        if slope is not None:
+            return _Detail(place, name, slope) if slope.any() else None
     return None
 
 
@@ -151,7 +157,7 @@ def _correction(refitter: Refitter, one: Refitted, details: Sequence[_Detail]) -
     scaling = [bool(h.effect.strength) for h in one.hypotheses]
     damping = np.where(np.arange(len(slopes)) < n, 1e-6, _USUAL_ERROR**-2.0)
     step = np.linalg.solve(design.T @ design + np.diag(damping), design.T @ left)
-    step[:n] = np.where(scaling, np.clip(step[:n], -_LARGEST_OF_STRENGTH, _LARGEST_OF_STRENGTH), 0.0)
+    step[:n] = np.where(scaling, np.clip(step[:n], -LARGEST_STEP, LARGEST_STEP), 0.0)
     step[n:] = np.clip(step[n:], -_LARGEST_STEP, _LARGEST_STEP)
     return step, log_density(residual - step @ slopes, noise.of(one.parts))
 
@@ -181,11 +187,8 @@ def _secant(before: Refitted, after: Refitted, details: Sequence[_Detail], step:
     difference = after.vectors - before.vectors
     error = difference.std(axis=0, ddof=1) / np.sqrt(len(difference))
     unforeseen = beyond_chance(difference.mean(axis=0) - step @ slopes, error)
-    shares = step[len(before.hypotheses) :] / float(step @ step)
-    return [
-        replace(detail, slope=detail.slope + share * unforeseen)
-        for detail, share in zip(details, shares, strict=True)
-    ]
+    new = broyden(slopes, step, unforeseen)[len(before.hypotheses) :]
+    return [replace(detail, slope=slope) for detail, slope in zip(details, new, strict=True)]
 
 
 def _logarithm(one: Effect, other: Effect, name: str) -> float:

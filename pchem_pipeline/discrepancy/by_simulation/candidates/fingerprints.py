@@ -5,15 +5,13 @@ science attributes warming (Hasselmann 1997; Allen and Tett 1999): ``y = sum_e c
 >= 0``. The noise has the covariance of the null replicates, and a relative error of each fingerprint on top,
 since the details of a real effect are never those of the library.
 
-Every set of up to three candidates is fitted on one split and scored on the other, both ways round. The
-scores, less a price for every effect, give each set a probability; an effect is named where the sets that
-hold it have nearly all of it, and what could as well stand in its place is listed with it where not.
+Every set of up to three candidates is fitted on one split and scored on the other, both ways round; the
+scores, less a price for every effect, say which sets are worth a refit of the pixels.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -35,11 +33,19 @@ _LARGEST_SET = 3
 _SHORTLIST = 9
 _SMALLEST_FACTOR = 2.0  # standard errors: less of an effect is none
 _SEEN = 3.5  # standard deviations by which some statistic must ask for an effect among others
-_MOVED = 2.0  # standard deviations by which the effect itself must move it
+#: Standard deviations by which the effect itself must move it.
+MOVED = 2.0
+#: Deviations that a model leaves of a statistic for it to stand out.
+STANDS_OUT = 4.0
+#: Nats behind from which on a fingerprint is no rival of a right set, and share of what there is to explain,
+#: in addition, for a set that leaves something.
+FAR, FAR_SHARE_OF_PART = 40.0, 0.5
+#: Factor of a fingerprint beyond which it says nothing, and is another hypothesis.
+LARGEST_FACTOR = 30.0
 _BLUR = 2.0  # model errors of the others that are added to chance there
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Hypothesis:
     """An effect with parameters, and what it would do to the statistics.
 
@@ -126,12 +132,6 @@ class SetFit:
         """Return the Gaussian log density of a shift of statistics, up to a constant, nats."""
         parts = self.parts
         return log_density(shift - parts.sum(axis=0), noise.of(parts))
-
-    def distance(self, other: SetFit, noise: Noise) -> float:
-        """Return how far the predictions of two sets lie apart, in standard deviations of the statistics."""
-        mine, theirs = self.parts, other.parts
-        covariance = noise.of(np.concatenate([mine, theirs]) / np.sqrt(2.0))
-        return float(np.linalg.norm(covariance.white(mine.sum(axis=0) - theirs.sum(axis=0))))
 
 
 def correction(
@@ -233,59 +233,27 @@ class ScoredSet:
         return tuple(h.times(float(c)) for h, c in zip(self.hypotheses, factors, strict=True))
 
     @property
-    def worth(self) -> float:
+    def penalised_log_likelihood(self) -> float:
         """Score less the price of its effects, nats."""
         return self.score - _PRICE - PRICE_OF_MORE * (len(self.hypotheses) - 1)
 
 
 @dataclass(frozen=True)
-class Contender:
-    """An effect that could stand in the place of a chosen one.
-
-    Attributes:
-        hypothesis: of the rival.
-        score: log score of the best set with it in that place, relative to the chosen set, nats.
-        stderr: of that score: how far the two predictions lie apart, nats.
-        probability: of such sets among all.
-    """
-
-    hypothesis: Hypothesis
-    score: float
-    stderr: float
-    probability: float
-
-
-@dataclass(frozen=True)
 class Choice:
-    """What the comparison came to.
+    """How sets of effects compare by their fingerprints.
 
     Attributes:
-        best: the likeliest set.
-        rivals: for each of its effects, who could stand in its place, itself first.
-        probability: of each of its effects.
-        tried: all sets, the likeliest first.
-        advantage: held-out log score of the best set over no effect at all, less its price, nats.
+        tried: all that improve on no effect at all, the best first.
+        advantage: held-out log score of the best one over no effect, less its price, nats.
     """
 
-    best: ScoredSet
-    rivals: tuple[tuple[Contender, ...], ...]
-    probability: tuple[float, ...]
     tried: tuple[ScoredSet, ...]
     advantage: float
 
-    def present(self, certainty: float) -> tuple[Hypothesis, ...]:
-        """Return the effects of the best set in whose place there is something, with that probability."""
-        kept = tuple(
-            hypothesis
-            for hypothesis, rivals in zip(self.best.hypotheses, self.rivals, strict=True)
-            if sum(rival.probability for rival in rivals) >= certainty
-        )
-        return kept or self.best.hypotheses[:1]
-
-    def rivals_of(self, tag: str) -> tuple[Contender, ...]:
-        """Return who could stand in the place of an effect of the best set."""
-        tags = [h.tag for h in self.best.hypotheses]
-        return self.rivals[tags.index(tag)]
+    @property
+    def best(self) -> ScoredSet:
+        """The best set."""
+        return self.tried[0]
 
 
 def score_set(
@@ -348,64 +316,21 @@ def choose(
         shifts: measured statistics minus null mean of the two splits, shape (m,) each.
         noise: covariance of a shift.
     """
-    shortlist, alone = _shortlist(hypotheses, shifts, noise), firsts(hypotheses)
+    shortlist, alone = _shortlist(hypotheses, shifts, noise), set(firsts(hypotheses))
     sets = []
     for size in range(1, _LARGEST_SET + 1):
         for members in itertools.combinations(shortlist, size):
             once = len({h.tag for h in members}) == size and not meets_itself(members)
-            led = all(any(h is one for one in alone) for h in firsts(members))
-            if once and led and not share_place(h.effect for h in members):
+            if once and alone.issuperset(firsts(members)) and not share_place(h.effect for h in members):
                 scored = score_set(members, shifts, noise)
                 if _all_needed(scored, shifts, noise):
                     sets.append(scored)
     base = sum(log_density(shift, noise.covariance) for shift in shifts)
-    sets = [s for s in sets if s.worth > base]
+    sets = [s for s in sets if s.penalised_log_likelihood > base]
     if not sets:
         return None
-    sets.sort(key=lambda s: s.worth, reverse=True)
-    weights = np.exp([s.worth - sets[0].worth for s in sets])
-    weights /= weights.sum() + np.exp(base - sets[0].worth)
-    best = sets[0]
-    rivals, probabilities = [], []
-    for hypothesis in best.hypotheses:
-        others = best.tags - {hypothesis.tag}
-        probabilities.append(
-            float(sum(w for s, w in zip(sets, weights, strict=True) if hypothesis.tag in s.tags))
-        )
-        rivals.append(_rivals(hypothesis, others, best, sets, weights, noise))
-    return Choice(best, tuple(rivals), tuple(probabilities), tuple(sets), best.worth - base)
-
-
-def _rivals(
-    hypothesis: Hypothesis,
-    others: frozenset[str],
-    best: ScoredSet,
-    sets: Sequence[ScoredSet],
-    weights: FloatArray,
-    noise: Noise,
-) -> tuple[Contender, ...]:
-    """Return what could stand in the place of a hypothesis of the best set, by probability."""
-    found: dict[str, Contender] = {}
-    for scored, weight in zip(sets, weights, strict=True):
-        new = scored.tags - others
-        if not new or (not others <= scored.tags and len(new) > len(best.tags)):
-            continue
-        for candidate in scored.hypotheses:
-            if candidate.tag not in new:
-                continue
-            if hypothesis.tag in new and candidate.tag != hypothesis.tag:
-                continue  # it joins the chosen one, it does not replace it
-            if candidate.tag in found:
-                old = found[candidate.tag]
-                found[candidate.tag] = Contender(
-                    old.hypothesis, old.score, old.stderr, old.probability + float(weight)
-                )
-            else:
-                apart = math.hypot(
-                    *(a.distance(b, noise) for a, b in zip(best.fits, scored.fits, strict=True))
-                )
-                found[candidate.tag] = Contender(candidate, scored.worth - best.worth, apart, float(weight))
-    return tuple(sorted(found.values(), key=lambda r: (-r.probability, -r.score)))
+    sets.sort(key=lambda s: s.penalised_log_likelihood, reverse=True)
+    return Choice(tuple(sets), sets[0].penalised_log_likelihood - base)
 
 
 def _shortlist(
@@ -418,7 +343,7 @@ def _shortlist(
     def take(count: int, others: Sequence[Hypothesis]) -> None:
         scored = []
         for hypothesis in alone:
-            if any(hypothesis is h for h in chosen) or hypothesis.tag in {h.tag for h in others}:
+            if hypothesis in chosen or hypothesis.tag in {h.tag for h in others}:
                 continue
             scored.append((score_set([*others, hypothesis], shifts, noise).score, hypothesis))
         scored.sort(key=lambda pair: pair[0], reverse=True)
@@ -437,7 +362,7 @@ def _shortlist(
             take(_SHORTLIST - len(chosen), (best, second))
     # an effect that does well in one region may do so in others at once
     kept = {h.effect.tag for h in chosen if h.effect.region is not None}
-    return chosen + [h for h in hypotheses if h.effect.tag in kept and not any(h is one for one in alone)]
+    return chosen + [h for h in hypotheses if h.effect.tag in kept and h not in alone]
 
 
 def _all_needed(scored: ScoredSet, shifts: tuple[FloatArray, FloatArray], noise: Noise) -> bool:
@@ -473,4 +398,4 @@ def seen_among(part: FloatArray, others: FloatArray, shift: FloatArray, noise: N
     blur = _BLUR * tolerance(others, noise.model_error, noise.events)
     scale = np.sqrt(noise.covariance.variances + blur**2)
     left, own = (shift - others.sum(axis=0)) / scale, part / scale
-    return bool(np.any((np.abs(left) > _SEEN) & (np.abs(own) > _MOVED) & (left * own > 0.0)))
+    return bool(np.any((np.abs(left) > _SEEN) & (np.abs(own) > MOVED) & (left * own > 0.0)))

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.candidates.by_histograms import Histograms
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import (
     MOST_HYPOTHESES,
     ReplicateSimulator,
@@ -23,8 +22,8 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import expected_codes
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Histograms
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
@@ -84,20 +83,19 @@ class Screening:
             self.observed.frames.effects(model),
             self.work.effort,
             self.observed.frames.samples_of,
-            simulator.defects,
+            self.defects,
         )
         guesses = histograms.with_numbers(self._guesses(simulator, model, null, evidence, MOST_HYPOTHESES))
         parts = self.observed.frames.parts
         suggested = self._apart(model, histograms.suggested(self.classes, parts, guesses))
         guesses += suggested
-        hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses, simulator)])
+        hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses)])
         shift = self.z.both - null.mean
         noise = noise_of_splits(null, 2, self.model_error)
         hypotheses = simulator.refined(hypotheses, shift, noise, histograms.told)
         # what they do to pixels that are led astray says little about them: others do not go before them
         hypotheses.sort(key=lambda h: all(h.effect is not each for each in suggested))
         hypotheses += seconds(hypotheses)
-        self.defects.update(simulator.defects)
         return tuple(hypotheses), self._compared(hypotheses, null)
 
     def beside(
@@ -113,17 +111,14 @@ class Screening:
         """
         simulator = self._simulator(model, null, number, "/".join([str(number), *(e.tag for e in model)]))
         guesses = self._guesses(simulator, model, null, (), _MOST_BESIDE)
-        hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses, simulator)])
-        self.defects.update(simulator.defects)
+        hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses)])
         return self._compared(hypotheses, null, _DOUBT * slopes)
 
-    def _placebo(
-        self, model: tuple[Effect, ...], guesses: Sequence[Effect], simulator: ReplicateSimulator
-    ) -> list[Effect]:
+    def _placebo(self, model: tuple[Effect, ...], guesses: Sequence[Effect]) -> list[Effect]:
         """Return an effect that the model does not have and for which nothing speaks."""
         have = {effect.tag for effect in model}
         others = {tag: kind for tag, kind in self.classes.items() if tag not in have}
-        return placebo_for(guesses, others, simulator.defects)
+        return placebo_for(guesses, others, self.defects)
 
     def _compared(
         self, hypotheses: Sequence[Hypothesis], null: NullModel, doubt: FloatArray | None = None
@@ -146,7 +141,7 @@ class Screening:
             self.work.counted,
             f"r{number}",
             self.work.seed_of(f"fingerprint/{purpose}"),
-            dict(self.defects),
+            self.defects,
         )
 
     def _guesses(
@@ -175,9 +170,8 @@ class Screening:
         """
         if not model:
             return None
-        frames, plain, fit = self.observed.frames, self.observed.plain, self.work.mapped(model).fit
-        codes = plain.code.first + np.arange(plain.code.observed.size)
-        expected = expected_codes(fit.maps, frames.effects(model), codes, frames.seen_numbers, fit.added)
+        plain = self.observed.plain
+        expected = self.work.expected(model, plain, self.observed.frames.seen_numbers)
         code = plain.code if expected is None else replace(plain.code, expected=expected)
         left = dict(zip(null.names, null.pulls(self.z.both, 2).tolist(), strict=True))
         return replace(plain, code=code, z=left)

@@ -13,22 +13,24 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.measured.modes import codes_within_reach, score_tables
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
-from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.by_simulation.measured.modes import CodeScores
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
+    Distance,
+    Measurement,
+    PartSamples,
+    frames_apart,
+)
 from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons, Fate
 from pchem_pipeline.effects.estimators.count_scores import charlier_information
-from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-Place = tuple[int, int, int]
 
-_PLACES: tuple[Place, ...] = ((1, 0, 0), (2, 0, 0), (3, 0, 0), (0, 0, 1), (0, 1, 0))
-_OWN: Place = (0, 0, 0)
-_NEXT: Place = (1, 0, 0)
+_PLACES: tuple[Distance, ...] = ((1, 0, 0), (2, 0, 0), (3, 0, 0), (0, 0, 1), (0, 1, 0))
+_OWN: Distance = (0, 0, 0)
+_NEXT: Distance = (1, 0, 0)
 _CLEAR = 5.0  # standard errors of a chance
 _FEWEST = 1000  # products
 _ALIKE = 2.0  # factor within which the chances are that electrons go, and that they come elsewhere
@@ -65,42 +67,26 @@ class Electrons(NamedTuple):
     """
 
     excess: Chances
-    together: dict[Place, Chances]
+    together: dict[Distance, Chances]
 
 
-def electron_chances(
-    frames: NDArray[np.unsignedinteger],
-    numbers: IntArray,
-    laws: PixelLaws,
-    maps: PixelMaps,
-    evidence: Evidence,
-    inside: BoolArray,
-) -> Electrons:
-    """Measure how electron numbers vary and go together.
-
-    Args:
-        frames: (frame, y, x), DN.
-        numbers: of the frames in the run, increasing, shape (frame,).
-        laws: of the pixels' samples in these frames.
-        maps: plain fit of these frames.
-        evidence: of the frames of the data, which says how well their electrons are told.
-        inside: pixels that are looked at, shape (y, x).
-    """
-    inside = inside & maps.usable & evidence.maps.usable & (maps.quanta_exposure > 0)
+def electron_chances(samples: PartSamples) -> Electrons:
+    """Measure how electron numbers vary and go together."""
+    maps, evidence = samples.maps, samples.evidence
+    inside = samples.inside & maps.usable & evidence.maps.usable & (maps.quanta_exposure > 0)
     if not inside.any():
         return Electrons(_NOTHING, {})
-    samples = Samples.by_laws(Stack(frames), laws, maps).without(~inside)
-    u = np.concatenate([chunk for (chunk,) in samples.chunks((0,))])
+    u = samples.scores(0, inside)
     # what a whole frame shares is another thing
     u -= np.where(inside, u.sum(axis=(1, 2), keepdims=True) / inside.sum(), 0.0)
     exposure = np.where(inside, maps.quanta_exposure, 1.0)
     spread = np.where(inside, evidence.charge_std, 0.0)
-    together = {place: _together(u, numbers, exposure, spread, place) for place in _PLACES}
-    return Electrons(_excess(frames, maps, inside), together)
+    together = {place: _together(u, samples.numbers, exposure, spread, place) for place in _PLACES}
+    return Electrons(_excess(samples.frames, maps, inside), together)
 
 
 def _together(
-    u: NDArray[np.float32], numbers: IntArray, exposure: FloatArray, spread: FloatArray, place: Place
+    u: NDArray[np.float32], numbers: IntArray, exposure: FloatArray, spread: FloatArray, place: Distance
 ) -> Chances:
     """Return how electrons go with those at a place, per electron and per pair of them.
 
@@ -111,13 +97,12 @@ def _together(
         spread: standard deviation of the expected electrons, 0 where not known, e-, shape (y, x).
         place: frames later, rows and columns.
     """
-    later = np.searchsorted(numbers, numbers + place[0]).clip(max=numbers.size - 1)
-    first = np.flatnonzero(numbers[later] == numbers + place[0])
+    first, later = frames_apart(numbers, place[0])
     ny, nx = exposure.shape
     here = slice(0, ny - place[1]), slice(0, nx - place[2])
     there = slice(place[1], ny), slice(place[2], nx)
     one, two = u[(slice(None), *here)], u[(slice(None), *there)]
-    products = sum(np.einsum("yx,yx->yx", one[a], two[b]) for a, b in zip(first, later[first], strict=True))
+    products = sum(np.einsum("yx,yx->yx", one[a], two[b]) for a, b in zip(first, later, strict=True))
     # what one further electron there, for each that is here, does to that product
     for_each = spread[here] * spread[there] / exposure[there]
     known = for_each > 0.0
@@ -130,11 +115,7 @@ def _together(
 def _excess(frames: NDArray[np.unsignedinteger], maps: PixelMaps, inside: BoolArray) -> Chances:
     """Return the excess of the variance over Poisson, per electron and per pair of them."""
     pixels = np.flatnonzero(inside.ravel())
-    own = frames.reshape(len(frames), -1)[:, pixels]
-    first = own.min(axis=0).astype(np.int64)
-    length = codes_within_reach(maps, pixels, first, own.max(axis=0))
-    table = score_tables(maps, pixels, first, length)[-1]
-    score = table[np.arange(pixels.size), np.minimum(own - first, length - 1)].sum(axis=0)
+    score = CodeScores.of(frames, maps, pixels).of_samples(-1).sum(axis=0)
     exposure, gain, _, sigma = (values.ravel()[pixels] for values in maps.maps)
     number = len(frames) * charlier_information(exposure, gain * sigma)
     # of further electrons Var K = H + 2 c H, of pairs H + 2 c H^2
@@ -163,9 +144,9 @@ def measured_electrons(data: Electrons, model: Electrons) -> Measurement | None:
     each, _ = following.get(_NEXT, _NOTHING)
     chain = each.value if each.clear > _CLEAR else 0.0
     more, of_pairs = _without_chain(*_beyond(data.excess, model.excess), chain)
-    found: list[tuple[Fate, Place, float]] = []
+    found: list[tuple[Fate, Distance, float]] = []
     # what makes electrons come in company: others that follow them, or samples without any
-    ways: list[tuple[float, tuple[Fate, Place, float]]] = []
+    ways: list[tuple[float, tuple[Fate, Distance, float]]] = []
     if more.clear > _CLEAR:
         ways.append((more.clear, ("followed", _OWN, more.value)))
     if of_pairs.clear > _CLEAR:
@@ -202,7 +183,7 @@ def _without_chain(more: Chance, of_pairs: Chance, chain: float) -> Chances:
     return more._replace(value=more.value - made), of_pairs._replace(value=of_pairs.value * left)
 
 
-def _effect(events: Sequence[tuple[Fate, Place, float]]) -> EmpiricalElectrons:
+def _effect(events: Sequence[tuple[Fate, Distance, float]]) -> EmpiricalElectrons:
     """Return the effect of events: what happens, where, and the chance."""
     chance = max(value for _, _, value in events)
     modes = tuple(

@@ -16,7 +16,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement, shares_of
+from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import share_of
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
+    FARTHEST,
+    Measurement,
+    PartSamples,
+    frames_apart,
+)
 from pchem_pipeline.effects.analog.empirical_noise import (
     Changed,
     Cycles,
@@ -40,7 +46,6 @@ _NEARLY = 0.5  # of the nats of the clearest change: another one may be it as we
 _OF_GAUSSIAN, _BURST = 0.3, 10.0
 _REACH = 20.0  # widths of the highest peak from it, up to where scores are told apart
 _CHUNK = 256  # frames at once
-_FARTHEST = 3  # frames
 _MOST_BLOCKS, _SMALLEST_BLOCK = 8, 4  # along an axis; px
 _UNEVEN = 5.0  # standard errors of its power by which a shape must be clearer than the same everywhere
 _OF_ERROR = 2.0  # standard errors: blocks of less have none
@@ -50,7 +55,8 @@ _BETWEEN = (0.7, 0.8, 0.9, 1.1, 1.2, 1.35)  # of the likeliest of them
 _MOST_IN_BURSTS = 0.3
 _WAVES: tuple[Changed, ...] = ("gain", "light")  # one of the offset is periodic pickup
 _SAME_PHASE = 0.25  # cycles from end to end, below which all lines of a frame share a wave
-_MADE = 0.5  # of the amplitude of a wave, from which on a model that makes one makes this
+#: Of the amplitude of a wave, from which on a model that makes one makes this.
+MADE = 0.5
 _MOST_OF_POWER = 0.5  # of the power of a change, for it to be a wave
 
 
@@ -81,35 +87,24 @@ class Sums(NamedTuple):
         return len(self.sums) * int(np.count_nonzero(self.information))
 
 
-def common_scores(
-    frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps, inside: BoolArray
-) -> dict[tuple[Shared, Changed], Sums]:
-    """Sum the scores of the samples over frames, rows and columns, for each kind of change.
-
-    Args:
-        frames: (frame, y, x), DN.
-        numbers: of the frames in the run, increasing, shape (frame,).
-        maps: parameters of the pixels.
-        inside: pixels that are looked at, shape (y, x).
-    """
-    inside = inside & maps.usable
+def common_scores(samples: PartSamples) -> dict[tuple[Shared, Changed], Sums]:
+    """Sum the scores of the samples over frames, rows and columns, for each kind of change."""
+    inside, numbers = samples.inside & samples.maps.usable, samples.numbers
     found: dict[tuple[Shared, Changed], Sums] = {}
     pixels = np.flatnonzero(inside.ravel())
     if not pixels.size:
         return found
-    flat = frames.reshape(len(frames), -1)
-    first = flat.min(axis=0)[pixels].astype(np.int64)
-    length = codes_within_reach(maps, pixels, first, flat.max(axis=0)[pixels])
-    for changed, table in zip(_CHANGED, score_tables(maps, pixels, first, length), strict=False):
+    scores, n = CodeScores.of(samples.frames, samples.maps, pixels), len(samples.frames)
+    for kind, changed in enumerate(_CHANGED):
         gathered: list[tuple[FloatArray, ...]] = []
         mean, square = np.zeros(inside.shape), np.zeros(inside.shape)
-        for begin in range(0, len(flat), _CHUNK):
-            u = np.zeros((len(flat[begin : begin + _CHUNK]), *inside.shape))
-            codes = np.minimum(flat[begin : begin + _CHUNK, pixels] - first, length - 1)
-            u[:, inside] = table[np.arange(pixels.size), codes]
+        for begin in range(0, n, _CHUNK):
+            some = slice(begin, min(begin + _CHUNK, n))
+            u = np.zeros((some.stop - begin, *inside.shape))
+            u[:, inside] = scores.of_samples(kind, some)
             gathered.append((u.sum(axis=(1, 2))[:, None], u.sum(axis=2), u.sum(axis=1), _in_blocks(u)))
-            mean += u.sum(axis=0) / len(flat)
-            square += np.einsum("tyx,tyx->yx", u, u) / len(flat)
+            mean += u.sum(axis=0) / n
+            square += np.einsum("tyx,tyx->yx", u, u) / n
         power = np.maximum(square - mean**2, 0.0)
         frame, row, column, block = (np.concatenate(parts) for parts in zip(*gathered, strict=True))
         blocks = block - _in_blocks(mean[None]), _in_blocks(power[None])[0]
@@ -117,6 +112,34 @@ def common_scores(
         found["row", changed] = Sums(row - mean.sum(axis=1), power.sum(axis=1), numbers)
         found["column", changed] = Sums(column - mean.sum(axis=0), power.sum(axis=0), numbers)
     return found
+
+
+class CodeScores(NamedTuple):
+    """Scores of the samples of some pixels for changes of their law, by tables of their codes.
+
+    Attributes:
+        codes: of the samples, (frame, n), DN.
+        first: lowest code of each pixel, (n,).
+        tables: see `score_tables`, shape (5, n, c).
+    """
+
+    codes: NDArray[np.unsignedinteger]
+    first: IntArray
+    tables: FloatArray
+
+    @classmethod
+    def of(cls, frames: NDArray[np.unsignedinteger], maps: PixelMaps, pixels: IntArray) -> CodeScores:
+        """Return those of pixels of frames (frame, y, x) under their parameters; ``pixels`` are positions."""
+        codes = frames.reshape(len(frames), -1)[:, pixels]
+        first = codes.min(axis=0).astype(np.int64)
+        length = codes_within_reach(maps, pixels, first, codes.max(axis=0))
+        return cls(codes, first, score_tables(maps, pixels, first, length))
+
+    def of_samples(self, kind: int, some: slice = slice(None)) -> FloatArray:
+        """Return the scores of samples of some frames for a kind of change, (frame, n)."""
+        table = self.tables[kind]
+        codes = np.minimum(self.codes[some] - self.first, table.shape[1] - 1)
+        return np.asarray(table[np.arange(self.first.size), codes])
 
 
 def _in_blocks(values: FloatArray) -> FloatArray:
@@ -310,7 +333,7 @@ def _line(one: Sums, power: float, model: Sums) -> Line | None:
     if line is None or (one.information.size > 1 and abs(line.along) * known < _SAME_PHASE):
         return None
     made = _highest_line(model)
-    if made is not None and made.amplitude > _MADE * line.amplitude:
+    if made is not None and made.amplitude > MADE * line.amplitude:
         return None
     return line if 0.5 * line.amplitude**2 > _MOST_OF_POWER * power else None
 
@@ -327,12 +350,11 @@ def _correlation(one: Sums, power: float) -> tuple[tuple[Lag, ...], tuple[float,
     scaled = one.sums / np.maximum(one.information, np.finfo(np.float64).tiny)
     lags: list[Lag] = []
     found: list[float] = []
-    for step in range(1, _FARTHEST + 1):
-        later = np.searchsorted(one.numbers, one.numbers + step).clip(max=len(scaled) - 1)
-        first = np.flatnonzero(one.numbers[later] == one.numbers + step)
+    for step in range(1, FARTHEST + 1):
+        first, later = frames_apart(one.numbers, step)
         if not first.size:
             continue
-        products = (scaled[first] * scaled[later[first]])[:, one.information > 0.0]
+        products = (scaled[first] * scaled[later])[:, one.information > 0.0]
         value, error = float(products.mean()), float(products.std() / np.sqrt(products.size))
         if abs(value) > _CERTAIN * error:
             lags.append((step, 0, 0))
@@ -356,9 +378,9 @@ def _bursts(one: Sums, gaussian: float) -> tuple[float | None, float]:
 
     def try_sizes(sizes: Iterable[float]) -> None:
         for size in sizes:
-            shares, gain = shares_of((size * sums - 0.5 * size**2 * information)[None])
-            if shares[0] < _MOST_IN_BURSTS:
-                found.append((gain, float(shares[0]), size))
+            share, gain = share_of(size * sums - 0.5 * size**2 * information)
+            if share < _MOST_IN_BURSTS:
+                found.append((gain, share, size))
 
     try_sizes(sign * size for sign in (1.0, -1.0) for size in _SIZES)
     if found:

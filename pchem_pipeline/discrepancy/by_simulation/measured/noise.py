@@ -4,7 +4,8 @@ The readout residuals of pairs of samples are multiplied, and their mean product
 near samples, of samples far apart in one row, far apart in one column, and far apart in both. What the model
 makes of such pairs is measured in frames simulated with it, and taken off. What is left beyond chance is the
 covariance of a Gaussian noise. Its variance is known where whole rows, columns or frames share it; that of
-single samples is read noise as well, so there it is the least with which the others are a covariance.
+single samples is read noise as well, so there it is the least with which the others are a covariance. An
+offset may also run as a wave across rows, columns and frames.
 """
 
 from __future__ import annotations
@@ -16,12 +17,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
-from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
-from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, Lag, NoiseMode, Shared, spectrum
+from pchem_pipeline.discrepancy.by_simulation.measured.modes import MADE
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
+    CERTAIN,
+    FARTHEST,
+    Measurement,
+    PartSamples,
+    frames_apart,
+)
+from pchem_pipeline.discrepancy.observe.waves import Waves, waves_across
+from pchem_pipeline.effects.analog.empirical_noise import (
+    EmpiricalNoise,
+    Lag,
+    NoiseMode,
+    Shared,
+    root_mean_square,
+    spectrum,
+)
 from pchem_pipeline.effects.estimators.common_modes import mean_response
-from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.evidence import Evidence
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -29,10 +43,8 @@ BoolArray = NDArray[np.bool_]
 
 _SHARED: tuple[Shared, ...] = ("frame", "row", "column", "sample")
 _LINES: tuple[Shared, ...] = ("row", "column")
-_FARTHEST = 3  # frames, rows and columns
 _GROUPS = 60  # of frames, whose scatter tells the error
 _CLEAR = 4.0  # standard errors that a covariance must have; a fit to all statistics comes behind
-_CERTAIN = 3.0  # of a model's, in simulated frames: less is taken for none
 _MOST_LAGS = 64
 # of the variance of single samples, over the least: a spectrum that vanishes needs a long moving average
 _OVER_LEAST = 1.15
@@ -69,38 +81,24 @@ class Covariances(NamedTuple):
     lines: Mapping[Shared, Line]
 
 
-def residual_covariances(
-    frames: NDArray[np.unsignedinteger],
-    numbers: IntArray,
-    laws: PixelLaws,
-    maps: PixelMaps,
-    inside: BoolArray,
-) -> Covariances:
-    """Measure how the readout residuals of near and far samples vary together.
-
-    Args:
-        frames: (frame, y, x), DN.
-        numbers: of the frames in the run, increasing, shape (frame,).
-        laws: of the pixels' samples in these frames.
-        maps: plain fit of these frames, or of more of the same pixels.
-        inside: pixels that are looked at, shape (y, x).
-    """
-    inside = inside & maps.usable
+def residual_covariances(samples: PartSamples) -> Covariances:
+    """Measure how the readout residuals of near and far samples vary together."""
+    inside = samples.inside & samples.maps.usable
     rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
     if not rows.size:
         return Covariances({}, {})
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    samples = Samples.by_laws(Stack(frames), laws, maps).without(~inside)
-    u = np.concatenate([chunk for (chunk,) in samples.chunks((1,), *box)])
+    u = samples.scores(1, inside, *box)
     found: dict[tuple[Shared, Lag], Covariance] = {}
-    for step in range(_FARTHEST + 1):
-        later = np.searchsorted(numbers, numbers + step).clip(max=numbers.size - 1)
-        first = np.flatnonzero(numbers[later] == numbers + step)
+    for step in range(FARTHEST + 1):
+        first, later = frames_apart(samples.numbers, step)
         if first.size >= 2 * _GROUPS:
-            found |= _of_step(u[first], u[later[first]], inside[box], step)
+            found |= _of_step(u[first], u[later], inside[box], step)
     whole = np.zeros((len(u), *inside.shape), np.float32)
     whole[(slice(None), *box)] = u
-    return Covariances(found, {"row": _line(whole, inside), "column": _line(whole.swapaxes(1, 2), inside.T)})
+    turned = {"row": (whole, inside), "column": (whole.swapaxes(1, 2), inside.T)}
+    # the shape of a line beyond the window is not known
+    return Covariances(found, {of: _line(*turned[of]) for of in _LINES if of in samples.whole_lines})
 
 
 def _line(u: NDArray[np.float32], inside: BoolArray) -> Line:
@@ -116,7 +114,7 @@ def _of_step(
     one: NDArray[np.float32], two: NDArray[np.float32], inside: BoolArray, step: int
 ) -> dict[tuple[Shared, Lag], Covariance]:
     """Return the covariances of frames with those ``step`` later."""
-    far_y, far_x = (min(_FARTHEST, (size - 1) // 4) for size in inside.shape)
+    far_y, far_x = (min(FARTHEST, (size - 1) // 4) for size in inside.shape)
     down, right = range(-far_y, far_y + 1), range(-far_x, far_x + 1)
     pixels = inside[None].astype(np.float32)
     starts = np.arange(_GROUPS) * len(one) // _GROUPS
@@ -192,7 +190,7 @@ class _Pairs(NamedTuple):
 def _products(one: NDArray[Any], two: NDArray[Any], starts: IntArray) -> FloatArray:
     """Return ``sum one[n, i] two[n, i + d]`` of groups of n by distance d, negative ones from the end."""
     axes = tuple(range(1, one.ndim))
-    size = [n + _FARTHEST for n in one.shape[1:]]
+    size = [n + FARTHEST for n in one.shape[1:]]
     products = np.conj(fft.rfftn(one, size, axes)) * fft.rfftn(two, size, axes)
     return np.asarray(fft.irfftn(np.add.reduceat(products, starts, axis=0), size, axes), np.float64)
 
@@ -209,7 +207,7 @@ def measured_noise(
         inside: pixels that were looked at, shape (y, x).
     """
     inside = inside & evidence.maps.usable
-    own = {key: one for key, one in model.pairs.items() if abs(one.value) > _CERTAIN * one.error}
+    own = {key: one for key, one in model.pairs.items() if abs(one.value) > CERTAIN * one.error}
     none = Covariance(0.0, 0.0)
     left = {key: one.value - own.get(key, none).value for key, one in data.pairs.items()}
     error = {key: np.hypot(one.error, own.get(key, none).error) for key, one in data.pairs.items()}
@@ -277,7 +275,7 @@ class _Profile(NamedTuple):
         for key in list(left):
             if key[0] == of:
                 left[key] = 0.0
-        for far in range(1, _FARTHEST + 1):
+        for far in range(1, FARTHEST + 1):
             near: Lag = (0, 0, far) if of == "row" else (0, far, 0)
             if ("sample", near) in left:
                 made = self.power * response**2 * float(np.mean(self.shape[:-far] * self.shape[far:]))
@@ -308,7 +306,7 @@ def _profile(of: Shared, data: Covariances, model: Covariances, response: FloatA
     unit = np.where(known, response, 0.0).sum(axis=axis) / np.maximum(known.sum(axis=axis), 1)
     size = unit.size
     n_points = min(_MOST_POINTS, size // 4)
-    one, two = np.nonzero(np.triu((counts > 0) & (np.outer(unit, unit) > 0), _FARTHEST + 1))
+    one, two = np.nonzero(np.triu((counts > 0) & (np.outer(unit, unit) > 0), FARTHEST + 1))
     if n_points < _FEWEST_POINTS or one.size < 4 * n_points**2:
         return None
     scale = unit[one] * unit[two]
@@ -333,3 +331,27 @@ def _profile(of: Shared, data: Covariances, model: Covariances, response: FloatA
     if clear < _CLEAR_SHAPE or clear**2 < _BETTER * alike**2 + _CLEAR_SHAPE**2 / 2.0:
         return None
     return _Profile(np.linalg.lstsq(hats, shape, rcond=None)[0], shape, found, clear)
+
+
+def running_waves(samples: PartSamples) -> Waves:
+    """Measure the waves that run across rows, columns and frames."""
+    return waves_across(samples.frames, samples.numbers, samples.laws, samples.maps, samples.inside)
+
+
+def measured_wave(data: Waves, model: Waves, evidence: Evidence, inside: BoolArray) -> Measurement | None:
+    """Return the wave whose phase runs on, beyond a model's; None where there is none.
+
+    Args:
+        data: of the frames.
+        model: of frames simulated with it.
+        evidence: of the frames.
+        inside: pixels that were looked at, shape (y, x).
+    """
+    wave, made = data.steady, model.steady
+    if wave is None or (made is not None and made.amplitude > MADE * wave.amplitude):
+        return None
+    per_frame, per_row, per_column = wave.per_frame or 0.0, wave.per_row, wave.per_column
+    cycles = round(per_frame, 7), round(per_row, 6), round(per_column, 6)
+    size = wave.amplitude * root_mean_square(cycles) / mean_response(evidence, inside)
+    mode = NoiseMode(of="sample", share=1.0, wave=cycles)
+    return Measurement(EmpiricalNoise(noise_dn=size, modes=(mode,)), wave.excess)

@@ -15,11 +15,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
+    CERTAIN,
+    Distance,
+    Measurement,
+    PartSamples,
+)
 from pchem_pipeline.discrepancy.observe.digital.groups import GROUP
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples, Follows
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.effects.analog.empirical_response import (
     AXES,
     Axis,
@@ -27,18 +31,15 @@ from pchem_pipeline.effects.analog.empirical_response import (
     ResponseTerm,
     Source,
 )
-from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.framework.neighbours import neighbours
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-Place = tuple[int, int, int]
 Mirrored = tuple[Axis, ...]
 
 _MIRRORED: tuple[Mirrored, ...] = ((), ("rows",), ("columns",), ("rows", "columns"))
 _CLEAR = 20.0  # nats that a term must be worth beyond the number of those that are tried
-_CERTAIN = 3.0  # standard errors of a model's, in simulated frames: less is taken for none
 _DETAIL = 1e-3  # of the nats of the first term: less may be how the pixels differ in it
 _MOST_TERMS = 16
 _NEARLY_ALL = 0.7  # of the columns
@@ -48,40 +49,26 @@ _STEPS = 8  # up to that, before all numbers near the clearest are tried
 
 
 class Responses(NamedTuple):
-    """How the residuals of frames follow the charge of other samples.
+    """How the residuals of frames go with the charge of other samples.
 
     Attributes:
         views: the frames, as they are and with their charge mirrored, by along what.
-        follows: sums of products of all of them, likewise.
+        covariances: sums of products of residuals and charge of all of them, likewise.
     """
 
     views: Mapping[Mirrored, FollowingSamples]
-    follows: Mapping[Mirrored, Follows]
+    covariances: Mapping[Mirrored, Follows]
 
 
-def residual_responses(
-    frames: NDArray[np.unsignedinteger],
-    numbers: IntArray,
-    laws: PixelLaws,
-    maps: PixelMaps,
-    inside: BoolArray,
-) -> Responses | None:
-    """Measure how the residuals of samples follow the charge of others; None where frames are too few.
-
-    Args:
-        frames: (frame, y, x), DN.
-        numbers: of the frames in the run, increasing, shape (frame,).
-        laws: of the pixels' samples in these frames.
-        maps: plain fit of these frames.
-        inside: pixels whose residuals are looked at, shape (y, x).
-    """
-    edges = blocks_of(numbers, numbers.size)
-    samples = FollowingSamples.of(frames, edges, laws, maps, inside)
-    if samples is None:
+def residual_responses(samples: PartSamples) -> Responses | None:
+    """Measure how the residuals of samples go with the charge of others; None where frames are too few."""
+    edges = blocks_of(samples.numbers, samples.numbers.size)
+    own = FollowingSamples.of(samples.frames, edges, samples.laws, samples.maps, samples.inside)
+    if own is None:
         return None
-    views = {along: replace(samples, mirrored=tuple(AXES[each] for each in along)) for along in _MIRRORED}
-    follows = samples.by_distance([view.mirrored for view in views.values()])
-    return Responses(views, dict(zip(views, follows, strict=True)))
+    views = {along: replace(own, mirrored=tuple(AXES[each] for each in along)) for along in _MIRRORED}
+    covariances = own.by_distance([view.mirrored for view in views.values()])
+    return Responses(views, dict(zip(views, covariances, strict=True)))
 
 
 class _Term(NamedTuple):
@@ -97,7 +84,7 @@ class _Term(NamedTuple):
     """
 
     of: Source
-    place: Place
+    place: Distance
     value: float
     gain: float
     columns: tuple[int, int] | None = None
@@ -119,8 +106,8 @@ def measured_response(
     if data is None:
         return None
     left = {
-        along: _Left.of(follows, None if model is None else model.follows[along])
-        for along, follows in data.follows.items()
+        along: _Left.of(own, None if model is None else model.covariances[along])
+        for along, own in data.covariances.items()
     }
     terms: list[_Term] = []
     while len(terms) < _MOST_TERMS:
@@ -178,7 +165,7 @@ class _Left:
         """Return what is left of the products of the data beyond those of a model that are certain."""
         products = data.products.copy()
         if model is not None:
-            sure = np.abs(np.nan_to_num(model.z("sample"))) > _CERTAIN
+            sure = np.abs(np.nan_to_num(model.z("sample"))) > CERTAIN
             products -= np.where(sure, model.products / np.maximum(model.pairs, 1.0) * data.pairs, 0.0)
         return cls(products, data.pairs, data.wider)
 

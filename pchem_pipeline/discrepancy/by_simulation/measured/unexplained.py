@@ -4,44 +4,33 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
-from pchem_pipeline.discrepancy.by_simulation.measured.electrons import (
-    Electrons,
-    electron_chances,
-    measured_electrons,
-)
-from pchem_pipeline.discrepancy.by_simulation.measured.modes import Sums, common_scores, measured_mode
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement, measured_moves
+from pchem_pipeline.discrepancy.by_simulation.measured.electrons import electron_chances, measured_electrons
+from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import measured_mixture_shifts
+from pchem_pipeline.discrepancy.by_simulation.measured.modes import common_scores, measured_mode
 from pchem_pipeline.discrepancy.by_simulation.measured.noise import (
-    Covariances,
     measured_noise,
+    measured_wave,
     residual_covariances,
+    running_waves,
 )
-from pchem_pipeline.discrepancy.by_simulation.measured.response import (
-    Responses,
-    measured_response,
-    residual_responses,
-)
-from pchem_pipeline.discrepancy.by_simulation.measured.waves import measured_wave
+from pchem_pipeline.discrepancy.by_simulation.measured.response import measured_response, residual_responses
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import Measurement, PartSamples
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import simulate_frames
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import FEW, Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.sets.trials import leaves_little, leaves_nothing
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import CONVINCING
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
-from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.observe.places import Part
-from pchem_pipeline.discrepancy.observe.waves import Waves, waves_across
-from pchem_pipeline.effects.analog.empirical_noise import Changed, Shared
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
@@ -53,19 +42,6 @@ _WORTHWHILE = 0.25  # of the nats of what is clearest: less cannot be all there 
 _AS_CLEAR = 0.5  # of these nats, which are not of the same statistics
 _MOST_TRIED = 3  # of all forms and parts
 _MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
-
-
-class _Shared(NamedTuple):
-    """How samples vary together: products and waves of residuals, sums of scores, electrons, responses."""
-
-    covariances: Covariances
-    waves: Waves
-    scores: dict[tuple[Shared, Changed], Sums]
-    electrons: Electrons
-    responses: Responses | None
-
-
-SharedBy = Callable[[Part], _Shared]
 
 
 class _Likely(NamedTuple):
@@ -97,17 +73,20 @@ class Unexplained:
     defects: dict[str, str] = field(default_factory=dict)
     instead: Refitted | None = None
     alone: dict[int, Refitted | None] = field(default_factory=dict)
+    _stacks: dict[Model | None, tuple[NDArray[np.unsignedinteger], PixelMaps]] = field(
+        default_factory=dict, repr=False
+    )
+    _recent: dict[tuple[Model | None, Part], PartSamples] = field(default_factory=dict, repr=False)
+    _known: dict[tuple[Model | None, Part], dict[Any, Any]] = field(default_factory=dict, repr=False)
 
     @functools.cached_property
     def _forms(self) -> dict[str, Measure]:
         """The forms that the model does not have already."""
-        known: dict[str, SharedBy] = {}
-        data = self._shared(self.work.frames.seen_stack, self.work.plain.maps)
         forms: dict[str, Measure] = {
-            "empirical": self._moves,
-            "empirical_noise": functools.partial(self._noise_of_samples, data, known),
-            "empirical_response": functools.partial(self._response, data, known),
-            "empirical_electrons": functools.partial(self._electrons, data, known),
+            "empirical": self._mixture_shifts,
+            "empirical_noise": self._noise,
+            "empirical_response": self._response,
+            "empirical_electrons": self._electrons,
         }
         return {tag: form for tag, form in forms.items() if tag not in {e.tag for e in self.refitter.present}}
 
@@ -118,19 +97,12 @@ class Unexplained:
 
     def by_itself(self) -> Refitted | None:
         """Return what no known effect makes, where it leaves little by itself; None where it does not."""
-        if self.instead is not None:
-            return self.instead
-        best: Refitted | None = None
-        for number, likely in enumerate(self._of_all):
-            clear = likely.measured.gain > _WORTHWHILE * self._of_all[0].measured.gain
-            if clear and likely.measured.unlisted:
-                found = self._alone(number)
-                if found is None or not found.effects[0].empirical_unnamed or not self._leaves_little(found):
-                    continue
-                if best is None or found.score > best.score:
-                    best = found
-                if self.leaves_nothing(best):
-                    break
+        best = self.instead
+        for found in () if best is not None else self._small_alone(_WORTHWHILE, unlisted=True):
+            if found.effects[0].empirical_unnamed and (best is None or found.score > best.score):
+                best = found
+            if best is not None and self.refitter.passes_goodness_of_fit(best):
+                break
         self.instead = best
         return best
 
@@ -139,7 +111,9 @@ class Unexplained:
         if not self._of_all or not self._of_all[0].measured.unlisted:
             return False
         found = self._alone(0)
-        return found is not None and found.effects[0].empirical_unnamed and self.leaves_nothing(found)
+        if found is None or not found.effects[0].empirical_unnamed:
+            return False
+        return self.refitter.passes_goodness_of_fit(found)
 
     def clearest(self, unlisted: bool = False) -> Refitted | None:
         """Return the clearest by itself, or another that is as clear; None where they leave more than little.
@@ -149,15 +123,24 @@ class Unexplained:
         Args:
             unlisted: only what no known effect makes.
         """
+        return next(self._small_alone(_AS_CLEAR, unlisted=unlisted, parts=1), None)
+
+    def _small_alone(self, share: float, *, unlisted: bool, parts: float = np.inf) -> Iterator[Refitted]:
+        """Yield what leaves little by itself at its best fit, the clearest first.
+
+        Args:
+            share: of the nats of the clearest, that one must have more than.
+            unlisted: only what no known effect makes.
+            parts: the most that one consists of.
+        """
         for number, likely in enumerate(self._of_all):
-            one, effect = likely.measured, likely.measured.effect
-            as_clear = one.gain > _AS_CLEAR * self._of_all[0].measured.gain
-            if not as_clear or effect.measured_parts > 1 or (unlisted and not one.unlisted):
+            one = likely.measured
+            clear = one.gain > share * self._of_all[0].measured.gain
+            if not clear or one.effect.measured_parts > parts or (unlisted and not one.unlisted):
                 continue
             found = self._alone(number)
-            if found is not None and self._leaves_little(found):
-                return found
-        return None
+            if found is not None and self.refitter.residual_is_small(found):
+                yield found
 
     def _alone(self, number: int) -> Refitted | None:
         """Return one of what explains most without any effect, at its best fit; it is fitted once."""
@@ -165,21 +148,13 @@ class Unexplained:
             self.alone[number] = self._tried((), self._of_all[number], whole=True)
         return self.alone[number]
 
-    def leaves_nothing(self, one: Refitted) -> bool:
-        """Tell whether a set leaves no statistic beyond chance."""
-        return leaves_nothing(self.refitter, one)
-
-    def _leaves_little(self, one: Refitted) -> bool:
-        """Tell whether a set leaves nothing, or so little of what there was that it may be its details."""
-        return leaves_little(self.refitter, one)
-
     def measured(self, kept: tuple[Hypothesis, ...]) -> Refitted | None:
         """Return effects with what is best measured beside them, and with other forms beside all of these."""
         if not kept and self.instead is not None:
             return self.instead
         forms = dict(self._forms)
         found: Refitted | None = None
-        while forms and not (found is not None and self._leaves_little(found)):
+        while forms and not (found is not None and self.refitter.residual_is_small(found)):
             beside, better, score = kept, "", -np.inf
             if found is not None:
                 beside, score = found.hypotheses, found.score + CONVINCING
@@ -195,7 +170,7 @@ class Unexplained:
                     return found
                 if one is not None and one.score > score:
                     found, better, score = one, likely.form, one.score
-                    if self._leaves_little(one):
+                    if self.refitter.residual_is_small(one):
                         break
             if not better:
                 break
@@ -255,7 +230,7 @@ class Unexplained:
             found = self._fitted(kept, effect, whole)
             if found is not None and (best is None or found.score > best.score):
                 best = found
-            if best is not None and self._leaves_little(best):
+            if best is not None and self.refitter.residual_is_small(best):
                 break
         if best is None:
             return None
@@ -275,56 +250,59 @@ class Unexplained:
         found = refitter.refined((*kept, Hypothesis(effect, shift)), whole=whole)
         return None if found.short else refitter.sharpened(found, self.replicates)
 
-    def _moves(
-        self, part: Part, present: tuple[Effect, ...], beside: tuple[Effect, ...]
-    ) -> Measurement | None:
-        """Measure the moves of the samples of a part beside effects, with the pixels as they now are."""
-        maps = self.work.refit(present).maps
-        own = replace(maps, usable=maps.usable & self.work.frames.inside(part))
+    def _mixture_shifts(self, part: Part, present: Model, beside: Model) -> Measurement | None:
+        """Measure the mixture shifts of a part beside effects, with the pixels as they now are."""
+        maps, frames = self.work.refit(present).maps, self.work.frames
+        own = replace(maps, usable=maps.usable & frames.inside(part))
         if not own.usable.any():
             return None
-        numbers = self.work.frames.seen_numbers
-        some = part.frames(numbers)
-        return measured_moves(self.work.frames.stack[self.work.frames.seen[some]], numbers[some], own, beside)
+        some = part.frames(frames.seen_numbers)
+        stack = frames.stack[frames.seen[some]]
+        return measured_mixture_shifts(stack, frames.seen_numbers[some], own, beside)
 
-    def _noise_of_samples(
-        self, data: SharedBy, known: dict[str, SharedBy], part: Part, _: Model, beside: Model
-    ) -> Measurement | None:
+    def _noise(self, part: Part, _: Model, beside: Model) -> Measurement | None:
         """Measure what samples of a part share beyond what effects make of them."""
-        own, model = data(part), self._made(known, beside)(part)
-        inside = self.work.frames.inside(part)
+        data, model = self._of(part, None), self._of(part, beside)
         found = (
-            measured_mode(own.scores, model.scores, self.work.plain.maps, inside),
-            measured_noise(own.covariances, model.covariances, self.work.plain, inside),
+            measured_mode(data.of(common_scores), model.of(common_scores), data.maps, data.inside),
+            measured_noise(
+                data.of(residual_covariances), model.of(residual_covariances), data.evidence, data.inside
+            ),
         )
         best = max(filter(None, found), key=lambda one: one.gain, default=None)
-        wave = measured_wave(own.waves, model.waves, self.work.plain, inside)
+        wave = measured_wave(data.of(running_waves), model.of(running_waves), data.evidence, data.inside)
         if wave is None or best is None:
             return wave or best
         # a wave is in the covariances of all distances, each of which counts by itself
         return Measurement(wave.effect, max(wave.gain, best.gain), (best.effect, *best.others))
 
-    def _electrons(
-        self, data: SharedBy, known: dict[str, SharedBy], part: Part, _: Model, beside: Model
-    ) -> Measurement | None:
+    def _electrons(self, part: Part, _: Model, beside: Model) -> Measurement | None:
         """Measure what electrons of a part do to each other beyond what effects make of them."""
-        return measured_electrons(data(part).electrons, self._made(known, beside)(part).electrons)
+        data, model = self._of(part, None), self._of(part, beside)
+        return measured_electrons(data.of(electron_chances), model.of(electron_chances))
 
-    def _response(
-        self, data: SharedBy, known: dict[str, SharedBy], part: Part, _: Model, beside: Model
-    ) -> Measurement | None:
-        """Measure which samples of a part follow which beyond what effects make of them."""
-        model, inside = self._made(known, beside)(part).responses, self.work.frames.inside(part)
-        return measured_response(data(part).responses, model, self.work.plain, inside)
+    def _response(self, part: Part, _: Model, beside: Model) -> Measurement | None:
+        """Measure which samples of a part go with which beyond what effects make of them."""
+        data, model = self._of(part, None), self._of(part, beside)
+        return measured_response(
+            data.of(residual_responses), model.of(residual_responses), data.evidence, data.inside
+        )
 
-    def _made(self, known: dict[str, SharedBy], model: Model) -> SharedBy:
-        """Return the same of frames simulated with a model; ``known`` are those of other models."""
-        key = "|".join(e.model_dump_json() for e in model)
-        if key not in known:
-            known[key] = self._shared(*self._simulated(model))
-        return known[key]
+    def _of(self, part: Part, model: Model | None) -> PartSamples:
+        """Return the seen samples of a part, or as they are in frames simulated with a model."""
+        key, frames = (model, part), self.work.frames
+        if model not in self._stacks:
+            seen = frames.seen_stack, self.work.plain.maps
+            self._stacks[model] = seen if model is None else self._simulated(model)
+        if key not in self._recent:
+            stack, maps = self._stacks[model]
+            own = stack, frames.seen_numbers, maps, self.work.plain, frames.inside(part), part
+            samples = PartSamples(*own, frames.whole_lines, self._known.setdefault(key, {}))
+            # of frames and tables those of the data and of one model are kept, and all that was measured
+            self._recent = {k: one for k, one in self._recent.items() if k == (None, part)} | {key: samples}
+        return self._recent[key]
 
-    def _simulated(self, model: tuple[Effect, ...]) -> tuple[NDArray[np.unsignedinteger], PixelMaps]:
+    def _simulated(self, model: Model) -> tuple[NDArray[np.unsignedinteger], PixelMaps]:
         """Simulate the frames that are seen under a model, and fit their pixels."""
         seed = self.work.seed_of("covariances")
         drawn = self.work.mapped(model).sensor.usual(seed)
@@ -332,23 +310,3 @@ class Unexplained:
         frames = simulate_frames(drawn, model, seed, taken)
         self.work.effort.simulate(frames.size, drawn.usable.size, 1)
         return frames, fitted_maps(frames, ~drawn.usable)
-
-    def _shared(self, frames: NDArray[np.unsignedinteger], maps: PixelMaps) -> Callable[[Part], _Shared]:
-        """Return what measures how the samples of a part vary together in frames like those that are seen."""
-        numbers = self.work.frames.seen_numbers
-
-        @functools.cache
-        def of(part: Part) -> _Shared:
-            some, inside = part.frames(numbers), self.work.frames.inside(part)
-            laws = laws_of_frames(frames[some], maps)
-            found = residual_covariances(frames[some], numbers[some], laws, maps, inside)
-            # the shape of a line beyond the window is not known
-            lines = {of: line for of, line in found.lines.items() if of in self.work.frames.whole_lines}
-            found = Covariances(found.pairs, lines)
-            electrons = electron_chances(frames[some], numbers[some], laws, maps, self.work.plain, inside)
-            responses = residual_responses(frames[some], numbers[some], laws, maps, inside)
-            scores = common_scores(frames[some], numbers[some], maps, inside)
-            waves = waves_across(frames[some], numbers[some], laws, maps, inside)
-            return _Shared(found, waves, scores, electrons, responses)
-
-        return of

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.discrepancy.by_simulation.sensor.population import (
+    MANY_MISTAKEN,
     Posterior,
     clipped_mean,
-    lost_variance,
     posterior_of,
     posterior_of_estimates,
-    to_theta,
+    shrinkage_bias,
 )
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
@@ -25,6 +25,7 @@ from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.shared import to_theta
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
@@ -32,12 +33,11 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
 
-_UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
+#: Of the parameters of a pixel, in their order.
+UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
 
 _LEAST_LEFT = 0.2  # of the fitted exposure, or variance of the read noise, without what effects add to it
 _FEWEST_CODES = 3  # that a pixel must have shown
-#: Share of pixels with a mistaken bias from which what is learnt does not rest on their maxima.
-MANY_MISTAKEN = 0.3
 _MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
 # near their plain fit pixels arrive in some ten evaluations, or hardly ever; a fit within 0.005 of its error
 _SEARCHED = FitSettings(max_iterations=60, tolerance=1e-5)
@@ -111,8 +111,7 @@ def refit_maps(
     flat = maps.flat.maps
     try:
         numbers = np.arange(frames.shape[0]) if numbers is None else numbers
-        places = PixelPlaces.of_block(None, (shape[0], shape[1]), numbers)
-        law = sample_law(effects, pixel_maps(flat, maps.usable), added, places)
+        law = sample_law(effects, pixel_maps(flat, maps.usable), added, _places(maps, numbers))
     except ConfigError:
         return Refit(maps, {}, covariance)
     if law.components > _MOST_COMPONENTS:
@@ -137,12 +136,13 @@ def refit_maps(
     if np.mean(np.isfinite(probe.bias)) < _LEAST_FITTED:
         raise NotFittedError("almost no pixel can be fitted with it")
     fit = fitted(np.arange(len(near)))
-    for start in (off_by(near, -1.0), off_by(near, 1.0), _of_usual_noise(near, fit.columns)):
+    shifted = (shift_bias_by_electrons(near, electrons) for electrons in (-1.0, 1.0))
+    for start in (*shifted, _of_usual_noise(near, fit.columns)):
         if np.mean(_likelier(fitted(probed, start), probe)) > _OFTEN_BETTER:
             other = fitted(known, start)
             better = np.flatnonzero(_likelier(other, fit.of(known)))
             fit = fit.with_pixels(known[better], other.of(better))
-    astray, start = at_other_peaks(counts, histograms.origin.ravel(), law, fit.columns)
+    astray, start = multistart(counts, histograms.origin.ravel(), law, fit.columns)
     inside = maps.usable.ravel()[astray] & acted_on[astray]
     if inside.any():
         fit = fit.with_pixels(astray[inside], fitted(astray[inside], start))
@@ -152,7 +152,7 @@ def refit_maps(
     inside = good & acted_on
     moved = {
         name: _change(after[inside] - before[inside], error[inside], unit)
-        for (name, unit), before, after, error in zip(_UNITS.items(), flat, new, stderr, strict=True)
+        for (name, unit), before, after, error in zip(UNITS.items(), flat, new, stderr, strict=True)
     }
     new_maps = PixelMaps.known(new, good.reshape(shape))
     covariance = fit.covariance[:, :4, :4].reshape(*shape, 4, 4)
@@ -167,7 +167,7 @@ def _acted_on(effects: Sequence[Effect], shape: tuple[int, int]) -> NDArray[np.b
     return np.asarray(np.logical_or.reduce(inside)) if inside else np.ones(shape, np.bool_)
 
 
-def off_by(start: FloatArray, electrons: float) -> FloatArray:
+def shift_bias_by_electrons(start: FloatArray, electrons: float) -> FloatArray:
     """Return parameters (n, 4) whose bias is lower, and exposure higher, by so many electrons.
 
     Under noise of another law the peak that was taken for that of no electron may be that of one.
@@ -178,7 +178,7 @@ def off_by(start: FloatArray, electrons: float) -> FloatArray:
     return off
 
 
-def at_other_peaks(
+def multistart(
     counts: NDArray[Any], origin: NDArray[np.integer], law: SampleLaw, now: FloatArray
 ) -> tuple[NDArray[np.intp], FloatArray]:
     """Find pixels whose bias a few samples below all others led astray, and what is likelier under a law.
@@ -208,7 +208,7 @@ def at_other_peaks(
         return fit_histograms(counts[some], origin[some], law=law.of(some), start=start, settings=_CONTEST)
 
     first = best = fitted(now[some])
-    for start in (guarded, off_by(guarded, -1.0), off_by(guarded, 1.0)):
+    for start in (guarded, shift_bias_by_electrons(guarded, -1.0), shift_bias_by_electrons(guarded, 1.0)):
         fit = fitted(start)
         better = np.flatnonzero(fit.log_likelihood > best.log_likelihood)
         best = best.with_pixels(better, fit.of(better))
@@ -254,16 +254,20 @@ def expected_codes(
         Shape (c,); None where the effects give no law.
     """
     usable = maps.usable.ravel()
-    every = maps.maps
-    flat = tuple(values.ravel()[usable] for values in every)
+    flat = tuple(values.ravel()[usable] for values in maps.maps)
     try:
-        shape = maps.usable.shape
-        places = PixelPlaces.of_block(None, (shape[0], shape[1]), numbers).of(usable)
+        places = _places(maps, numbers).of(usable)
         beside = None if added is None else added.flat().of(usable)
         law = sample_law(effects, pixel_maps(flat, usable[usable]), beside, places)
     except ConfigError:
         return None
     return np.asarray(numbers.size * sample_mass(law, flat, codes, far_tails=False).sum(axis=0))
+
+
+def _places(maps: PixelMaps, numbers: NDArray[np.int64]) -> PixelPlaces:
+    """Return the places of all pixels, in frames of some numbers."""
+    ny, nx = maps.usable.shape
+    return PixelPlaces.of_block(None, (ny, nx), numbers)
 
 
 def _change(difference: NDArray[np.float64], stderr: NDArray[np.float64], unit: str) -> dict[str, Any]:
@@ -347,11 +351,8 @@ def learn_sensor(
     """
     maps = fit.maps
     usable = maps.usable.ravel()
-    every = maps.maps
-    parameters = np.where(usable[:, None], np.stack([values.ravel() for values in every], axis=1), np.nan)
-    covariance = fit.covariance.reshape(-1, 4, 4)
-    shape = maps.usable.shape
-    places = PixelPlaces.of_block(None, (shape[0], shape[1]), numbers)
+    parameters = np.where(usable[:, None], np.stack(maps.flat.maps, axis=1), np.nan)
+    covariance, places = fit.covariance.reshape(-1, 4, 4), _places(maps, numbers)
     law = _law_of_all(effects, parameters, places, fit.added)
     if law is None or law.free_satellites:
         drawn = usable
@@ -375,7 +376,7 @@ def learn_sensor(
         )
         if lost is None:
             known = mistaken <= MANY_MISTAKEN
-            lost = lost_variance(posterior, counts[drawn].sum(axis=1), law.of(drawn)) if known else 0.0
+            lost = shrinkage_bias(posterior, counts[drawn].sum(axis=1), law.of(drawn)) if known else 0.0
     return Sensor(
         posterior.moved(np.array([0.0, 0.0, 0.0, lost])), drawn.reshape(maps.usable.shape), maps.usable, lost
     )

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.by_simulation.sensor.population_numba import solve_parabolas
 from pchem_pipeline.model.arithmetic.robust import robust_sd
+from pchem_pipeline.model.fit.shared import to_parameters, to_theta
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -44,8 +45,9 @@ _LARGEST_STEP = np.array([0.7, 0.15, 0.5, 0.8])  # of theta at once; of mu in DN
 # scatters below which pixels are alike for all purposes: of log H, log 1/g, mu (DN), log sigma_R^2
 _LEAST_SCATTER = np.array([2e-3, 2e-4, 5e-3, 2e-3])
 _LOWEST_LOG_EXPOSURE, _LOWEST_LOG_VARIANCE = float(np.log(1e-5)), float(np.log(1e-4))
-# share of mistaken pixels up to which the fits are nearly the truth, and beyond which they are no start
-_HARDLY_ANY, _MANY = 0.003, 0.3
+_HARDLY_ANY = 0.003  # share of mistaken pixels up to which the fits are nearly the truth
+#: The same beyond which they are no start, and what is learnt does not rest on the pixels' maxima.
+MANY_MISTAKEN = 0.3
 _SHIFTS = (0, 1, -1)  # electrons by which a bias may be mistaken
 _ALIKE = np.array([0.3, 0.02, 0.5, 0.15])  # scatter of theta of pixels that are much alike
 _WIDEST_DRAW = 1.5  # of log H and log sigma_R^2 from the maximum
@@ -56,7 +58,8 @@ _USUAL_NOISE, _NOISE_RANGE = 0.3, 0.2  # e-^2: squared read noise where peaks ar
 _MOST_NOISE = 12.0  # of 1/g over what it were without read noise
 _ITERATIONS = 30
 _MOST_DRAWN_AGAIN = 500  # pixels behind what is learnt too low
-_REACH = 7.0  # standard deviations of the samples: their histograms reach no further
+#: Standard deviations of samples: their histograms reach no further.
+REACH = 7.0
 _LEAST_ELECTRONS = 0.01  # that a pixel is begun with
 _OUTLYING = 15.0  # median deviations of a cumulant beyond which a pixel is not asked
 
@@ -128,23 +131,6 @@ class Posterior:
         return to_parameters(theta)
 
 
-def to_parameters(theta: FloatArray) -> FloatArray:
-    """Return (H, g, mu, sigma with quantisation) of theta, shape (..., 4)."""
-    found = np.empty_like(theta)
-    found[..., 0] = np.exp(theta[..., 0])
-    found[..., 1] = np.exp(-theta[..., 1])
-    found[..., 2] = theta[..., 2]
-    found[..., 3] = np.sqrt(np.exp(theta[..., 3]) + QUANTISATION_VARIANCE)
-    return found
-
-
-def to_theta(parameters: FloatArray) -> FloatArray:
-    """Return theta of (H, g, mu, sigma), shape (..., 4)."""
-    h, g, mu, sigma = np.moveaxis(parameters, -1, 0)
-    analog = np.maximum(sigma**2 - QUANTISATION_VARIANCE, 0.05 * sigma**2)
-    return np.stack([np.log(h), -np.log(g), mu, np.log(analog)], axis=-1)
-
-
 def posterior_of(
     counts: NDArray[np.integer],
     origin: IntArray,
@@ -153,7 +139,6 @@ def posterior_of(
     replaced: ReplacedSamples | None = None,
     *,
     mistaken: float = 1.0,
-    seed: int = 0,
 ) -> Posterior:
     """Learn the population of the pixels from their histograms, and where each of them may lie.
 
@@ -164,15 +149,14 @@ def posterior_of(
         law: of the samples; the PCD if None.
         replaced: what becomes of them, at the codes of the histograms; None: nothing.
         mistaken: share of pixels whose bias may be off by an electron: says what starts are worth a try.
-        seed: of the choice of pixels to learn from.
     """
     pixels = _Pixels(counts, np.asarray(origin, np.int64), law or SampleLaw(), replaced)
     some = np.arange(len(counts))
     if some.size > _MOST_LEARNT_FROM:
-        some = np.sort(np.random.default_rng(seed).choice(some, _MOST_LEARNT_FROM, replace=False))
+        some = np.sort(np.random.default_rng(0).choice(some, _MOST_LEARNT_FROM, replace=False))
     shifts = (0,) if mistaken <= _HARDLY_ANY else _SHIFTS
     best, most = None, -np.inf
-    for start, population in _beginnings(pixels, parameters, mistaken):
+    for start, population in _seeds(pixels, parameters, mistaken):
         starts = np.stack([_shifted(start, each) for each in shifts])
         if replaced is not None:
             starts = np.concatenate([starts, _usual(pixels, population)[None]])
@@ -184,7 +168,7 @@ def posterior_of(
     return _climb(pixels, *best, _LAST_STEPS).posterior(best[1])
 
 
-def lost_variance(posterior: Posterior, totals: NDArray[np.integer], law: SampleLaw | None = None) -> float:
+def shrinkage_bias(posterior: Posterior, totals: NDArray[np.integer], law: SampleLaw | None = None) -> float:
     """Return by how much log sigma_R^2 is learnt too low: where peaks overlap some noise is taken for signal.
 
     Histograms are drawn from what was learnt, and learnt from again (parametric bootstrap: Efron 1979).
@@ -200,8 +184,8 @@ def lost_variance(posterior: Posterior, totals: NDArray[np.integer], law: Sample
     own = (law or SampleLaw()).of(some)
     reach = np.sqrt(drawn[:, 0]) / drawn[:, 1] + drawn[:, 3]
     centre = drawn[:, 2] + drawn[:, 0] / drawn[:, 1]
-    first = np.floor(centre - _REACH * reach).astype(np.int64)
-    width = int(2.0 * _REACH * np.quantile(reach, 0.99)) + 1
+    first = np.floor(centre - REACH * reach).astype(np.int64)
+    width = int(2.0 * REACH * np.quantile(reach, 0.99)) + 1
     codes = first[:, None] + np.arange(width)
     mass = np.maximum(sample_mass(own, [np.ascontiguousarray(column) for column in drawn.T], codes), 0.0)
     counts = rng.multinomial(totals[some].astype(np.int64), mass / mass.sum(axis=1, keepdims=True))
@@ -312,12 +296,13 @@ class _Maxima:
     def _parabolas(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         return self.theta, self.value, self.score, self.information
 
+    def _among(self, kinds: NDArray[np.bool_] | slice, pixels: NDArray[np.intp] | slice) -> _Maxima:
+        theta, value, score, information = (each[kinds][:, pixels] for each in self._parabolas)
+        return _Maxima(theta, value, score, information, self.widening[pixels])
+
     def of(self, some: NDArray[np.intp]) -> _Maxima:
         """Return those of some pixels."""
-        theta, value, score, information = self._parabolas
-        return _Maxima(
-            theta[:, some], value[:, some], score[:, some], information[:, some], self.widening[some]
-        )
+        return self._among(slice(None), some)
 
     def with_those(self, found: _Maxima, some: NDArray[np.intp]) -> _Maxima:
         """Return it with what was found for some pixels, if that has all kinds of maxima; changes it."""
@@ -330,9 +315,7 @@ class _Maxima:
     def likely(self, population: Population) -> _Maxima:
         """Return the maxima without those kinds that hardly a pixel has."""
         share = self.solve(population)[2].mean(axis=1)
-        some = (share > _RARE) | (np.arange(share.size) == 0)
-        theta, value, score, information = self._parabolas
-        return _Maxima(theta[some], value[some], score[some], information[some], self.widening)
+        return self._among((share > _RARE) | (np.arange(share.size) == 0), slice(None))
 
     def posterior(self, population: Population) -> Posterior:
         """Return the posterior under a population."""
@@ -443,9 +426,7 @@ def _inside(theta: FloatArray) -> FloatArray:
     return found
 
 
-def _beginnings(
-    pixels: _Pixels, parameters: FloatArray, mistaken: float
-) -> list[tuple[FloatArray, Population]]:
+def _seeds(pixels: _Pixels, parameters: FloatArray, mistaken: float) -> list[tuple[FloatArray, Population]]:
     """Return starts of theta (n, 4) and of the population: from the fits, or from all pixels' cumulants.
 
     Where peaks are hardly resolved the fits of single pixels lead far from the truth, all to the same side.
@@ -462,7 +443,7 @@ def _beginnings(
     start = np.tile(centre, (mean.size, 1))
     start[:, 2] = mean - np.exp(centre[0] + centre[1])
     found: list[tuple[FloatArray, Population]] = []
-    resolved = mistaken <= _MANY
+    resolved = mistaken <= MANY_MISTAKEN
     if known.any() and (resolved or not pixels.law.neutral or pixels.replaced is not None):
         fits = np.where(known[:, None], to_theta(np.where(known[:, None], parameters, 1.0)), start)
         found.append((fits, _first_guess(fits[known])))

@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import without_squares
+from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import without_squares
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
-    MANY_MISTAKEN,
     Refit,
     Sensor,
+    expected_codes,
     learn_sensor,
     refit_maps,
 )
+from pchem_pipeline.discrepancy.by_simulation.sensor.population import MANY_MISTAKEN
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Replicate, by_part
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.digital.misplaced import own_lines
@@ -56,7 +57,6 @@ class Simulations:
         mapper: runs the simulated stacks.
         seed: root of all random numbers.
         effort: counts the work.
-        done: parts of simulated stacks so far.
         lost: share of the pixels that the plain fit mistakes; None: not learnt yet.
         known: the models that were mapped of late.
     """
@@ -65,7 +65,6 @@ class Simulations:
     mapper: Mapper
     seed: int
     effort: Effort
-    done: int = 0
     lost: float | None = None
     known: dict[tuple[Effect, ...], Mapped] = field(default_factory=dict)
 
@@ -97,6 +96,13 @@ class Simulations:
         tags = (effect.tag for effect in model)
         self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags, learnt=fit.learnt)
         return fit
+
+    def expected(
+        self, model: tuple[Effect, ...], evidence: Evidence, numbers: NDArray[np.int64]
+    ) -> NDArray[np.float64] | None:
+        """Return the samples that a model expects at each code of some evidence; see `expected_codes`."""
+        fit, codes = self.mapped(model).fit, evidence.code.first + np.arange(evidence.code.observed.size)
+        return expected_codes(fit.maps, self.frames.effects(model), codes, numbers, fit.added)
 
     def own_samples(self, model: tuple[Effect, ...]) -> NDArray[np.unsignedinteger]:
         """Return the seen frames without the samples that effects likely gave to other pixels."""
@@ -159,7 +165,7 @@ class Simulations:
         seed = self.seed_of(purpose)
         taken = replace(self.frames.acquisition(), numbers=self.frames.seen_numbers)
         one = Replicate(purpose, sensor.draw(seed), model, seed, taken)
-        self.done += 1
+        self.effort.replicates += 1
         self.effort.simulate(one.samples, one.maps.usable.size, one.fits)
         return one
 
@@ -183,12 +189,12 @@ class Simulations:
             if isinstance(result, Exception):
                 raise result
             vectors += by_part(result)
-        self.done += len(vectors) - len(tasks)
+        self.effort.replicates += len(vectors) - len(tasks)
         return vectors
 
     def counted(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:
         """Return the statistics of replicates, or what they raised; count the work."""
-        self.done += len(replicates)
+        self.effort.replicates += len(replicates)
         for each in replicates:
             self.effort.simulate(each.samples, each.maps.usable.size, each.fits)
         return self.mapper(replicates)

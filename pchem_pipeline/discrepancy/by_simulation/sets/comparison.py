@@ -9,6 +9,7 @@ for where the set leaves nothing.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -19,9 +20,9 @@ from scipy import special
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
-    PRICE_OF_MORE,
+    FAR,
+    STANDS_OUT,
     Choice,
-    Contender,
     Hypothesis,
     ScoredSet,
     firsts,
@@ -31,16 +32,14 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Witness, note_defect
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_dear
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood, note_defect
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_expensive
 from pchem_pipeline.discrepancy.by_simulation.sets.trials import (
-    FAR,
     LOOSE,
+    PENALISED,
     Trials,
     alike,
-    leaves_nothing,
-    of_kinds,
-    worth,
+    same_kinds,
 )
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
@@ -51,17 +50,32 @@ Answer = TypeVar("Answer")
 _MOST_SINGLES, _FIRST_SINGLES = 7, 3
 _MOST_OF_ONE = 3  # hypotheses of the same effect
 _MOST_SETS = 5
-# single effects that sets are grown from, and share of what the best one explains within which another one is
-# as good a beginning; how many of these sets are refitted, by how many effects they have besides
-_MOST_BEGINNINGS, _REACH_SHARE = 2, 0.05
+# sets that others are grown from, and share of what the best one explains within which another one is as good
+# a seed; how many of these sets are refitted, by how many effects they have besides
+_MOST_SEEDS, _REACH_SHARE = 2, 0.05
 _MOST_GROWN = {1: 2, 2: 1}
-_SEEN = 4.0  # deviations that the others leave of a statistic for it to ask for an effect
-_MOVED = 3.0  # by which that effect must move it
+_MOVED = 3.0  # deviations by which an effect must move a statistic that stands out without it
 _UNTOUCHED = 0.5  # of that, the most by which the others may move it
 _NO_WORSE = 10.0  # nats by which fewer replicates may make a set look worse
-_NEARLY_AS_GOOD = 40.0  # nats between sets that a second witness is asked about
 _MOST_ALIKE = 3  # look-alikes of a single effect that are refitted before anything beside it
-_SILENT = Witness()
+_NO_LIKELIHOOD = HistogramLikelihood()
+
+
+@dataclass(frozen=True)
+class Contender:
+    """An effect that could stand in the place of a chosen one.
+
+    Attributes:
+        hypothesis: of the rival.
+        score: log score of the best set with it in that place, relative to the chosen set, nats.
+        stderr: of that score: how far the two predictions lie apart, nats.
+        probability: among all that could stand there.
+    """
+
+    hypothesis: Hypothesis
+    score: float
+    stderr: float
+    probability: float
 
 
 @dataclass(frozen=True)
@@ -71,13 +85,13 @@ class Comparison:
     Attributes:
         chosen: the best.
         tried: all, the best first.
-        witnessed: by their tags, how far other sets are behind the chosen one by another witness than the
-            statistics, nats, and the error of that.
+        by_histograms: by their tags, how far other sets are behind the chosen one by the likelihood of the
+            pixels' histograms, nats, and the error of that.
     """
 
     chosen: Refitted
     tried: tuple[Refitted, ...]
-    witnessed: Mapping[frozenset[str], tuple[float, float]] = field(default_factory=dict)
+    by_histograms: Mapping[frozenset[str], tuple[float, float]] = field(default_factory=dict)
 
     def rivals_of(self, tag: str) -> tuple[Contender, ...]:
         """Return what could stand in the place of an effect of the chosen set, itself first."""
@@ -91,16 +105,17 @@ class Comparison:
             hypothesis = next(h for h in one.hypotheses if h.tag == name)
             if name != tag and hypothesis.effect.tag == tag.partition(" ")[0]:
                 continue  # the same effect elsewhere
-            if one.tags in self.witnessed:
-                behind, error = self.witnessed[one.tags]
+            if one.tags in self.by_histograms:
+                behind, error = self.by_histograms[one.tags]
                 # neither need be the very law of the samples
                 probability = float(special.ndtr(behind / max(error, 1e-9)))
             else:
-                behind, error = worth(one) - worth(self.chosen), _apart(one, self.chosen)
+                behind = one.penalised_log_likelihood - self.chosen.penalised_log_likelihood
+                error = _apart(one, self.chosen)
                 probability = float(np.exp(min(behind, 0.0)))
             found[name] = Contender(hypothesis, behind, error, probability)
         total = sum(c.probability for c in found.values())
-        shared = [Contender(c.hypothesis, c.score, c.stderr, c.probability / total) for c in found.values()]
+        shared = [replace(c, probability=c.probability / total) for c in found.values()]
         return tuple(sorted(shared, key=lambda c: (-c.probability, -c.score)))
 
 
@@ -111,7 +126,7 @@ def compare(
     choice: Choice,
     before: Refitted | None = None,
     beside: Callable[[Refitted], Choice | None] = lambda _: None,
-    witness: Witness = _SILENT,
+    likelihood: HistogramLikelihood = _NO_LIKELIHOOD,
     unlisted: Callable[[], bool] = lambda: False,
     measured: Callable[[bool], Refitted | None] = lambda _: None,
 ) -> Comparison | None:
@@ -128,7 +143,8 @@ def compare(
         choice: how their sets compare by fingerprints.
         before: the effects held, at their best fit; None: not known.
         beside: compares new hypotheses by what they do beside a refitted set.
-        witness: brings a set near its best, and is asked about sets that the statistics tell badly apart.
+        likelihood: of the pixels' histograms: brings a set near its best, and is asked about sets that the
+            statistics tell badly apart.
         unlisted: tells whether what no known effect makes leaves nothing by itself.
         measured: returns what is clearest of all that is measured, or of what no known effect makes (True),
             where that leaves little by itself.
@@ -136,12 +152,12 @@ def compare(
     Raises:
         EffortSpentError: the work is at its limit.
     """
-    trials = Trials(refitter, tuple(held), witness)
-    tried, beside = trials.tried, _asked_once(beside)
-    singles = witness.ranked(_singles(hypotheses, choice))
+    trials = Trials(refitter, tuple(held), likelihood)
+    tried, beside = trials.tried, functools.cache(beside)
+    singles = likelihood.ranked(_singles(hypotheses, choice))
     # what the likeliest set is made of, then that set: it may leave no others worth a refit
     first = len(choice.best.hypotheses)
-    for hypothesis in _dear_last(singles[:first]):
+    for hypothesis in _expensive_last(singles[:first]):
         trials.refit((hypothesis,))
     if trials.nearly:
         # a strong effect that is not quite this one leaves as little: what stands out beside it is in vain
@@ -151,20 +167,19 @@ def compare(
         trials.tune()
         if not held and not trials.complete and _within(unlisted):
             return None
-        _grow(trials, beside)
+        _forward_select(trials, beside)
     if first > 1 and tried and not trials.complete and all(len(one) == 1 for one in trials.asked):
         if not (held or trials.nearly):
             trials.measured = _within(lambda: measured(True))
-        trials.refit(_begun(_sets(choice, tried)[0], tried, held))
-        trials.thin()
+        trials.refit_set(_sets(choice, tried)[0])
     # the likeliest in its place, whatever was spent until here: one of them may be all there is
     ahead = max(first, _FIRST_SINGLES)
-    for hypothesis in _dear_last(singles[first:ahead]):
+    for hypothesis in _expensive_last(singles[first:ahead]):
         trials.refit((hypothesis,), whatever=True)
     if not held and tried and not (trials.complete or trials.nearly or trials.measured):
         trials.measured = _within(lambda: measured(False))
-    # the others, dear ones last: they may be beaten by then
-    for hypothesis in _dear_last(singles[ahead:]):
+    # the others, expensive ones last: they may be beaten by then
+    for hypothesis in _expensive_last(singles[ahead:]):
         if not trials.refit((hypothesis,)):
             break
     if not tried:
@@ -173,29 +188,27 @@ def compare(
         return None  # nothing beside the effects held explains more than they do by themselves
     if first > 1 and not trials.complete:
         # the same of the kinds that have done best
-        trials.refit(_begun(_sets(choice, tried)[0], tried, held))
-        trials.thin()
+        trials.refit_set(_sets(choice, tried)[0])
     trials.tune()
     if not held and not trials.complete and (_within(unlisted) or trials.beaten):
         return None
     if len(trials.best.hypotheses) > len(held) + 1 or not trials.complete:
         grown = [] if trials.complete else _grown(trials, beside)
         for members in _of_different_effects([*grown, *_sets(choice, tried)])[:_MOST_SETS]:
-            if not (trials.refit(_begun(members, tried, held)) and trials.thin()):
+            if not trials.refit_set(members):
                 break
             trials.tune()
-    return _concluded(trials, [] if before is None else [before], hypotheses, witness, measured)
+    return _concluded(trials, [] if before is None else [before], hypotheses, measured)
 
 
 def _concluded(
     trials: Trials,
     before: Sequence[Refitted],
     hypotheses: Sequence[Hypothesis],
-    witness: Witness,
     measured: Callable[[bool], Refitted | None],
 ) -> Comparison | None:
     """Choose among the sets that were tried, and fit placebos in the place of its effects; see `compare`."""
-    tried = trials.tried
+    tried, likelihood = trials.tried, trials.likelihood
     # the work that led here must not be lost for the little that is left: no limit
     to_choose = replace(trials.refitter, allow=lambda _: None)
     chosen = _chosen(to_choose, tried, before)
@@ -204,17 +217,17 @@ def _concluded(
     if not trials.held and len(chosen.hypotheses) > 1:
         # one thing that explains as much as several is the simpler answer
         one = trials.measured or _within(lambda: measured(False))
-        if one is not None and worth(one) > worth(chosen):
+        if one is not None and one.penalised_log_likelihood > chosen.penalised_log_likelihood:
             return None
-    witnessed = _witnessed(chosen, tried, witness)
-    best = max(tried, key=lambda one: witnessed.get(one.tags, (0.0, 0.0))[0])
-    if witnessed.get(best.tags, (0.0, 0.0))[0] > 0.0 and _all_seen(to_choose, best, tried):
-        chosen, witnessed = best, _witnessed(best, tried, witness)
+    by_histograms = _by_histograms(chosen, tried, likelihood)
+    best = max(tried, key=lambda one: by_histograms.get(one.tags, (0.0, 0.0))[0])
+    if by_histograms.get(best.tags, (0.0, 0.0))[0] > 0.0 and _all_seen(to_choose, best, tried):
+        chosen, by_histograms = best, _by_histograms(best, tried, likelihood)
     known = {h.tag for h in trials.held}
     for member in chosen.hypotheses:
         if member.tag not in known:
             tried += _placebo(trials, hypotheses, chosen, member)
-    return Comparison(chosen, tuple(tried), witnessed)
+    return Comparison(chosen, tuple(tried), by_histograms)
 
 
 def _within(asked: Callable[[], Answer]) -> Answer | None:
@@ -225,9 +238,9 @@ def _within(asked: Callable[[], Answer]) -> Answer | None:
         return None
 
 
-def _dear_last(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+def _expensive_last(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return hypotheses, those last whose refit takes long."""
-    return sorted(hypotheses, key=lambda h: is_dear([h.effect]))
+    return sorted(hypotheses, key=lambda h: is_expensive([h.effect]))
 
 
 def _chosen(refitter: Refitter, tried: list[Refitted], before: Sequence[Refitted]) -> Refitted | None:
@@ -239,33 +252,29 @@ def _chosen(refitter: Refitter, tried: list[Refitted], before: Sequence[Refitted
         before: sets that are known besides.
     """
     while True:
-        tried.sort(key=worth, reverse=True)
+        tried.sort(key=PENALISED, reverse=True)
         known = [*tried, *before]
         chosen = next((one for one in tried if _all_seen(refitter, one, known)), None)
         if chosen is None:
             return None
-        reach = chosen.promise - PRICE_OF_MORE * (len(chosen.hypotheses) - 1)
-        short = [
-            i
-            for i, one in enumerate(tried)
-            if one.short and one.promise - PRICE_OF_MORE * (len(one.hypotheses) - 1) >= reach
-        ]
+        reach = chosen.promise - chosen.price
+        short = [i for i, one in enumerate(tried) if one.short and one.promise - one.price >= reach]
         if not short:
             return chosen
         for i in short:
             tried[i] = refitter.refined(tried[i].hypotheses, chosen.score)
 
 
-def _witnessed(
-    chosen: Refitted, tried: Sequence[Refitted], witness: Witness
+def _by_histograms(
+    chosen: Refitted, tried: Sequence[Refitted], likelihood: HistogramLikelihood
 ) -> dict[frozenset[str], tuple[float, float]]:
     """Ask about the sets nearly as good as the chosen one that have another effect in the place of one."""
     found: dict[frozenset[str], tuple[float, float]] = {}
     for one in tried:
         swapped = len(one.tags - chosen.tags) == len(chosen.tags - one.tags) == 1
-        near = abs(worth(one) - worth(chosen)) < _NEARLY_AS_GOOD
+        near = abs(one.penalised_log_likelihood - chosen.penalised_log_likelihood) < FAR
         if swapped and near and one.tags not in found:
-            answer = witness.behind(one.effects, chosen.effects)
+            answer = likelihood.behind(one.effects, chosen.effects)
             if answer is not None:
                 found[one.tags] = answer
     return found
@@ -292,7 +301,7 @@ def _placebo(
         for h in hypotheses
         if h.tag not in chosen.tags
         and unrelated(h.effect, member.effect)
-        and not is_dear([h.effect])
+        and not is_expensive([h.effect])
         and not share_place(other.effect for other in (*others, h))
     ]
     if any(one.tags == kept | {h.tag} for one in trials.tried for h in pool):
@@ -328,7 +337,7 @@ def own_signature(own: FloatArray, others: FloatArray, left: FloatArray, noise: 
     """
     touched = np.abs(others).max(axis=0, initial=0.0)
     mine = (np.abs(own) > _MOVED * noise) & (touched < _UNTOUCHED * np.abs(own))
-    return bool(np.any(mine & (np.abs(left) > _SEEN) & (left * own > 0.0)))
+    return bool(np.any(mine & (np.abs(left) > STANDS_OUT) & (left * own > 0.0)))
 
 
 def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesis]:
@@ -337,7 +346,7 @@ def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesi
     for hypothesis in firsts(hypotheses):
         same = sum(h.tag == hypothesis.tag for h in chosen)
         most = 1 if type(hypothesis.effect).random_realisation else _MOST_OF_ONE
-        if same < most and len(chosen) < _MOST_SINGLES and all(hypothesis is not h for h in chosen):
+        if same < most and len(chosen) < _MOST_SINGLES and hypothesis not in chosen:
             chosen.append(hypothesis)
     return chosen
 
@@ -349,24 +358,10 @@ def _look_alikes(choice: Choice) -> list[Hypothesis]:
         return []
     singles = [one.hypotheses[0] for one in choice.tried if len(one.hypotheses) == 1]
     others = (h for h in singles if h.tag != best[0].tag and not unrelated(h.effect, best[0].effect))
-    return [h for h in others if not is_dear([h.effect])][:_MOST_ALIKE]
+    return [h for h in others if not is_expensive([h.effect])][:_MOST_ALIKE]
 
 
-def _asked_once(beside: Callable[[Refitted], Choice | None]) -> Callable[[Refitted], Choice | None]:
-    """Return the same, which remembers its answers."""
-    known: list[tuple[Refitted, Choice | None]] = []
-
-    def answer(one: Refitted) -> Choice | None:
-        found = [choice for asked, choice in known if asked is one]
-        if not found:
-            found = [beside(one)]
-            known.append((one, found[0]))
-        return found[0]
-
-    return answer
-
-
-def _grow(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> None:
+def _forward_select(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> None:
     """Refit the best set with what stands out beside it, and so on, as long as that is better.
 
     With the fewest effects that are not far behind: a refit shows what their fingerprints cannot tell.
@@ -379,10 +374,10 @@ def _grow(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> None:
             return
         fewest = min(
             (one for one in choice.tried if not _far_behind(one, choice)),
-            key=lambda one: (len(one.hypotheses), -one.worth),
+            key=lambda one: (len(one.hypotheses), -one.penalised_log_likelihood),
         )
         members = (*best.hypotheses[len(trials.held) :], *fewest.at_fit())
-        if not (trials.refit(_begun(members, trials.tried, trials.held)) and trials.thin()):
+        if not trials.refit_set(members):
             return
         trials.tune()
 
@@ -398,23 +393,23 @@ def _grown(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> list[
     """
     held = len(trials.held)
     kinds: dict[frozenset[str], Refitted] = {}
-    for one in sorted(trials.tried, key=worth, reverse=True):
+    for one in sorted(trials.tried, key=PENALISED, reverse=True):
         kinds.setdefault(one.tags, one)
     best = next(iter(kinds.values()))
     near = best.score - _REACH_SHARE * (best.score - trials.refitter.nothing)
-    begun: list[Refitted] = []
+    seeds: list[Refitted] = []
     for number, one in enumerate(kinds.values()):
         # what a set has besides is in vain where a part of it is better
         in_vain = any(better < one.tags for better in list(kinds)[:number])
         # a part of a better set has grown already
-        if one.score >= near and not in_vain and not any(one.tags < better.tags for better in begun):
-            begun.append(one)
-    begun = begun[:_MOST_BEGINNINGS]
-    choices = [(one.hypotheses[held:], choice) for one in begun if (choice := beside(one)) is not None]
+        if one.score >= near and not in_vain and not any(one.tags < better.tags for better in seeds):
+            seeds.append(one)
+    seeds = seeds[:_MOST_SEEDS]
+    choices = [(one.hypotheses[held:], choice) for one in seeds if (choice := beside(one)) is not None]
     grown: list[tuple[Hypothesis, ...]] = []
     for size, most in _MOST_GROWN.items():
         found = [
-            (each.worth, (*own, *each.at_fit()))
+            (each.penalised_log_likelihood, (*own, *each.at_fit()))
             for own, choice in choices
             for each in choice.tried
             if len(each.hypotheses) == size and not _far_behind(each, choice)
@@ -426,7 +421,8 @@ def _grown(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> list[
 
 def _far_behind(one: ScoredSet, choice: Choice) -> bool:
     """Tell whether the fingerprints beside a refitted set say that another one explains far more."""
-    return one.worth < choice.best.worth - FAR - _REACH_SHARE * choice.advantage
+    best = choice.best.penalised_log_likelihood
+    return one.penalised_log_likelihood < best - FAR - _REACH_SHARE * choice.advantage
 
 
 def _sets(choice: Choice, singles: Sequence[Refitted]) -> list[tuple[Hypothesis, ...]]:
@@ -438,7 +434,9 @@ def _sets(choice: Choice, singles: Sequence[Refitted]) -> list[tuple[Hypothesis,
         kinds.setdefault(one.hypotheses[-1].tag, one.hypotheses[-1])
     # of an effect that was refitted alone, the kind that did best; its strength is that of the set
     sets = [scored.at_fit() for scored in choice.tried if len(scored.hypotheses) > 1]
-    better = [tuple(_kind(h, kinds[h.tag]) if h.tag in kinds else h for h in members) for members in sets]
+    better = [
+        tuple(h if alike(h, kinds.get(h.tag, h)) else kinds[h.tag] for h in members) for members in sets
+    ]
     return [own if meets_itself(new) else new for own, new in zip(sets, better, strict=True)]
 
 
@@ -448,29 +446,6 @@ def _of_different_effects(sets: Sequence[tuple[Hypothesis, ...]]) -> list[tuple[
     for members in sets:
         found.setdefault(frozenset(h.tag for h in members), members)
     return list(found.values())
-
-
-def _kind(member: Hypothesis, best: Hypothesis) -> Hypothesis:
-    """Return a member of a set, of the kind of another hypothesis where they are of different kinds."""
-    return member if alike(member, best) else best
-
-
-def _begun(
-    members: Sequence[Hypothesis], tried: Sequence[Refitted], held: Sequence[Hypothesis] = ()
-) -> tuple[Hypothesis, ...]:
-    """Return a set at the strengths of the best refitted one that is a part of it or differs in one effect.
-
-    A strong effect alone is nearer to its strength in the set than its fingerprint can tell.
-    """
-    tags = {h.tag for h in (*held, *members)}
-    common = max(2, len(members) - 1)
-    near = [one for one in tried if one.tags < tags or sum(h.tag in one.tags for h in members) >= common]
-    if not near:
-        return tuple(members)
-    best = max(near, key=worth)
-    own = {h.tag: h for h in best.hypotheses}
-    better = best.tuned and best.tags != tags
-    return tuple(own[h.tag] if h.tag in own and (better or alike(h, own[h.tag])) else h for h in members)
 
 
 def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
@@ -488,21 +463,21 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
         return len(one.hypotheses) == 1
     # without an effect its own scatter is not there: events of which three are seen scatter by half of that
     noise = refitter.scatter(refitter.null.covariance, len(one.vectors))
-    complete = leaves_nothing(refitter, one)
+    complete = refitter.passes_goodness_of_fit(one)
     if not complete and not all(_untouched(one, place, noise) for place in range(len(one.hypotheses))):
         return False
     for place, hypothesis in enumerate(one.hypotheses):
         members = [h for h in one.hypotheses if h.tag != hypothesis.tag]
         # at numbers of their own the others may move other statistics
-        fixed = not has_numbers(refitter, members) or is_dear(h.effect for h in members)
+        fixed = not has_numbers(refitter, members) or is_expensive(h.effect for h in members)
         if fixed and _beyond_others(refitter, one, place):
             continue
         # the same kinds: another kind of one that mimics both is another set
-        others = next((other for other in known if of_kinds(other, members)), None)
+        others = next((other for other in known if same_kinds(other.hypotheses, members)), None)
         tags = {h.tag for h in members}
         # but for what these make of it at numbers of their own
         others = next((other for other in known if other.tuned and other.tags == tags), others)
-        if others is None and is_dear(h.effect for h in members):
+        if others is None and is_expensive(h.effect for h in members):
             return False
         if others is None:
             try:

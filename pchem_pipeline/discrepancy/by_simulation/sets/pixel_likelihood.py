@@ -1,4 +1,4 @@
-"""The likelihood of the pixels' histograms: a second witness where the statistics tell effects badly apart.
+"""The likelihood of the pixels' histograms, asked where the statistics tell effects badly apart.
 
 The statistics of a search are few, and two effects on the law of a sample (a wide tail, a skew) may differ
 little in them. The joint likelihood of the pixels' own parameters and all numbers of such effects holds all
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +18,16 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError, error_words
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, leads_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
-from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, at_other_peaks, off_by
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import LARGEST_FACTOR, Hypothesis
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, multistart, shift_bias_by_electrons
 from pchem_pipeline.discrepancy.effort import Effort
+from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.framework.effect import Effect, tag_of
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.histogram.count import histogram_frames
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 _log = logging.getLogger(__name__)
 
@@ -37,12 +39,15 @@ _MOST_STARTS = 3  # of one effect
 # nats that an effect for which no estimator speaks must explain, and times as strong as is typical, where a
 # plain fit is led astray
 _SPEAKS, _STRONG = 15.0, 5.0
-_FARTHEST = 30.0  # factor of a fingerprint: beyond, it is another hypothesis
 _PROBED = 64  # pixels
 _SILENT = 0.5  # nats of so many pixels: an effect that explains less is not in more of them
 _REMEMBERED = 12  # fits: each holds the masses of all codes
 _ALIKE = 0.5  # nats: fits that came to the same
 _ASTRAY = 5.0  # nats of a pixel that an effect explains, from which on it may mistake the peak of no electron
+_FEWEST_PIXELS, _FEWEST_FRAMES = 16, 200  # of a place, whose histograms tell numbers
+_MOST_IN_A_PART = 2  # effects for which no estimator speaks
+# nats of few pixels, and share of what the best one explains, by which an effect is far behind that
+_FAR, _FAR_SHARE = 10.0, 0.1
 
 
 class PixelLikelihood:
@@ -132,8 +137,10 @@ class PixelLikelihood:
 
     def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         """Return the effects of a set at the numbers that are likeliest together, where a law tells them."""
-        told = [h.effect for h in hypotheses if is_told(h.effect)]
-        fit = self._fit_once(told, [h.effect for h in hypotheses if not is_told(h.effect)])
+        told = [h.effect for h in hypotheses if identifiable_from_histograms(h.effect)]
+        fit = self._fit_once(
+            told, [h.effect for h in hypotheses if not identifiable_from_histograms(h.effect)]
+        )
         if fit is None or any(member.at_limit for member in fit.members):
             return tuple(hypotheses)
         likely = {member.tag: member.effect for member in fit.members}
@@ -152,10 +159,13 @@ class PixelLikelihood:
 
         Args:
             one: effects.
-            other: the same but for those that `is_told`.
+            other: the same but for those that `identifiable_from_histograms`.
         """
-        besides = [e for e in one if not is_told(e)]
-        fits = [self._fit_once([e for e in each if is_told(e)], besides) for each in (one, other)]
+        besides = [e for e in one if not identifiable_from_histograms(e)]
+        fits = [
+            self._fit_once([e for e in each if identifiable_from_histograms(e)], besides)
+            for each in (one, other)
+        ]
         if fits[0] is None or fits[1] is None:
             return None
         rise, error = self._sets.difference(fits[0], fits[1])
@@ -182,7 +192,7 @@ class PixelLikelihood:
             if without is None:
                 without = float(sets.fit(()).fit.log_likelihood.sum())
                 self._without[sets.present] = without
-            fitted = _at_other_peaks(sets, fitted)
+            fitted = _multistart(sets, fitted)
             if fitted.fit.log_likelihood.sum() - without > _ASTRAY * len(fitted.fit.log_likelihood):
                 for electrons in (-1.0, 1.0):
                     fitted = _electrons_off(sets, fitted, electrons)
@@ -195,7 +205,7 @@ class PixelLikelihood:
 
 
 @dataclass(frozen=True)
-class Witness:
+class HistogramLikelihood:
     """The likelihood of the pixels where one law holds for all their samples; by default it says nothing.
 
     Attributes:
@@ -209,7 +219,7 @@ class Witness:
 
         A number beside the strength stays as it is told here; a few pixels tell it badly.
         """
-        told = [h.effect for h in hypotheses if is_told(h.effect)]
+        told = [h.effect for h in hypotheses if identifiable_from_histograms(h.effect)]
         if not told:
             return tuple(hypotheses)
         number = MANY_PIXELS if any(len(Member.of(e).coordinates) > 1 for e in told) else FEW_PIXELS
@@ -240,24 +250,120 @@ class Witness:
         None also where they differ in what no law of a sample holds.
         """
         tags = {e.tag for e in one} ^ {e.tag for e in other}
-        if not all(is_told(e) for e in (*one, *other) if e.tag in tags):
+        if not all(identifiable_from_histograms(e) for e in (*one, *other) if e.tag in tags):
             return None
         pixels = self.of((*one, *other), number)
         return None if pixels is None else pixels.behind(one, other)
+
+
+@dataclass
+class Histograms:
+    """The pixels of a stack, place by place.
+
+    Attributes:
+        frames: (frame, y, x), DN.
+        maps: of their pixels under the model.
+        present: effects of the model.
+        effort: counts the work.
+        samples_of: returns the frames, (frame,), and the pixels, (y, x), of a part.
+        defects: effects that failed, and why; more come to them.
+        told: effects of which the numbers are those that the histograms tell.
+    """
+
+    frames: NDArray[np.unsignedinteger]
+    maps: PixelMaps
+    present: Sequence[Effect]
+    effort: Effort
+    samples_of: Callable[[Part], tuple[BoolArray, BoolArray]]
+    defects: dict[str, str] = field(default_factory=dict)
+    told: list[Effect] = field(default_factory=list)
+    _known: dict[Part, PixelLikelihood | None] = field(default_factory=dict, repr=False)
+
+    def with_numbers(self, guesses: Sequence[Effect]) -> list[Effect]:
+        """Return guesses with the numbers that histograms tell, the likeliest of an effect in a place first.
+
+        Those of effects with a law, by the samples on which they act: a strong effect has moved the pixels
+        from which its estimator takes a strength. Others, and those that no pixel can be fitted with, stay as
+        they are. Guesses that come to the same are one.
+        """
+        by_place: dict[Part, dict[str, list[Effect]]] = {}
+        for g in guesses:
+            by_place.setdefault(Part(g.region, g.when), {}).setdefault(g.tag, []).append(g)
+        likely: dict[tuple[str, Part], list[Effect]] = {}
+        for place, own in by_place.items():
+            anywhere = {tag: [g.at_place(None) for g in there] for tag, there in own.items()}
+            told = {
+                tag: there
+                for tag, there in anywhere.items()
+                if any(identifiable_from_histograms(g) for g in there)
+            }
+            by = self._of(place) if told else None
+            for tag, effects in {} if by is None else _likeliest(by, told).items():
+                likely[tag, place] = [e.at_place(place.region, place.when) for e in effects]
+        found: list[Effect] = []
+        for tag in dict.fromkeys(g.tag for g in guesses):
+            for place, own in by_place.items():
+                found += likely.get((tag, place)) or own.get(tag, [])
+        self.told += [effect for effects in likely.values() for effect in effects]
+        return found
+
+    def suggested(
+        self, classes: Mapping[str, type[Effect]], parts: Sequence[Part], guesses: Sequence[Effect]
+    ) -> list[Effect]:
+        """Return what explains much of the histograms of parts, of effects that are not guessed there."""
+        found: list[Effect] = []
+        for part in parts:
+            known = {g.tag for g in guesses if (g.region, g.when) == (part.region, part.when)}
+            by = self._of(part)
+            kinds = [kind for tag, kind in classes.items() if tag not in known]
+            likely = [] if by is None else by.suggested(kinds)[:_MOST_IN_A_PART]
+            found += [effect.at_place(part.region, part.when) for effect in likely]
+        self.told += found
+        return found
+
+    def _of(self, part: Part) -> PixelLikelihood | None:
+        """Return the likelihood of the samples of a part; None: they are too few, or have no one law."""
+        if part not in self._known:
+            some, inside = self.samples_of(part)
+            usable = self.maps.usable & inside
+            enough = usable.sum() >= _FEWEST_PIXELS and some.sum() >= _FEWEST_FRAMES
+            told = enough and all(each.everywhere for each in self.present)
+            own = self.frames if some.all() else self.frames[some]
+            maps = replace(self.maps, usable=usable)
+            of = own, maps, self.present, self.effort, FEW_PIXELS
+            self._known[part] = PixelLikelihood(*of, self.defects) if told else None
+        return self._known[part]
+
+
+def _likeliest(by: PixelLikelihood, guesses: Mapping[str, Sequence[Effect]]) -> dict[str, list[Effect]]:
+    """Return the numbers of effects in a place, by tag: as a part of its pixels tells them first.
+
+    As all of them do where an effect comes near the best one; the others are in vain, or beside it, where
+    numbers that were fitted without it say little.
+    """
+    few = by.fewer()
+    rough = {tag: few.fitted(own) for tag, own in guesses.items()}
+    best = max((fits[0][0] for fits in rough.values() if fits), default=0.0)
+    found = {}
+    for tag, fits in rough.items():
+        near = bool(fits) and fits[0][0] > (1.0 - _FAR_SHARE) * best - _FAR
+        fits = by.fitted([effect for _, effect in fits]) if near and few is not by else fits
+        found[tag] = [effect for _, effect in fits]
+    return found
 
 
 def _at(hypothesis: Hypothesis, effect: Effect) -> Hypothesis:
     """Return a hypothesis with its effect at other numbers, its fingerprint in proportion to the strength."""
     old, new = (float(getattr(e, e.strength)) for e in (hypothesis.effect, effect))
     factor = max(new / old, 0.0) ** effect.power if old else 0.0
-    if not 1.0 / _FARTHEST < factor < _FARTHEST:
+    if not 1.0 / LARGEST_FACTOR < factor < LARGEST_FACTOR:
         return hypothesis
     return replace(hypothesis, effect=effect, fingerprint=hypothesis.fingerprint * factor)
 
 
 def _starts(kind: type[Effect]) -> tuple[Effect, ...]:
     """Return what is typical of an effect and the same stronger; nothing where no law tells it."""
-    typical = next((e for e in kind.typical() if e.strength and is_told(e)), None)
+    typical = next((e for e in kind.typical() if e.strength and identifiable_from_histograms(e)), None)
     return () if typical is None else (typical, typical.scaled(_STRONG))
 
 
@@ -269,9 +375,9 @@ def _electrons_off(sets: SetComparison, fitted: FittedSet, electrons: float) -> 
     if len(sets.train) > 2 * _PROBED:
         few = sets.of(slice(None, None, len(sets.train) // _PROBED), fitted.fit.parameters)
         probe = few.fit(fitted.members)
-        if not _likelier(few.fit(fitted.members, off_by(few.start, electrons)), probe).any():
+        if not _likelier(few.fit(fitted.members, shift_bias_by_electrons(few.start, electrons)), probe).any():
             return fitted
-    other = sets.fit(fitted.members, off_by(fitted.fit.parameters, electrons))
+    other = sets.fit(fitted.members, shift_bias_by_electrons(fitted.fit.parameters, electrons))
     better = _likelier(other, fitted)
     if not better.any():
         return fitted
@@ -285,11 +391,11 @@ def _likelier(one: FittedSet, other: FittedSet) -> NDArray[np.bool_]:
     return np.asarray(one.fit.log_likelihood > other.fit.log_likelihood + CLEARLY)
 
 
-def _at_other_peaks(sets: SetComparison, fitted: FittedSet) -> FittedSet:
+def _multistart(sets: SetComparison, fitted: FittedSet) -> FittedSet:
     """Return a fit with the pixels that samples below all others led astray put right, or as it is."""
     parameters, shared = fitted.fit.parameters, fitted.fit.shared
     law = law_of(sets.present, fitted.members, shared, parameters, sets.samples)
-    moved, start = at_other_peaks(sets.train, sets.origin, law, parameters)
+    moved, start = multistart(sets.train, sets.origin, law, parameters)
     if not moved.size:
         return fitted
     other = sets.fit(fitted.members, start)
@@ -298,12 +404,12 @@ def _at_other_peaks(sets: SetComparison, fitted: FittedSet) -> FittedSet:
 
 def _has_law(effect: Effect) -> bool:
     """Tell whether a law of a sample, if only a rough one, has an effect that its histograms show first."""
-    return is_told(effect) or (
+    return identifiable_from_histograms(effect) or (
         effect.everywhere and type(effect).rough_law and leads_in_histograms(type(effect))
     )
 
 
-def is_told(effect: Effect) -> bool:
+def identifiable_from_histograms(effect: Effect) -> bool:
     """Tell whether the law of a sample holds all numbers of an effect that its histograms show first."""
     kind = type(effect)
     if not effect.everywhere or kind.rough_law or kind.random_realisation:

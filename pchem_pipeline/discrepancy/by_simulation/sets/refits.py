@@ -11,34 +11,41 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    PRICE_OF_MORE,
     Hypothesis,
     Noise,
     correction,
     log_density,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError, Refit
-from pchem_pipeline.discrepancy.by_simulation.sets.steps import Steps
 from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 
 FloatArray = NDArray[np.float64]
 
+_SPLITS = 2  # train and test frames, whose mean is explained
 #: Replicates at each strength on the way.
 FEW = 6
 _ENOUGH = 12  # replicates that tell a scatter
 _MOST_STEPS = 5
-_STEPS_OF_DEAR = 2
+_STEPS_OF_EXPENSIVE = 2
+#: Standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
+#: than a single one would by chance.
+ESTABLISHED = 4.5
 _CLOSE = 0.05  # relative change of a factor that is not worth another simulation
 _CERTAIN = 3.5  # errors of a difference of means: less is chance
-_SMALLEST_SECANT = 0.05  # of the logarithm of a factor: shorter steps say nothing about the slope
+#: Of the logarithm of a factor: shorter steps say nothing about the slope.
+SMALLEST_SECANT = 0.05
 _TRIAL = 0.3  # step of the logarithm of a factor by which a slope is measured
 _STRONG = 10.0  # standard deviations by which an effect moves a statistic where its slope is
 _LARGEST_SHARE = 0.9  # of a factor that a correction takes away
@@ -50,12 +57,22 @@ _LEAST_GAIN = 0.5  # nats of a step, about a standard error of a strength: the n
 _SLIGHT = (
     0.15  # of what a set leaves beyond chance, gained by a step that leaves it behind another set: in vain
 )
+_LEFT = 0.02  # chance of what a complete set may leave, anywhere among the statistics
+_LITTLE = 0.03  # of what there is to explain, nats, that the details of effects may leave
 # nats, and share of what there is to explain, that a set must promise to leave for it not to be all there is;
 # the logarithm of a factor up to which its promise is believed
 _SHORT, _SHORT_SHARE, _BELIEVED = 100.0, 0.05, 0.75
 
+#: Most that the logarithm of the factor of a strength changes in one step.
+LARGEST_STEP = float(np.log(4.0))
+_FURTHER = 2  # steps beyond one that explains less, where the data go on asking for the same
+# of a step, what the data ask for after it: too much for a good slope, and the most that is believed
+_SLOW, _SLOWEST = 0.5, 0.75
+_SHORTEST = 0.25  # of the step that the data ask for
+State = TypeVar("State")
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Refitted:
     """A set of effects at strengths for which the refitted model was simulated.
 
@@ -102,6 +119,21 @@ class Refitted:
         return tuple(h.effect for h in self.hypotheses)
 
     @property
+    def words(self) -> str:
+        """Tags of the effects."""
+        return " + ".join(h.tag for h in self.hypotheses)
+
+    @property
+    def price(self) -> float:
+        """Nats that the effects cost beyond the first one."""
+        return PRICE_OF_MORE * (len(self.hypotheses) - 1)
+
+    @property
+    def penalised_log_likelihood(self) -> float:
+        """Score less the price of the effects, nats."""
+        return self.score - self.price
+
+    @property
     def mean(self) -> FloatArray:
         """Mean of the statistics, shape (m,)."""
         return np.asarray(self.vectors.mean(axis=0))
@@ -118,6 +150,104 @@ class Refitted:
 
 
 @dataclass
+class DampedSteps(Generic[State]):
+    """The best of several states, and the length of the next step, which a step in vain halves.
+
+    Attributes:
+        best: the state of the highest score so far.
+        score: its log score, nats.
+        length: of the next step, in what the data ask for.
+    """
+
+    best: State
+    score: float
+    length: float = 1.0
+
+    def judge(self, now: State | None, score: float = -np.inf) -> bool:
+        """Keep the better one, and tell whether it is the new one; None: the step led nowhere."""
+        if now is None or not score > self.score:
+            self.length *= 0.5
+            return False
+        self.best, self.score, self.length = now, score, 1.0
+        return True
+
+
+def broyden(slopes: FloatArray, step: FloatArray, unforeseen: FloatArray) -> FloatArray:
+    """Return slopes that account for what a step has done, too (Broyden 1965).
+
+    Args:
+        slopes: of the statistics with each coordinate, shape (e, m).
+        step: of the coordinates, shape (e,).
+        unforeseen: change of the statistics beyond that by these slopes, shape (m,).
+    """
+    return np.asarray(slopes + np.outer(step, unforeseen / float(step @ step)))
+
+
+@dataclass
+class Steps(DampedSteps[Refitted]):
+    """A way to the strengths of a set that explain the data best, as far as it was gone.
+
+    Slopes are those of the last step, and what a set leaves is a matter of chance, too: a step may explain
+    less where the way on explains more, or do a fraction of what it promised, time after time.
+
+    Attributes:
+        now: the set at its last strengths.
+        step: that led there, logarithms of factors, shape (e,).
+        gained: by the last step to something better, nats.
+        further: steps that were gone on after one that explains less.
+    """
+
+    now: Refitted = field(kw_only=True)
+    step: FloatArray = field(kw_only=True)
+    gained: float = np.inf
+    further: int = 0
+
+    @classmethod
+    def begin(cls, one: Refitted) -> Steps:
+        """Begin at the guessed strengths."""
+        return cls(one, one.score, now=one, step=one.change)
+
+    @property
+    def kept_its_promise(self) -> bool:
+        """Whether the last step did about what it promised; else the next one's promise says little."""
+        return self.length <= 1.0
+
+    def ahead(self) -> tuple[Refitted, FloatArray]:
+        """Return from where the next step is to be, and the step."""
+        if self.further:
+            change = self.now.change
+            step = change * (np.linalg.norm(self.step) / max(float(np.linalg.norm(change)), 1e-12))
+            return self.now, np.clip(step, -LARGEST_STEP, LARGEST_STEP)
+        return self.best, np.clip(self.best.change * self.length, -LARGEST_STEP, LARGEST_STEP)
+
+    def taken(self, step: FloatArray, now: Refitted | None) -> bool:
+        """Take note of where a step led (None: nowhere), and tell whether there is another one to try."""
+        self.step, before = step, self.score
+        if now is not None and not now.score > before and self._goes_on(now):
+            self.now, self.further = now, self.further + 1
+            return True
+        another, self.length, self.further = self.length > _SHORTEST, min(self.length, 2.0), 0
+        if not self.judge(now, -np.inf if now is None else now.score) or now is None:
+            return another
+        self.gained, self.now, self.length = self.score - before, now, _lengthened(now.change, step)
+        return True
+
+    def _goes_on(self, now: Refitted) -> bool:
+        """Tell whether the data ask for more of the same on both sides of a dip."""
+        return self.further < _FURTHER and self.length >= 1.0 and float(now.change @ self.step) > 0.0
+
+
+def _lengthened(change: FloatArray, step: FloatArray) -> float:
+    """Return by how much the next step is to be longer than the change that is asked for after a step.
+
+    Where each asks for nearly as much as the last one, slopes are too steep: all of them together are a
+    geometric series.
+    """
+    ratio = float(change @ step) / max(float(step @ step), 1e-12)
+    return 1.0 if ratio < _SLOW else 1.0 / (1.0 - min(ratio, _SLOWEST))
+
+
+@dataclass
 class Refitter:
     """Fits sets of effects to the statistics of the data.
 
@@ -125,10 +255,9 @@ class Refitter:
         draw: refits the pixels with effects beside those of the model, and returns the fit and the statistics
             of so many replicates of it, which share their random numbers whatever the effects.
         null: of the model without them.
-        target: mean of the statistics of ``splits`` parts of the data, shape (m,).
+        target: mean of the statistics of train and test frames, shape (m,).
         events: see :class:`~pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints.Noise`.
         present: effects that the model has besides.
-        splits: number of parts.
         steps: corrections of the strengths, at most.
         allow: hears which effects are simulated next, and raises an error where the work is at its limit.
         defects: effects that failed, and why; more come to them.
@@ -139,7 +268,6 @@ class Refitter:
     target: FloatArray
     events: FloatArray
     present: tuple[Effect, ...] = ()
-    splits: int = 2
     steps: int = _MOST_STEPS
     allow: Callable[[str], None] = lambda _: None
     defects: dict[str, str] = field(default_factory=dict)
@@ -163,10 +291,9 @@ class Refitter:
         Raises:
             NotFittedError: hardly a pixel can be fitted with the set at its guessed strengths.
         """
-        words = " + ".join(h.tag for h in hypotheses)
-        self.allow(words)
+        self.allow(words := " + ".join(h.tag for h in hypotheses))
         way = Steps.begin(self.simulated(tuple(hypotheses), None, replicates))
-        dear = is_dear(h.effect for h in hypotheses)
+        expensive = is_expensive(h.effect for h in hypotheses)
         for step_number in range(self.steps):
             best = way.best
             if best.settled or way.gained < _LEAST_GAIN:
@@ -175,7 +302,7 @@ class Refitter:
                 break
             if whole and self._explains_a_part(best):
                 return replace(best, short=True)
-            if dear and (step_number >= _STEPS_OF_DEAR or (step_number and best.score < rival)):
+            if expensive and (step_number >= _STEPS_OF_EXPENSIVE or (step_number and best.score < rival)):
                 break
             start, step = way.ahead()
             moved = _moved(start.hypotheses, step)
@@ -242,7 +369,7 @@ class Refitter:
         Replicates share their random numbers, whatever the strength: few of them show a slope.
         """
         strong = np.max(np.abs(one.parts) / self.null.std, axis=1) > _STRONG
-        if not strong.any() or is_dear(one.effects):
+        if not strong.any() or is_expensive(one.effects):
             return None
         ahead = np.diag(np.where(strong, np.copysign(_TRIAL, one.change), 0.0))
         found = [self._slope(one, place, ahead[place]) for place in range(strong.size)]
@@ -255,21 +382,44 @@ class Refitter:
         moved = _moved(one.hypotheses, ahead)
         if moved is None:
             return None
-        step = float(_step(one.effects, tuple(h.effect for h in moved))[place])
-        if abs(step) < _SMALLEST_SECANT:
+        effects = tuple(h.effect for h in moved)
+        step = float(_step(one.effects, effects)[place])
+        if abs(step) < SMALLEST_SECANT:
             return None
-        self.allow(" + ".join(sorted(one.tags)))
+        # a shift in proportion to the factor has this slope between the two
+        middle = np.exp(step / 2.0)
+        slope = self.measured_slope(one, effects, step, middle * one.slopes[place])
+        return None if slope is None else np.asarray(slope / middle)
+
+    def measured_slope(
+        self, one: Refitted, effects: tuple[Effect, ...], step: float, foreseen: FloatArray | float = 0.0
+    ) -> FloatArray | None:
+        """Measure how the statistics go with a number of a set, by a simulation; None: it cannot be fitted.
+
+        Args:
+            one: the set.
+            effects: the same with one number changed.
+            step: by how much the logarithm of it was changed.
+            foreseen: the slope where the measured one does not differ beyond chance, shape (m,).
+        """
+        self.allow(one.words)
         try:
-            _, vectors = self.draw(tuple(h.effect for h in moved), len(one.vectors))
+            _, vectors = self.draw(effects, len(one.vectors))
         except NotFittedError:
             return None
         apart = (vectors - one.vectors) / step
         error = apart.std(axis=0, ddof=1) / np.sqrt(len(apart))
-        # a shift in proportion to the factor has this slope between the two
-        middle = np.exp(step / 2.0)
-        foreseen = middle * one.slopes[place]
-        slope = foreseen + beyond_chance(apart.mean(axis=0) - foreseen, error)
-        return np.asarray(slope / middle)
+        return np.asarray(foreseen + beyond_chance(apart.mean(axis=0) - foreseen, error))
+
+    def passes_goodness_of_fit(self, one: Refitted) -> bool:
+        """Tell whether a set leaves no statistic beyond chance."""
+        p = float(self.null.p_of(one.rest, _SPLITS).min())
+        return look_elsewhere(p, self.null.effective_tests) > _LEFT
+
+    def residual_is_small(self, one: Refitted) -> bool:
+        """Tell whether a set leaves nothing, or so little of what there was that it may be its details."""
+        little = one.chance - one.score < _LITTLE * (one.chance - self.nothing)
+        return little or self.passes_goodness_of_fit(one)
 
     def kept(self, hypotheses: Sequence[Hypothesis]) -> NDArray[np.bool_]:
         """Return which statistics tell strengths.
@@ -281,7 +431,7 @@ class Refitter:
 
     def noise(self, covariance: Covariance, replicates: int) -> Noise:
         """Return the noise of the data less the mean of so many replicates."""
-        return Noise(covariance.times(1.0 / self.splits + 1.0 / replicates), _FINE_ERROR, self.events)
+        return Noise(covariance.times(1.0 / _SPLITS + 1.0 / replicates), _FINE_ERROR, self.events)
 
     def scatter(self, covariance: Covariance, replicates: int) -> FloatArray:
         """Return standard deviations of the same, by chance alone, shape (m,)."""
@@ -306,7 +456,7 @@ class Refitter:
         scaling = np.array([bool(h.effect.strength) for h in hypotheses])
         scatter = None
         if replicates >= _ENOUGH:
-            scatter = (vectors - mean) * np.sqrt(1.0 / self.splits + 1.0 / replicates)
+            scatter = (vectors - mean) * np.sqrt(1.0 / _SPLITS + 1.0 / replicates)
         kept = self.kept(hypotheses)
         change, stderr = correction(
             slopes[:, kept],
@@ -363,11 +513,11 @@ class Refitter:
             return parts
         step = _step(before.effects, tuple(h.effect for h in hypotheses))
         length, old = float(step @ step), before.slopes
-        if length < _SMALLEST_SECANT**2:
+        if length < SMALLEST_SECANT**2:
             return old
         apart = vectors.mean(axis=0) - before.mean - step @ old
         error = _error_of_difference(vectors, before.vectors, np.sqrt(covariance.variances))
-        slope = old + np.outer(step, beyond_chance(apart, error) / length)
+        slope = broyden(old, step, beyond_chance(apart, error))
         # a secant holds between the two; a shift in proportion to the factor has its end's slope
         return np.asarray(slope * np.exp(step / 2.0)[:, None])
 
@@ -382,7 +532,7 @@ class Refitter:
         return null.covariance.scaled(ratio)
 
 
-def is_dear(effects: Iterable[Effect]) -> bool:
+def is_expensive(effects: Iterable[Effect]) -> bool:
     """Tell whether a refit with effects takes long: those look for levels or a path in every pixel."""
     return any(type(effect).random_realisation for effect in effects)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pchem_pipeline.discrepancy.by_simulation.measured.waves import measured_wave
+from pchem_pipeline.discrepancy.by_simulation.measured.noise import measured_wave
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.observe.waves import Waves, waves_across

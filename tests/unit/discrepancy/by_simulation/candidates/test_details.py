@@ -113,10 +113,8 @@ def test_an_effect_that_wrong_numbers_of_another_brought_in_is_not_kept() -> Non
     hypotheses = [Hypothesis(e, statistics([e])) for e in (BLINKING, RowNoise(row_noise_dn=0.6))]
     shifts = (world.parts[0] - world.null.mean, world.parts[1] - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
-    assert choice is not None
     assert choice.best.tags == {"dark_current_rts", "row_noise"}
     found = compare(world.refitter(), [], hypotheses, choice)
-    assert found is not None
     assert found.chosen.tags == {"dark_current_rts"}
 
 
@@ -162,7 +160,6 @@ def test_what_an_effect_of_another_package_raises_ends_no_search(strange: type[D
     assert choice is not None
     refitter = world.refitter()
     found = compare(refitter, [], hypotheses, choice)
-    assert found is not None
     assert "dark_current_rts" in found.chosen.tags
     assert refitter.defects
     assert all("dark_current_rts" in failed for failed in refitter.defects)

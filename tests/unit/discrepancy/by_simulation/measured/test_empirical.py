@@ -7,24 +7,28 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.charge_material import a_uniform_sensor
+from helpers.charge_material import simulated as simulated_frames
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings, _sentence
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import _Mixture, measured_moves, without_squares
+from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import (
+    _Mixture,
+    measured_mixture_shifts,
+    without_squares,
+)
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.verdict import closed_share
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.readout.empirical import Empirical, Move, neighbour_words
+from pchem_pipeline.effects.readout.empirical import Empirical, MixtureShift, neighbour_words
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.simulate.chain import simulate_block
-from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.truth import TruthMaps
 
 SHAPE, FRAMES, STEP = (10, 12), 1500, 12.0
+SENSOR = a_uniform_sensor(SHAPE, 1.0, 1 / STEP, 100.0, 0.25)
 
 
 def sensor(seed: int) -> tuple[np.ndarray, np.random.Generator, PixelMaps]:
@@ -46,12 +50,12 @@ def codes(dn: np.ndarray) -> np.ndarray:
 
 
 def plain(dn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Move nothing."""
+    """MixtureShift nothing."""
     return codes(dn)
 
 
 def shifted(share: float, shift: int):
-    """Move samples by a number of DN."""
+    """MixtureShift samples by a number of DN."""
     return lambda dn, rng: codes(dn) + shift * (rng.random(dn.shape) < share)
 
 
@@ -95,7 +99,7 @@ def frames(seed: int, move: Any = plain) -> tuple[np.ndarray, np.ndarray, PixelM
 
 def measured(move: Any, seed: int) -> Empirical | None:
     """Return what is measured in frames of which some samples are moved."""
-    found = measured_moves(*frames(seed, move), ())
+    found = measured_mixture_shifts(*frames(seed, move), ())
     assert found is None or found.gain > 10.0
     return None if found is None else found.effect
 
@@ -103,7 +107,6 @@ def measured(move: Any, seed: int) -> Empirical | None:
 @pytest.mark.parametrize(("share", "shift"), [(0.004, -8), (0.02, 4)])
 def test_shifts_are_measured(share: float, shift: int) -> None:
     found = measured(shifted(share, shift), 3)
-    assert found is not None
     samples = FRAMES * SHAPE[0] * SHAPE[1]
     mean = float(found.shares() @ np.array([move.shift_dn for move in found.moves]))
     # neighbouring shifts of the grid stand for one another: their mean is what is known well
@@ -115,14 +118,13 @@ def test_shifts_are_measured(share: float, shift: int) -> None:
 @pytest.mark.parametrize(
     ("move", "share", "wanted"),
     [
-        (averaged, 0.1, Move(towards=(-1, 0, 0), part=0.5, within_dn=6)),
-        (drawn(2.0), 1.0, Move(towards=(-1, 0, 0), shift_dn=2)),
-        (drawn(0.7), 0.7, Move(towards=(-1, 0, 0), shift_dn=1)),
+        (averaged, 0.1, MixtureShift(towards=(-1, 0, 0), part=0.5, within_dn=6)),
+        (drawn(2.0), 1.0, MixtureShift(towards=(-1, 0, 0), shift_dn=2)),
+        (drawn(0.7), 0.7, MixtureShift(towards=(-1, 0, 0), shift_dn=1)),
     ],
 )
-def test_what_depends_on_a_neighbour_is_measured(move: Any, share: float, wanted: Move) -> None:
+def test_what_depends_on_a_neighbour_is_measured(move: Any, share: float, wanted: MixtureShift) -> None:
     found = measured(move, 5)
-    assert found is not None
     main = max(found.moves, key=lambda one: one.weight)
     assert main.model_copy(update={"weight": 1.0}) == wanted
     assert found.together == "sample"
@@ -133,7 +135,6 @@ def test_what_depends_on_a_neighbour_is_measured(move: Any, share: float, wanted
 
 def test_squares_that_come_as_their_mean_are_measured_where_they_begin() -> None:
     found = measured(merged, 6)
-    assert found is not None
     assert found.squares == (1, 0)
     assert found.share == pytest.approx(0.05, rel=0.1)
     assert "from odd rows and even columns on" in found.describe()
@@ -143,20 +144,22 @@ def test_squares_that_come_as_their_mean_are_measured_where_they_begin() -> None
 
 
 def test_simulated_squares_are_the_mean_of_their_samples() -> None:
-    found, own = simulated(Empirical(share=0.3, moves=(Move(),), squares=(1, 0)), 400)
+    found, own = simulated(Empirical(share=0.3, moves=(MixtureShift(),), squares=(1, 0)), 400)
     mean = own[:, 1:-1].reshape(400, SHAPE[0] // 2 - 1, 2, SHAPE[1] // 2, 2).sum(axis=(2, 4)) // 4
     squares = found[:, 1:-1].reshape(400, SHAPE[0] // 2 - 1, 2, SHAPE[1] // 2, 2)
     equal = (squares == mean[:, :, None, :, None]).all(axis=(2, 4))
     assert abs(equal.mean() - 0.3) < 5 * np.sqrt(0.21 / equal.size) + 0.01
     np.testing.assert_array_equal(found[:, 0], own[:, 0])
     with pytest.raises(ValidationError, match="not moved"):
-        Empirical(share=0.3, moves=(Move(shift_dn=3),), squares=(1, 0))
+        Empirical(share=0.3, moves=(MixtureShift(shift_dn=3),), squares=(1, 0))
 
 
 def test_pixels_are_fitted_without_samples_that_were_averaged() -> None:
     dn, rng, maps = sensor(11)
     found, own = merged(dn, rng).astype(np.uint16), codes(dn)
-    left = without_squares(found, maps.usable, (Empirical(share=0.05, moves=(Move(),), squares=(1, 0)),))
+    left = without_squares(
+        found, maps.usable, (Empirical(share=0.05, moves=(MixtureShift(),), squares=(1, 0)),)
+    )
     error = np.sqrt(2.0) * own.std(axis=0) / np.sqrt(FRAMES)
     inside = np.s_[:, 1:-1]
 
@@ -181,15 +184,14 @@ def test_moves_of_which_none_is_needed_are_not_measured(monkeypatch: pytest.Monk
 
 def simulated(effect: Empirical, n_frames: int) -> tuple[np.ndarray, np.ndarray]:
     """Return simulated frames with and without an effect."""
-    values = (1.0, 1 / STEP, 100.0, 0.25)
-    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
-    how = SimulateSettings(shape=SHAPE, n_frames=n_frames, seed=4, bit_depth=12)
-    with_it = how.model_copy(update={"effects": (effect,)})
-    return tuple(simulate_block(truth, each, (0, n_frames))[0].astype(int) for each in (with_it, how))
+    both = (simulated_frames(SENSOR, *each, n_frames=n_frames, seed=4)[0] for each in ((effect,), ()))
+    return tuple(frames.astype(int) for frames in both)
 
 
 def test_samples_are_moved_by_their_shares() -> None:
-    effect = Empirical(share=0.2, moves=(Move(shift_dn=-9, weight=3.0), Move(shift_dn=5, weight=1.0)))
+    effect = Empirical(
+        share=0.2, moves=(MixtureShift(shift_dn=-9, weight=3.0), MixtureShift(shift_dn=5, weight=1.0))
+    )
     np.testing.assert_allclose(effect.shares(), [0.15, 0.05])
     found, own = simulated(effect, 1000)
     for shift, share in ((-9, 0.15), (5, 0.05), (0, 0.8)):
@@ -204,7 +206,7 @@ def test_samples_are_moved_by_their_shares() -> None:
 
 
 def test_samples_are_moved_towards_what_was_delivered_before() -> None:
-    found, own = simulated(Empirical(share=0.2, moves=(Move(towards=(-1, 0, 0), part=0.5),)), 400)
+    found, own = simulated(Empirical(share=0.2, moves=(MixtureShift(towards=(-1, 0, 0), part=0.5),)), 400)
     towards = own[1:] + (found[:-1] - own[1:]) // 2
     moved = (found[1:] != own[1:]) & (towards != own[1:])
     # four moves after another are followed, a fifth one is not
@@ -215,7 +217,7 @@ def test_samples_are_moved_towards_what_was_delivered_before() -> None:
 
 @pytest.mark.parametrize(("together", "axes"), [("row", 2), ("frame", (1, 2)), ("column", 1)])
 def test_what_is_moved_together_comes_from_one_side(together: Any, axes: Any) -> None:
-    move = Move(towards=(0, 0, 1))
+    move = MixtureShift(towards=(0, 0, 1))
     found, own = simulated(Empirical(share=0.3, moves=(move,), together=together), 400)
     moved, kept = found[:, :, :-1] == own[:, :, 1:], found[:, :, :-1] == own[:, :, :-1]
     assert np.all(moved | kept)
@@ -225,25 +227,25 @@ def test_what_is_moved_together_comes_from_one_side(together: Any, axes: Any) ->
 
 
 def test_the_same_frames_at_every_division() -> None:
-    moves = (Move(towards=(-1, 0, 0), part=0.5), Move(towards=(0, 1, 0)))
+    moves = (MixtureShift(towards=(-1, 0, 0), part=0.5), MixtureShift(towards=(0, 1, 0)))
     effect = Empirical(share=0.4, moves=moves)
-    values = (1.0, 1 / STEP, 100.0, 0.25)
-    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
-    how = SimulateSettings(shape=SHAPE, n_frames=30, seed=4, bit_depth=12, effects=(effect,))
-    whole = simulate_block(truth, how, (0, 30))[0]
-    np.testing.assert_array_equal(simulate_block(truth, how, (9, 22), (3, 6))[0], whole[9:22, 3:6])
+    whole, part = (
+        simulated_frames(SENSOR, effect, n_frames=30, seed=4, frames=some, rows=rows)[0]
+        for some, rows in ((None, None), ((9, 22), (3, 6)))
+    )
+    np.testing.assert_array_equal(part, whole[9:22, 3:6])
 
 
 def test_it_competes_with_nothing_and_refuses_half_a_table() -> None:
     assert "empirical" not in candidate_classes(DiscrepancySettings())
     with pytest.raises(ValidationError, match="earlier"):
-        Move(towards=(1, 0, 0))
+        MixtureShift(towards=(1, 0, 0))
     with pytest.raises(ValidationError, match="weight above 0"):
-        Empirical(share=0.1, moves=(Move(shift_dn=1, weight=0.0),))
+        Empirical(share=0.1, moves=(MixtureShift(shift_dn=1, weight=0.0),))
 
 
 def test_a_described_sensor_is_said_so_and_keeps_the_component_in_its_model() -> None:
-    effect = Empirical(share=0.004, moves=(Move(shift_dn=-8),))
+    effect = Empirical(share=0.004, moves=(MixtureShift(shift_dn=-8),))
     before, after = Gap(2e-3, 5e-5, (0.0, 0.0), {}), Gap(3e-5, 5e-5, (0.0, 0.0), {})
     addition = Addition(effect, True, "", (), 1e-4, before, after, (), None, (), described=True)
     found = Findings(
@@ -266,7 +268,7 @@ def test_a_described_sensor_is_said_so_and_keeps_the_component_in_its_model() ->
 
 
 def test_a_description_that_leaves_a_part_of_the_gap_is_proposed_and_not_in_the_model() -> None:
-    effect, named = Empirical(share=0.004, moves=(Move(shift_dn=-8),)), RowNoise(row_noise_dn=0.3)
+    effect, named = Empirical(share=0.004, moves=(MixtureShift(shift_dn=-8),)), RowNoise(row_noise_dn=0.3)
     first, second, third = (Gap(value, 5e-5, (0.0, 0.0), {}) for value in (4e-3, 2e-3, 4e-4))
     steps = (
         Addition(named, True, "", (), 1e-4, first, second, (), None, ()),

@@ -7,21 +7,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.charge_material import a_uniform_sensor
+from helpers.charge_material import simulated as simulated_frames
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.by_simulation.measured.electrons import electron_chances, measured_electrons
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import PartSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.simulate.chain import simulate_block
-from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.truth import TruthMaps
 
 SHAPE, FRAMES, STEP, NOISE = (16, 16), 2000, 14.0, 0.25
+QUIET = a_uniform_sensor(SHAPE, 2.0, 1 / STEP, 100.0, 1e-6)
 EVERYWHERE = np.ones(SHAPE, bool)
 RNG = np.random.default_rng(20)
 EXPOSURE = np.exp(RNG.normal(0.6, 0.25, SHAPE))
@@ -71,14 +71,7 @@ def codes(electrons: np.ndarray, seed: int) -> np.ndarray:
 def chances(frames: np.ndarray, inside: np.ndarray = EVERYWHERE) -> Any:
     """Return what is measured of frames."""
     evidence = observe(frames, np.arange(len(frames)), n_run=len(frames), block_frames=100)
-    return electron_chances(
-        frames,
-        np.arange(len(frames)),
-        laws_of_frames(frames, evidence.maps),
-        evidence.maps,
-        evidence,
-        inside,
-    )
+    return electron_chances(PartSamples(frames, np.arange(len(frames)), evidence.maps, evidence, inside))
 
 
 def drawn(fate: Fate, seed: int) -> np.ndarray:
@@ -108,8 +101,6 @@ def test_what_happens_to_electrons_is_told_with_its_chance(
     plain: Any, fate: Fate, told: str, place: tuple[int, int, int], chance: float
 ) -> None:
     found = measured_electrons(chances(drawn(fate, 2)), plain)
-    assert found is not None
-    assert isinstance(found.effect, EmpiricalElectrons)
     (mode,) = found.effect.modes
     assert (mode.fate, mode.place) == (told, place)
     # to first order in the chance; refits make it exact
@@ -123,11 +114,8 @@ def test_electrons_that_come_by_themselves_need_nothing(plain: Any) -> None:
 
 def simulated(*modes: ElectronMode, chance: float) -> np.ndarray:
     """Return electron numbers of a sensor of next to no read noise under the effect."""
-    values = (2.0, 1 / STEP, 100.0, 1e-6)
-    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
     effect = EmpiricalElectrons(chance=chance, modes=modes)
-    how = SimulateSettings(shape=SHAPE, n_frames=FRAMES, seed=5, bit_depth=14, effects=(effect,))
-    return (simulate_block(truth, how, (0, FRAMES))[0] - 100.0) / STEP
+    return (simulated_frames(QUIET, effect, n_frames=FRAMES, seed=5)[0] - 100.0) / STEP
 
 
 def test_simulated_electrons_are_followed_by_as_many_as_told() -> None:
@@ -192,17 +180,16 @@ def test_the_law_has_the_mean_of_electrons_with_those_that_follow(place: tuple[i
 
 
 def test_simulated_frames_do_not_depend_on_how_they_are_cut() -> None:
-    values = (2.0, 1 / STEP, 100.0, 1e-6)
-    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
     modes = (
         ElectronMode(fate="followed", place=(1, 0, 0)),
         ElectronMode(fate="followed", place=(0, 1, 0)),
         ElectronMode(fate="moved", place=(0, 1, 0)),
     )
     effect = EmpiricalElectrons(chance=0.1, modes=modes)
-    how = SimulateSettings(shape=SHAPE, n_frames=40, seed=5, bit_depth=14, effects=(effect,))
-    whole = simulate_block(truth, how, (0, 40))[0]
-    np.testing.assert_array_equal(whole[10:20], simulate_block(truth, how, (10, 20))[0])
+    whole, part = (
+        simulated_frames(QUIET, effect, n_frames=40, seed=5, frames=some)[0] for some in (None, (10, 20))
+    )
+    np.testing.assert_array_equal(whole[10:20], part)
 
 
 def test_it_competes_with_nothing_and_refuses_what_cannot_be() -> None:

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.charge_material import a_uniform_sensor
+from helpers.charge_material import simulated as simulated_frames
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.by_simulation.measured.modes import (
@@ -15,11 +17,9 @@ from pchem_pipeline.discrepancy.by_simulation.measured.modes import (
     common_scores,
     measured_mode,
 )
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import PartSamples
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.simulate.chain import simulate_block
-from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.truth import TruthMaps
 
 SHAPE, FRAMES, STEP = (16, 20), 1500, 14.0
 SIGNAL = 1.5 * STEP
@@ -41,9 +41,15 @@ def frames(
 
 def measured(stack: tuple[np.ndarray, PixelMaps], inside: np.ndarray = EVERYWHERE) -> EmpiricalNoise | None:
     """Return what is measured beside a model without common changes."""
-    data = common_scores(stack[0], np.arange(len(stack[0])), stack[1], inside)
+    data = scores(*stack, inside)
     found = measured_mode(data, nothing(data), stack[1], inside)
     return None if found is None else found.effect
+
+
+def scores(frames: np.ndarray, maps: PixelMaps, inside: np.ndarray = EVERYWHERE) -> dict[Any, Sums]:
+    """Return the sums of scores of frames."""
+    evidence: Any = None
+    return common_scores(PartSamples(frames, np.arange(len(frames)), maps, evidence, inside))
 
 
 def nothing(data: dict[Any, Sums]) -> dict[Any, Sums]:
@@ -62,7 +68,6 @@ def drawn(*shape: int) -> np.ndarray:
 )
 def test_a_gain_that_moves_is_told_by_what_shares_it(of: str, shape: tuple[int, ...]) -> None:
     found = measured(frames(1, gain=1.0 + 0.02 * drawn(*shape)))
-    assert found is not None
     (mode,) = found.modes
     assert (mode.of, mode.changes, mode.burst, mode.shape) == (of, "gain", None, ())
     # its own variance is known to sqrt(2 / n); the scores see a little less where the peaks overlap
@@ -77,7 +82,6 @@ def test_light_in_bursts_in_a_corner_is_told_with_its_place() -> None:
     corner[:4, :5] = 1.0
     burst = np.random.default_rng(3).random((FRAMES, 1, 1)) < 0.05
     found = measured(frames(2, light=1.0 + 1.5 * burst * corner))
-    assert found is not None
     (mode,) = found.modes
     assert (mode.of, mode.changes) == ("frame", "light")
     assert mode.burst == pytest.approx(burst.mean(), rel=0.3)
@@ -91,7 +95,6 @@ def test_light_in_bursts_in_a_corner_is_told_with_its_place() -> None:
 def test_frames_that_are_noisier_are_told_with_how_many_they_are() -> None:
     some = np.random.default_rng(3).random((FRAMES, 1, 1)) < 0.05
     found = measured(frames(7, loud=1.0 + 0.5 * some))
-    assert found is not None
     (mode,) = found.modes
     assert (mode.of, mode.changes, mode.negative) == ("frame", "noise", False)
     # of one frame the size is known to sqrt(1 / (2 * 320)) of itself: hardly any is taken for another
@@ -117,7 +120,6 @@ def test_bursts_are_told_however_strong_they_are(size: float) -> None:
         )
     }
     found = measured_mode(data, nothing(data), frames(1)[1], EVERYWHERE)
-    assert found is not None
     assert found.effect.modes[0].burst == pytest.approx(some.mean(), rel=0.2)
 
 
@@ -125,7 +127,6 @@ def test_a_strong_gaussian_change_is_no_burst() -> None:
     sums = np.random.default_rng(8).standard_normal((FRAMES, 1))
     data = {("frame", "noise"): Sums(80.0 * sums, np.full(1, 100.0), np.arange(FRAMES))}
     found = measured_mode(data, nothing(data), frames(1)[1], EVERYWHERE)
-    assert found is not None
     assert found.effect.modes[0].burst is None
 
 
@@ -146,7 +147,6 @@ def test_noise_of_changing_size_has_the_law_that_is_simulated() -> None:
 def test_a_change_that_has_a_memory_is_told_with_it() -> None:
     white = drawn(FRAMES + 1, 1, 1)
     found = measured(frames(4, gain=1.0 + 0.03 * (white[1:] + 0.7 * white[:-1])))
-    assert found is not None
     assert found.modes[0].lags == ((1, 0, 0),)
     # 0.7 / (1 + 0.7^2) = 0.47, within five errors of 1 / sqrt(1500)
     assert found.modes[0].correlation[0] == pytest.approx(0.47, abs=0.13)
@@ -161,7 +161,6 @@ def test_frames_that_are_left_out_are_no_neighbours() -> None:
     for numbers, known in ((seen, True), (np.arange(seen.size), False)):  # and as if none were missing
         data = {("frame", "gain"): Sums(sums[seen], np.full(1, 100.0), numbers)}
         found = measured_mode(data, nothing(data), frames(1)[1], EVERYWHERE)
-        assert found is not None
         [correlation] = found.effect.modes[0].correlation
         # half of the pairs that are taken for neighbours without the numbers are none
         assert bool(abs(correlation - 0.47) < 4 / np.sqrt(seen.size / 2)) is known
@@ -180,7 +179,6 @@ def test_a_wave_of_gain_or_light_is_told_by_its_frequencies(
     sine = amplitude * np.sin(2.0 * np.pi * (per_frame * frame + per_line * line) + 0.4)
     stack = frames(11, gain=1.0 + sine) if changes == "gain" else frames(11, light=1.0 + sine)
     found = measured(stack)
-    assert found is not None
     assert found.empirical_unnamed
     (mode,) = found.modes
     assert (mode.of, mode.changes, mode.lags, mode.burst) == (of, changes, (), None)
@@ -188,7 +186,7 @@ def test_a_wave_of_gain_or_light_is_told_by_its_frequencies(
     told = mode.wave[0], mode.wave[2 if of == "column" else 1]
     known = told if np.sign(told[0]) == np.sign(per_frame) else (-told[0], -told[1])
     # of a sine of amplitude a in n values of which each holds the information i (Rife and Boorstyn 1974)
-    sums = common_scores(stack[0], np.arange(FRAMES), stack[1], EVERYWHERE)[of, changes]
+    sums = scores(*stack)[of, changes]
     error = np.sqrt(24.0 / (amplitude**2 * sums.information.sum() * FRAMES)) / (2.0 * np.pi)
     assert abs(known[0] - per_frame) < 4.0 * error / FRAMES
     assert abs(known[1] - per_line) < 4.0 * error / max(sums.information.size, 2)
@@ -201,12 +199,10 @@ def test_a_wave_that_a_model_makes_is_not_measured_again() -> None:
     """In frames simulated with it its phase is another, and chance is another."""
     frame, row, _ = np.ogrid[:FRAMES, : SHAPE[0], : SHAPE[1]]
     sine = [0.03 * np.sin(2.0 * np.pi * (0.163 * frame + 0.21 * row) + phase) for phase in (0.4, 2.0)]
-    scores = []
-    for seed, each in enumerate(sine):
-        values, maps = frames(20 + seed, gain=1.0 + each)
-        scores.append(common_scores(values, np.arange(FRAMES), maps, EVERYWHERE))
-    assert measured_mode(scores[0], nothing(scores[0]), maps, EVERYWHERE) is not None
-    assert measured_mode(scores[0], scores[1], maps, EVERYWHERE) is None
+    stacks = [frames(20 + seed, gain=1.0 + each) for seed, each in enumerate(sine)]
+    (data, model), maps = (scores(*stack) for stack in stacks), stacks[1][1]
+    assert measured_mode(data, nothing(data), maps, EVERYWHERE) is not None
+    assert measured_mode(data, model, maps, EVERYWHERE) is None
 
 
 @pytest.mark.parametrize("wave", [(0.163, 0.21, 0.0), (0.5, 0.5, 0.0)])
@@ -255,7 +251,6 @@ def test_neither_nothing_nor_an_offset_is_taken_for_gain_or_light() -> None:
 def test_an_offset_in_bursts_is_told_with_how_often_and_how_large() -> None:
     some = np.random.default_rng(4).random((FRAMES, 1, 1)) < 0.05
     found = measured(frames(12, offset=1.5 * some))
-    assert found is not None
     (mode,) = found.modes
     assert (mode.of, mode.changes, mode.negative) == ("frame", "offset", False)
     assert mode.burst == pytest.approx(some.mean(), rel=0.05)  # a frame of 320 samples tells it
@@ -266,17 +261,15 @@ def test_an_offset_in_bursts_is_told_with_how_often_and_how_large() -> None:
 
 def test_what_a_model_makes_is_taken_off() -> None:
     stack = frames(6, gain=1.0 + 0.03 * drawn(FRAMES, 1, 1))
-    data = common_scores(stack[0], np.arange(FRAMES), stack[1], EVERYWHERE)
+    data = scores(*stack)
     assert measured_mode(data, data, stack[1], EVERYWHERE) is None
 
 
 def simulated(mode: NoiseMode, noise_dn: float, read_noise: float = 1e-6, light: float = 4.0) -> np.ndarray:
     """Return frames of a sensor, with next to no read noise (e-), in which something is shared."""
-    values = (light, 1 / STEP, 100.0, read_noise)
-    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
+    sensor = a_uniform_sensor(SHAPE, light, 1 / STEP, 100.0, read_noise)
     effect = EmpiricalNoise(noise_dn=noise_dn, modes=(mode,))
-    how = SimulateSettings(shape=SHAPE, n_frames=FRAMES, seed=5, bit_depth=14, effects=(effect,))
-    return simulate_block(truth, how, (0, FRAMES))[0] - 100.0
+    return simulated_frames(sensor, effect, n_frames=FRAMES, seed=5)[0] - 100.0
 
 
 @pytest.mark.parametrize("on", ["gain", "light"])
@@ -319,8 +312,6 @@ def test_a_hit_by_a_particle_needs_no_tables_of_its_codes_and_outweighs_no_other
     length = codes_within_reach(maps, pixels, first, last.ravel().astype(np.int64))
     assert int(stack.max() - stack.min()) <= length < 1000
     found, usual = measured((hit, maps)), measured((stack, maps))
-    assert found is not None
-    assert usual is not None
     assert found.modes[0].changes == usual.modes[0].changes
     assert found.noise_dn == pytest.approx(usual.noise_dn, rel=0.1)
 

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.charge_material import a_uniform_sensor
+from helpers.charge_material import simulated as simulated_frames
 from pydantic import ValidationError
 
 from pchem_pipeline.config.load import parse_config
@@ -17,16 +19,13 @@ from pchem_pipeline.discrepancy.by_simulation.measured.noise import (
     measured_noise,
     residual_covariances,
 )
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import PartSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode, spectrum
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.simulate.chain import simulate_block
-from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.truth import TruthMaps
 
 ROWS, COLUMNS, FRAMES, STEP = 16, 18, 900, 12.0
 SHAPE = (ROWS, COLUMNS)
@@ -74,9 +73,7 @@ def measured(frames: np.ndarray, inside: np.ndarray | None = None) -> EmpiricalN
     numbers = np.arange(FRAMES)
     inside = np.ones(SHAPE, bool) if inside is None else inside
     evidence = observe(frames, numbers, n_run=FRAMES, block_frames=30)
-    found = residual_covariances(
-        frames, numbers, laws_of_frames(frames, evidence.maps), evidence.maps, inside
-    )
+    found = residual_covariances(PartSamples(frames, numbers, evidence.maps, evidence, inside))
     noise = measured_noise(found, NOTHING, evidence, inside)
     return None if noise is None else noise.effect
 
@@ -91,7 +88,6 @@ def measured(frames: np.ndarray, inside: np.ndarray | None = None) -> EmpiricalN
 )
 def test_what_samples_share_is_measured_by_distance(noise, of, lag, covariance):
     found = measured(stack(4, noise))
-    assert found is not None
     (mode,) = found.modes
     assert (mode.of, mode.lags) == (of, (lag,))
     # pairs at that distance, each with a product of standard deviation 1, of residuals that follow half of it
@@ -121,7 +117,6 @@ def test_the_shape_of_what_lines_share_is_measured(axis):
         return rng.standard_normal((FRAMES, 1, COLUMNS)) * slope[:, None]
 
     found = measured(stack(7, tilted))
-    assert found is not None
     (mode,) = found.modes  # near samples share it, and nothing else
     assert mode.of == ("row" if axis == 2 else "column")
     shape = mode.along(np.linspace(0.0, 1.0, slope.size))
@@ -145,7 +140,6 @@ def test_only_a_part_is_looked_at():
     left = np.zeros(SHAPE, bool)
     left[:, : COLUMNS // 2] = True
     found = measured(frames, left)
-    assert found is not None
     assert found.noise_dn**2 == pytest.approx(POWER, rel=0.25)
     assert measured(frames, ~left) is None
 
@@ -154,9 +148,7 @@ def test_what_a_model_makes_is_taken_off():
     frames = stack(6, of_whole_rows)
     evidence = observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=30)
     inside = np.ones(SHAPE, bool)
-    data = residual_covariances(
-        frames, np.arange(FRAMES), laws_of_frames(frames, evidence.maps), evidence.maps, inside
-    )
+    data = residual_covariances(PartSamples(frames, np.arange(FRAMES), evidence.maps, evidence, inside))
     assert measured_noise(data, data, evidence, inside) is None
     by_chance = {key: Covariance(2.0 * one.error, one.error) for key, one in data.pairs.items()}
     assert measured_noise(data, Covariances(by_chance, {}), evidence, inside) == measured_noise(
@@ -166,13 +158,9 @@ def test_what_a_model_makes_is_taken_off():
 
 def simulated(effect: EmpiricalNoise, n_frames: int = 600) -> np.ndarray:
     """Return the noise, DN, of a sensor of no other noise and no light, in steps of a hundredth."""
-    maps = {"quanta_exposure": 1e-9, "conversion_gain": 1.0, "bias": 30000.0, "analog_read_noise_e": 1e-6}
-    values = {name: np.full(SHAPE, value) for name, value in maps.items()}
-    truth = TruthMaps(**values, defect=np.zeros(SHAPE, np.uint8))
-    sensor = SimulateSettings(
-        shape=SHAPE, n_frames=n_frames, seed=5, bit_depth=16, effects=(effect.scaled(100.0),)
-    )
-    return (simulate_block(truth, sensor, (0, n_frames))[0] - 30000.0) / 100.0
+    sensor = a_uniform_sensor(SHAPE, 1e-9, 1.0, 30000.0, 1e-6)
+    frames, _ = simulated_frames(sensor, effect.scaled(100.0), n_frames=n_frames, seed=5, bit_depth=16)
+    return (frames - 30000.0) / 100.0
 
 
 @pytest.mark.parametrize(
@@ -208,12 +196,11 @@ def test_the_same_frames_at_every_division():
         NoiseMode(of="row", share=0.5, lags=((0, 2, 0),), correlation=(-0.4,)),
     )
     effect = EmpiricalNoise(noise_dn=3.0, modes=modes)
-    sensor = SimulateSettings(shape=SHAPE, n_frames=20, seed=8, effects=(effect,))
-    truth = TruthMaps(
-        *(np.full(SHAPE, value) for value in (1.0, 0.1, 100.0, 0.2)), defect=np.zeros(SHAPE, np.uint8)
+    sensor = a_uniform_sensor(SHAPE, 1.0, 0.1, 100.0, 0.2)
+    whole, part = (
+        simulated_frames(sensor, effect, n_frames=20, seed=8, frames=some, rows=rows)[0]
+        for some, rows in ((None, None), ((7, 12), (5, 9)))
     )
-    whole = simulate_block(truth, sensor, (0, 20))[0]
-    part = simulate_block(truth, sensor, (7, 12), (5, 9))[0]
     np.testing.assert_array_equal(part, whole[7:12, 5:9])
 
 

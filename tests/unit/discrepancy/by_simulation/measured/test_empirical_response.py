@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.charge_material import a_uniform_sensor
+from helpers.charge_material import simulated as simulated_frames
 from pydantic import ValidationError
 from scipy import stats
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
-from pchem_pipeline.discrepancy.by_simulation.measured.moves import Measurement
 from pchem_pipeline.discrepancy.by_simulation.measured.response import measured_response, residual_responses
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import Measurement, PartSamples
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
@@ -27,9 +29,6 @@ from pchem_pipeline.effects.analog.empirical_response import (
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
-from pchem_pipeline.simulate.chain import simulate_block
-from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.truth import TruthMaps
 
 SHAPE, FRAMES, STEP, NOISE = (14, 18), 1200, 14.0, 0.25
 EVERYWHERE = np.ones(SHAPE, bool)
@@ -101,9 +100,7 @@ def measured(frames: np.ndarray) -> Measurement | None:
     """Return what is measured of frames beside no effect."""
     numbers = np.arange(len(frames))
     evidence = observe(frames, numbers, n_run=len(frames), block_frames=100)
-    data = residual_responses(
-        frames, numbers, laws_of_frames(frames, evidence.maps), evidence.maps, EVERYWHERE
-    )
+    data = residual_responses(PartSamples(frames, numbers, evidence.maps, evidence, EVERYWHERE))
     return measured_response(data, None, evidence, EVERYWHERE)
 
 
@@ -120,8 +117,6 @@ def test_what_samples_follow_is_told_with_its_part(
     response: Response, source: str, place: tuple[int, int, int], part: float, noise: float
 ) -> None:
     found = measured(drawn(response, 2, noise))
-    assert found is not None
-    assert isinstance(found.effect, EmpiricalResponse)
     (term,) = found.effect.terms
     assert (term.of, term.place, term.columns) == (source, place, None)
     # to first order; refits make it exact
@@ -131,8 +126,6 @@ def test_what_samples_follow_is_told_with_its_part(
 
 def test_what_only_large_charge_does_is_told_with_how_large() -> None:
     found = measured(drawn(ghost, 3))
-    assert found is not None
-    assert isinstance(found.effect, EmpiricalResponse)
     (term,) = found.effect.terms
     assert (term.of, term.place, term.above) == ("sample", (-1, 0, 0), 3.0)
     assert found.effect.response * term.weight == pytest.approx(-0.05, rel=0.3)
@@ -141,8 +134,6 @@ def test_what_only_large_charge_does_is_told_with_how_large() -> None:
 
 def test_what_follows_its_mirror_image_is_told_in_one() -> None:
     found = measured(drawn(opposite, 4))
-    assert found is not None
-    assert isinstance(found.effect, EmpiricalResponse)
     (term,) = found.effect.terms
     assert (term.of, term.place, term.mirrored) == ("sample", (0, 0, 0), ("rows",))
     assert term.columns == (SHAPE[1] // 2, SHAPE[1])
@@ -179,8 +170,6 @@ def test_the_excess_of_poisson_counts_has_its_moments(above: float) -> None:
 
 def test_what_only_some_columns_follow_is_told_with_these() -> None:
     found = measured(drawn(settling, 3))
-    assert found is not None
-    assert isinstance(found.effect, EmpiricalResponse)
     first, second = found.effect.terms
     last = SHAPE[1] - 1
     # at the first distance the sensor has one pair of columns only
@@ -199,7 +188,7 @@ def test_what_a_model_makes_is_not_measured_again() -> None:
     first, second = (drawn(distant, seed) for seed in (5, 6))
     evidence = [observe(f, numbers, n_run=FRAMES, block_frames=100) for f in (first, second)]
     data, model = (
-        residual_responses(frames, numbers, laws_of_frames(frames, each.maps), each.maps, EVERYWHERE)
+        residual_responses(PartSamples(frames, numbers, each.maps, each, EVERYWHERE))
         for frames, each in zip((first, second), evidence, strict=True)
     )
     assert measured_response(data, None, evidence[0], EVERYWHERE) is not None
@@ -214,7 +203,6 @@ def test_sums_by_distance_are_those_of_all_pairs(axes: tuple[int, ...]) -> None:
     inside = np.ones((5, 6), bool)
     inside[1, 2] = False
     plain = FollowingSamples.of(frames, edges, laws, evidence.maps, inside)
-    assert plain is not None
     found = plain.by_distance([(1,), (2,), (1, 2), (), axes])[-1]
     prepared = replace(plain, mirrored=axes)
     residual, charge = (np.concatenate(parts).astype(float) for parts in zip(*prepared.chunks(), strict=True))
@@ -238,11 +226,9 @@ def test_sums_by_distance_are_those_of_all_pairs(axes: tuple[int, ...]) -> None:
 
 def simulated(*terms: ResponseTerm, response: float, region: Any = None) -> np.ndarray:
     """Return signals of a sensor of next to no read noise under the effect, e-."""
-    values = (2.0, 1 / STEP, 100.0, 1e-6)
-    truth = TruthMaps(*(np.full(SHAPE, v) for v in values), defect=np.zeros(SHAPE, np.uint8))
+    sensor = a_uniform_sensor(SHAPE, 2.0, 1 / STEP, 100.0, 1e-6)
     effect = EmpiricalResponse(response=response, terms=terms, region=region)
-    how = SimulateSettings(shape=SHAPE, n_frames=400, seed=5, bit_depth=14, effects=(effect,))
-    return (simulate_block(truth, how, (0, 400))[0] - 100.0) / STEP
+    return (simulated_frames(sensor, effect, n_frames=400, seed=5)[0] - 100.0) / STEP
 
 
 @pytest.mark.parametrize(
@@ -294,7 +280,6 @@ def test_its_size_is_that_of_all_the_sensor() -> None:
     maps = PixelMaps.known((np.full(SHAPE, v) for v in (2.1, 1 / STEP, 100.0, 4.0)), EVERYWHERE)
     effect = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(0, 0, -SHAPE[1] + 1)),))
     size = size_of(effect, maps, FRAMES)
-    assert size is not None
     assert size.samples == pytest.approx(1 / SHAPE[1], rel=0.1)  # of the last column only
     assert size.electrons == pytest.approx(0.1 * 2.1**0.5, rel=0.1)
 
@@ -303,7 +288,6 @@ def test_its_size_in_a_place_is_that_of_the_place() -> None:
     maps = PixelMaps.known((np.full(SHAPE, v) for v in (2.1, 1 / STEP, 100.0, 4.0)), EVERYWHERE)
     term, place = ResponseTerm(place=(0, 0, -1), columns=(7, 8)), Region(columns=((6, 8),))
     size = size_of(EmpiricalResponse(response=0.1, terms=(term,), region=place), maps, FRAMES)
-    assert size is not None
     assert size.samples == pytest.approx(0.5, abs=0.02)
     assert size.electrons == pytest.approx(0.1 * (2.1 / 2) ** 0.5, rel=0.1)
 

@@ -13,7 +13,7 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     learn_sensor,
     refit_maps,
 )
-from pchem_pipeline.discrepancy.by_simulation.sensor.population import posterior_of_estimates, to_theta
+from pchem_pipeline.discrepancy.by_simulation.sensor.population import posterior_of_estimates
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import (
     Acquisition,
     Replicate,
@@ -33,6 +33,7 @@ from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.readout.pixel_correction import PixelCorrection
+from pchem_pipeline.model.fit.shared import to_theta
 
 SPREAD = (0.25, 0.015, 0.06, 3.0)
 

@@ -26,7 +26,7 @@ def test_what_stands_in_for_replaced_samples_is_drawn_from_the_model():
     work = Simulations(observed, serial, 1, Effort(None))
     found = work.mapped((effect,))
     # one stack for what stands in, one whose fits are compared with those of the frames
-    assert work.done == 2
+    assert work.effort.replicates == 2
     seen = work.frames.seen_stack, work.frames.seen_numbers
     by_seen = learn_sensor(*seen, found.fit, (effect,), observed.plain.ambiguous, work.lost)
 

@@ -15,6 +15,8 @@ from scipy import stats
 from pchem_pipeline.discrepancy.build_verdict import Findings
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
 from pchem_pipeline.discrepancy.by_simulation.additions import (
+    AddedRounds,
+    ExtendedModel,
     unexplained_of_its_kind,
     unexplained_of_its_own,
 )
@@ -27,21 +29,18 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     score_set,
 )
 from pchem_pipeline.discrepancy.by_simulation.explainer import Explanation, FrameExplainer
-from pchem_pipeline.discrepancy.by_simulation.extended_model import ExtendedModel
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sets.comparison import (
     Comparison,
     _all_seen,
-    _asked_once,
-    _begun,
     _far_behind,
     _grown,
     compare,
     own_signature,
 )
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Witness
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials, of_kinds
+from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials, same_kinds
 from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import StatisticsGap
@@ -49,6 +48,7 @@ from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.discrepancy.skeleton import Prepared
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
@@ -122,7 +122,7 @@ class World:
         held: Sequence[Hypothesis] = (),
         before: Any = None,
         beside: Sequence[Hypothesis] = (),
-        witness: Witness | None = None,
+        likelihood: HistogramLikelihood | None = None,
         unlisted: Callable[[], bool] = lambda: False,
         measured: Callable[[bool], Refitted | None] = lambda _: None,
     ) -> Comparison | None:
@@ -130,8 +130,27 @@ class World:
         assert choice is not None
         grown = (lambda one: self.choice(*beside, mean=one.mean)) if beside else (lambda _: None)
         return compare(
-            self.refitter(), held, hypotheses, choice, before, grown, witness or Witness(), unlisted, measured
+            self.refitter(),
+            held,
+            hypotheses,
+            choice,
+            before,
+            grown,
+            likelihood or HistogramLikelihood(),
+            unlisted,
+            measured,
         )
+
+    def chosen(self, *hypotheses: Hypothesis, **how: Any) -> frozenset[str] | None:
+        """Return the tags of the chosen set; None where none holds."""
+        found = self.compare(*hypotheses, **how)
+        return None if found is None else found.chosen.tags
+
+    def tried(self, *sets: Sequence[Hypothesis]) -> Choice:
+        """Return a choice among given sets, all far better than nothing."""
+        noise = self.refitter().noise(self.null.covariance, 40)
+        shifts = (self.z.train - self.null.mean, self.z.test - self.null.mean)
+        return Choice(tuple(score_set(one, shifts, noise) for one in sets), 100.0)
 
 
 @pytest.mark.parametrize("strength", [0.03, 0.1, 0.4, 1.2])
@@ -242,8 +261,8 @@ def test_a_part_that_stands_out_makes_no_effect_stronger_that_acts_everywhere(
     assert factors[False, 8.0] > 1.01 * factors[False, 0.0]
 
 
-def test_a_dear_refit_is_not_repeated_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.refits.is_dear", lambda _: True)
+def test_an_expensive_refit_is_not_repeated_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.refits.is_expensive", lambda _: True)
     world = World([effect("row_noise", 2.0)])
     found = world.refitter().refined([hypothesis("row_noise", 0.02)])
     assert world.drawn <= 3 * 6
@@ -264,7 +283,6 @@ def test_an_effect_that_explains_a_part_only_is_not_tuned_to_the_end_unless_it_i
     assert full.score > short.score
     # where there is no other, it is
     found = world.compare(guess)
-    assert found is not None
     assert not found.chosen.short
     assert found.chosen.score >= full.score - 0.5
 
@@ -290,7 +308,6 @@ def test_the_search_ends_where_no_effect_explains_more_beside_those_held() -> No
     [held] = world.refitter().refined([hypothesis("row_noise")]).hypotheses
     before = world.refitter().refined([held], replicates=16)
     more = world.compare(hypothesis("frame_noise"), held=[held], before=before)
-    assert more is not None
     assert more.chosen.tags == {"row_noise", "frame_noise"}
     better = replace(before, score=more.chosen.score + 20.0)
     assert world.compare(hypothesis("frame_noise"), held=[held], before=better) is None
@@ -311,7 +328,6 @@ def test_a_choice_among_sets_that_were_refitted_is_made_at_the_limit_too(
     plain = world.refitter()
     monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
     found = world.compare(*(hypothesis(tag, 0.3) for tag in tags))
-    assert found is not None
     assert found.chosen.tags == set(tags)
 
 
@@ -331,9 +347,10 @@ def test_the_likeliest_set_is_fitted_before_other_effects_and_kept_at_the_limit(
     monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
     for name, value in (("FAR", 1e9), ("_HARDLY", 0.0)):  # nothing is in vain
         monkeypatch.setattr(f"pchem_pipeline.discrepancy.by_simulation.sets.trials.{name}", value)
-    found = world.compare(*(hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift")))
-    assert found is not None
-    assert found.chosen.tags == {"row_noise", "frame_noise"}
+    assert world.chosen(*(hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift"))) == {
+        "row_noise",
+        "frame_noise",
+    }
     assert "exposure_drift" in asked
 
 
@@ -352,12 +369,8 @@ def test_fewer_effects_are_tried_before_rivals_of_a_set_of_more(monkeypatch: pyt
     monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.trials._beaten", lambda *_: False)
     row, frame, drift, coupling = (hypothesis(tag) for tag in TRUTH)
     drift, coupling = (replace(h, fingerprint=0.02 * h.fingerprint) for h in (drift, coupling))
-    noise = world.refitter().noise(world.null.covariance, 40)
-    shifts = (world.z.train - world.null.mean, world.z.test - world.null.mean)
-    tried = tuple(score_set([row, frame, more], shifts, noise) for more in (drift, coupling))
-    choice = Choice(tried[0], ((),) * 3, (1.0,) * 3, tried, 100.0)
+    choice = world.tried([row, frame, drift], [row, frame, coupling])
     found = compare(world.refitter(), [], [row, frame, drift, coupling], choice)
-    assert found is not None
     assert found.chosen.tags == {"row_noise", "frame_noise"}
     sets = list(dict.fromkeys(words for words in asked if "+" in words))
     assert sets[:2] == ["row_noise + frame_noise + exposure_drift", "row_noise + frame_noise"]
@@ -374,7 +387,6 @@ def test_what_does_not_move_a_statistic_that_stands_out_is_no_rival_of_what_leav
     likely = world.choice(*guesses)
     assert likely is not None
     found = compare(world.refitter(), [], [*guesses, twin], likely)
-    assert found is not None
     assert found.chosen.tags == {"row_noise", "frame_noise"}
     assert "exposure_drift" not in asked  # as near as row noise by itself, which leaves what frame noise does
 
@@ -402,7 +414,6 @@ def test_an_effect_of_a_later_round_is_judged_beside_those_held() -> None:
     assert likely is not None
     others = [hypothesis("exposure_drift", 0.05), hypothesis("frame_noise")]
     found = compare(world.refitter(), first.hypotheses, others, likely, first)
-    assert found is not None
     assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
@@ -410,14 +421,18 @@ def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> No
     world = World([effect("row_noise", 0.5), effect("frame_noise", 0.3)])
     known = world.refitter().refined([hypothesis("row_noise"), hypothesis("frame_noise")])
     drift = hypothesis("exposure_drift")
-    first, second = _begun([hypothesis("row_noise"), drift], [known])
+
+    def begun(members: Sequence[Hypothesis], *tried: Refitted) -> tuple[Hypothesis, ...]:
+        return Trials(world.refitter(), (), HistogramLikelihood(), list(tried)).begun(members)
+
+    first, second = begun([hypothesis("row_noise"), drift], known)
     assert (first.effect, second) == (hypothesis("row_noise").effect, drift)  # one in common is not enough
     members = [hypothesis("row_noise"), drift, hypothesis("frame_noise")]
-    begun = _begun(members, [known])
-    assert {begun[0].effect, begun[2].effect} == set(known.effects)
-    assert begun[1] is drift
+    found = begun(members, known)
+    assert {found[0].effect, found[2].effect} == set(known.effects)
+    assert found[1] is drift
     alone = world.refitter().refined([hypothesis("row_noise")])
-    assert _begun(members[:2], [known, alone])[0].effect == alone.effects[0]
+    assert begun(members[:2], known, alone)[0].effect == alone.effects[0]
 
 
 def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
@@ -425,40 +440,39 @@ def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
     # frame noise helps the fingerprint of row noise out where that is extrapolated
     mimic = Hypothesis(effect("frame_noise", 0.1), 20.0 * (np.eye(M)[0] + np.eye(M)[1]))
     found = world.compare(hypothesis("row_noise"), mimic)
-    assert found is not None
     assert found.chosen.tags == {"row_noise"}
     assert found.rivals_of("row_noise")[0].hypothesis.tag == "row_noise"
 
 
-def test_a_second_witness_decides_between_effects_that_the_statistics_tell_badly_apart() -> None:
+def likelihood_of(behind: Callable[[str, str], tuple[float, float] | None]) -> HistogramLikelihood:
+    """Return a likelihood that says so of the first effects of two sets."""
+
+    class Told(HistogramLikelihood):
+        def behind(
+            self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
+        ) -> tuple[float, float] | None:
+            return behind(one[0].tag, other[0].tag)
+
+    return Told()
+
+
+def test_histograms_decide_between_effects_that_the_statistics_tell_badly_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     world = World([effect("row_noise", 0.5)])
     twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
-    row, column = TRUTH["row_noise"], TRUTH["frame_noise"]
-    asked: list[tuple[str, str]] = []
+    row, asked = TRUTH["row_noise"], []
 
-    class Decided(Witness):
-        def behind(
-            self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
-        ) -> tuple[float, float] | None:
-            asked.append((one[0].tag, other[0].tag))
-            return (12.0, 4.0) if one[0].tag == "frame_noise" else (-12.0, 4.0)
+    def decided(one: str, other: str) -> tuple[float, float]:
+        asked.append((one, other))
+        return (12.0, 4.0) if one == "frame_noise" else (-12.0, 4.0)
 
-    class Undecided(Witness):
-        def behind(
-            self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
-        ) -> tuple[float, float] | None:
-            return -3.0, 4.0
-
-    TRUTH["frame_noise"] = (row[0] + 0.5 * np.eye(M)[1], row[1])
-    try:
-        plain = world.compare(hypothesis("row_noise", 0.5), twin)
-        found = world.compare(hypothesis("row_noise", 0.5), twin, witness=Decided())
-        open_ = world.compare(hypothesis("row_noise", 0.5), twin, witness=Undecided())
-    finally:
-        TRUTH["frame_noise"] = column
-    assert plain is not None
-    assert found is not None
-    assert open_ is not None
+    monkeypatch.setitem(TRUTH, "frame_noise", (row[0] + 0.5 * np.eye(M)[1], row[1]))
+    plain: Any = world.compare(hypothesis("row_noise", 0.5), twin)
+    found: Any = world.compare(hypothesis("row_noise", 0.5), twin, likelihood=likelihood_of(decided))
+    open_: Any = world.compare(
+        hypothesis("row_noise", 0.5), twin, likelihood=likelihood_of(lambda *_: (-3.0, 4.0))
+    )
     assert plain.chosen.tags == open_.chosen.tags == {"row_noise"}
     assert found.chosen.tags == {"frame_noise"}
     # once whether its refit is in vain
@@ -479,26 +493,15 @@ def test_what_the_histograms_rule_out_is_not_refitted(
     """A look-alike's fingerprint may promise all; its refits cost what a second effect would need."""
     world = World([effect("row_noise", 0.5)])
     twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
-
-    class Sure(Witness):
-        def behind(
-            self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
-        ) -> tuple[float, float] | None:
-            return answer
-
-    found = world.compare(hypothesis("row_noise", 0.5), twin, witness=Sure())
-    assert found is not None
+    found = world.compare(hypothesis("row_noise", 0.5), twin, likelihood=likelihood_of(lambda *_: answer))
     assert found.chosen.tags == {"row_noise"}
     assert ({"frame_noise"} in [one.tags for one in found.tried]) == refitted
 
 
 def test_two_effects_with_signatures_of_their_own_are_found_together() -> None:
     world = World([effect("row_noise", 0.1), effect("frame_noise", 0.06)])
-    found = world.compare(hypothesis("row_noise"), hypothesis("frame_noise"))
-    assert found is not None
-    assert found.chosen.tags == {"row_noise", "frame_noise"}
+    assert world.chosen(hypothesis("row_noise"), hypothesis("frame_noise")) == {"row_noise", "frame_noise"}
     later = world.compare(hypothesis("frame_noise"), held=[hypothesis("row_noise")])
-    assert later is not None
     assert later.chosen.tags == {"row_noise", "frame_noise"}
     none = world.compare(hypothesis("row_noise"), held=[hypothesis("exposure_drift")])
     assert none is None  # what was held has nothing in the data
@@ -508,20 +511,9 @@ def test_what_a_strong_effect_hides_is_asked_for_beside_it() -> None:
     """Nothing in the frames leads to the noise of frames: it is guessed of what the rows' leaves."""
     world = World([effect("row_noise", 0.3), effect("frame_noise", 0.04)])
     alone = world.compare(hypothesis("row_noise"))
-    assert alone is not None
     assert alone.chosen.tags == {"row_noise"}
     grown = world.compare(hypothesis("row_noise"), beside=[hypothesis("frame_noise", 0.04)])
-    assert grown is not None
     assert grown.chosen.tags == {"row_noise", "frame_noise"}
-
-
-def test_what_stands_out_beside_a_set_is_asked_once() -> None:
-    asked: list[Any] = []
-    answers = {1: "one", 2: None}
-    beside: Any = _asked_once(lambda one: asked.append(one) or answers[one.number])  # type: ignore[arg-type]
-    first, second = SimpleNamespace(number=1), SimpleNamespace(number=2)
-    assert [beside(one) for one in (first, second, first, second)] == ["one", None, "one", None]
-    assert asked == [first, second]
 
 
 @pytest.mark.parametrize(
@@ -531,36 +523,34 @@ def test_what_stands_out_beside_a_set_is_asked_once() -> None:
 def test_fewer_effects_beside_a_set_are_far_behind_by_more_than_their_fingerprints_may_err(
     behind: float, explained: float, far: bool
 ) -> None:
-    choice: Any = SimpleNamespace(best=SimpleNamespace(worth=explained), advantage=explained)
-    one: Any = SimpleNamespace(worth=explained - behind)
-    assert _far_behind(one, choice) is far
+    best, one = (SimpleNamespace(penalised_log_likelihood=explained - off) for off in (0.0, behind))
+    choice: Any = SimpleNamespace(best=best, advantage=explained)
+    assert _far_behind(one, choice) is far  # type: ignore[arg-type]
+
+
+def seeds(refitter: Refitter, *tried: Refitted) -> list[frozenset[str]]:
+    """Return the sets, of those that were tried, beside which others are asked for."""
+    asked: list[frozenset[str]] = []
+    trials = Trials(refitter, (), HistogramLikelihood(), list(tried))
+    _grown(trials, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
+    return asked
 
 
 def test_a_part_of_a_better_set_is_not_grown_again() -> None:
-    world = World([effect(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift")])
-    refitter = world.refitter()
+    refitter = World([effect(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift")]).refitter()
     row, frame, drift = (hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift"))
     # of all that there is to explain each explains nearly as much
     far = replace(refitter, null=replace(refitter.null, mean=refitter.null.mean - 1e4 * np.eye(M)[0]))
-
-    def begun(*sets: list[Hypothesis]) -> list[frozenset[str]]:
-        asked: list[frozenset[str]] = []
-        trials = Trials(far, (), Witness(), [refitter.refined(one) for one in sets])
-        _grown(trials, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
-        return asked
-
-    assert begun([row], [row, frame]) == [{"row_noise", "frame_noise"}]
-    assert len(begun([row, drift], [row, frame])) == 2
+    alone, both, other = (refitter.refined(one) for one in ([row], [row, frame], [row, drift]))
+    assert seeds(far, alone, both) == [{"row_noise", "frame_noise"}]
+    assert len(seeds(far, other, both)) == 2
 
 
 def test_a_set_with_more_in_vain_is_not_grown_beside_its_part() -> None:
     refitter = World([effect("row_noise", 0.3), effect("exposure_drift", 0.3)]).refitter()
-    asked: list[frozenset[str]] = []
     alone = refitter.refined([hypothesis("row_noise")])
     more = refitter.refined([hypothesis("row_noise"), hypothesis("frame_noise")])
-    trials = Trials(refitter, (), Witness(), [alone, replace(more, score=alone.score)])
-    _grown(trials, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
-    assert asked == [{"row_noise"}]
+    assert seeds(refitter, alone, replace(more, score=alone.score)) == [{"row_noise"}]
 
 
 def test_what_stands_out_beside_a_set_that_leaves_little_is_fitted_before_others_in_its_place(
@@ -571,9 +561,7 @@ def test_what_stands_out_beside_a_set_that_leaves_little_is_fitted_before_others
     beside = [hypothesis("frame_noise", 0.04)]
     asked = asked_by_refits(world, monkeypatch)
     monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.trials._beaten", lambda *_: False)
-    found = world.compare(hypothesis("row_noise", 0.3), twin, beside=beside)
-    assert found is not None
-    assert found.chosen.tags == {"row_noise", "frame_noise"}
+    assert world.chosen(hypothesis("row_noise", 0.3), twin, beside=beside) == {"row_noise", "frame_noise"}
     assert asked.index("row_noise + frame_noise") < asked.index("exposure_drift")
 
 
@@ -582,12 +570,8 @@ def test_an_effect_that_its_set_lets_vanish_does_not_take_the_others_with_it() -
     true = effect("row_noise", 0.3), effect("frame_noise", 0.3), effect("interpixel_capacitance", 0.1)
     world = World(true)
     row, frame, drift = (hypothesis(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift"))
-    noise = world.refitter().noise(world.null.covariance, 40)
-    shifts = (world.z.train - world.null.mean, world.z.test - world.null.mean)
-    tried = (score_set([row, frame, drift], shifts, noise),)
-    choice = Choice(tried[0], ((),) * 3, (1.0,) * 3, tried, 100.0)
+    choice = world.tried([row, frame, drift])
     found = compare(world.refitter(), [], [row, frame, drift], choice)
-    assert found is not None
     assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
@@ -646,7 +630,6 @@ def test_one_thing_that_is_measured_stands_before_several_that_explain_as_much()
     world = World(both)
     row, frame = hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.3)
     best = world.compare(row, frame)
-    assert best is not None
     for behind, wins in ((PRICE_OF_MORE - 1.0, True), (PRICE_OF_MORE + 1.0, False)):
         measured = replace(whole, score=best.chosen.score - behind)
         found = world.compare(row, frame, measured=lambda _, one=measured: one)
@@ -683,21 +666,8 @@ def test_the_likeliest_effects_are_fitted_whatever_was_spent() -> None:
         spent.append(words)
 
     world.refitter = lambda: replace(plain, allow=allow)  # type: ignore[method-assign]
-    noise = plain.noise(world.null.covariance, 40)
-    shifts = (world.z.train - world.null.mean, world.z.test - world.null.mean)
-    tried = tuple(score_set([h], shifts, noise) for h in (row, frame))
-    found = compare(world.refitter(), [], [row, frame], Choice(tried[0], ((),) * 2, (1.0,) * 2, tried, 100.0))
-    assert found is not None
+    found = compare(world.refitter(), [], [row, frame], world.tried([row], [frame]))
     assert found.chosen.tags == {"frame_noise"}
-
-
-def test_a_set_that_leaves_less_than_what_is_measured_stays() -> None:
-    world = World([effect("row_noise", 0.3), effect("frame_noise", 0.3)])
-    poor = world.refitter().refined([hypothesis("row_noise")])
-    both = hypothesis("row_noise"), hypothesis("frame_noise")
-    found = world.compare(*both, measured=lambda _: poor)
-    assert found is not None
-    assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
 def test_a_signature_is_asked_of_the_same_kind_of_the_others() -> None:
@@ -706,9 +676,9 @@ def test_a_signature_is_asked_of_the_same_kind_of_the_others() -> None:
     guess = hypothesis("row_noise", 0.2)
     elsewhere = replace(guess, effect=guess.effect.at_place(Region.model_validate({"columns": "0:8"})))
     one = world.refitter().refined([guess])
-    assert of_kinds(one, [hypothesis("row_noise", 0.9)])
-    assert not of_kinds(one, [elsewhere])
-    assert not of_kinds(one, [hypothesis("row_noise", 0.2), hypothesis("frame_noise")])
+    assert same_kinds(one.hypotheses, [hypothesis("row_noise", 0.9)])
+    assert not same_kinds(one.hypotheses, [elsewhere])
+    assert not same_kinds(one.hypotheses, [hypothesis("row_noise", 0.2), hypothesis("frame_noise")])
 
 
 @pytest.mark.parametrize("second", ["columns=0:8", "columns=16:24"])
@@ -719,7 +689,6 @@ def test_effects_that_meet_in_one_part_are_one_cause_without_a_name(second: str)
         for h, place in ((hypothesis("row_noise"), "columns=0:8"), (hypothesis("frame_noise"), second))
     ]
     found = world.compare(*guesses)
-    assert found is not None
     assert len(found.chosen.tags) == (1 if second == "columns=0:8" else 2)
     later = world.compare(guesses[1], held=guesses[:1])
     assert (later is None) == (second == "columns=0:8")
@@ -813,7 +782,7 @@ def test_a_set_is_fitted_again_with_the_kind_of_an_effect_that_does_better() -> 
     row, frame, other = (
         hypothesis("row_noise"), hypothesis("frame_noise"), hypothesis("frame_noise").effect
     )  # fmt: skip
-    trials = Trials(world.refitter(), (), Witness())
+    trials = Trials(world.refitter(), (), HistogramLikelihood())
     for members in ((row,), (frame,), (row, frame), (row, frame)):
         trials.refit(members)
     assert len(trials.tried) == 3
@@ -856,7 +825,6 @@ def test_few_events_of_an_exact_count_are_a_signature_though_they_scatter(
 
     monkeypatch.setattr(world, "draw", draw)
     found = world.compare(hypothesis("row_noise"), hypothesis("frame_noise"))
-    assert found is not None
     assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
@@ -871,7 +839,6 @@ def test_effects_that_move_the_same_statistics_are_seen_where_they_leave_nothing
     left = rest * np.eye(M)[5]
     world.z = Measured(world.z.train + left, world.z.test + left, world.z.final + left)
     found = world.compare(hypothesis("row_noise"), hypothesis("frame_noise"))
-    assert found is not None
     assert found.chosen.tags == ({"row_noise"} if rest else {"row_noise", "frame_noise"})
 
 
@@ -890,16 +857,14 @@ def add(
     work: Any = SimpleNamespace(mapped=mapped, forget=lambda _: None, effort=Effort(None))
     unused: Any = None
     settings = DiscrepancySettings()
-    judge = Acceptance(world.null, z, StatisticsGap(world.null, 100_000), settings.model_error)
-    search = FrameExplainer(settings, unused, work, unused, judge, ExtendedModel(work, world.null, (), ()))
+    judge = Acceptance(world.null, z, StatisticsGap(world.null, 100_000), settings)
+    prepared = Prepared(settings, "frames", unused, unused, world.null, z, work.effort, 3, {})
+    search = FrameExplainer(prepared, unused, work, unused, judge, ExtendedModel(work, world.null, (), ()))
     monkeypatch.setattr(search, "_refitter", lambda: world.refitter())
     monkeypatch.setattr(search, "_left_by", lambda *_: None)
     monkeypatch.setattr(search, "_likelihood", lambda *_: None)
-    monkeypatch.setattr(
-        search,
-        "_unexplained",
-        lambda: SimpleNamespace(explains_all=lambda: False, clearest=lambda unlisted: None),
-    )
+    nothing = SimpleNamespace(explains_all=lambda: False, clearest=lambda unlisted: None)
+    monkeypatch.setattr(FrameExplainer, "_unexplained", nothing)
     shifts = (z.train - world.null.mean, z.test - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
     assert choice is not None
@@ -962,7 +927,7 @@ def test_what_explains_all_but_is_not_certain_is_told_without_a_name(
     left = rest * np.eye(M)[5]
     world.z = Measured(world.z.train + left, world.z.test + left, world.z.final)
     unlisted = SimpleNamespace(explains_all=lambda: False)
-    monkeypatch.setattr(FrameExplainer, "_unexplained", lambda _: unlisted)
+    monkeypatch.setattr(FrameExplainer, "_unexplained", unlisted)
     search, extended = add(world, monkeypatch, hypothesis("row_noise"))
     assert extended is None
     told = search.probable()
@@ -981,12 +946,41 @@ def test_only_effects_that_account_for_what_they_move_are_kept_beside_what_is_me
 ) -> None:
     world = World([effect("row_noise", 0.5)])
     search, extended = add(world, monkeypatch, hypothesis("row_noise"))
-    assert [h.tag for h in search.accept.accounted(search.extended.rounds, extended)] == ["row_noise"]
     elsewhere, own = np.eye(M)[5] * 60.0, np.eye(M)[0] * 60.0
-    assert [h.tag for h in search.accept.accounted(search.extended.rounds, extended.shifted(elsewhere))] == [
-        "row_noise"
-    ]
-    assert search.accept.accounted(search.extended.rounds, extended.shifted(own)) == ()
+    rounds = AddedRounds(search.extended.rounds, search.accept)
+    for model in (extended, extended.shifted(elsewhere)):
+        assert [h.tag for h in rounds.accounted(model)] == ["row_noise"]
+    assert rounds.accounted(extended.shifted(own)) == ()
+
+
+def established(
+    null: NullModel,
+    parts: np.ndarray,
+    stderr: float,
+    seen: np.ndarray,
+    *,
+    effects: Sequence[Effect] = (),
+    final: np.ndarray | None = None,
+    scatter: float = 1.0,
+    **more: Any,
+) -> set[str]:
+    """Return the tags of the effects of a set that are certain, which do ``parts`` and are known so well."""
+    effects = effects or [effect(tag, 0.1) for tag in ("row_noise", "frame_noise")[: len(parts)]]
+    m, unused = len(null.names), cast("Any", None)
+    added: dict[str, Any] = {
+        "hypotheses": tuple(Hypothesis(e, part) for e, part in zip(effects, parts, strict=True)),
+        "parts": parts,
+        "slopes": parts,
+        "mean": seen,
+        "change": np.zeros(len(parts)),
+        "stderr": np.full(len(parts), stderr),
+        "vectors": np.zeros((400, m)),
+        "covariance": Covariance(np.full(m, scatter**2), np.zeros((0, m))),
+        "rest": np.zeros(m),
+    }
+    z = Measured(seen, seen, seen if final is None else final)
+    accept = Acceptance(null, z, unused, DiscrepancySettings(model_error=0.0))
+    return {h.tag for h in accept.established(cast("Any", SimpleNamespace(**{**added, **more})))}
 
 
 @pytest.mark.parametrize(
@@ -1002,44 +996,20 @@ def test_only_effects_that_account_for_what_they_move_are_kept_beside_what_is_me
 def test_what_gets_no_name_needs_fewer_errors_and_more_of_them_in_the_final_frames(
     error: float, in_final: float, with_name: bool, without: bool
 ) -> None:
-    world, part = World([]), np.eye(M)[0] * 6.0
-    unused: Any = None
-    for one, there in (
-        (effect("row_noise", 0.1), with_name),
-        (EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),)), without),
-    ):
-        added: Any = SimpleNamespace(
-            hypotheses=(Hypothesis(one, part),),
-            parts=part[None],
-            slopes=part[None],
-            mean=world.null.mean + part,
-            change=np.zeros(1),
-            stderr=np.array([error]),
-            vectors=np.zeros((400, M)),
-            covariance=Covariance(np.ones(M), np.zeros((0, M))),
-            rest=np.zeros(M),
-        )
-        final = world.null.mean + np.eye(M)[0] * in_final
-        accept = Acceptance(world.null, Measured(final, final, final), unused, 0.0)
-        assert bool(accept.established(added)) is there
+    null, part = World([]).null, np.eye(M)[0] * 6.0
+    seen = null.mean + np.eye(M)[0] * in_final
+    noise = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))
+    for one, there in ((effect("row_noise", 0.1), with_name), (noise, without)):
+        found = established(null, part[None], error, seen, effects=[one], mean=null.mean + part)
+        assert bool(found) is there
 
 
 def test_an_effect_that_moves_nothing_is_not_there() -> None:
     """Seen: missing codes where the pixels have no samples; no statistic moves, and no strength is off."""
     world = World([])
-    unused: Any = None
-    added: Any = SimpleNamespace(
-        hypotheses=(Hypothesis(effect("row_noise", 0.1), np.zeros(M)),),
-        parts=np.zeros((1, M)),
-        slopes=np.zeros((1, M)),
-        mean=world.null.mean,
-        change=np.zeros(1),
-        stderr=np.zeros(1),
-        vectors=np.zeros((400, M)),
-        covariance=Covariance(np.ones(M), np.zeros((0, M))),
-        rest=np.zeros(M),
+    assert not established(
+        world.null, np.zeros((1, M)), 0.0, world.z.both, final=world.z.final, mean=world.null.mean
     )
-    assert not Acceptance(world.null, world.z, unused, 0.0).established(added)
 
 
 @pytest.mark.parametrize(
@@ -1049,23 +1019,10 @@ def test_an_effect_beyond_doubt_is_there_though_few_frames_know_its_strength_bad
     size: float, other: float, there: bool
 ) -> None:
     """Light that flickers in 97 of 1,000 frames moved statistics by 480 sd; its strength had 4.3 errors."""
-    world, unused = World([]), cast("Any", None)
+    null = World([]).null
     parts = np.array([np.eye(M)[0] * size, np.eye(M)[0] * other])[: 2 if other else 1]
-    seen = world.null.mean + np.eye(M)[0] * size
-    tags = ("row_noise", "frame_noise")
-    added: Any = SimpleNamespace(
-        hypotheses=tuple(Hypothesis(effect(t, 0.1), p) for t, p in zip(tags, parts, strict=False)),
-        parts=parts,
-        slopes=parts,
-        mean=seen,
-        change=np.zeros(len(parts)),
-        stderr=np.full(len(parts), 0.26),
-        vectors=np.zeros((400, M)),
-        covariance=Covariance(np.ones(M), np.zeros((0, M))),
-        rest=np.zeros(M),
-    )
-    accept = Acceptance(world.null, Measured(seen, seen, seen), unused, 0.0)
-    assert ("row_noise" in {h.tag for h in accept.established(added)}) is there
+    found = established(null, parts, 0.26, null.mean + np.eye(M)[0] * size)
+    assert ("row_noise" in found) is there
 
 
 @pytest.mark.parametrize(
@@ -1082,50 +1039,29 @@ def test_a_few_events_are_an_effect_though_they_hardly_tell_its_strength(
     name: str, seen: float, final: float, made: float, there: bool
 ) -> None:
     """A dozen events where chance makes one: their number is known to a third, but there they are."""
-    rng, unused = np.random.default_rng(3), cast("Any", None)
-    names = (name, *NAMES[:8])
-    null = NullModel.from_replicates(names, rng.standard_normal((40, 9)))
-    first = np.eye(9)[0]
-    scatter = 1.3 * rng.standard_normal((16, 9))
-    vectors = null.mean + made * first + scatter - scatter.mean(axis=0)
-    error = np.sqrt(1.3**2 * (1 / 2 + 1 / 16))
-    added: Any = SimpleNamespace(
-        hypotheses=(Hypothesis(effect("row_noise", 0.1), made * first),),
-        parts=made * first[None],
-        slopes=made * first[None],
+    rng, first, size = np.random.default_rng(3), np.eye(9)[0], 1.3
+    null = NullModel.from_replicates((name, *NAMES[:8]), rng.standard_normal((40, 9)))
+    scatter = size * rng.standard_normal((16, 9))
+    found = established(
+        null,
+        made * first[None],
+        0.36,
+        null.mean + seen * first,
+        final=null.mean + final * first,
+        scatter=size,
         mean=null.mean + made * first,
-        change=np.zeros(1),
-        stderr=np.array([0.36]),
-        vectors=vectors,
-        covariance=Covariance(np.full(9, 1.3**2), np.zeros((0, 9))),
-        rest=(seen - made) * first / error,
+        vectors=null.mean + made * first + scatter - scatter.mean(axis=0),
+        rest=(seen - made) * first / (size * np.sqrt(1 / 2 + 1 / 16)),
     )
-    z = null.mean + seen * first
-    accept = Acceptance(null, Measured(z, z, null.mean + final * first), unused, 0.0)
-    assert bool(accept.established(added)) is there
+    assert bool(found) is there
 
 
 def test_strong_effects_need_not_add_up_to_be_there() -> None:
     """Column noise beside a ghost that alone would move the statistics by more than both together do."""
-    world, unused = World([]), cast("Any", None)
-    own, shared = np.eye(M)[0] * 100.0, np.eye(M)[1] * 100.0
+    null, own, shared = World([]).null, np.eye(M)[0] * 100.0, np.eye(M)[1] * 100.0
     parts = np.array([own + 0.5 * shared, 3.6 * shared + 1.4 * own])
-    seen = world.null.mean + own + 2.6 * shared
-    added: Any = SimpleNamespace(
-        hypotheses=tuple(
-            Hypothesis(effect(t, 0.1), p) for t, p in zip(("row_noise", "frame_noise"), parts, strict=True)
-        ),
-        parts=parts,
-        slopes=parts,
-        mean=seen,
-        change=np.zeros(2),
-        stderr=np.full(2, 0.02),
-        vectors=np.zeros((400, M)),
-        covariance=Covariance(np.ones(M), np.zeros((0, M))),
-        rest=np.zeros(M),
-    )
-    accept = Acceptance(world.null, Measured(seen, seen, seen), unused, 0.0)
-    assert {h.tag for h in accept.established(added)} == {"row_noise", "frame_noise"}
+    found = established(null, parts, 0.02, null.mean + own + 2.6 * shared)
+    assert found == {"row_noise", "frame_noise"}
 
 
 def test_what_the_final_frames_do_not_show_stays_outside(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1203,7 +1139,6 @@ def test_a_set_of_which_a_part_cannot_be_fitted_is_not_chosen_and_the_others_are
     pair = hypothesis("row_noise"), hypothesis("frame_noise")
     world.unfit = lambda effects: [e.tag for e in effects] == ["frame_noise"]
     found = world.compare(*pair)
-    assert found is not None
     assert found.chosen.tags == {"row_noise"}
 
 

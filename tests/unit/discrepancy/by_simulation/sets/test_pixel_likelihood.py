@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
-from pchem_pipeline.discrepancy.by_simulation.candidates.by_histograms import Histograms
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import placebo_for
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
+    HistogramLikelihood,
+    Histograms,
     PixelLikelihood,
-    Witness,
-    is_told,
+    identifiable_from_histograms,
 )
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
@@ -72,7 +72,6 @@ def test_share_and_width_of_a_tail_are_found_from_afar(share: float, factor: flo
     assert effort.spent > 0.0
     likelihood = PixelLikelihood(frames, maps_of(0.28), (), effort, 256)
     fit = likelihood._fit([found], ())
-    assert fit is not None
     _, error = fit.coordinates("heavy_tailed_noise")
     assert abs(found.share - share) < 4.0 * error[0]  # type: ignore[attr-defined]
     assert abs(found.factor - factor) < 4.0 * error[1]  # type: ignore[attr-defined]
@@ -105,7 +104,11 @@ def test_guesses_of_few_pixels_and_other_effects_stay_as_they_are() -> None:
         Histograms(frames, maps_of(0.28), present, Effort(None), samples_of).with_numbers(everywhere)
         == everywhere
     )
-    assert [is_told(each) for each in (*others, HEAVY(share=0.1))] == [False, False, True]
+    assert [identifiable_from_histograms(each) for each in (*others, HEAVY(share=0.1))] == [
+        False,
+        False,
+        True,
+    ]
 
 
 def test_a_strong_effect_for_which_no_estimator_speaks_is_found_where_a_plain_fit_is_led_astray() -> None:
@@ -146,7 +149,6 @@ def test_rare_and_wide_tails_are_told_though_they_led_plain_fits_astray() -> Non
     assert np.mean(mistaken) > 0.03
     likelihood = PixelLikelihood(frames, maps, (), Effort(None))
     fit = likelihood._fit([HEAVY(share=0.003, factor=4.0)], ())
-    assert fit is not None
     (share, factor), error = fit.coordinates("heavy_tailed_noise")
     assert abs(share - 0.003) < 4.0 * error[0] < 0.007
     assert abs(factor - 8.0) < 4.0 * error[1] < 4.0
@@ -164,10 +166,14 @@ def test_hypotheses_come_in_the_order_of_their_likelihood_where_a_law_has_them()
     flipped ^= (np.random.default_rng(27).random(flipped.shape) < 0.002).astype(np.uint16) << 5
     for frames, first, second in ((wide, tails, bit), (flipped, bit, tails)):
         likelihood = PixelLikelihood(frames, maps_of(0.25), (), Effort(None))
-        witness = Witness(lambda effects, pixels, known=likelihood: known)
+        told_by = HistogramLikelihood(lambda effects, pixels, known=likelihood: known)
         for given in ([bit, row, tails], [tails, row, bit]):
-            assert witness.ranked(given) == [first, row, second]
-    assert Witness().ranked([bit, row, tails]) == [bit, row, tails]  # of no one law nothing is said
+            assert told_by.ranked(given) == [first, row, second]
+    assert HistogramLikelihood().ranked([bit, row, tails]) == [
+        bit,
+        row,
+        tails,
+    ]  # of no one law nothing is said
 
 
 def test_a_skew_is_told_from_tails_and_tails_from_a_skew() -> None:
@@ -176,7 +182,6 @@ def test_a_skew_is_told_from_tails_and_tails_from_a_skew() -> None:
     for noise, right, wrong in ((exgaussian(rng, 0.4), skew, heavy), (mixture(rng, 0.2, 1.8), heavy, skew)):
         likelihood = PixelLikelihood(frames_of(noise, 9), maps_of(0.3), (), Effort(None))
         answer, back = likelihood.behind([wrong], [right]), likelihood.behind([right], [wrong])
-        assert answer is not None
         assert back is not None
         assert answer[0] < -4.0 * answer[1] < 0.0
         assert back == pytest.approx((-answer[0], answer[1]))
@@ -190,7 +195,6 @@ def test_a_set_begins_where_its_numbers_are_likeliest_together() -> None:
     same, moved = likelihood.begun([row, skew])
     assert same is row
     fit = likelihood._fit([skew.effect], [row.effect])
-    assert fit is not None
     coordinate, error = fit.coordinates("noise_skew")
     assert abs(coordinate[0] - 0.4**3) < 4.0 * error[0] < 0.05
     share = moved.effect.share  # type: ignore[attr-defined]
@@ -207,7 +211,6 @@ def test_of_noise_without_either_nothing_is_said() -> None:
     noise = np.random.default_rng(10).normal(0.0, 0.3, (FRAMES, SIDE, SIDE))
     likelihood = PixelLikelihood(frames_of(noise, 11), maps_of(0.3), (), Effort(None))
     answer = likelihood.behind([SKEW(share=0.1)], [HEAVY(share=0.05, factor=1.5)])
-    assert answer is not None
     assert abs(answer[0]) < 4.0  # fits of nothing: chance makes a nat of each number, and of that half
 
 
@@ -225,12 +228,12 @@ def test_what_no_law_of_a_sample_holds_is_not_told() -> None:
         asked.append(effects)
         return likelihood
 
-    witness = Witness(of)
-    assert witness.behind([heavy], [row]) is None
-    assert witness.behind([row], [column]) is None
-    assert witness.begun([Hypothesis(row, np.ones(2))])[0].effect is row
+    asked_of = HistogramLikelihood(of)
+    assert asked_of.behind([heavy], [row]) is None
+    assert asked_of.behind([row], [column]) is None
+    assert asked_of.begun([Hypothesis(row, np.ones(2))])[0].effect is row
     assert asked == []  # nothing is counted in vain
-    assert witness.behind([heavy, row], [skew, row]) is not None
+    assert asked_of.behind([heavy, row], [skew, row]) is not None
 
 
 def test_a_fit_that_went_astray_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,7 @@
-"""The empirical component: what no known effect explains, measured as moves of the samples.
+"""The empirical component: what no known effect explains, measured as a mixture of shifts of the samples.
 
-The samples are taken for a mixture of their law and of what moves would make of it: shifts on a grid, and,
-given the sample beside or before, moves towards that one. The shares of the moves are those of maximum
+The samples are taken for a mixture of their law and of what shifts would make of it: those on a grid, and,
+given the sample beside or before, those towards that one. The shares of the shifts are those of maximum
 likelihood (Laird 1978; by Newton steps as Kim, Carbonetto, Stephens and Anitescu 2020 take them). Few of them
 come out different from nothing, and those that the likelihood needs are kept. A neighbour must explain more
 than a sample of the same pixel from another time, which stands for it where the law alone is wrong.
@@ -11,25 +11,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import Distance, Measurement
 from pchem_pipeline.discrepancy.observe.digital.misplaced import with_others
 from pchem_pipeline.discrepancy.observe.digital.repeats import equal_squares
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.readout.empirical import Empirical, Move, Together
+from pchem_pipeline.effects.readout.empirical import Empirical, MixtureShift, Together
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-Place = tuple[int, int, int]
 
 _MOST_PIXELS = 600  # that stand for all
 _MOST_SAMPLES = 60_000  # that stand for all where each has a neighbour
@@ -38,11 +37,11 @@ _FARTHEST_E = 6.0  # electrons: shifts beyond are hits of particles or the like
 _ITERATIONS, _HALVINGS = 20, 8
 _CONVERGED = 0.01  # nats
 _NOTHING = 1e-300
-_MOST_MOVES = 6
+_MOST_SHIFTS = 6
 _CLEAR = 10.0  # nats of likelihood that a move must be worth
 _LEAST = 1e-6  # share
 #: Neighbours: one and two frames before, and those beside in the same frame.
-_PLACES: tuple[Place, ...] = (
+_PLACES: tuple[Distance, ...] = (
     (-1, 0, 0), (-2, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1),
 )  # fmt: skip
 _TOWARDS = (1, 2, 4, 8)  # DN
@@ -51,23 +50,9 @@ _CHANCE = 7  # frames between a sample and the one that stands for a neighbour b
 _OF_CHANCE = 3.0  # times what that one explains, that a neighbour must
 _TOGETHER: tuple[Together, ...] = ("row", "column", "frame")
 _ROWS_TOGETHER = 4  # neighbouring rows
-_RARE = 1e-6  # least mass of a code: what is rarer has other reasons
 _SURE = 30.0  # nats, the most that a sample says
 _ALIGNED = 3.0  # times as many equal squares of one parity as of the others
 _FIRST_SHARE, _STEPS = 0.02, 60
-
-
-class Measurement(NamedTuple):
-    """What was measured, by how much likelier the samples are with it, nats, and what it may be as well."""
-
-    effect: Effect
-    gain: float
-    others: tuple[Effect, ...] = ()
-
-    @property
-    def unlisted(self) -> bool:
-        """Whether it may be of a kind that no effect with a name makes."""
-        return any(effect.empirical_unnamed for effect in (self.effect, *self.others))
 
 
 @dataclass(frozen=True)
@@ -125,7 +110,7 @@ class _Mixture:
     def needed(self) -> tuple[list[int], FloatArray, float]:
         """Return the moves that the likelihood needs, the shares of all, (l,), and what they gain, nats."""
         every, _ = self.fitted(range(len(self.mass)))
-        used = [0, *(int(i) for i in np.argsort(-every[1:])[:_MOST_MOVES] + 1 if every[i] > _LEAST)]
+        used = [0, *(int(i) for i in np.argsort(-every[1:])[:_MOST_SHIFTS] + 1 if every[i] > _LEAST)]
         shares, best = self.fitted(used)
         for one in sorted(used[1:], key=lambda i: shares[i]):
             fewer = [i for i in used if i != one]
@@ -180,7 +165,7 @@ class _Laws:
         place = (code - self.first[row]).clip(0, self.mass.shape[1] - 1)
         return np.asarray(self.mass[row, place])
 
-    def moved(self, move: Move, row: IntArray, code: IntArray, other: IntArray | None) -> FloatArray:
+    def moved(self, move: MixtureShift, row: IntArray, code: IntArray, other: IntArray | None) -> FloatArray:
         """Return the mass of codes that have been moved, given the neighbours' codes."""
         if other is None:
             return self.at(row, code - move.shift_dn)
@@ -197,7 +182,7 @@ class _Laws:
         return np.asarray(mass)
 
 
-def measured_moves(
+def measured_mixture_shifts(
     frames: NDArray[np.unsignedinteger],
     numbers: IntArray,
     maps: PixelMaps,
@@ -239,10 +224,8 @@ def _measured_squares(frames: NDArray[np.unsignedinteger], maps: PixelMaps) -> M
     share = float(found[best] - expected) / float(number[best])
     if gain < _CLEAR:
         return None
-    return _component(
-        [Move()], [1], np.array([1.0 - share, share]), gain / (len(frames) * np.count_nonzero(usable)),
-        squares=parities[best],
-    )  # fmt: skip
+    gain /= len(frames) * np.count_nonzero(usable)
+    return _component([MixtureShift()], [1], np.array([1.0 - share, share]), gain, squares=parities[best])
 
 
 def _measured_shifts(
@@ -256,7 +239,7 @@ def _measured_shifts(
     laws = _Laws.of(frames, maps, effects, pixels, 1 + max(sizes, default=0))
     if laws is None or not sizes:
         return None
-    moves = [Move(shift_dn=sign * size) for sign in (-1, 1) for size in sizes]
+    moves = [MixtureShift(shift_dn=sign * size) for sign in (-1, 1) for size in sizes]
     histograms = histogram_frames(frames)
     counts = histograms.counts.reshape(-1, histograms.counts.shape[2])[pixels]
     row, column = np.nonzero(counts)
@@ -268,7 +251,7 @@ def _measured_shifts(
 
 
 def _component(
-    moves: Sequence[Move], used: Sequence[int], shares: FloatArray, gain: float, **how: object
+    moves: Sequence[MixtureShift], used: Sequence[int], shares: FloatArray, gain: float, **how: object
 ) -> Measurement | None:
     total = float(shares[list(used)].sum())
     if not used or total <= 0.0:
@@ -305,12 +288,12 @@ def _measured_towards(
     laws = _Laws.of(frames, maps, effects, pixels, max(_TOWARDS) + 1)
     if laws is None:
         return None
-    best: tuple[float, Place] | None = None
+    best: tuple[float, Distance] | None = None
     for place in _PLACES:
         samples = _samples(frames, numbers, laws, place, some)
         if samples.code.size < _MOST_PIXELS:
             continue
-        moves = _moves_towards(place, step)
+        moves = _shifts_towards(place, step)
         gain = _mixture(laws, samples, moves, samples.other).gain()
         if gain > max(_CLEAR, 0.0 if best is None else best[0]):
             gain -= _OF_CHANCE * _mixture(laws, samples, moves, samples.chance).gain()
@@ -318,7 +301,7 @@ def _measured_towards(
             best = gain, place
     if best is None:
         return None
-    samples, moves = _samples(frames, numbers, laws, best[1], some), _moves_towards(best[1], step)
+    samples, moves = _samples(frames, numbers, laws, best[1], some), _shifts_towards(best[1], step)
     used, shares, gain = _mixture(laws, samples, moves, samples.other).needed()
     if not used:
         return None  # together they help, none of them is needed
@@ -375,7 +358,7 @@ def _chosen(usable: NDArray[np.bool_], n_frames: int) -> tuple[IntArray, IntArra
 
 
 def _samples(
-    frames: NDArray[np.unsignedinteger], numbers: IntArray, laws: _Laws, place: Place, some: IntArray
+    frames: NDArray[np.unsignedinteger], numbers: IntArray, laws: _Laws, place: Distance, some: IntArray
 ) -> _Samples:
     """Return the samples of some frames that have a neighbour at a place."""
     ny, nx = frames.shape[1:]
@@ -392,24 +375,26 @@ def _samples(
     return _Samples(i, np.stack([t, y[i], x[i]]), code, other, chance)
 
 
-def _moves_towards(place: Place, step: float) -> list[Move]:
+def _shifts_towards(place: Distance, step: float) -> list[MixtureShift]:
     """Return the moves that are tried towards a neighbour, ``step`` DN per electron."""
     near = [max(int(part * step), 1) for part in _WITHIN]
     return [
-        Move(towards=place),
-        Move(towards=place, part=0.5),
-        *(Move(towards=place, part=0.5, within_dn=within) for within in near),
-        *(Move(towards=place, shift_dn=shift) for shift in _TOWARDS),
+        MixtureShift(towards=place),
+        MixtureShift(towards=place, part=0.5),
+        *(MixtureShift(towards=place, part=0.5, within_dn=within) for within in near),
+        *(MixtureShift(towards=place, shift_dn=shift) for shift in _TOWARDS),
     ]
 
 
-def _mixture(laws: _Laws, samples: _Samples, moves: Sequence[Move], other: IntArray) -> _Mixture:
+def _mixture(laws: _Laws, samples: _Samples, moves: Sequence[MixtureShift], other: IntArray) -> _Mixture:
     """Return the samples as a mixture of moves towards some neighbours."""
     mass = [laws.moved(move, samples.row, samples.code, other) for move in moves]
     return _Mixture(np.ones(samples.code.size), np.stack([laws.at(samples.row, samples.code), *mass]))
 
 
-def _log_ratio(laws: _Laws, samples: _Samples, moves: Sequence[Move], shares: FloatArray) -> FloatArray:
+def _log_ratio(
+    laws: _Laws, samples: _Samples, moves: Sequence[MixtureShift], shares: FloatArray
+) -> FloatArray:
     """Return by how much likelier samples are if they were moved, nats, shape (m,)."""
     mass = _mixture(laws, samples, moves, samples.other).mass
     moved = shares[1:] @ mass[1:] / max(float(shares[1:].sum()), _LEAST)
@@ -418,7 +403,7 @@ def _log_ratio(laws: _Laws, samples: _Samples, moves: Sequence[Move], shares: Fl
 
 
 def _together(
-    laws: _Laws, samples: _Samples, moves: Sequence[Move], shares: FloatArray, shape: tuple[int, ...]
+    laws: _Laws, samples: _Samples, moves: Sequence[MixtureShift], shares: FloatArray, shape: tuple[int, ...]
 ) -> tuple[Together, float]:
     """Return what is moved alike, by the likelihood, and the share of it that is."""
     ratio = _log_ratio(laws, samples, moves, shares)
@@ -426,9 +411,9 @@ def _together(
     best = float(np.logaddexp(np.log1p(-single), np.log(single) + ratio).sum()) + _CLEAR
     found: tuple[Together, float] = ("sample", 0.0)
     for together in _TOGETHER:
-        share, likelihood = shares_of(_of_groups(ratio, samples.place, together, shape)[None], single)
+        share, likelihood = share_of(_of_groups(ratio, samples.place, together, shape), single)
         if likelihood > best:
-            best, found = likelihood, (together, float(share[0]))
+            best, found = likelihood, (together, share)
     return found
 
 
@@ -444,21 +429,16 @@ def _of_groups(ratio: FloatArray, place: IntArray, together: Together, shape: tu
     return np.where(known, np.bincount(group, ratio, count), -np.inf)
 
 
-def shares_of(ratio: FloatArray, first: float = _FIRST_SHARE) -> tuple[FloatArray, float]:
-    """Return the shares of groups that are moved in each of several ways, and what they gain, nats.
-
-    By expectation and maximisation.
+def share_of(ratio: FloatArray, first: float = _FIRST_SHARE) -> tuple[float, float]:
+    """Return the share of groups that are moved, and what it gains, nats, by expectation and maximisation.
 
     Args:
-        ratio: log likelihood of each group moved, over that of the group as it should be, shape (ways, n).
-        first: share of each from which the steps begin.
+        ratio: log likelihood of each group moved, over that of the group as it should be, shape (n,).
+        first: share from which the steps begin.
     """
-    ratio = ratio[:, np.isfinite(ratio).any(axis=0)]
-    every = np.concatenate([np.zeros((1, ratio.shape[1])), ratio])
-    share = np.full(len(every), first)
-    share[0] -= share.sum() - 1.0
-    for _ in range(_STEPS):
-        log = every + np.log(np.maximum(share, _NOTHING))[:, None]
-        share = special.softmax(log, axis=0).mean(axis=1) if ratio.size else share
-    total = special.logsumexp(every + np.log(np.maximum(share, _NOTHING))[:, None], axis=0)
-    return share[1:], float(total.sum())
+    ratio, share = ratio[np.isfinite(ratio)], first
+    for _ in range(_STEPS if ratio.size else 0):
+        share = float(special.expit(ratio + special.logit(share)).mean())
+    with np.errstate(divide="ignore"):
+        gain = np.logaddexp(np.log1p(-share), np.log(share) + ratio).sum()
+    return share, float(gain)
