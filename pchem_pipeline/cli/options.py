@@ -36,9 +36,7 @@ Progress = Annotated[
     Literal["auto", "on", "off"], typer.Option(help="progress bars; auto: only on a terminal")
 ]
 Output = Annotated[Path, typer.Option("--output", "-o", help="folder to write to", callback=on_this_machine)]
-Strict = Annotated[
-    bool, typer.Option("--strict", help="exit code 3 where the report says not to believe its results")
-]
+Strict = Annotated[bool, typer.Option("--strict", help="exit code 3 where the results are not reliable")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="warnings and errors only")]
 
 #: Name, type with help, and default of each, in the order of ``--help``.

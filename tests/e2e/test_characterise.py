@@ -35,7 +35,7 @@ def test_an_array_becomes_a_run_and_nothing_is_done_twice(frames, tmp_path):
         assert abs(np.mean((value - true) / error)) < 5 / np.sqrt(value.size)
         assert 0.05 * true / np.median(error) * np.sqrt(value.size) > 10  # off by a twentieth would be seen
     np.testing.assert_allclose(run.maps.dark_current.values, run.maps.quanta_exposure.values / 2.0)
-    assert "Is this sensor all right? <b>" in run._repr_html_()
+    assert "Is the sensor within limits? <b>" in run._repr_html_()
     assert "conversion gain" in run.pixel(2, 3)._repr_html_()
     made = (tmp_path / "night.zarr" / "report.html").stat().st_mtime_ns
     other = again(dask.array.from_array(frames, chunks=(100, 8, 9)))

@@ -47,7 +47,7 @@ def test_a_folder_of_tiffs_becomes_a_report(shell, frames):
     again = shell.ok("run", "runs/dark.yaml")
     said = again.stderr.splitlines()
     assert said[:6] == [f"{stage}: up to date" for stage in STAGES]
-    assert any(line.startswith("Can I believe these results? ") for line in said)
+    assert any(line.startswith("Are these results reliable? ") for line in said)
     assert said[-1].startswith("  pchem ")
 
 

@@ -33,7 +33,7 @@ def table(data: ReportData, name: str):
 def test_where_most_pixels_are_flagged_the_answer_is_no() -> None:
     data = flagged(0.6)
     sensor, belief = answers(data)
-    assert (sensor.level, sensor.word) == ("serious", "Not known")
+    assert (sensor.level, sensor.word) == ("serious", "Unknown")
     assert (belief.level, belief.word) == ("serious", "No")
     assert "pchem joint" in belief.text
     assert key_numbers(data) == []
@@ -59,7 +59,7 @@ def test_a_bias_an_electron_off_leaves_gain_and_read_noise() -> None:
 def test_just_below_half_is_a_caution_and_says_that_the_rest_is_a_selection() -> None:
     data = flagged(0.45)
     sensor, belief = answers(data)
-    assert (sensor.level, sensor.word) == ("caution", "Known in part only")
+    assert (sensor.level, sensor.word) == ("caution", "Partly known")
     assert belief.level == "caution"
     assert any("a selection, as a rule quieter" in flag.text for flag in flags(data))
     assert key_numbers(data)[0].label == "read noise of unflagged pixels"

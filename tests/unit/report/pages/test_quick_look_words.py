@@ -48,7 +48,7 @@ def test_nothing_found_is_a_check_that_passed_with_its_limit(data: ReportData) -
 
 
 @pytest.mark.parametrize(
-    ("size", "level", "word"), [(1.0, "caution", "With caution"), (2.0, "serious", "Not as they are")]
+    ("size", "level", "word"), [(1.0, "caution", "With caution"), (2.0, "serious", "No")]
 )
 def test_row_noise_of_a_third_of_the_read_noise_is_not_believed(
     data: ReportData, size: float, level: str, word: str

@@ -165,9 +165,9 @@ def test_tables_have_headings_and_scroll_by_keyboard(page: Page) -> None:
 
 
 def test_the_first_screen_has_the_numbers(page: Page, data: ReportData) -> None:
-    before = page.text.index("Parameter maps", page.text.index("Is this sensor all right?"))
+    before = page.text.index("Parameter maps", page.text.index("Is the sensor within limits?"))
     first = page.text[:before]
-    for words in ("Is this sensor all right?", "Can I believe these results?", "checks passed", "criteria"):
+    for words in ("Is the sensor within limits?", "Are these results reliable?", "checks passed", "criteria"):
         assert words in first
     for number in key_numbers(data):
         assert first.count(number.value) == 1

@@ -212,7 +212,7 @@ def test_the_choice_repeats() -> None:
 def test_all_right_and_to_be_believed(data: ReportData) -> None:
     clean = replace(report_data((40, 40), failed=0.0), fit={"fit_status": np.zeros((40, 40), np.uint16)})
     sensor, belief = answers(clean)
-    assert (sensor.level, sensor.question) == ("good", "Is this sensor all right?")
+    assert (sensor.level, sensor.question) == ("good", "Is the sensor within limits?")
     assert sensor.text == "All 1,600 pixels have a value; the 6 criteria are met."
     assert [each.found for each in sensor.criteria if each.setting == "read_noise_e"] == ["0.299 e⁻"]
     assert (belief.level, belief.word) == ("good", "No problem found by the quick checks")
@@ -237,7 +237,7 @@ def test_a_wrong_model_is_not_to_be_believed() -> None:
     data = report_data((40, 40), failed=0.0)
     rmse = {"rmse": {"epcd_exact": 5e-4, "noise_floor": 1e-4}}
     belief = answers(replace(data, ensemble_facts=rmse))[1]
-    assert (belief.level, belief.word) == ("serious", "Not as they are")
+    assert (belief.level, belief.word) == ("serious", "No")
     assert "does not explain the data" in belief.text
 
 
