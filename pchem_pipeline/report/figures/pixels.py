@@ -322,7 +322,7 @@ def _one_pixel(pixel: PixelFit, letter: str) -> Stack:
     remarks = [f"{total:,} {'samples' if pixel.channel else 'frames'}"]
     outside = total - int(pixel.counts[where].sum())
     if outside:
-        remarks.append(f"{outside:,} beyond the axis")
+        remarks.append(f"{outside:,} outside the axis")
     strip = Panel(Axis(residual, -3.5, 3.5), (), 1.0)
     if has_fit(pixel.parameters):
         if pixel.mass is None:

@@ -213,11 +213,11 @@ def test_all_right_and_to_be_believed(data: ReportData) -> None:
     clean = replace(report_data((40, 40), failed=0.0), fit={"fit_status": np.zeros((40, 40), np.uint16)})
     sensor, belief = answers(clean)
     assert (sensor.level, sensor.question) == ("good", "Is the sensor within limits?")
-    assert sensor.text == "All 1,600 pixels have a value; the 6 criteria are met."
+    assert sensor.text == "All 1,600 pixels have a value; all 6 criteria pass."
     assert [each.found for each in sensor.criteria if each.setting == "read_noise_e"] == ["0.299 e⁻"]
     assert (belief.level, belief.word) == ("good", "No problem found by the quick checks")
     assert belief.text == (
-        "2 checks of the model against the data passed. What the model may be missing was not looked for."
+        "2 checks of the model against the data passed. Missing effects were not searched for."
     )
 
 
@@ -238,7 +238,7 @@ def test_a_wrong_model_is_not_to_be_believed() -> None:
     rmse = {"rmse": {"epcd_exact": 5e-4, "noise_floor": 1e-4}}
     belief = answers(replace(data, ensemble_facts=rmse))[1]
     assert (belief.level, belief.word) == ("serious", "No")
-    assert "does not explain the data" in belief.text
+    assert "does not describe the data" in belief.text
 
 
 def test_no_fit_at_all() -> None:
