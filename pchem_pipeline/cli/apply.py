@@ -25,23 +25,23 @@ def apply(
     prior: Annotated[
         str,
         typer.Option(
-            help="numbers: exposure to expect: frames (estimated from these), flat (any number alike), run "
-            "(of the characterisation), a number (e-), or a file with a map (npy, TIFF, FITS)"
+            help="numbers: prior exposure: frames (estimated from these frames), flat (all numbers equally "
+            "likely), run (from the characterisation), a number (e-), or a file with a map (npy, TIFF, FITS)"
         ),
     ] = "frames",
     dataset: Annotated[
         str | None,
-        typer.Option(help="frames inside an HDF5, zarr or FITS file  [default: as the run has it]"),
+        typer.Option(help="dataset of an HDF5, zarr or FITS file [default: as in the run]"),
     ] = None,
     format: Annotated[Literal["zarr", "tiff", "fits"], typer.Option(help="format of the output")] = "zarr",
     keep_modes: Annotated[
         bool,
         typer.Option(
             "--keep-modes",
-            help="leave row, column and frame noise, drift and pickup of the model in the frames",
+            help="do not subtract row, column and frame noise, drift and pickup of the model",
         ),
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="replace calibrated frames that are there")] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace existing calibrated frames")] = False,
     *,
     command: Command,
 ) -> None:

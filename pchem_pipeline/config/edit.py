@@ -51,8 +51,8 @@ def check_writable(path: Path) -> None:
     # the mode counts, too: whoever may write everything still means what it says
     if not os.access(path, os.W_OK) or not path.stat().st_mode & 0o222:
         raise StoreError(
-            f"{path} is read-only, and its section model is to be written; make it writable (chmod u+w), or "
-            "leave the model as it is (discrepancy: --no-refit, or discrepancy.add: false)"
+            f"{path} is read-only, but its section model must change; make it writable (chmod u+w), or keep "
+            "the model (discrepancy: --no-refit, or discrepancy.add: false)"
         )
 
 
@@ -105,7 +105,7 @@ def with_model(text: str, model: ModelSettings, name: str, folder: Path | None =
         given = (effect.model_dump(mode="json", exclude_defaults=True) for effect in model.effects)
         line["effects"] = [{"tag": e.tag, **own} for e, own in zip(model.effects, given, strict=True)]
     words = yaml.safe_dump({_SECTION: line}, sort_keys=False, default_flow_style=True, width=10**6).strip()
-    raise ConfigError(f"{name}: its section model cannot be edited; write it by hand: {words}")
+    raise ConfigError(f"{name}: cannot edit the section model; edit it by hand: {words}")
 
 
 def _says(text: str, content: dict[str, Any], model: ModelSettings, folder: Path | None) -> bool:

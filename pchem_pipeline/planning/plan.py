@@ -157,9 +157,9 @@ def _refuse(need: Need, point: Point, max_frames: float, best: float, best_frame
             if several.frames <= max_frames:
                 cure = f"; several samples (--samples best) need {several.frames:,.0f}"
         asked = (
-            f"the bound asks for {need.frames:,.3g}"
+            f"bound: {need.frames:,.0f} frames"
             if np.isfinite(need.frames)
-            else "they tell nothing of it"
+            else "not determined at this exposure"
         )
         raise ConfigError(
             _hopeless(target, point, f"at an exposure of {point.quanta_exposure:.3g} e-", f" ({asked}){cure}")
@@ -167,10 +167,8 @@ def _refuse(need: Need, point: Point, max_frames: float, best: float, best_frame
 
 
 def _hopeless(target: Target, point: Point, where: str, more: str) -> str:
-    return (
-        f"{target}: no number of frames of one sample within --max-frames reaches it {where} "
-        f"and a read noise of {point.read_noise_e:g} e-{more}"
-    )
+    return f"{target}: not reached with one sample within --max-frames, {where} and a read noise of "
+    f"{point.read_noise_e:g} e-{more}"
 
 
 def _best(targets: Sequence[Target], point: Point, max_exposure: float) -> tuple[float, float]:
@@ -239,8 +237,8 @@ def plan_samples(
     if frames > max_frames:
         lights = ", ".join(f"{h:g}" for h in split.exposures)
         raise ConfigError(
-            f"{targets[0]}: no number of frames within --max-frames reaches it with samples of {lights} e- "
-            f"and a read noise of {point.read_noise_e:g} e-; give other exposures, one of them with electrons"
+            f"{targets[0]}: not reached within --max-frames with exposures of {lights} e- and a read noise "
+            f"of {point.read_noise_e:g} e-; give other exposures, at least one above 0"
         )
     total = float(budget) if budget is not None else frames
     even = split_frames(aims, split.exposures, [1.0 / len(split.shares)] * len(split.shares), point)

@@ -13,15 +13,15 @@ _SUBJECTS = "frames, rows, columns, neighbours, successive samples, pickup and c
 
 #: What a check of resemblance finds where the correlation is negative.
 _OPPOSED = {
-    "lag": "successive samples of a pixel are anticorrelated",
-    "frame_lag": "means of successive frames are anticorrelated",
-    "neighbours_x": "neighbours in a row are anticorrelated",
-    "neighbours_y": "neighbours in a column are anticorrelated",
+    "lag": "samples differ from those of the frame before more than chance makes them",
+    "frame_lag": "the mean of a frame differs from that of the frame before more than chance makes it",
+    "neighbours_x": "neighbours in a row differ more than chance makes them",
+    "neighbours_y": "neighbours in a column differ more than chance makes them",
 }
 
 
 def check_title(check: Check) -> str:
-    """Return what was checked, or the opposite where that was found."""
+    """Return what was looked for, or where the opposite was found that."""
     title = _OPPOSED.get(check.name, check.title) if check.found and check.size < 0 else check.title
     return f"{title[:1].upper()}{title[1:]}"
 
@@ -34,7 +34,7 @@ def check_sentence(check: Check) -> str:
     elif check.where:
         text += f" ({check.where})"
     if check.in_model:
-        return f"{text}; included in the model"
+        return f"{text}; the model has an effect like it"
     return f"{text}; {check.advice}" if check.advice else text
 
 
@@ -50,7 +50,7 @@ def size_text(check: Check) -> str:
             size += f", {percent(check.share, 1.0)} of the read noise"
         return size
     if check.unit == "LSB":
-        return f"{short(check.size, 2)} LSB rms" if math.isfinite(check.size) else "size unknown"
+        return f"{short(check.size, 2)} LSB rms" if math.isfinite(check.size) else "size not known"
     if check.name in ("lag", "frame_lag", "neighbours_x", "neighbours_y"):
         return f"correlation {short(check.size, 2)}"
     noun = (
@@ -64,11 +64,11 @@ def size_text(check: Check) -> str:
 
 
 def nothing_found(look: QuickLook) -> str:
-    """Return that nothing was found, and the smallest detectable row noise."""
+    """Return that nothing was found, and how small it would have been found."""
     rows = next((check for check in look.checks if check.name == "row_noise"), None)
     if rows is None:
-        return "Quick look at the codes: nothing significant."
-    text = f"Quick look at {_SUBJECTS}: nothing significant"
+        return "A quick look at the codes found nothing beyond chance."
+    text = f"A quick look at {_SUBJECTS} found nothing beyond chance"
     if math.isfinite(rows.limit):
-        text += f"; row noise is detectable from {short(rows.limit, 2)} DN"
+        text += f"; row noise of {short(rows.limit, 2)} DN would have been found"
     return f"{text}."

@@ -66,13 +66,14 @@ def _quick_look(data: ReportData) -> Table:
         )
         for check in look.checks
     )
-    missing = "".join(f" Not checked: {part} ({why})." for part, why in look.missing.items())
+    missing = "".join(f" Not looked at: {part} ({why})." for part, why in look.missing.items())
     return Table(
         "quick-look",
         "Quick look",
-        "Test of all pixels for samples that are not independent between pixels and frames, as the model "
-        f"assumes. p-value: for the whole table.{missing}",
-        ("check", "found", "size", "smallest detectable", "p-value", "where"),
+        "Samples that follow the model are independent from pixel to pixel and from frame to frame. From "
+        "sums that every run keeps this is tested for all pixels; the probability is that of as much by "
+        f"chance anywhere in this table.{missing}",
+        ("what was looked for", "found", "size", "would be found from", "by chance", "where"),
         rows,
         "discrepancy",
     )
