@@ -47,7 +47,7 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
     if add:
         target, words = adopt_verdict(target)
         if words:
-            written = "" if path is None else f" (it is in {path} now)"
+            written = "" if path is None else f" (added to {path})"
             Reporter(command.progress, quiet=command.quiet, log=command.log_json).info(words + written)
     if refit:
         done = {s.stage for s in run_status(target) if s.state != "missing"}

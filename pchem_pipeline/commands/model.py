@@ -114,7 +114,7 @@ def _effect_words(effect: Effect) -> str:
 
 
 def use_model(target: Target, number: int) -> str:
-    """Put a version of the model in force, in store and YAML; return in words what is stale thereby.
+    """Put a version of the model in force, in store and YAML; return which results are stale.
 
     Args:
         target: the run.
@@ -131,7 +131,7 @@ def use_model(target: Target, number: int) -> str:
         version = version_with(store, number)
         changed = _put_in_force(store, target, version)
     if before.number == number:
-        words = f"model {number} was in force already: {_words(version)}"
+        words = f"model {number} is already in use: {_words(version)}"
     else:
         words = _change_words(changed, before, version)
     return "\n".join([words, *_stale_lines(changed)])
@@ -141,7 +141,7 @@ def _change_words(target: Target, before: ModelVersion, version: ModelVersion) -
     """Say which version is in force now, and how to go back to the one before."""
     place = quoted(yaml_of(target) or target.store)
     back = f"to go back: pchem model {place} --use {before.number}"
-    return f"model {version.number} is in force: {_words(version)}; {back}"
+    return f"model {version.number} is now in use: {_words(version)}; {back}"
 
 
 def _stale_lines(target: Target) -> list[str]:
@@ -149,8 +149,8 @@ def _stale_lines(target: Target) -> list[str]:
     stale = [state.stage for state in run_status(target) if state.state == "stale"]
     place = quoted(yaml_of(target) or target.store)
     usual = [name for name in stale if not STAGES[name].on_demand]
-    lines = [f"stale: {', '.join(usual)}; to do them again: pchem run {place}"] if usual else []
-    lines += [f"stale: {name}; to do it again: pchem {name} {place}" for name in stale if name not in usual]
+    lines = [f"stale: {', '.join(usual)}; to update: pchem run {place}"] if usual else []
+    lines += [f"stale: {name}; to update: pchem {name} {place}" for name in stale if name not in usual]
     return lines or ["nothing is stale"]
 
 

@@ -21,7 +21,7 @@ _DEFECT = "DEFECT: the candidate {} failed and was not compared: {}"
 _PLAIN = str.maketrans({"−": "-", "→": "->", "⁻": "-", "±": "+-", "…": "...", "\u00a0": " "})
 # a number and its unit stay in one line
 _HELD = "\u00a0"
-_BEFORE_UNIT = re.compile(r"(?<=\d) (?=%|DN|e-|sd\b|nats)")
+_BEFORE_UNIT = re.compile(r"(?<=\d) (?=%|DN|e-|sigma\b)")
 
 
 def verdict_text(found: Verdict) -> str:
@@ -38,18 +38,16 @@ def verdict_text(found: Verdict) -> str:
     lines += _gap(found)
     if found.examined.left_out:
         words = frame_words(np.array(found.examined.left_out))
-        lines += _wrapped(f"left out, empty or far from the others: {words}")
+        lines += _wrapped(f"excluded, empty or outlying: {words}")
     if found.proposed:
         tags = ", ".join(str(effect["tag"]) for effect in found.proposed)
-        lines += _wrapped(
-            f"proposed, not in the model: {tags} (discrepancy.json: proposed); it leaves a part"
-        )
+        lines += _wrapped(f"proposed, not in the model: {tags} (discrepancy.json: proposed); a part remains")
     if found.examined.elsewhere is not None:
         lines += _wrapped(found.examined.elsewhere.says())
     if found.doubt and found.steps:
-        lines += _wrapped(f"not tested, and no size in e-: {found.doubt}")
+        lines += _wrapped(f"not tested, no size in e-: {found.doubt}")
     if found.unexplained:
-        lines += _places("left unexplained: ", found.unexplained, _MOST_LEFT)
+        lines += _places("unexplained: ", found.unexplained, _MOST_LEFT)
     lines += [line for tag, why in found.defects.items() for line in _wrapped(_DEFECT.format(tag, why))]
     if found.untestable:
         lines += _listed("not testable with such frames", list(found.untestable), 0)
@@ -95,15 +93,15 @@ def _spots(place: Place) -> str:
 
 
 def _sd(z: float) -> str:
-    return f"{z:+.1f} sd" if math.isfinite(z) else "sd not known"
+    return f"{abs(z):.{1 if abs(z) < 9.95 else 0}f} sigma" if math.isfinite(z) else "sigma not known"
 
 
 def _step(step: Step, number: int, found: Verdict) -> list[str]:
-    """Return what was named in a step and why its rivals lost, or the table of those not told apart."""
+    """Return the named effect of a step and why its rivals are rejected, or the table of candidates."""
     lines = []
     title = f"step {number}" if number else "candidate"
     if step.effect:
-        lines += [line for rival in step.rivals for line in _beaten(step.effect, rival)]
+        lines += [line for rival in step.rivals for line in _rejected(rival)]
     elif len(step.candidates) > 1 and found.verdict == "ambiguous":
         lines.append(f"{title:<28}{'score':>10}{'stderr':>9}{'probability':>13}")
         for each in step.candidates[:_MOST_CANDIDATES]:
@@ -122,19 +120,16 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
         lines += [
             line
             for rival, text in step.separate.items()
-            for line in _wrapped(f"to tell {rival} apart: {text}")
+            for line in _wrapped(f"to distinguish {rival}: {text}")
         ]
     return lines
 
 
-def _beaten(effect: str, rival: Rival) -> list[str]:
+def _rejected(rival: Rival) -> list[str]:
     nats = -rival.behind
-    behind = f" ({nats:{',.0f' if nats >= 100.0 else '.3g'}} nats behind)" if math.isfinite(nats) else ""
-    return _wrapped(
-        f"{effect}, not {rival.effect}{behind}: {rival.why}"
-        if rival.why
-        else f"{effect}, not {rival.effect}{behind}"
-    )
+    lower = f"{nats:{',.0f' if nats >= 100.0 else '.3g'}}"
+    size = f" (log-likelihood lower by {lower})" if math.isfinite(nats) else ""
+    return _wrapped(f"{rival.effect} is rejected{size}{f': {rival.why}' if rival.why else ''}")
 
 
 def _number(value: float, digits: int = 1) -> str:
@@ -150,18 +145,18 @@ def _gap(found: Verdict) -> list[str]:
         words += f" -> {micronats(gap.after)}"
     words += f" micronats per sample (floor {micronats(gap.floor)}"
     if found.steps and gap.within_chance:
-        words += ": chance alone makes as much, before and after"
+        words += "; within sampling noise before and after"
     elif found.steps and math.isfinite(gap.closed_fraction):
-        nearest = " by what is most like it" if found.verdict == "unexplained" else ""
+        nearest = " by the most similar effect" if found.verdict == "unexplained" else ""
         words += f", {100 * gap.closed_fraction:.1f} % closed{nearest}"
     words += ")"
     for step in found.steps:
         if step.within_chance:
-            continue  # what anything leaves of it tells nothing
-        for role, rival in (("runner-up", step.runner_up), ("placebo", step.placebo)):
+            continue  # what remains of it is sampling noise
+        for role, rival in (("next best effect", step.runner_up), ("control", step.placebo)):
             if rival is not None and step.effect:
-                left = f"{rival.effect} leaves {micronats(rival.gap_after)}"
-                words += f"; in the place of {step.effect} the {role} {left}"
+                remain = f"{micronats(rival.gap_after)} remain"
+                words += f"; with the {role} {rival.effect} instead of {step.effect}, {remain}"
         if step.effect and step.placebo is None:
-            words += f"; no effect unrelated to {step.effect} closes any of it"
+            words += f"; no effect unrelated to {step.effect} reduces it"
     return _wrapped(words)

@@ -42,7 +42,9 @@ def test_nothing_found_is_a_check_that_passed_with_its_limit(data: ReportData) -
         "what is the same in all frames and pixels (a nonlinearity, charge that is not Poisson distributed): "
         "run pchem discrepancy run.zarr."
     )
-    assert any("row noise of 0.12 DN would have been found" in flag.text for flag in flags(looked(data, 0.4, 0.0)))
+    assert any(
+        "row noise of 0.12 DN would have been found" in flag.text for flag in flags(looked(data, 0.4, 0.0))
+    )
 
 
 @pytest.mark.parametrize(
