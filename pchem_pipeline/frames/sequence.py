@@ -275,8 +275,8 @@ def _frame_range(settings: InputSettings, total: int, least: int) -> tuple[int, 
     end = total if end is None else end
     if end > total or end - first < least:
         raise InputError(
-            f"input.frame_range [{first}, {end}] has fewer than {least} of the {total} frames; correct it "
-            "(--frames)"
+            f"input.frame_range [{first}, {end}] does not select at least {least} of the {total} frames; "
+            "correct it (--frames)"
         )
     return first, end
 

@@ -156,11 +156,8 @@ def _refuse(need: Need, point: Point, max_frames: float, best: float, best_frame
             several = best_samples([target, _SEEN], point, max(point.quanta_exposure, 1.0))
             if several.frames <= max_frames:
                 cure = f"; several samples (--samples best) need {several.frames:,.0f}"
-        asked = (
-            f"bound: {need.frames:,.0f} frames"
-            if np.isfinite(need.frames)
-            else "not determined at this exposure"
-        )
+        # a larger number is as good as none
+        asked = f"{need.frames:,.0f} frames" if need.frames < 1e12 else "no number of frames suffices"
         raise ConfigError(
             _hopeless(target, point, f"at an exposure of {point.quanta_exposure:.3g} e-", f" ({asked}){cure}")
         )

@@ -60,7 +60,7 @@ def test_without_a_store_it_goes_with_the_run(frames):
     ("stack", "words"),
     [
         (np.zeros((4, 4), np.uint16), "give an array"),
-        (np.zeros((0, 4, 4), np.uint16), "of 2 frames or more"),
+        (np.zeros((0, 4, 4), np.uint16), "of at least 2 frames"),
         ([[[0.5]], [[1.5]]], "give integers"),
         (np.zeros((4, 4, 4)), "give integers"),
         (np.full((4, 4, 4), -1), "from -1 to -1 DN"),

@@ -67,7 +67,7 @@ def test_a_scheduler_that_goes_away_is_one_line(processes, executor, tmp_path):
         if len(found) == 3:
             scheduler.send_signal(signal.SIGKILL)
 
-    with pytest.raises(IncompleteRunError, match="went away; finished tiles are kept") as caught:
+    with pytest.raises(IncompleteRunError, match="stopped; finished tiles are kept") as caught:
         executor.map(functools.partial(slow_square, tmp_path), range(400), on_result)
     assert str(file) in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -111,7 +111,7 @@ def test_going_back_to_an_older_model_and_forth_gives_the_same_bits(searched, tm
     assert "PCD + row_noise 1.2" in listed[2]
     after, text = read(other, "fit/read_noise_dn"), (other.folder / "run.yaml").read_text()
     words = other.ok("model", "run.yaml", "--use", "1").stdout
-    assert "stale: fit; to do them again: pchem run" in words
+    assert "stale: fit; to update: pchem run" in words
     assert "row_noise" not in (other.folder / "run.yaml").read_text().split("model:")[1]
     assert "fit         stale - model 2 -> 1  model 2" in other.ok("status", "run.yaml").stdout
     other.ok("run", "run.yaml", "--until", "fit")

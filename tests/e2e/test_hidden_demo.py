@@ -18,7 +18,7 @@ def test_a_hidden_effect_is_found_and_told(shell):
     result = json.loads((run / "discrepancy.json").read_text())
     plain, extended = (
         next(line for line in part.splitlines() if line.startswith("read_noise_e")).split()
-        for part in told.split("with the plain model:")[1].split("with the model of the verdict:")
+        for part in told.split("with the plain model:")[1].split("with the model found:")
     )
     # row noise counts as read noise until the model has it; columns: name, unit, true, estimated
     found = result["steps"][0]["parameters"]["row_noise_dn"]["value"]

@@ -345,7 +345,7 @@ def test_a_refused_list_leaves_its_name_free(joint):
 def test_what_is_no_joint_fit_says_so(joint):
     with pytest.raises(ConfigError, match=r"dark_1s\.yaml is a single run, and a joint fit needs several"):
         find_joint([joint / "dark_1s.yaml"])
-    with pytest.raises(ConfigError, match="only for runs"):
+    with pytest.raises(ConfigError, match="only with runs"):
         find_joint([joint / "dark.yaml"], store=joint / "x.zarr")
     with pytest.raises(ConfigError, match="exists with other settings"):
         find_joint([joint / "dark_1s.yaml", joint / "dark_2s.yaml"], store=joint / "dark.zarr")

@@ -50,7 +50,7 @@ def test_methods_with_other_exposures(exposures):
     fit = store.read("fit/conversion_gain")[store.read("methods/pixel_y"), store.read("methods/pixel_x")]
     np.testing.assert_array_equal(gains[names.index("pchem_em")], fit)
     page = (exposures.folder / "bright.zarr" / "report.html").read_text()
-    assert "Other methods beside PCH-EM" in page
+    assert "Comparison with other methods" in page
     assert transfer["title"] in page
     # what the command line chose stays in force, also where the YAML is asked; other settings make it anew
     for run in ("bright.zarr", "bright.yaml"):

@@ -62,10 +62,10 @@ def npy(path: Path, header: str) -> Path:
 @pytest.mark.parametrize(
     ("shape", "words"),
     [
-        ("(6, 8, 9", "not a sound npy file"),
-        ("(6, 8, 9" + "(" * 60, "not a sound npy file"),
+        ("(6, 8, 9", "not a valid npy file"),
+        ("(6, 8, 9" + "(" * 60, "not a valid npy file"),
         (f"({1 << 62}, 8, 9)", "truncated"),
-        (f"({1 << 40}, 0, 9)", "holds no frames"),
+        (f"({1 << 40}, 0, 9)", "no frames"),
         ("(6, -8, 9)", "damaged header"),
         (f"(2, 1, {1 << 40})", "damaged header"),
     ],

@@ -148,8 +148,8 @@ def _image(path: Path, hdus: Any, settings: InputSettings) -> tuple[int, Any, An
         names = ", ".join(f"{n} ({hdu.name or 'unnamed'})" for n, hdu in images[:12]) or "none"
         names += f" and {len(images) - 12} more" if len(images) > 12 else ""
         raise InputError(
-            f"{path}: several images{' of this name' * (settings.dataset is not None)}: {names}; choose one "
-            "by its number in input.dataset (--dataset), or write the frames as one cube"
+            f"{path}: images in the file{' with this name' * (settings.dataset is not None)}: {names}; "
+            "choose one by its number in input.dataset (--dataset), or write the frames as one cube"
         )
     return *images[0], hdus[0].header
 

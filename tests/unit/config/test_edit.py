@@ -185,7 +185,7 @@ def test_a_model_that_cannot_be_put_in_is_told_whole(monkeypatch: pytest.MonkeyP
 
     for name in ("_with_lines", "_with_document"):
         monkeypatch.setattr(f"pchem_pipeline.config.edit.{name}", refuse)
-    with pytest.raises(ConfigError, match="write it by hand") as error:
+    with pytest.raises(ConfigError, match="edit it by hand") as error:
         with_model(TEXT, model(CLIP, ROW), "a.yaml")
     words = str(error.value).partition("by hand: ")[2]
     assert ModelSettings.model_validate(yaml.safe_load(words)["model"]) == model(CLIP, ROW)

@@ -60,7 +60,7 @@ def test_nats_are_plain_numbers() -> None:
 
 def test_an_unexplained_verdict_says_what_is_left() -> None:
     lines = verdict_text(verdict_of("unexplained")).splitlines()
-    at = lines.index("left unexplained:")
+    at = lines.index("unexplained:")
     assert "residuals of adjacent codes have opposite signs (+22.5 sd)" in lines[at + 1]
     assert "left unexplained" not in verdict_text(verdict_of("named"))
 

@@ -183,7 +183,7 @@ def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample() -> None:
     reasons = dict(chosen.reasons)
     assert chosen.index.size == np.unique(chosen.index).size == 1500
     assert reasons["shown in the report"] == (1 * 120 + 2,)
-    assert reasons["named by the discrepancy verdict"] == (5 * 120 + 6,)
+    assert reasons["from the search for missing effects"] == (5 * 120 + 6,)
     assert reasons["poorest goodness of fit"][0] == 40 * 120 + 50
     known = np.where(np.isfinite(data.maps["bias"]), data.maps["bias"], -np.inf)
     assert reasons["largest bias"][0] == known.argmax()
