@@ -34,8 +34,10 @@ def holds_secret(place: str) -> bool:
 
 
 #: What is said of such a URL, which is not repeated.
-NO_SECRETS = "a URL with a password, key or signature, which would be stored in the run's YAML; give keys as "
-"for AWS tools (AWS_ACCESS_KEY_ID, ~/.aws), or download the file first"
+NO_SECRETS = (
+    "a URL with a password, key or signature, which would be stored in the run's YAML; give keys as "
+    "for AWS tools (AWS_ACCESS_KEY_ID, ~/.aws), or download the file first"
+)
 
 
 def _without_secrets(place: str) -> str:

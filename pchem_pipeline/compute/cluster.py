@@ -119,10 +119,14 @@ class DistributedExecutor:
     def _given_up(self, workers: Sequence[dict[str, Any]]) -> str:
         waited = f"for {self._seconds:g} s (compute.wait_for_workers)"
         if workers:
-            return f"{self._name}: all {len(workers)} workers were paused {waited}, {_limit(workers[0])} is "
-            f"nearly full; {_MORE_MEMORY}, and run the same command to continue"
-        return f"{self._name} had no worker {waited}; finished tiles are kept: start workers with dask "
-        "worker, or raise this time, and run the same command to continue"
+            return (
+                f"{self._name}: all {len(workers)} workers were paused {waited}, {_limit(workers[0])} is "
+                f"nearly full; {_MORE_MEMORY}, and run the same command to continue"
+            )
+        return (
+            f"{self._name} had no worker {waited}; finished tiles are kept: start workers with dask "
+            "worker, or raise this time, and run the same command to continue"
+        )
 
     def _completed(self, futures: Sequence[Any]) -> Iterator[tuple[Any, Outcome]]:
         """Yield futures and what became of them as they end, with an eye on the workers while none does."""
@@ -253,5 +257,7 @@ def _outcome(future: Any) -> Outcome:
 def _killed(error: Any) -> str:
     """Say in one line that workers died at an item; the scheduler does not know of what."""
     last, times = error.last_worker, error.allowed_failures + 1
-    return f"{times} worker{'s' * (times > 1)} died on it, the last at {last.address}: killed, or above "
-    f"{_limit({'memory_limit': last.memory_limit})}; {_MORE_MEMORY}, and run the same command to continue"
+    return (
+        f"{times} worker{'s' * (times > 1)} died on it, the last at {last.address}: killed, or above "
+        f"{_limit({'memory_limit': last.memory_limit})}; {_MORE_MEMORY}, and run the same command to continue"
+    )

@@ -82,8 +82,10 @@ def guarded(function: Callable[[T], Any], item: T) -> Outcome:
 
 def out_of_memory(error: MemoryError) -> str:
     """Say in one line that memory was not enough."""
-    return f"out of memory{f' ({error})' if str(error) else ''}; use fewer --workers, a smaller --max-memory "
-    "or a smaller run.tile, or a machine with more, and run the same command to continue"
+    return (
+        f"out of memory{f' ({error})' if str(error) else ''}; use fewer --workers, a smaller --max-memory "
+        "or a smaller run.tile, or a machine with more, and run the same command to continue"
+    )
 
 
 def call_all(tasks: Sequence[Callable[[], T]], threads: int) -> list[T]:

@@ -164,8 +164,10 @@ def _refuse(need: Need, point: Point, max_frames: float, best: float, best_frame
 
 
 def _hopeless(target: Target, point: Point, where: str, more: str) -> str:
-    return f"{target}: not reached with one sample within --max-frames, {where} and a read noise of "
-    f"{point.read_noise_e:g} e-{more}"
+    return (
+        f"{target}: not reached with one sample within --max-frames, {where} and a read noise of "
+        f"{point.read_noise_e:g} e-{more}"
+    )
 
 
 def _best(targets: Sequence[Target], point: Point, max_exposure: float) -> tuple[float, float]:

@@ -70,7 +70,7 @@ def test_missing_and_empty(tmp_path: Path) -> None:
     (tmp_path / "c.tif").write_bytes(b"II*\0nonsense")
     not_opened(r"c\.tif: not a valid TIFF", tmp_path / "c.tif")
     (tmp_path / "d.fits").write_text("hello")
-    not_opened(r"d\.fits: not a sound FITS", tmp_path / "d.fits")
+    not_opened(r"d\.fits: not a valid FITS", tmp_path / "d.fits")
     with pytest.raises(ConfigError, match=r"input\.format 'jpeg' is not known; choose one of: auto, npy"):
         opened(tmp_path / "b.xyz", format="jpeg")
 

@@ -168,7 +168,7 @@ def test_truncated_cube(tmp_path: Path, kept: int) -> None:
     path = tmp_path / "cut.fits"
     fits.PrimaryHDU(STACK).writeto(path)
     path.write_bytes(path.read_bytes()[:kept])
-    refused(r"cut\.fits: .*(truncated|not a sound)", path)
+    refused(r"cut\.fits: .*(truncated|not a valid)", path)
 
 
 def test_truncated_compressed_cube(tmp_path: Path) -> None:
