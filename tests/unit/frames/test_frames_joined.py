@@ -71,7 +71,7 @@ def test_missing_and_empty(tmp_path: Path) -> None:
     not_opened(r"c\.tif: not a valid TIFF", tmp_path / "c.tif")
     (tmp_path / "d.fits").write_text("hello")
     not_opened(r"d\.fits: not a valid FITS", tmp_path / "d.fits")
-    with pytest.raises(ConfigError, match=r"input\.format 'jpeg' is not known; choose one of: auto, npy"):
+    with pytest.raises(ConfigError, match=r"unknown input\.format 'jpeg'; choose one of: auto, npy"):
         opened(tmp_path / "b.xyz", format="jpeg")
 
 
