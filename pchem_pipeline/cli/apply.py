@@ -45,9 +45,9 @@ def apply(
     *,
     command: Command,
 ) -> None:
-    """Turn other frames of the sensor into electrons, electron numbers and a map of the exposure.
+    """Convert other frames of the sensor to electrons, electron numbers and a map of the exposure.
 
-    With standard errors, a quality layer and provenance. What was stopped goes on.
+    With standard errors, a quality layer and provenance. Continues after an interruption.
     """
     from pchem_pipeline.commands.apply.apply import apply_to_frames
     from pchem_pipeline.commands.apply.settings import ApplySettings, kinds_of

@@ -45,9 +45,9 @@ def plan(
         Path | None, typer.Option(help="write the numbers to this file", callback=on_this_machine)
     ] = None,
 ) -> None:
-    """Tell how many frames are enough.
+    """Compute how many frames are needed for a precision.
 
-    From the Cramer-Rao bound, at once; --verify simulates pixels and fits them.
+    From the Cramer-Rao bound; --verify simulates pixels and fits them.
     """
     from pchem_pipeline.commands.plan import PlanRequest, make_plan
 

@@ -41,9 +41,9 @@ def twin(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="replace existing files")] = False,
 ) -> None:
-    """Write the camera as it was measured: a YAML for pchem simulate, with maps, effects and ADC.
+    """Write a simulated copy of the camera: a YAML for pchem simulate, with maps, effects and ADC.
 
-    A larger sensor gets the distributions and spatial correlations of this one.
+    A sensor of another size has the same distributions and spatial correlations.
     """
     from pchem_pipeline.commands.twin import write_twin
     from pchem_pipeline.run.target import find_run
