@@ -190,8 +190,8 @@ def effects() -> str:
         "constant exposure cannot show it, or it is an empirical description without a cause.",
         "",
         "Each can be limited to a region and a range of frames (`region`, `when`). For effects that differ",
-        "by readout tap or group of columns give several entries of `frame_noise`, `bias_drift`, `gain_drift`,",
-        "`exposure_flicker` or another, each with its strength and `region`, for example `taps=64/1`.",
+        "by readout tap or group of columns give several entries of `frame_noise`, `bias_drift`,",
+        "`gain_drift` or another, each with its strength and `region`, for example `taps=64/1`.",
         "The maps of the pixels include constant differences of bias, gain and read noise between taps.",
     ]
     for plane in Plane:

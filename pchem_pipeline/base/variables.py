@@ -296,7 +296,7 @@ _ALL: list[Variable] = [
     ),
     *_ends("fit", INTERVALS),
     Variable("fit/log_likelihood", _MAP, "float64", "nat", "log-likelihood at the estimate"),
-    Variable("fit/likelihood_gap", _MAP, "float64", "nat", "log-likelihood minus that of the runner-up"),
+    Variable("fit/likelihood_gap", _MAP, "float64", "nat", "log-likelihood ratio to the next best fit"),
     Variable(
         "fit/fit_status",
         _MAP,
@@ -452,13 +452,7 @@ _ALL: list[Variable] = [
         for name in PARAMETERS
     ],
     *[_parameter("truth", name, "true ") for name in (*PARAMETERS, "read_noise_e", "analog_read_noise_e")],
-    Variable(
-        "truth/defect",
-        _MAP,
-        "uint8",
-        "1",
-        "what is special about the pixel: 0 nothing, 1 hot, 2 dead, 3 stuck",
-    ),
+    Variable("truth/defect", _MAP, "uint8", "1", "kind of pixel: 0 normal, 1 hot, 2 dead, 3 stuck"),
     Variable("truth/electron_number", ("frame", "y", "x"), "uint32", "e-", "true electron number", "K"),
 ]
 

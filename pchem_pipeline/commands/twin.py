@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 #: Bits of the ADC where the run does not say, and frames where nothing else is asked for.
 _BIT_DEPTH, TWIN_FRAMES = 16, 1000
-_HEAD = """# The camera of {run} as it was measured: pchem run makes its frames and characterises them.
-# What the model of that run had is simulated, and is in the model here too.
+_HEAD = """# Simulated copy of the camera of {run}: pchem run makes its frames and characterises them.
+# The effects of its model are simulated, and are in the model here.
 """
 
 

@@ -34,7 +34,7 @@ class MethodsSettings(Section):
     study_read_noise: tuple[_ReadNoise, ...] = Field(
         default=(0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.6, 0.7, 0.85, 1.0),
         min_length=1,
-        description="e-: read noises of the simulated pixels; exposure, gain and frames are those of the run",
+        description="e-: read noises of the simulated pixels; exposure, gain and frames as in the run",
     )
     seed: int = Field(default=1, ge=0, lt=2**63, description="random seed of the simulation")
     em_iterations: int = Field(

@@ -41,8 +41,8 @@ class Criteria(Section):
     gain_nonuniformity: float | None = Field(
         default=0.15,
         gt=0,
-        description="spread of the conversion gain between pixels over its median: robust deviation, "
-        "without what the errors of the pixels add",
+        description="spread of the conversion gain between pixels over its median: robust standard "
+        "deviation, corrected for the errors of the pixels",
     )
 
 
@@ -65,8 +65,8 @@ class ReportSettings(Section):
     )
     map_stretch: Literal["beta", "linear"] = Field(
         default="beta",
-        description="colours of the maps: 'beta' follows the rank of a pixel (Beta(2,2) transform), "
-        "'linear' its value between the 1st and the 99th percentile",
+        description="colours of the maps: 'beta' by rank (Beta(2,2) transform, histogram-equalised), "
+        "'linear' by value from the 1st to the 99th percentile",
     )
     criteria: Criteria = Field(default_factory=Criteria, description="limits of the sensor; null: no limit")
     histogram_bins: int = Field(

@@ -41,7 +41,7 @@ _HALVES = (("raw", "dn", "", "epcd_", "DN"), ("nuced", "electrons", "nuced_", "n
 
 _ENSEMBLE_CAPTION = (
     "Histogram of all pixels over the chosen frames (gray), raw at the top and after two-point non-"
-    "uniformity correction at the bottom, where the peaks lie at whole electrons. Lines: prediction "
+    "uniformity correction at the bottom, with peaks at whole electrons. Lines: prediction "
     "from the fitted parameters, as the exact mean over the pixels, with the parameters' joint "
     "histogram (dependent), and with the product of their four histograms (independent). Strips: data"
     " minus prediction; gray: 2 sigma of sampling noise. The model describes the data if the RMSE is "

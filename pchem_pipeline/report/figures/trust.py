@@ -210,7 +210,7 @@ def left_out_chart(share: FloatArray, n_frames: int | None) -> Chart:
     top = max(float(np.max(hit, initial=1.0)), 1.0)
     edges = np.arange(0.5, min(top, 60.0) + 1.5) if n_frames else np.linspace(0.0, 1.05 * top, 21)
     counts = np.histogram(np.minimum(hit, edges[-1] - 1e-9), edges)[0]
-    x = Axis(f"{label} of a pixel", float(edges[0]), float(edges[-1]), whole=bool(n_frames))
+    x = Axis(f"{label} per pixel", float(edges[0]), float(edges[-1]), whole=bool(n_frames))
     # room for the words above the bars
     y = Axis("pixels", 0.0, 1.18 * max(float(counts.max()), 1.0), whole=True)
     note = f"{count(int(hit.size), 'pixel')} of {samples.size:,} with any"

@@ -346,7 +346,7 @@ def _electrons(data: ReportData) -> Table:
         words += f" {measured(rate, error)} % of the estimates are wrong (truth known)."
     if facts.get("expected_error_rate") is not None:
         expected_errors = percent(float(facts["expected_error_rate"]), 1.0)
-        words += f" {expected_errors} wrong are expected from the fitted parameters."
+        words += f" Expected from the fitted parameters: {expected_errors}."
     return Table(
         "electron-table",
         "Electron numbers",

@@ -80,8 +80,8 @@ def run(context: StageContext) -> None:
     for y, x in context.config.report.pixels:
         if y >= ny or x >= nx:
             raise ConfigError(
-                f"report.pixels: pixel y = {y}, x = {x} lies outside the sensor of {ny} x {nx} pixels; "
-                f"choose y below {ny} and x below {nx}"
+                f"report.pixels: pixel y = {y}, x = {x} is outside the sensor of {ny} x {nx} pixels; choose "
+                f"y below {ny} and x below {nx}"
             )
     task = functools.partial(
         _write,
@@ -392,7 +392,7 @@ def _missing(run: StoredRun, maps: Mapping[str, NDArray[Any]]) -> dict[str, str]
         words = "compare methods in the run of one sample (pchem methods RUN --with OTHER)"
         found["methods"] = words
     elif run.methods is None:
-        found["methods"] = f"not compared; to compare: pchem methods {quoted(Path(run.name))}"
+        found["methods"] = f"to compare other methods: pchem methods {quoted(Path(run.name))}"
     return found
 
 
