@@ -56,7 +56,7 @@ def pace_words(progress: Mapping[str, Any]) -> str:
     if rate:
         words += f", {rate:.3g}/s" if rate >= 1 else f", {1 / rate:.3g} s each"
     if remaining is not None:
-        words += f", {_time(remaining)} remaining"
+        words += f", {_time(remaining)} left"
     return words
 
 

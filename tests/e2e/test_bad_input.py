@@ -320,7 +320,7 @@ def test_a_joint_run_that_is_refused_leaves_no_yaml(shell, finished):
     )
     result = shell("joint", "run.yaml", "other.yaml", "--store", "notes")
     assert result.code == 2
-    assert "holds the same frames" in result.last
+    assert "has the same frames" in result.last
     assert not (shell.folder / "notes.yaml").exists()
     assert (shell.folder / "notes").read_text() == "of mine"
 

@@ -22,13 +22,13 @@ def test_the_verdict_comes_first_and_lines_are_short(verdict: str) -> None:
 
 def test_what_a_named_effect_is_told_with() -> None:
     text = " ".join(verdict_text(verdict_of("named")).split())
-    assert "where: row means of the readout residuals scatter from frame to frame (+84.0 sd)" in text
+    assert "where: row means of the readout residuals scatter from frame to frame (84 sigma)" in text
     assert "148 to 152 DN" in text
     assert "and 1 more" in text
     assert "row_noise_dn = 0.3512 +- 0.0041 DN" in text
     assert "gap: 477 -> 0.4 micronats per sample (floor 0.66, 99.9 % closed)" in text
-    assert "in the place of row_noise the runner-up periodic_pickup leaves 120" in text
-    assert "placebo flicker_noise leaves 116" in text
+    assert "with the next best effect periodic_pickup instead of row_noise, 120 remain" in text
+    assert "control flicker_noise instead of row_noise, 116 remain" in text
     assert "DEFECT: the candidate odd_plugin failed and was not compared: ValueError: boom" in text
 
 
@@ -40,13 +40,13 @@ def test_no_line_ends_between_a_number_and_its_unit() -> None:
 
 def test_an_ambiguous_verdict_says_what_would_decide() -> None:
     text = verdict_text(verdict_of("ambiguous"))
-    assert "to tell periodic_pickup apart: a faster or slower row time" in text
+    assert "to distinguish periodic_pickup: a faster or slower row time" in text
     assert "score" in text
 
 
 def test_a_verdict_says_why_the_next_rivals_lost() -> None:
     text = " ".join(verdict_text(verdict_of("named_in_part")).split())
-    assert "row_noise, not periodic_pickup (16.8 nats behind): with it in the model adjacent" in text
+    assert "periodic_pickup is rejected (log-likelihood lower by 16.8): with it in the model adjacent" in text
     assert "(+9.1 sd)" in text
 
 
@@ -55,14 +55,14 @@ def test_nats_are_plain_numbers() -> None:
     (rival, *_), first = found.steps[0].rivals, found.steps[0]
     far = rival.model_copy(update={"behind": -6594.2})
     found = found.model_copy(update={"steps": (first.model_copy(update={"rivals": (far,)}),)})
-    assert "(6,594 nats behind)" in " ".join(verdict_text(found).split())
+    assert "(log-likelihood lower by 6,594)" in " ".join(verdict_text(found).split())
 
 
 def test_an_unexplained_verdict_says_what_is_left() -> None:
     lines = verdict_text(verdict_of("unexplained")).splitlines()
     at = lines.index("unexplained:")
-    assert "residuals of adjacent codes have opposite signs (+22.5 sd)" in lines[at + 1]
-    assert "left unexplained" not in verdict_text(verdict_of("named"))
+    assert "residuals of adjacent codes have opposite signs (22 sigma)" in lines[at + 1]
+    assert "unexplained:" not in verdict_text(verdict_of("named"))
 
 
 def test_a_consistent_verdict_has_no_candidates() -> None:
@@ -82,7 +82,7 @@ def test_numbers_that_are_not_known_are_said_so() -> None:
     steps = [{**step("row_noise", "named", 477.0, 31.0), "rivals": [], "candidates": []}]
     text = verdict_text(verdict_of("named", gap=gap, steps=steps, where=[{"statistic": "code.top"}]))
     assert "gap:" not in text
-    assert "code.top (sd not known)" in text
+    assert "code.top (sigma not known)" in text
 
 
 def test_pixels_that_are_not_identified_are_said_beside_a_name() -> None:
@@ -94,10 +94,8 @@ def test_a_gap_that_chance_makes_is_not_said_to_be_closed() -> None:
     weak = {**step("row_noise", "named", 0.6, 0.0), "gap_floor": 1e-6}
     gap = {**verdict_of("named").gap.model_dump(), "before": 0.6e-6, "after": 0.0, "floor": 1e-6}
     text = " ".join(verdict_text(verdict_of("named", steps=[weak], gap=gap)).split())
-    assert (
-        "gap: 0.6 -> 0 micronats per sample (floor 1: chance alone makes as much, before and after)" in text
-    )
-    assert "leaves" not in text
+    assert "gap: 0.6 -> 0 micronats per sample (floor 1; within sampling noise before and after)" in text
+    assert "remain" not in text
 
 
 def test_a_single_candidate_has_its_numbers_and_no_probability() -> None:
@@ -113,5 +111,5 @@ def test_a_place_is_told_once() -> None:
     pixels = {"pixels": [[2, 9, 10], [8, 0, 1]]}
     few = Place.of("shape.goodness.cnt", z=7.3, region=pixels, pixels=((2, 9), (8, 0), (1, 5)))
     text = " ".join(verdict_text(verdict_of("named", where=[part.model_dump(), few.model_dump()])).split())
-    assert "along x, in columns 10 to 13 (+6.6 sd)" in text
-    assert "(+7.3 sd; 3 pixels, first (y, x) = (2, 9))" in text
+    assert "along x, in columns 10 to 13 (6.6 sigma)" in text
+    assert "(7.3 sigma; 3 pixels, first (y, x) = (2, 9))" in text
