@@ -101,7 +101,7 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
     lines = []
     title = f"step {number}" if number else "candidate"
     if step.effect:
-        lines += [line for rival in step.rivals for line in _rejected(rival)]
+        lines += [line for rival in step.rivals for line in _rejected(step.effect, rival)]
     elif len(step.candidates) > 1 and found.verdict == "ambiguous":
         lines.append(f"{title:<28}{'score':>10}{'stderr':>9}{'probability':>13}")
         for each in step.candidates[:_MOST_CANDIDATES]:
@@ -125,11 +125,12 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
     return lines
 
 
-def _rejected(rival: Rival) -> list[str]:
+def _rejected(effect: str, rival: Rival) -> list[str]:
     nats = -rival.behind
     lower = f"{nats:{',.0f' if nats >= 100.0 else '.3g'}}"
     size = f" (log-likelihood lower by {lower})" if math.isfinite(nats) else ""
-    return _wrapped(f"{rival.effect} is rejected{size}{f': {rival.why}' if rival.why else ''}")
+    words = f"{rival.effect} instead of {effect} is rejected{size}"
+    return _wrapped(f"{words}: {rival.why}" if rival.why else words)
 
 
 def _number(value: float, digits: int = 1) -> str:

@@ -108,7 +108,7 @@ def test_the_same_command_goes_on_with_a_yaml_that_says_more(tmp_path, file, mon
         assert unwritten(again) is None
     with pytest.raises(ConfigError, match=r"\(input\.bit_depth 12 in the file, 14 here\); continue"):
         find_or_start([file], place, {"bit_depth": 14})
-    with pytest.raises(ConfigError, match=r"\(input\.roi \[0, 8, 8, 16\] there, \[0, 8, 0, 8\] here\)"):
+    with pytest.raises(ConfigError, match=r"\(input\.roi \[0, 8, 8, 16\] in the file, \[0, 8, 0, 8\] here\)"):
         find_or_start([file], place, {}, (0, 8, 0, 8))
     assert path.read_text() == edited
 
@@ -136,7 +136,7 @@ def test_a_refusal_that_names_a_setting_says_where_settings_are(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     np.save("f.npy", np.full((9, 8, 8), (1 << 13) + 1, np.uint16))
     with pytest.raises(
-        InputError, match=r"; for settings .*: pchem init 'my run.yaml' FILES, then pchem run"
+        InputError, match=r"; for settings .*: pchem init 'my run.yaml' FILES, edit it, then pchem run"
     ):
         CliRunner().invoke(
             app, ["run", "f.npy", "--store", "my run.zarr", "--bit-depth", "12"], catch_exceptions=False

@@ -28,7 +28,7 @@ def test_what_a_named_effect_is_told_with() -> None:
     assert "row_noise_dn = 0.3512 +- 0.0041 DN" in text
     assert "gap: 477 -> 0.4 micronats per sample (floor 0.66, 99.9 % closed)" in text
     assert "with the next best effect periodic_pickup instead of row_noise, 120 remain" in text
-    assert "control flicker_noise instead of row_noise, 116 remain" in text
+    assert "control flicker_noise instead of bias_drift, 116 remain" in text
     assert "DEFECT: the candidate odd_plugin failed and was not compared: ValueError: boom" in text
 
 
@@ -46,7 +46,10 @@ def test_an_ambiguous_verdict_says_what_would_decide() -> None:
 
 def test_a_verdict_says_why_the_next_rivals_lost() -> None:
     text = " ".join(verdict_text(verdict_of("named_in_part")).split())
-    assert "periodic_pickup is rejected (log-likelihood lower by 16.8): with it in the model adjacent" in text
+    assert (
+        "periodic_pickup instead of row_noise is rejected (log-likelihood lower by 16.8): with it in the model adjacent"
+        in text
+    )
     assert "(+9.1 sd)" in text
 
 

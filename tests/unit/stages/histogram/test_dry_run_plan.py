@@ -96,7 +96,7 @@ def test_the_plan_in_words(camera):
     assert "16 tiles of 64 x 64" in text
     assert "2000 MiB allowed" in text
     less = config.model_copy(update={"compute": config.compute.model_copy(update={"max_memory": 64})})
-    assert "twice, by bands of rows" in "\n".join(make_plan(less, path.parent).words())
+    assert "twice, in bands of rows" in "\n".join(make_plan(less, path.parent).words())
 
 
 def test_a_plan_compiles_nothing_that_is_missing(camera, monkeypatch, tmp_path):
