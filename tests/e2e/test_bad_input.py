@@ -232,7 +232,7 @@ def test_changed_camera_files_make_the_run_stale(shell, frames):
     data[0, 0, 0] += 1
     tiff(path, data)
     rows = shell.ok("status", "run.yaml").stdout
-    assert "ingest      stale - the content of the input changed" in rows
+    assert "ingest      stale - the input has changed" in rows
     os.utime(sorted(frames.glob("*.tif"))[1])
     shell.ok("ingest", "run.yaml")
     assert "ingest      complete" in shell.ok("status", "run.yaml").stdout

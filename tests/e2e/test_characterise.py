@@ -41,7 +41,7 @@ def test_an_array_becomes_a_run_and_nothing_is_done_twice(frames, tmp_path):
     other = again(dask.array.from_array(frames, chunks=(100, 8, 9)))
     assert (tmp_path / "night.zarr" / "report.html").stat().st_mtime_ns == made
     np.testing.assert_array_equal(other.maps.bias.values, run.maps.bias.values)
-    with pytest.raises(ConfigError, match=r"input\.integration_time 2\.0 there, 3\.0 here"):
+    with pytest.raises(ConfigError, match=r"input\.integration_time 2\.0 in the file, 3\.0 here"):
         again(frames, 3.0)
 
 

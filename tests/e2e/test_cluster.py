@@ -101,7 +101,7 @@ def test_a_worker_over_its_memory_is_one_line_and_the_run_goes_on_to_the_same_bi
     killed = shell("fit", "small.yaml", "--tiles", "0.0")
     assert killed.code == 3
     (line,) = [each for each in killed.stderr.splitlines() if each.startswith("pchem: ")]
-    assert "1 worker died at it, the last at tcp://127.0.0.1" in line
+    assert "1 worker died on it, the last at tcp://127.0.0.1" in line
     assert "above their memory of 170 MiB; give each more memory (fewer workers" in line
     assert "Traceback" not in killed.stderr
     shell.ok("fit", "run.yaml")

@@ -119,7 +119,7 @@ def test_going_back_to_an_older_model_and_forth_gives_the_same_bits(searched, tm
     # a search that is up to date is asked for what it named, and nothing is searched again
     again = other.ok("discrepancy", "run.yaml")
     assert "discrepancy: up to date" in again.stderr
-    assert "model 2 is in force" in again.stderr
+    assert "model 2 is now in use" in again.stderr
     assert (other.folder / "run.yaml").read_text() == text
     assert np.array_equal(read(other, "fit/read_noise_dn"), after, equal_nan=True)
 

@@ -13,7 +13,7 @@ def test_a_hidden_effect_is_found_and_told(shell):
         "demo", "--hidden", "row_noise", "--output", "out", "--size", "32", "--frames", "3000", "--quiet"
     ).stdout
     assert told.startswith("NAMED: ")
-    assert "hidden was: row_noise" in told
+    assert "hidden effect: row_noise" in told
     run = shell.folder / "out" / "demo.zarr"
     result = json.loads((run / "discrepancy.json").read_text())
     plain, extended = (

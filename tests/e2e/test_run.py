@@ -215,4 +215,4 @@ def test_a_run_stops_where_it_was_told_to(shell, frames):
     assert [stage for stage in STAGES if rows[stage] == "complete"] == ["ingest", "histogram"]
     wrong = shell("run", "run.yaml", "--until", "simulate")
     assert wrong.code == 2
-    assert wrong.last == f"pchem: --until simulate: this run does {', '.join(STAGES)}"
+    assert wrong.last == f"pchem: --until simulate: the stages of this run are {', '.join(STAGES)}"

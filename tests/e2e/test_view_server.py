@@ -224,7 +224,7 @@ def test_a_run_that_is_done_again_is_not_shown(finished, tmp_path):
         for changed in (replace(fit, finished=False), replace(fit, fingerprint="another")):
             store.records.write(changed)
             assert status() == {503}
-            with pytest.raises(StoreError, match="is not finished, or older than its stages; run: pchem rep"):
+            with pytest.raises(StoreError, match="is incomplete or stale; run: pchem rep"):
                 make_server(store.path)
         store.records.write(fit)
         assert status() == {200}
