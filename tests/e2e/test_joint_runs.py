@@ -284,11 +284,7 @@ def test_a_search_looks_at_all_samples_and_the_fit_takes_what_it_names(joint, ke
             {},
             "has 8 x 8 pixels, input.samples.0 (dark_1s.zarr) 8 x 12",
         ),
-        (
-            [("dark_1s.zarr", ""), ("twelve.yaml", "")],
-            {},
-            "has 12 bits, input.samples.0 (dark_1s.zarr) 14",
-        ),
+        ([("dark_1s.zarr", ""), ("twelve.yaml", "")], {}, "has 12 bits, input.samples.0 (dark_1s.zarr) 14"),
         (
             [("dark_1s.zarr", ""), ("twin.yaml", "")],
             {},

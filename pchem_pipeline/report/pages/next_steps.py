@@ -63,12 +63,7 @@ def next_steps(data: ReportData) -> list[Step]:
             ),
         ]
     if data.mostly_coarse:
-        found.append(
-            Step(
-                f"pchem run {RUN}",
-                "set fit.likelihood: auto in the YAML and run again",
-            )
-        )
+        found.append(Step(f"pchem run {RUN}", "set fit.likelihood: auto in the YAML and run again"))
     if data.discrepancy is None and not data.often_flagged and (data.n_frames or 0) >= _SEARCHED:
         found.append(Step(f"pchem discrepancy {RUN}", "search for effects missing from the model"))
     if not found:

@@ -41,21 +41,11 @@ OPEN: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
         "Variance against mean. Points off the curve: nonlinearity, or samples of different gain.",
         ("samples",),
     ),
-    (
-        "stability",
-        "Stability and structure",
-        "Drift in time, fixed-pattern noise, row and column noise.",
-        (),
-    ),
+    ("stability", "Stability and structure", "Drift in time, fixed-pattern noise, row and column noise.", ()),
     ("status", "Fit status", "", ()),
 )
 FOLDED: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
-    (
-        "pixels",
-        "Single pixels",
-        "Histograms with the fitted photon counting distribution.",
-        ("pixels",),
-    ),
+    ("pixels", "Single pixels", "Histograms with the fitted photon counting distribution.", ("pixels",)),
     (
         "goodness",
         "Does the model describe each pixel?",

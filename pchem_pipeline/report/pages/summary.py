@@ -401,10 +401,7 @@ def _conditions(data: ReportData) -> list[Flag]:
     for stage in data.stages:
         if stage.get("state") not in (None, "complete"):
             found.append(
-                Flag(
-                    "serious",
-                    f"Stage {stage.get('stage')} is {stage['state']}: the report is incomplete.",
-                )
+                Flag("serious", f"Stage {stage.get('stage')} is {stage['state']}: the report is incomplete.")
             )
         # why there is no charge rate is said once, with what is missing
         found += [

@@ -143,9 +143,7 @@ def test_files_of_two_cameras_are_no_stack(tmp_path: Path) -> None:
         image = fits.PrimaryHDU(STACK[i])
         image.header["SERIALNO"] = serial
         image.writeto(tmp_path / f"{i}.fits")
-    words = (
-        r"different cameras: serial number A1 in 0\.fits, serial number B2 in 2\.fits; make one run of each"
-    )
+    words = r"different cameras: serial number A1 in 0\.fits, serial number B2 in 2\.fits; make one run"
     for files in (("*.fits",), ("1.fits", "2.fits")):
         with pytest.raises(InputError, match=words.replace("0", files[0][0].replace("*", "0"))):
             open_frames(InputSettings(files=files), tmp_path)

@@ -224,10 +224,7 @@ def test_ser_refusals(tmp_path: Path) -> None:
         (ser_bytes(STACK, 16, colour=100), r"colour video \(RGB"),
         (ser_bytes(STACK, 33), "damaged header"),
         (ser_bytes(STACK, 16)[:100], "truncated, or not SER"),
-        (
-            ser_bytes(STACK, 16)[:-1],
-            r"truncated: 5 frames need 1608 bytes, the file has 1607 \(4 complete fr",
-        ),
+        (ser_bytes(STACK, 16)[:-1], r"truncated: 5 frames need 1608 bytes, the file has 1607 \(4 compl"),
     ]:
         path.write_bytes(data)
         refused(words, path)
