@@ -53,9 +53,9 @@ class RunConfig(Section):
         default=None, description="simulated camera; remove this section to use your own files"
     )
     input: InputSettings = Field(default_factory=InputSettings, description="camera files")
-    histogram: HistogramSettings = Field(default_factory=HistogramSettings, description="counting")
+    histogram: HistogramSettings = Field(default_factory=HistogramSettings, description="histograms")
     model: ModelSettings = Field(default_factory=ModelSettings, description="effects added to the PCD")
-    fit: FitSettings = Field(default_factory=FitSettings, description="PCH-EM")
+    fit: FitSettings = Field(default_factory=FitSettings, description="fit of the pixels (PCH-EM)")
     maps: MapsSettings = Field(default_factory=MapsSettings, description="parameter maps")
     ensemble: EnsembleSettings = Field(default_factory=EnsembleSettings, description="ensemble distributions")
     discrepancy: DiscrepancySettings = Field(

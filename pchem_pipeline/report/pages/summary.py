@@ -515,7 +515,7 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
     if pixels.failed > data.allowed_failed * pixels.total:
         word = f"For the {data.noun}s with a value"
         return Answer(
-            question, "caution", word, f"{checks}; {count(pixels.failed, data.noun)} have none.{looked}"
+            question, "caution", word, f"{checks}; {count(pixels.failed, data.noun)} without a value.{looked}"
         )
     quick = data.discrepancy is None
     return Answer(question, "good", _QUICK_YES if quick else "Yes", f"{checks}.{looked}")
