@@ -228,7 +228,7 @@ def _applied() -> list[Variable]:
 
 _ALL: list[Variable] = [
     Variable("frames/dn", ("frame", "y", "x"), "*", "DN", "raw frames"),
-    Variable("frames/excluded", _MAP, "uint8", "1", "1: excluded by the mask or the camera's marker"),
+    Variable("frames/excluded", _MAP, "uint8", "1", "0 used, 1 excluded by the mask or its marker"),
     # counts per pixel; DN of bin b is origin + b
     Variable("histogram/counts", ("y", "x", "bin"), "*", "1", "number of frames with DN = origin + bin"),
     Variable("histogram/origin", _MAP, "int32", "DN", "DN of bin 0"),

@@ -157,7 +157,7 @@ def _refuse(need: Need, point: Point, max_frames: float, best: float, best_frame
             if several.frames <= max_frames:
                 cure = f"; several samples (--samples best) need {several.frames:,.0f}"
         # a larger number is as good as none
-        asked = f"{need.frames:,.0f} frames" if need.frames < 1e12 else "no number of frames suffices"
+        asked = f"{float(f'{need.frames:.2g}'):,.0f} frames" if need.frames < 1e12 else "no number suffices"
         raise ConfigError(
             _hopeless(target, point, f"at an exposure of {point.quanta_exposure:.3g} e-", f" ({asked}){cure}")
         )

@@ -341,7 +341,7 @@ def test_a_region_beyond_the_sensor_is_one_line(shell, command, finished):
     result = shell(command, "run.yaml", "--roi", "0:99,0:9")
     assert result.code == 2
     assert result.last == (
-        "pchem: --roi 0:99,0:9 reaches beyond the sensor of 20 x 28 pixels (y x x); choose within 0:20,0:28"
+        "pchem: --roi 0:99,0:9 exceeds the sensor of 20 x 28 pixels (y x x); choose within 0:20,0:28"
     )
     assert "Traceback" not in result.stderr
     assert sorted((shell.folder / "run.zarr").rglob("*")) == before

@@ -72,7 +72,7 @@ def test_words_and_kinds(store: RunStore) -> None:
     assert entries["maps/bias_stderr"].label == "standard error of the bias"
     assert entries["fit/fit_status"].words == {int(bit): text for bit, text in MEANINGS.items()}
     assert entries["maps/quality"].words == {0: "good", 1: "use with caution", 2: "no value"}
-    assert entries["truth/defect"].words == {0: "nothing", 1: "hot", 2: "dead", 3: "stuck"}
+    assert entries["truth/defect"].words == {0: "normal", 1: "hot", 2: "dead", 3: "stuck"}
     assert entries["fit/goodness_p"].label == "goodness of fit p"
 
 
