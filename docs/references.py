@@ -34,8 +34,8 @@ def commands() -> str:
     from pchem_pipeline.cli.app import app
 
     group = typer.main.get_command(app)
-    lines = ["# Commands", "", "As `pchem --help` and `pchem COMMAND --help` say it.", ""]
-    lines += ["| command | what it does |", "|---|---|"]
+    lines = ["# Commands", "", "Output of `pchem --help` and `pchem COMMAND --help`.", ""]
+    lines += ["| command | function |", "|---|---|"]
     named = group.commands.items()  # type: ignore[attr-defined]
     lines += [f"| [`{name}`](#pchem-{name}) | {_cell(c.get_short_help_str(200))} |" for name, c in named]
     for name, command in named:
@@ -68,8 +68,8 @@ def settings() -> str:
     lines = [
         "# Settings (YAML)",
         "",
-        "A run is recorded in one YAML file; `pchem init` writes it with these explanations. Unknown keys",
-        "are refused, and what is not stated has its default. `null`: the program chooses.",
+        "A run is described by one YAML file; `pchem init` writes it with these explanations. Unknown keys",
+        "are refused, missing keys have their default. `null`: the program chooses.",
     ]
     for name, field in RunConfig.model_fields.items():
         section = _section_of(field.annotation)
@@ -150,14 +150,13 @@ def store() -> str:
         "# The store",
         "",
         "`run.zarr` is a zarr group (format 3). Every array has dimension names, `units` and `long_name`:",
-        '`xarray.open_zarr("run.zarr", group="fit", consolidated=False)`; a type of `*` is that of the',
-        "data. What a run did not ask for is not there. `report.html` and `report.json` lie beside",
-        "the arrays, with `figures/` where `report.figure_formats` asks for it, the versions of the model as "
-        "`model/0001.json` and so on.",
+        '`xarray.open_zarr("run.zarr", group="fit", consolidated=False)`; type `*`: type of the data.',
+        "Arrays that a run did not need are missing. The folder also has `report.html`, `report.json`,",
+        "`figures/` (see `report.figure_formats`) and the versions of the model (`model/0001.json`, ...).",
     ]
     variables = sorted(VARIABLES.values(), key=lambda v: list(VARIABLES).index(v.path))
     for group, members in groupby(variables, key=lambda v: v.group):
-        lines += ["", f"## {group}", "", "| array | dimensions | type | unit | what it is |"]
+        lines += ["", f"## {group}", "", "| array | dimensions | type | unit | meaning |"]
         lines.append("|---|---|---|---|---|")
         for each in members:
             symbol = f" (${_latex(each.symbol)}$)" if each.symbol else ""
@@ -186,17 +185,14 @@ def effects() -> str:
     lines = [
         "# Effects",
         "",
-        "What the plain model lacks and real sensors have. Each may stand in `model.effects` (it is",
-        "fitted with) and in `simulate.effects` (it is simulated), and is a candidate of `pchem discrepancy`",
-        "unless its own text says that frames of one constant exposure cannot show it, or that it is",
-        "measured where all others have failed. Each is told by the",
-        "statistics that it moves first.",
+        "Effects of real sensors that the plain model lacks. Each can be in `model.effects` (fitted) and in",
+        "`simulate.effects` (simulated), and is a candidate of `pchem discrepancy`, unless frames of one",
+        "constant exposure cannot show it, or it is an empirical description without a cause.",
         "",
-        "Each may have a place and a time (`region`, `when`). What differs by readout tap or group of",
-        "columns is so described, without effects of its own: several entries of `frame_noise`,",
-        "`bias_drift`, `gain_drift`, `exposure_flicker` or another, each with its own strength and",
-        "`region`, for example `taps=64/1`.",
-        "Bias, gain and read noise that differ by tap and stay are in the maps of the pixels already.",
+        "Each can be limited to a region and a range of frames (`region`, `when`). For effects that differ",
+        "by readout tap or group of columns give several entries of `frame_noise`, `bias_drift`,",
+        "`gain_drift` or another, each with its strength and `region`, for example `taps=64/1`.",
+        "The maps of the pixels include constant differences of bias, gain and read noise between taps.",
     ]
     for plane in Plane:
         members = [c for c in own if c.plane is plane]
@@ -223,7 +219,7 @@ def _effect(effect: type[Any]) -> Iterator[str]:
         yield f"Not testable with one constant exposure: {_escaped(effect.untestable)}."
         yield ""
     if effect.signature:
-        yield "Moves first: " + ", ".join(f"`{s}`" for s in effect.signature) + "."
+        yield "Most affected statistics: " + ", ".join(f"`{s}`" for s in effect.signature) + "."
         yield ""
     yield "| setting | default | meaning |"
     yield "|---|---|---|"
@@ -232,7 +228,7 @@ def _effect(effect: type[Any]) -> Iterator[str]:
         yield f"| `{name}` | {_default(field)} | {_cell(field.description or '')}{_limits(field)} |"
     if effect.separate:
         yield ""
-        yield "| rival | what tells them apart |"
+        yield "| similar effect | distinguished by |"
         yield "|---|---|"
         for rival, words in effect.separate.items():
             yield f"| `{rival}` | {_cell(words)} |"

@@ -90,7 +90,7 @@ class IncompleteRunError(PchEmError):
 
 
 class NotBelievedError(PchEmError):
-    """With ``--strict``: the report says that the results cannot be believed as they are."""
+    """With ``--strict``: the results are not reliable."""
 
     exit_code = ExitCode.INCOMPLETE
 

@@ -35,8 +35,8 @@ def holds_secret(place: str) -> bool:
 
 #: What is said of such a URL, which is not repeated.
 NO_SECRETS = (
-    "a URL with a password, key or signature in it, which the run would keep in its YAML; give keys as AWS "
-    "tools take them (AWS_ACCESS_KEY_ID, ~/.aws), or fetch the file first"
+    "a URL with a password, key or signature, which would be stored in the run's YAML; give keys as "
+    "for AWS tools (AWS_ACCESS_KEY_ID, ~/.aws), or download the file first"
 )
 
 

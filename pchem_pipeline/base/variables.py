@@ -73,7 +73,7 @@ _PARAMETER_WORDS = {
     "analog_read_noise_e": ("e-", "analog read noise, quantisation removed", "sigma_R"),
     "charge_rate": ("e-/px/s", "charge rate: quanta exposure / integration time", "H/t"),
     "dark_current": ("e-/px/s", "dark current: quanta exposure / integration time, in the dark", "i_d"),
-    "spurious_charge": ("e-", "spurious charge: exposure that does not grow with time", "H_0"),
+    "spurious_charge": ("e-", "spurious charge: exposure at integration time 0", "H_0"),
     "dark_signal": ("e-", "dark signal: quanta exposure at light level 0", "H_0"),
     "charge_per_level": ("e-/level", "slope of the quanta exposure against the light level", ""),
 }
@@ -114,10 +114,10 @@ def _samples() -> list[Variable]:
         ("mean", cube, "DN", "mean of the sample", ""),
         ("variance", cube, "DN2", "variance of the sample", ""),
         ("covariance", (*_MAP, *both), "1", "covariance of (H_1 ... H_J, g, mu, sigma)", ""),
-        ("linearity_residual", cube, "e-", "quanta exposure minus the line through all", ""),
-        ("linearity_residual_stderr", cube, "e-", "standard error of that residual", ""),
+        ("linearity_residual", cube, "e-", "quanta exposure minus the fitted line", ""),
+        ("linearity_residual_stderr", cube, "e-", "standard error of the residual", ""),
         ("linearity_chi2", _MAP, "1", "chi-square of the exposures against the line", ""),
-        ("linearity_p", _MAP, "1", "probability of a larger one if the pixel is linear", ""),
+        ("linearity_p", _MAP, "1", "p-value of the chi-square for a linear pixel", ""),
     ]
     return [Variable(f"samples/{name}", dims, "float64", *rest) for name, dims, *rest in found]
 
@@ -126,31 +126,31 @@ def _discrepancy() -> list[Variable]:
     """Return what the figures of the discrepancy verdict are drawn from."""
     rows = {"row": "y", "column": "x"}
     found: list[tuple[str, tuple[str, ...], str, str, str]] = [
-        ("goodness", _MAP, "float32", "1", "goodness of fit of each pixel as a normal quantile; large: poor"),
-        ("score", ("score", *_MAP), "float32", "1", "efficient scores of each pixel, N(0, 1) by chance"),
+        ("goodness", _MAP, "float32", "1", "goodness of fit per pixel as normal quantile; large: poor"),
+        ("score", ("score", *_MAP), "float32", "1", "efficient scores per pixel, N(0, 1) expected"),
         ("block_spread", ("channel", *_MAP), "float32", "1", "scatter of the block means, normal quantile"),
         ("lag1", ("channel", *_MAP), "float32", "1", "autocorrelation at lag 1 over its standard error"),
-        ("trend", ("channel", *_MAP), "float32", "1", "rise of the block means, N(0, 1) by chance"),
-        ("neighbour", ("pair", *_MAP), "float32", "1", "covariance with the next pixel, N(0, 1) by chance"),
-        ("tail", ("side", *_MAP), "uint32", "1", "samples beyond all that the pixel's PCD allows"),
+        ("trend", ("channel", *_MAP), "float32", "1", "trend of the block means, N(0, 1) expected"),
+        ("neighbour", ("pair", *_MAP), "float32", "1", "covariance with the next pixel, N(0, 1) expected"),
+        ("tail", ("side", *_MAP), "uint32", "1", "samples outside the range of the pixel's PCD"),
         ("code_dn", ("code",), "int32", "DN", "digital number of the code axis"),
         ("code_observed", ("code",), "float64", "1", "samples at each DN, all usable pixels"),
         ("code_expected", ("code",), "float64", "1", "samples expected at each DN from the fitted PCDs"),
         ("code_extended", ("code",), "float64", "1", "samples expected at each DN with effects"),
         ("added_exposure", ("added_level", *_MAP), "float64", "e-", "exposure that effects add to pixels"),
-        ("added_weight", ("added_level", *_MAP), "float64", "1", "part of the frames at each added exposure"),
+        ("added_weight", ("added_level", *_MAP), "float64", "1", "share of frames at each added exposure"),
         ("frame_number", ("frame",), "int64", "1", "frame number in the run"),
         ("frame_charge", ("frame",), "float64", "1", "relative deviation of the exposure of each frame"),
         ("frame_readout", ("frame",), "float64", "DN", "mean readout residual of each frame"),
         ("frame_noise", ("frame",), "float64", "1", "squares of the residuals of each frame, N(0, 1)"),
-        ("frame_sd", ("channel",), "float64", "1", "sd by chance of frame_charge and frame_readout (DN)"),
+        ("frame_sd", ("channel",), "float64", "1", "sampling noise of frame_charge and frame_readout (DN)"),
         ("frame_charge_model", ("frame",), "float64", "1", "path of frame_charge under the named effects"),
         ("frame_readout_model", ("frame",), "float64", "DN", "path of frame_readout under the named effects"),
         ("z_before", ("statistic",), "float64", "1", "statistics against the plain model"),
         ("z_after", ("statistic",), "float64", "1", "statistics against the model with effects"),
     ]  # fmt: skip
     for line, axis in rows.items():
-        words = f"means of the {line}s over their standard deviation by chance"
+        words = f"means of the {line}s over their sampling noise"
         found += [
             (f"{line}_rms", ("channel", axis), "float64", "1", f"rms over the frames of the {words}"),
             (f"{line}_image", ("channel", "shown_frame", axis), "float32", "1", f"first frames: {words}"),
@@ -168,13 +168,13 @@ def _applied() -> list[Variable]:
         ("y", ("y",), "int64", "pixel", "row of the run"),
         ("x", ("x",), "int64", "pixel", "column of the run"),
         ("electrons", cube, "float32", "e-", "signal after two-point correction, g (x - mu)"),
-        ("electrons_stderr_read", _MAP, "float32", "e-", "standard error of a sample from read noise"),
+        ("electrons_stderr_read", _MAP, "float32", "e-", "1 sigma error per sample from read noise"),
         (
             "electrons_stderr_calibration",
             _MAP,
             "float32",
             "e-",
-            "standard error from the calibration at the mean signal, common to all frames",
+            "1 sigma error from the calibration at the mean signal, common to all frames",
         ),
         (
             "calibration_variance",
@@ -188,35 +188,35 @@ def _applied() -> list[Variable]:
         ("number_probability", cube, "float32", "1", "probability that the electron number is right"),
         ("expected_number", cube, "float32", "e-", "mean of the electron number given the sample"),
         ("exposure", _MAP, "float64", "e-", "quanta exposure of these frames, by maximum likelihood"),
-        ("exposure_stderr", _MAP, "float64", "e-", "standard error of the exposure, both parts together"),
-        ("exposure_stderr_counting", _MAP, "float64", "e-", "its part from the samples"),
-        ("exposure_stderr_calibration", _MAP, "float64", "e-", "its part from the calibration"),
-        ("quality", _MAP, "uint32", "1", "why a pixel has no value, or deserves caution; 0 is fine"),
-        ("row_offset", ("frame", "part", "y"), "float32", "DN", "offset of the row that was taken"),
-        ("column_offset", ("frame", "part", "x"), "float32", "DN", "offset of the column, likewise"),
+        ("exposure_stderr", _MAP, "float64", "e-", "standard error of the exposure: samples and calibration"),
+        ("exposure_stderr_counting", _MAP, "float64", "e-", "part of the error from the samples"),
+        ("exposure_stderr_calibration", _MAP, "float64", "e-", "part of the error from the calibration"),
+        ("quality", _MAP, "uint32", "1", "why a pixel has no value or needs caution; 0: good"),
+        ("row_offset", ("frame", "part", "y"), "float32", "DN", "subtracted row offset"),
+        ("column_offset", ("frame", "part", "x"), "float32", "DN", "subtracted column offset"),
         (
             "wave_offset",
             ("frame", "wave", "coefficient"),
             "float32",
             "DN",
-            "c and s of the periodic pattern c cos(2 pi (f_y y + f_x x)) + s sin(...) that was taken",
+            "c and s of the subtracted pattern c cos(2 pi (f_y y + f_x x)) + s sin(...)",
         ),
-        ("offset_part", ("part", *_MAP), "bool", "1", "pixels that share the offsets of the part"),
-        ("noise_before", _MAP, "float64", "e-", "standard deviation over the frames as they came"),
-        ("noise_after", _MAP, "float64", "e-", "standard deviation without the offsets"),
+        ("offset_part", ("part", *_MAP), "bool", "1", "pixels of the part with common offsets"),
+        ("noise_before", _MAP, "float64", "e-", "standard deviation over the frames, with the offsets"),
+        ("noise_after", _MAP, "float64", "e-", "standard deviation over the frames, without the offsets"),
     ]
     # what is done so far, while it is being made
     parts: list[tuple[str, tuple[str, ...], str, str, str]] = [
         ("sums", ("segment", "sum", *_MAP), "float64", "1", "sums over a segment of the frames"),
         ("range", ("end", *_MAP), "int64", "1", "smallest and largest code"),
-        ("prior", _MAP, "float64", "e-", "exposure by the mean of these frames, of which the prior is made"),
-        ("covariance", (*_MAP, "row", "column"), "float64", "1", "of (g, mu, sigma), by their likelihood"),
+        ("prior", _MAP, "float64", "e-", "exposure from the mean of these frames, used for the prior"),
+        ("covariance", (*_MAP, "row", "column"), "float64", "1", "of (g, mu, sigma), from their likelihood"),
         (
             "rivals",
             (*_MAP, "side", "quantity"),
             "float64",
             "1",
-            "probability that the bias is an electron lower or higher, and g, mu, sigma if so",
+            "probability that the bias is an electron lower or higher, and g, mu, sigma in this case",
         ),
     ]
     return [
@@ -228,7 +228,7 @@ def _applied() -> list[Variable]:
 
 _ALL: list[Variable] = [
     Variable("frames/dn", ("frame", "y", "x"), "*", "DN", "raw frames"),
-    Variable("frames/excluded", _MAP, "uint8", "1", "1 where a pixel is excluded by the mask or its marker"),
+    Variable("frames/excluded", _MAP, "uint8", "1", "0 used, 1 excluded by the mask or its marker"),
     # counts per pixel; DN of bin b is origin + b
     Variable("histogram/counts", ("y", "x", "bin"), "*", "1", "number of frames with DN = origin + bin"),
     Variable("histogram/origin", _MAP, "int32", "DN", "DN of bin 0"),
@@ -279,10 +279,10 @@ _ALL: list[Variable] = [
         "sum over 64 rows of a column of a frame",
     ),
     Variable(
-        "summary/open_sums", ("sum", "y", "x"), "int64", "1", "sums of the last time block, to go on from"
+        "summary/open_sums", ("sum", "y", "x"), "int64", "1", "sums of the last time block, for appending"
     ),
     Variable(
-        "summary/open_covariances", ("lag", "y", "x"), "float64", "DN2", "sums of covariances, to go on from"
+        "summary/open_covariances", ("lag", "y", "x"), "float64", "DN2", "sums of covariances, for appending"
     ),
     Variable("summary/frame_mean", ("frame",), "float64", "DN", "mean of a frame"),
     Variable("summary/frame_variance", ("frame",), "float64", "DN2", "variance over the pixels of a frame"),
@@ -296,30 +296,28 @@ _ALL: list[Variable] = [
     ),
     *_ends("fit", INTERVALS),
     Variable("fit/log_likelihood", _MAP, "float64", "nat", "log-likelihood at the estimate"),
-    Variable("fit/likelihood_gap", _MAP, "float64", "nat", "log-likelihood minus that of the runner-up"),
+    Variable("fit/likelihood_gap", _MAP, "float64", "nat", "log-likelihood ratio to the next best fit"),
     Variable(
         "fit/fit_status",
         _MAP,
         "uint16",
         "1",
-        "reasons for caution or failure, as bits; 0 is fine",
+        "reasons for caution or failure, as bits; 0: good",
         fill=16384,
     ),
-    Variable("fit/n_iterations", _MAP, "int32", "1", "evaluations of the likelihood used on the pixel"),
+    Variable("fit/n_iterations", _MAP, "int32", "1", "likelihood evaluations for the pixel"),
     Variable("fit/goodness_chi2", _MAP, "float64", "1", "Pearson chi-square of the histogram, bins merged"),
     Variable("fit/goodness_dof", _MAP, "float64", "1", "degrees of freedom of goodness_chi2"),
-    Variable("fit/goodness_p", _MAP, "float64", "1", "probability of a larger chi-square if the model holds"),
-    Variable("fit/outlier_share", _MAP, "float64", "1", "share of the frames left out by the tail guard"),
+    Variable("fit/goodness_p", _MAP, "float64", "1", "p-value of the chi-square if the model holds"),
+    Variable("fit/outlier_share", _MAP, "float64", "1", "share of the frames excluded by the tail guard"),
     # where the model's effects look for levels in each pixel (random telegraph noise)
     Variable(
-        "fit/satellite_amplitude_e", _MAP, "float64", "e-", "distance of the pixel's levels; NaN without any"
+        "fit/satellite_amplitude_e", _MAP, "float64", "e-", "distance of the pixel's levels; NaN: one level"
     ),
-    Variable("fit/satellite_weight", _MAP, "float64", "1", "probability off the quiet level; 0 without any"),
+    Variable("fit/satellite_weight", _MAP, "float64", "1", "probability of the other level; 0: one level"),
     *_both("maps", (*PARAMETERS, "read_noise_e", "analog_read_noise_e", *CHARGE_RATES)),
     *_ends("maps", (*INTERVALS, *CHARGE_RATES)),
-    Variable(
-        "maps/goodness_q", _MAP, "float64", "1", "false-discovery rate at which the pixel is called misfit"
-    ),
+    Variable("maps/goodness_q", _MAP, "float64", "1", "false-discovery rate at which the pixel is a misfit"),
     *_both("maps", ("spurious_charge", "charge_per_level", "dark_signal")),  # of several exposures
     *_samples(),
     Variable("maps/quality", _MAP, "uint8", "1", "0 good, 1 use with caution, 2 no value", fill=2),
@@ -339,7 +337,7 @@ _ALL: list[Variable] = [
         ("dn",),
         "float64",
         "1/DN",
-        "standard error of epcd_exact from those of the maps",
+        "standard error of epcd_exact from the errors of the maps",
     ),
     Variable(
         "ensemble/epcd_dependent", ("dn",), "float64", "1/DN", "EPCD: 4-D histogram of the parameters", "f_E"
@@ -347,13 +345,7 @@ _ALL: list[Variable] = [
     Variable(
         "ensemble/epcd_independent", ("dn",), "float64", "1/DN", "EPCD: product of four histograms", "f_E"
     ),
-    Variable(
-        "ensemble/residual",
-        ("dn",),
-        "float64",
-        "1",
-        "(density - epcd_exact) / its standard deviation by counting",
-    ),
+    Variable("ensemble/residual", ("dn",), "float64", "1", "(density - epcd_exact) / counting error"),
     # after two-point non-uniformity correction: axis `electrons`
     Variable("ensemble/electrons", ("electrons",), "float64", "e-", "centre of the bin of NUCed data"),
     Variable("ensemble/nuced_counts", ("electrons",), "int64", "1", "ensemble histogram of NUCed frames"),
@@ -368,7 +360,7 @@ _ALL: list[Variable] = [
         ("electrons",),
         "float64",
         "1/e-",
-        "standard error of nuced_exact from those of the maps",
+        "standard error of nuced_exact from the errors of the maps",
     ),
     Variable(
         "ensemble/nuced_dependent",
@@ -391,7 +383,7 @@ _ALL: list[Variable] = [
         ("electrons",),
         "float64",
         "1",
-        "(nuced_density - nuced_exact) / its standard deviation by counting",
+        "(nuced_density - nuced_exact) / counting error",
     ),
     # electron numbers: axis `k`
     Variable("ensemble/k", ("k",), "int32", "e-", "electron number", "k"),
@@ -406,7 +398,7 @@ _ALL: list[Variable] = [
         "mass predicted from the histogram of H",
         "p_Ke",
     ),
-    Variable("ensemble/electron_pmf_map", ("k",), "float64", "1", "mass that the estimator of k should show"),
+    Variable("ensemble/electron_pmf_map", ("k",), "float64", "1", "expected share of the estimates of k"),
     Variable(
         "ensemble/component_mean",
         ("component",),
@@ -449,7 +441,7 @@ _ALL: list[Variable] = [
         ("added_level", *_MAP),
         "float64",
         "1",
-        "part of the frames at each added exposure",
+        "share of frames at each added exposure",
     ),
     # other methods beside PCH-EM; the attribute `methods` of the estimates names the axis `method`
     *_applied(),
@@ -460,13 +452,7 @@ _ALL: list[Variable] = [
         for name in PARAMETERS
     ],
     *[_parameter("truth", name, "true ") for name in (*PARAMETERS, "read_noise_e", "analog_read_noise_e")],
-    Variable(
-        "truth/defect",
-        _MAP,
-        "uint8",
-        "1",
-        "what is special about the pixel: 0 nothing, 1 hot, 2 dead, 3 stuck",
-    ),
+    Variable("truth/defect", _MAP, "uint8", "1", "kind of pixel: 0 normal, 1 hot, 2 dead, 3 stuck"),
     Variable("truth/electron_number", ("frame", "y", "x"), "uint32", "e-", "true electron number", "K"),
 ]
 

@@ -70,13 +70,13 @@ def init(
     files: Annotated[list[str] | None, typer.Argument(help="camera files, globs or folders")] = None,
     simulated: Annotated[bool, typer.Option("--simulated", help="include a simulated camera")] = False,
     schema: Annotated[
-        bool, typer.Option("--schema", help="write the JSON schema of the YAML, for editors, beside it too")
+        bool, typer.Option("--schema", help="also write the JSON schema of the YAML, for editors")
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
 ) -> None:
     """Write a YAML file with every setting explained.
 
-    With --schema an editor completes and checks its keys: the first line names the schema.
+    With --schema an editor completes and checks its keys.
     """
     from pchem_pipeline.commands.new_run import write_template
 
@@ -90,9 +90,7 @@ def ingest(
     target: Target,
     append: Annotated[
         bool,
-        typer.Option(
-            "--append", help="take the files that came behind those of a finished run; reads only them"
-        ),
+        typer.Option("--append", help="add new files to a finished run; reads only these"),
     ] = False,
     *,
     given: dict[str, Any],
@@ -104,7 +102,7 @@ def ingest(
 
     run = find_run(target)
     if append and given:
-        raise ConfigError("--append: the further files are read as the others were; leave out the options")
+        raise ConfigError("--append: new files are read like the others; omit the options")
     if append:
         from pchem_pipeline.commands.append import append_frames
 
@@ -129,16 +127,16 @@ def run(
         Path | None, typer.Option(help="camera files: store of the run [default: run.zarr]")
     ] = None,
     until: Annotated[
-        str, typer.Option(help="last stage to be done", metavar=f"[{'|'.join(pipeline())}]")
+        str, typer.Option(help="last stage to run", metavar=f"[{'|'.join(pipeline())}]")
     ] = pipeline()[-1],
     strict: Strict = False,
     *,
     given: dict[str, Any],
     command: Command,
 ) -> None:
-    """Do every stage, from camera files to the report, and say what its first screen says.
+    """Run all stages, from camera files to report, and print the summary.
 
-    What is up to date is not done again. The path of the report is on stdout, all else on stderr.
+    Stages that are up to date are skipped. stdout has the path of the report, stderr the rest.
     """
     from pchem_pipeline.commands.first_screen import run_to_first_screen
     from pchem_pipeline.commands.new_run import find_or_start, first_try, unwritten
@@ -162,22 +160,22 @@ def discrepancy(
         bool,
         typer.Option(
             "--refit/--no-refit",
-            help="add what is named to the model, and do fit, maps, ensemble and report with it",
+            help="add named effects to the model and run fit, maps, ensemble and report again",
         ),
     ] = True,
     roi: Annotated[
-        str | None, typer.Option(help="look at the pixels y0:y1,x0:x1 only [default: all, or a window]")
+        str | None, typer.Option(help="search only in the pixels y0:y1,x0:x1 [default: all, or a window]")
     ] = None,
     effort: Annotated[
         float | None,
-        typer.Option(help="times the usual limit of the search's work [default: discrepancy.effort]"),
+        typer.Option(help="factor on the search budget [default: discrepancy.effort]"),
     ] = None,
     *,
     command: Command,
 ) -> None:
-    """Find what the model is missing, name it, and add it to the model.
+    """Search for effects missing from the model, and add what is found.
 
-    Simulates the fitted model many times and compares. What is named makes a new version of the model.
+    Compares the data with simulations of the fitted model. Named effects make a new version of the model.
     """
     from pchem_pipeline.commands.discrepancy import find_and_add
     from pchem_pipeline.run.target import find_run
@@ -192,23 +190,22 @@ def discrepancy(
 @takes_command(without=("roi",))
 def joint(
     targets: Annotated[
-        list[Path], typer.Argument(help="a joint.yaml, or the runs (YAML or store) in order of exposure")
+        list[Path],
+        typer.Argument(help="a joint.yaml, or the runs (YAML or store) in increasing order of exposure"),
     ],
-    bias: Annotated[
-        list[Path] | None, typer.Option(help="runs: one whose frames hold no electrons (repeatable)")
-    ] = None,
-    store: Annotated[Path | None, typer.Option(help="runs: store of the fit [default: joint.zarr]")] = None,
+    bias: Annotated[list[Path] | None, typer.Option(help="run of bias frames (repeatable)")] = None,
+    store: Annotated[Path | None, typer.Option(help="store of the fit [default: joint.zarr]")] = None,
     against: Annotated[
         Literal["integration_time", "none"] | None,
-        typer.Option(help="runs: over what H is a line; none: no charge rate [default: integration_time]"),
+        typer.Option(help="quantity on the x axis of H; none: no charge rate [default: integration_time]"),
     ] = None,
     strict: Strict = False,
     *,
     command: Command,
 ) -> None:
-    """Fit several exposures of a sensor together, as a run whose samples they are.
+    """Fit several exposures of one sensor jointly.
 
-    One gain, bias and read noise for each pixel; charge rate as the slope of H. Runs get their histograms.
+    One gain, bias and read noise per pixel; charge rate from the slope of H. Missing histograms are made.
     """
     from pchem_pipeline.commands.joint import find_joint, run_joint
 
@@ -225,12 +222,10 @@ app.command()(plan)
 @app.command()
 def status(
     target: Target,
-    watch: Annotated[
-        bool, typer.Option("--watch", help="go on until the command that works on the run ends")
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="one JSON object per line, for machines")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="update until the running command ends")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object per line")] = False,
 ) -> None:
-    """Print how far each stage is, and why one is stale."""
+    """Print the state of each stage, and why it is stale."""
     from pchem_pipeline.commands.watch import watch as follow
     from pchem_pipeline.run.target import find_run
 
@@ -241,12 +236,12 @@ def status(
 @app.command()
 def model(
     target: Target,
-    use: Annotated[int | None, typer.Option(min=1, help="put this version in force")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="one line of JSON, for machines")] = False,
+    use: Annotated[int | None, typer.Option(min=1, help="use this version")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="one line of JSON")] = False,
 ) -> None:
-    """List the versions of the model and what rests on each; go back to one.
+    """List the versions of the model and the results of each; go back to one.
 
-    A version is made from the section model of the YAML, or by a verdict of discrepancy.
+    A version comes from the section model of the YAML or from pchem discrepancy.
     """
     from pchem_pipeline.commands.model import list_models, model_lines, models_json, use_model
     from pchem_pipeline.run.target import find_run
@@ -266,7 +261,7 @@ def export(
     formats: Annotated[
         str,
         typer.Option(
-            "--format", help="fits, tiff, npz, csv (summary) and emva (a table in the words of EMVA 1288)"
+            "--format", help="fits, tiff, npz, csv (summary) and emva (table of EMVA 1288 quantities)"
         ),
     ] = "fits,csv",
 ) -> None:
@@ -286,7 +281,8 @@ def figures(
         str | None, typer.Option(help="width such as 88mm, 18cm or 3.5in [default: each figure's own]")
     ] = None,
     style: Annotated[
-        str | None, typer.Option(help="matplotlib style sheet, a file or a name, over the style of pchem")
+        str | None,
+        typer.Option(help="matplotlib style sheet (file or name), applied on top of the style of pchem"),
     ] = None,
     only: Annotated[str, typer.Option(help="names of figures, separated by commas [default: all]")] = "",
     dpi: Annotated[
@@ -295,7 +291,7 @@ def figures(
     workers: Workers = None,
     progress: Progress = "auto",
 ) -> None:
-    """Write every figure for a paper, its numbers beside it as CSV."""
+    """Write figures for a paper, with their numbers as CSV."""
     from pchem_pipeline.commands.figures import Wanted, figures_of_run
 
     wanted = Wanted(
@@ -308,19 +304,19 @@ def figures(
 def _listed(text: str, option: str) -> tuple[str, ...]:
     names = tuple(part.strip() for part in text.split(",") if part.strip())
     if text and not names:
-        raise ConfigError(f"{option}: {text!r} names none; write names with commas between them")
+        raise ConfigError(f"{option}: {text!r} is no name; separate names by commas")
     return names
 
 
 @app.command()
 def view(
     target: Target,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free one")] = 0,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free port")] = 0,
     show: Annotated[bool, typer.Option("--open/--no-open", help="open the browser")] = False,
 ) -> None:
     """Show the report with every pixel in the browser, from a server on this computer.
 
-    It reads the run and changes nothing. Ends with Ctrl-C.
+    Only reads the run. End it with Ctrl-C.
     """
     from pchem_pipeline.commands.view import serve
 
@@ -337,29 +333,29 @@ def compare(
     runs: Annotated[list[Path], typer.Argument(help="two runs or more; the first is the reference")],
     output: Output = Path("compare"),
     tolerance: Annotated[
-        float, typer.Option(help="same frames: relative difference that counts as rounding")
+        float, typer.Option(help="same frames: relative difference counted as rounding")
     ] = 1e-12,
     label: Annotated[
         list[str] | None,
         typer.Option(
-            help="label of a run in the history, in their order, such as a setpoint (repeatable) "
-            "[default: what it is drawn against]"
+            help="label of a run in the history, such as a setpoint; once per run, in the same order "
+            "[default: see --against]"
         ),
     ] = None,
     against: Annotated[
         Literal["date", "temperature", "label"] | None,
         typer.Option(
-            help="axis of the history: date and sensor temperature as the files say, or the number that a "
-            "label begins with [default: label where there are labels, else date]"
+            help="axis of the history: date or sensor temperature from the files, or the number at the start "
+            "of the label [default: label if there are labels, else date]"
         ),
     ] = None,
     fdr: Annotated[
-        float, typer.Option(help="false-discovery rate at which a pixel counts as moved since the first run")
+        float, typer.Option(help="false-discovery rate for pixels that changed since the first run")
     ] = 0.01,
     workers: Workers = None,
     progress: Progress = "auto",
 ) -> None:
-    """Compare runs, and write their history; exit code 3 if something changed.
+    """Compare runs and write their history; exit code 3 if something changed.
 
     Runs on the same frames are compared value by value, others in standard errors.
     """
@@ -382,19 +378,19 @@ def demo(
     output: Output = Path("pchem-demo"),
     size: Annotated[int, typer.Option(min=8, help="rows and columns of the simulated sensor")] = 64,
     frames: Annotated[int, typer.Option(min=16, help="number of frames")] = 4000,
-    seed: Annotated[int, typer.Option(min=0, help="root of the random numbers")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="random seed")] = 1,
     hidden: Annotated[
         str | None,
         typer.Option(
-            help="hide this effect and search for it: a tag; in a part of the sensor or of the run with "
-            "row_noise@columns=40:50"
+            help="hide this effect and search for it, such as row_noise, or row_noise@columns=40:50 in a "
+            "part of the sensor or run"
         ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Run everything on a small simulated sensor.
+    """Run all stages on a small simulated sensor.
 
-    Prints the estimated parameters beside the true ones, and the path of the report.
+    Prints estimated and true parameters, and the path of the report.
     """
     from pchem_pipeline.commands.demo import run_demo
 
@@ -432,7 +428,7 @@ _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 def _without_stdout(error: OSError) -> NoReturn:
     """End where the results could not be written to stdout; what is left of them goes nowhere."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    _fail(f"stdout cannot be written ({error.strerror}); check where it goes to", ExitCode.INPUT)
+    _fail(f"cannot write to stdout ({error.strerror}); check where it goes", ExitCode.INPUT)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -442,7 +438,7 @@ def main(arguments: list[str] | None = None) -> None:
     keep_standard_streams()
     if sys.flags.optimize:
         _fail(
-            "Python leaves out assertions, on which libraries rely; unset PYTHONOPTIMIZE, or leave out -O",
+            "Python runs without assertions, which libraries need; unset PYTHONOPTIMIZE or omit -O",
             ExitCode.USAGE,
         )
     prepare_environment()
@@ -459,7 +455,8 @@ def main(arguments: list[str] | None = None) -> None:
         _fail("out of memory; use fewer --workers or --max-memory", ExitCode.INTERNAL)
     except KeyboardInterrupt:
         _fail(
-            "stopped by SIGINT; finished tiles are kept, run the same command again to go on", ExitCode.SIGINT
+            "stopped by SIGINT; finished tiles are kept, run the same command again to continue",
+            ExitCode.SIGINT,
         )
 
 

@@ -25,29 +25,29 @@ def apply(
     prior: Annotated[
         str,
         typer.Option(
-            help="numbers: exposure to expect: frames (estimated from these), flat (any number alike), run "
-            "(of the characterisation), a number (e-), or a file with a map (npy, TIFF, FITS)"
+            help="numbers: prior exposure: frames (estimated from these frames), flat (all numbers equally "
+            "likely), run (from the characterisation), a number (e-), or a file with a map (npy, TIFF, FITS)"
         ),
     ] = "frames",
     dataset: Annotated[
         str | None,
-        typer.Option(help="frames inside an HDF5, zarr or FITS file  [default: as the run has it]"),
+        typer.Option(help="dataset of an HDF5, zarr or FITS file [default: as in the run]"),
     ] = None,
     format: Annotated[Literal["zarr", "tiff", "fits"], typer.Option(help="format of the output")] = "zarr",
     keep_modes: Annotated[
         bool,
         typer.Option(
             "--keep-modes",
-            help="leave row, column and frame noise, drift and pickup of the model in the frames",
+            help="do not subtract row, column and frame noise, drift and pickup of the model",
         ),
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="replace calibrated frames that are there")] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace existing calibrated frames")] = False,
     *,
     command: Command,
 ) -> None:
-    """Turn other frames of the sensor into electrons, electron numbers and a map of the exposure.
+    """Convert other frames of the sensor to electrons, electron numbers and a map of the exposure.
 
-    With standard errors, a quality layer and provenance. What was stopped goes on.
+    With standard errors, a quality layer and provenance. Continues after an interruption.
     """
     from pchem_pipeline.commands.apply.apply import apply_to_frames
     from pchem_pipeline.commands.apply.settings import ApplySettings, kinds_of

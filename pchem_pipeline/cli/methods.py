@@ -19,7 +19,8 @@ def methods(
     with_runs: Annotated[
         list[Path] | None,
         typer.Option(
-            "--with", help="store of a run of the same pixels at another exposure (dark first of all)"
+            "--with",
+            help="store of a run of the same pixels at another exposure, preferably dark (repeatable)",
         ),
     ] = None,
     pixels: Annotated[

@@ -26,7 +26,7 @@ def on_this_machine(path: Path | None) -> Path | None:
         return None
     path = local_path(path)
     if Path.is_fifo(path) or Path.is_socket(path):
-        raise ConfigError(f"{path} is no regular file; choose another name")
+        raise ConfigError(f"{path} is not a regular file; choose another name")
     return path
 
 
@@ -36,17 +36,15 @@ Progress = Annotated[
     Literal["auto", "on", "off"], typer.Option(help="progress bars; auto: only on a terminal")
 ]
 Output = Annotated[Path, typer.Option("--output", "-o", help="folder to write to", callback=on_this_machine)]
-Strict = Annotated[
-    bool, typer.Option("--strict", help="exit code 3 where the report says not to believe its results")
-]
+Strict = Annotated[bool, typer.Option("--strict", help="exit code 3 if the results are not reliable")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="warnings and errors only")]
 
 #: Name, type with help, and default of each, in the order of ``--help``.
 _COMMON: tuple[tuple[str, Any, Any], ...] = (
-    ("force", Annotated[bool, typer.Option("--force", help="do it again even if it is up to date")], False),
+    ("force", Annotated[bool, typer.Option("--force", help="run again even if up to date")], False),
     (
         "dry_run",
-        Annotated[bool, typer.Option("--dry-run", help="say what would be done and why; write nothing")],
+        Annotated[bool, typer.Option("--dry-run", help="print what would be done and why; write nothing")],
         False,
     ),
     (
@@ -59,7 +57,8 @@ _COMMON: tuple[tuple[str, Any, Any], ...] = (
         Annotated[
             str | None,
             typer.Option(
-                help="region y0:y1,x0:x1 in pixels; ingest and run FILES crop to it, others do its tiles"
+                help="region y0:y1,x0:x1 in pixels; ingest and run FILES crop to it, other commands process "
+                "its tiles"
             ),
         ],
         None,
@@ -69,7 +68,7 @@ _COMMON: tuple[tuple[str, Any, Any], ...] = (
         "backend",
         Annotated[
             Literal["serial", "threads", "processes", "distributed"] | None,
-            typer.Option(help="who does the work [default: compute.backend]"),
+            typer.Option(help="backend for the work [default: compute.backend]"),
         ],
         None,
     ),
@@ -77,7 +76,7 @@ _COMMON: tuple[tuple[str, Any, Any], ...] = (
         "max_memory",
         Annotated[
             int | None,
-            typer.Option(help="memory that it may take, MiB, 300 or more [default: compute.max_memory]"),
+            typer.Option(help="memory limit, MiB, at least 300 [default: compute.max_memory]"),
         ],
         None,
     ),
@@ -85,7 +84,7 @@ _COMMON: tuple[tuple[str, Any, Any], ...] = (
         "log_json",
         Annotated[
             Path | None,
-            typer.Option(help="append JSON lines about the run to this file", callback=on_this_machine),
+            typer.Option(help="append events as JSON lines to this file", callback=on_this_machine),
         ],
         None,
     ),
@@ -95,25 +94,25 @@ _COMMON: tuple[tuple[str, Any, Any], ...] = (
 
 #: Settings of the section ``input`` that have an option: name, type, help.
 _INPUT: tuple[tuple[str, Any, str], ...] = (
-    ("integration_time", float, "integration time of a frame, s"),
+    ("integration_time", float, "integration time per frame, s"),
     ("bit_depth", int, "bits of the ADC"),
-    ("bit_shift", int, "bits to shift right, of left-justified samples"),
+    ("bit_shift", int, "bits to shift right (left-justified samples)"),
     (
         "dtype",
         Literal["uint8", "uint16", "uint32"],
-        "raw: type of a sample; else what signed samples are read as",
+        "raw: sample type; other formats: unsigned type for signed samples",
     ),
-    ("offset", int, "DN to be added to signed samples, such as 32768"),
-    ("byte_order", Literal["little", "big"], "raw and SER: order of the bytes of a sample"),
-    ("frames", str, "first:end of the frames, end excluded, such as 5: or :1000"),
-    ("mask", Path, "image (npy, TIFF, FITS) whose pixels other than 0 are excluded"),
-    ("dataset", str, "which frames inside an HDF5, zarr or FITS file"),
+    ("offset", int, "DN to add to signed samples, such as 32768"),
+    ("byte_order", Literal["little", "big"], "raw and SER: byte order"),
+    ("frames", str, "range of frames first:end, end excluded, such as 5: or :1000"),
+    ("mask", Path, "image (npy, TIFF, FITS): pixels other than 0 are excluded"),
+    ("dataset", str, "dataset of an HDF5, zarr or FITS file"),
     (
         "kind",
         Literal["dark", "light", "unknown"],
-        "what made the charge; H over time is dark current in the dark alone",
+        "source of the charge; only with dark the charge rate is a dark current",
     ),
-    ("mode", Literal["copy", "reference"], "copy the frames into the store, or leave them where they are"),
+    ("mode", Literal["copy", "reference"], "copy the frames into the store, or only reference the files"),
 )
 
 
@@ -195,8 +194,8 @@ def region_of(text: str | None) -> tuple[int, int, int, int] | None:
     for name, first, end in (("y", y0, y1), ("x", x0, x1)):
         if not 0 <= first < end:
             raise ConfigError(
-                f"--roi {text}: {name} goes from {first} to {end}, which holds no pixel; write y0:y1,x0:x1 "
-                "with 0 <= y0 < y1 and 0 <= x0 < x1, ends excluded, such as 0:128,64:192"
+                f"--roi {text}: {name} from {first} to {end} contains no pixel; write y0:y1,x0:x1 with 0 <= "
+                "y0 < y1 and 0 <= x0 < x1, ends excluded, such as 0:128,64:192"
             )
     return y0, y1, x0, x1
 

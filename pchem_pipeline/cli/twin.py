@@ -16,28 +16,34 @@ def twin(
     target: Target,
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", help="YAML to write; maps go beside it", callback=on_this_machine),
+        typer.Option(
+            "--output", "-o", help="YAML file to write; maps are written beside it", callback=on_this_machine
+        ),
     ],
     scene: Annotated[
         str | None,
         typer.Option(
             help="e- per frame: a number, or a file with an image or a sequence of images (npy, TIFF, FITS) "
-            "[default: what the run saw]"
+            "[default: exposure of the run]"
         ),
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="number of frames [default: of the run]")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="of the frames: another one, other frames")] = 1,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="number of frames [default: as in the run]")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="random seed of the frames")] = 1,
     redraw: Annotated[
-        int | None, typer.Option(min=0, help="seed: draw the maps within their errors [default: as fitted]")
+        int | None,
+        typer.Option(min=0, help="random seed: draw the maps within their errors [default: fitted maps]"),
     ] = None,
     size: Annotated[
-        str | None, typer.Option(help="rows x columns of another sensor of this make, such as 512x512")
+        str | None,
+        typer.Option(help="simulate another sensor of this type with rows x columns, such as 512x512"),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace files that are there")] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace existing files")] = False,
 ) -> None:
-    """Write the camera as it was measured: a YAML for pchem simulate, with maps, effects and ADC.
+    """Write a simulated copy of the camera: a YAML for pchem simulate, with maps, effects and ADC.
 
-    A larger sensor gets the distributions and spatial correlations of this one.
+    A sensor of another size has the same distributions and spatial correlations.
     """
     from pchem_pipeline.commands.twin import write_twin
     from pchem_pipeline.run.target import find_run

@@ -68,7 +68,7 @@ def append_frames(target: Target, command: Command) -> list[StageState]:
         quick = quick_identity(paths)
         added, kept = _added(context, paths, quick)
         if not added:
-            context.reporter.info("ingest: there are no further files")
+            context.reporter.info("ingest: no new files")
             return []
         frames = open_frames(context.config.input, context.base_dir)
         _check_frames(context, frames, added)
@@ -91,15 +91,15 @@ def _check_run(context: StageContext) -> None:
             raise StoreError(f"{store.path}: {name} is not complete; run: pchem run {quoted(store.path)}")
         if record.content.get("settings") != setting_values(STAGES[name], context):
             raise StoreError(
-                f"{store.path}: {name} was done with other settings; to do all frames again: "
-                f"pchem run {quoted(store.path)}"
+                f"{store.path}: {name} was made with other settings; to process all frames again: pchem run "
+                f"{quoted(store.path)}"
             )
     lacks = context.config.histogram.summaries and not store.has("summary/open_sums")
     lacks |= ingested_identity(context) is None
     if context.sensor.kind != "frames" or lacks:
         raise StoreError(
-            f"{store.path}: nothing can be appended to ready-made histograms or runs of earlier versions; "
-            f"do all again: pchem run {quoted(store.path)} --force"
+            f"{store.path}: frames cannot be appended to ready-made histograms or runs of earlier versions; "
+            f"run all again: pchem run {quoted(store.path)} --force"
         )
 
 
@@ -116,9 +116,9 @@ def _added(
         same = known_identity(context)["files"][: len(before)] == known["identity"]["files"]
     if not same:
         raise InputError(
-            f"the first {len(before)} files of input.files are not those of the run, or were changed; new "
-            "files must come behind them in the order of their names; to do all again: "
-            f"pchem run {quoted(context.store.path)}"
+            f"the first {len(before)} files of input.files differ from the files of the run; new files must "
+            "follow them in the order of their names; to run all again: pchem run "
+            f"{quoted(context.store.path)}"
         )
     return paths[len(before) :], known["identity"]
 
@@ -132,26 +132,26 @@ def _check_frames(context: StageContext, frames: FrameSequence, added: list[Path
     sensor, place = context.sensor, context.store.path
     if frames.shape[1:] != sensor.shape or frames.dtype.name != sensor.dtype:
         raise InputError(
-            f"{added[0]}: the frames do not fit those of the run; all are {frames.shape[1:]} {frames.dtype}, "
-            f"the run has {sensor.shape} {sensor.dtype}"
+            f"{added[0]}: the frames differ from the run: {frames.shape[1:]} {frames.dtype}, the run has "
+            f"{sensor.shape} {sensor.dtype}"
         )
     if frames.shape[0] <= sensor.n_frames:
-        raise InputError(f"{added[0]}: input.frame_range leaves out the new frames; correct it")
+        raise InputError(f"{added[0]}: input.frame_range excludes the new frames; correct it")
     reader, first, _, _ = next(frames.pieces(sensor.n_frames, sensor.n_frames + 1))
     if first != 0 or reader.paths[0] not in added:
-        raise InputError(f"{added[0]}: is not what follows the frames of the run; correct input.files")
+        raise InputError(f"{added[0]}: does not follow the frames of the run; correct input.files")
     window = context.config.histogram.window_frames
     if sensor.n_frames < window:
         raise StoreError(
-            f"{place}: {sensor.n_frames} frames are fewer than histogram.window_frames ({window}), which "
-            f"decide the bins; do all again: pchem run {quoted(place)}"
+            f"{place}: the run has {sensor.n_frames} frames, fewer than histogram.window_frames ({window}), "
+            f"which set the bins; run all again: pchem run {quoted(place)}"
         )
     bins = context.store.array("histogram/counts").shape[2]
     need = single_pass_bytes(context.config, frames.shape, frames.dtype, bins)
     if need > allowed_bytes(context.config, worker_count(context.config)):
         raise StoreError(
-            f"{place}: appending needs {need >> 20} MiB; allow them (--max-memory), or do all again: "
-            f"pchem run {quoted(place)}"
+            f"{place}: appending needs {need >> 20} MiB; allow this (--max-memory), or run all again: pchem "
+            f"run {quoted(place)}"
         )
 
 

@@ -111,7 +111,7 @@ def fit_counts(counts: NDArray[Any], origin: NDArray[Any] | int = 0, **options: 
     """
     array = np.asarray(counts)
     if array.ndim < 1 or not np.issubdtype(array.dtype, np.number) or (array < 0).any() or (array % 1).any():
-        raise ValueError("counts: give whole numbers, none below 0, along the last axis")
+        raise ValueError("counts: give whole numbers of 0 or more along the last axis")
     flat = np.ascontiguousarray(array.reshape(-1, array.shape[-1]), dtype=np.uint32)
     first = np.broadcast_to(np.asarray(origin), array.shape[:-1]).reshape(-1).astype(np.int32)
     return fit_histograms(flat, first, **options)
@@ -127,10 +127,11 @@ def _check(frames: Any) -> None:
     dtype = np.dtype(getattr(frames, "dtype", object))
     if len(shape) != 3 or shape[0] < 2:
         raise ConfigError(
-            f"frames of shape {shape}: give an array (frame, y, x) of 2 frames or more, better some thousands"
+            f"frames of shape {shape}: give an array (frame, y, x) of at least 2 frames, better some "
+            "thousands"
         )
     if dtype.kind not in "ui":
-        raise ConfigError(f"frames of {dtype}: PCH-EM needs the whole DN that the ADC gave; give integers")
+        raise ConfigError(f"frames of {dtype}: PCH-EM needs raw DN of the ADC; give integers")
 
 
 def _target(place: Path, given: Mapping[str, Any], settings: Mapping[str, Mapping[str, Any]]) -> Target:

@@ -97,8 +97,8 @@ def hidden_effect(asked: str, size: int, n_frames: int) -> Effect:
     if tag not in effect_classes():
         known = ", ".join(effect_classes())
         raise ConfigError(
-            f"--hidden {tag!r}: there is no such effect; choose one of: {known}; "
-            f"behind it @ and a place, if any: {GRAMMAR}"
+            f"--hidden {tag!r}: no such effect; choose one of: {known}; "
+            f"for a part of the sensor or run append @ and a place: {GRAMMAR}"
         )
     typical = effect_class(tag).typical()
     if not typical:
@@ -125,11 +125,11 @@ def _search(target: Target, effect: Effect, command: Command, plain: str) -> str
     numbers = {n: v for n, v in effect.model_dump().items() if isinstance(v, int | float)}
     reason = type(effect).untestable
     return (
-        f"{verdict_text(found)}\n\nhidden was: {effect_words(effect)}"
+        f"{verdict_text(found)}\n\nhidden effect: {effect_words(effect)}"
         f"{''.join(f', {name} = {value:.4g}' for name, value in numbers.items())}"
-        f"{f' (such frames cannot show it: {reason})' if reason else ''}\n\n"
+        f"{f' (not detectable in such frames: {reason})' if reason else ''}\n\n"
         f"with the plain model:\n{plain}\n\n"
-        f"with the model of the verdict:\n{comparison_table(RunStore.open(target.store))}\n\n"
+        f"with the model found:\n{comparison_table(RunStore.open(target.store))}\n\n"
         f"verdict: {target.store / 'discrepancy.html'}"
     )
 
@@ -161,7 +161,7 @@ def comparison_table(store: RunStore) -> str:
         lines.append(f"{label:<24}" + "".join(f"{number:>14.4g}" for number in numbers))
     caution, failed = np.count_nonzero(quality == 1), np.count_nonzero(quality == 2)
     lines.append(
-        f"{good.sum()} of {good.size} pixels are good (the table is of these), {caution} are to be used with "
-        f"caution, {failed} have no value"
+        f"{good.size} pixels: {good.sum()} good (used in the table), {caution} to be used with caution, "
+        f"{failed} without a value"
     )
     return "\n".join(lines)

@@ -57,7 +57,7 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
     """
     unknown = [name for name in formats if name not in FORMATS]
     if unknown or not formats:
-        what = f"{', '.join(unknown)} cannot be written" if unknown else "none is given"
+        what = f"{', '.join(unknown)} cannot be written" if unknown else "no format"
         raise ConfigError(f"--format: {what}; choose from {', '.join(FORMATS)}")
     target = find_run(path)
     store = target.stored()
@@ -88,7 +88,7 @@ def _say_if_old(target: Target) -> None:
     """Warn where the maps are not those of the present settings and input."""
     state = next(state for state in run_status(target) if state.stage == "maps")
     if state.state != "complete":
-        Reporter("off").warning(f"maps: {state.words()}; they are written as they are")
+        Reporter("off").warning(f"maps: {state.words()}; written in this state")
 
 
 def _images(store: RunStore) -> list[MapImage]:

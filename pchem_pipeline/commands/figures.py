@@ -60,7 +60,7 @@ def millimetres(text: str) -> float:
         raise ConfigError(f"--width {text!r}: write a length such as 88mm, 8.8cm or 3.5in")
     length = float(match[1]) * _UNITS[match[2] or ""]
     if not _WIDTHS[0] <= length <= _WIDTHS[1]:
-        raise ConfigError(f"--width {text}: figures can be {_WIDTHS[0]:g} to {_WIDTHS[1]:g} mm wide")
+        raise ConfigError(f"--width {text}: give {_WIDTHS[0]:g} to {_WIDTHS[1]:g} mm")
     return length
 
 
@@ -94,13 +94,13 @@ def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:
     """
     unknown = [name for name in wanted.formats if name not in FORMATS]
     if unknown or not wanted.formats:
-        what = f"{', '.join(unknown)} cannot be drawn" if unknown else "none is given"
+        what = f"{', '.join(unknown)} cannot be drawn" if unknown else "no format"
         raise ConfigError(f"--format: {what}; choose from {', '.join(FORMATS)}")
     width = None if wanted.width is None else millimetres(wanted.width)
     sheet = {} if wanted.style is None else read_style_sheet(wanted.style)
     target = find_run(path)
     data = gather_run(target)
-    warn_if_old(target, ("maps", "ensemble"), "they are drawn as they are")
+    warn_if_old(target, ("maps", "ensemble"), "drawn in this state")
     settings = target.config.report
     kinds = tuple(dict.fromkeys(wanted.formats))
     jobs = [

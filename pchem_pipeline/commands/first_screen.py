@@ -58,7 +58,7 @@ def _tell(
     target: Target, stages: Sequence[str], command: Command, say: Callable[[str], None], *, warn: bool
 ) -> str:
     """Tell the first screen and the path; return what is serious in one line, or nothing."""
-    numbers = read_json(target.store / "report.json", "run again, which writes it again")
+    numbers = read_json(target.store / "report.json", "run again to write it")
     if "report" not in stages or numbers is None:
         say(str(target.store))
         return ""

@@ -37,15 +37,13 @@ def find_joint(
         found = find_run(targets[0])
         if not found.config.input.samples:
             raise ConfigError(
-                f"{targets[0]} is a single run, and a joint fit needs several; give them all, "
-                "or a YAML with input.samples"
+                f"{targets[0]} is a single run; a joint fit needs several: give all runs, or a YAML with "
+                "input.samples"
             )
         for option, value in (("run.store", store), ("input.against", against)):
             if value is not None:
                 name = option.partition(".")[2]
-                raise ConfigError(
-                    f"--{name}: only for runs; {targets[0]} has its own {option}, change it there"
-                )
+                raise ConfigError(f"--{name}: only with runs; {targets[0]} sets {option}, change it there")
         return found, False
     place = place_of(store or Path("joint.zarr")).resolve()
     remote, path = isinstance(place, RemotePath), settings_of(place)

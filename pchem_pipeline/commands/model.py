@@ -113,7 +113,7 @@ def _effect_words(effect: Effect) -> str:
 
 
 def use_model(target: Target, number: int) -> str:
-    """Put a version of the model in force, for store and YAML; return in words what is stale thereby.
+    """Put a version of the model in force; return which results are stale.
 
     Args:
         target: the run.
@@ -130,7 +130,7 @@ def use_model(target: Target, number: int) -> str:
         version = version_with(store, number)
         changed, file = _put_in_force(store, target, version)
     if before.number == number:
-        words = f"model {number} was in force already: {_words(version)}"
+        words = f"model {number} is already in use: {_words(version)}"
     else:
         words = _change_words(changed, before, version, file)
     return "\n".join([words, *_stale_lines(changed)])
@@ -141,7 +141,7 @@ def _change_words(target: Target, before: ModelVersion, version: ModelVersion, f
     place = quoted(_yaml_of(target) or target.store)
     held = "" if file is None else f" (in {file})"
     back = f"to go back: pchem model {place} --use {before.number}"
-    return f"model {version.number} is in force: {_words(version)}{held}; {back}"
+    return f"model {version.number} is now in use: {_words(version)}{held}; {back}"
 
 
 def _stale_lines(target: Target) -> list[str]:
@@ -149,8 +149,8 @@ def _stale_lines(target: Target) -> list[str]:
     stale = [state.stage for state in run_status(target) if state.state == "stale"]
     place = quoted(_yaml_of(target) or target.store)
     usual = [name for name in stale if not STAGES[name].on_demand]
-    lines = [f"stale: {', '.join(usual)}; to do them again: pchem run {place}"] if usual else []
-    lines += [f"stale: {name}; to do it again: pchem {name} {place}" for name in stale if name not in usual]
+    lines = [f"stale: {', '.join(usual)}; to update: pchem run {place}"] if usual else []
+    lines += [f"stale: {name}; to update: pchem {name} {place}" for name in stale if name not in usual]
     return lines or ["nothing is stale"]
 
 

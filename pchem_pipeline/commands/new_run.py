@@ -83,9 +83,7 @@ def find_or_start(
             names = [*(["store"] if store is not None else []), *given]
             words = (name.replace("frame_range", "frames").replace("_", "-") for name in names)
             options = ", ".join(f"--{name}" for name in words)
-            raise ConfigError(
-                f"{options}: only for camera files; {first} has its own settings, change them there"
-            )
+            raise ConfigError(f"{options}: only with camera files; change the settings in {first}")
         return find_run(first), False
     missing = [path for path in targets if not path.exists() and not set("*?[") & set(str(path))]
     if missing:
@@ -128,7 +126,7 @@ def settings_of(store: Path) -> Path:
         ConfigError: the store has the name of a YAML file.
     """
     if store.suffix.lower() in _YAML:
-        raise ConfigError(f"--store {store.name}: that is the name of a YAML file; give NAME.zarr")
+        raise ConfigError(f"--store {store.name}: this is the name of a YAML file; give NAME.zarr")
     name = store.name.removesuffix(".zarr") + ".yaml"
     return Path(name).resolve() if isinstance(store, RemotePath) else store.with_name(name)
 
@@ -149,11 +147,11 @@ def settings_there(path: Path, stated: Mapping[str, Any], command: str) -> RunCo
     differ = settings_that_differ(there, make_config(content, "the command line", path.parent))
     if not differ:
         return there
-    shown = [f"{each.name} {each.one} there, {each.other} here" for each in differ[:_SHOWN]]
+    shown = [f"{each.name} {each.one} in the file, {each.other} here" for each in differ[:_SHOWN]]
     more = [f"{len(differ) - _SHOWN} more"] if len(differ) > _SHOWN else []
     raise ConfigError(
-        f"{path} exists with other settings ({'; '.join([*shown, *more])}); go on with those there: pchem "
-        f"{command} {quoted(path)}; or edit them there, or begin another run with --store NAME.zarr"
+        f"{path} exists with other settings ({'; '.join([*shown, *more])}); continue with these: pchem "
+        f"{command} {quoted(path)}; or edit the file, or start another run with --store NAME.zarr"
     )
 
 
@@ -195,7 +193,7 @@ def first_try(target: Target, text: str | None) -> Iterator[None]:
             raise
         name = shlex.quote(path.name)
         raise type(error)(
-            f"{error}; a setting without an option goes into a YAML: pchem init {name} FILES, then pchem run "
+            f"{error}; for settings without an option: pchem init {name} FILES, edit it, then pchem run "
             f"{name}"
         ) from error
 

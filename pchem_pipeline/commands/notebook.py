@@ -75,7 +75,7 @@ def require_xarray(what: str) -> None:
     try:
         import xarray as _  # noqa: F401
     except ImportError as error:
-        raise MissingDependencyError(f"{what} needs another library: {install_hint('notebook')}") from error
+        raise MissingDependencyError(f"{what} needs another package: {install_hint('notebook')}") from error
 
 
 class Run:
@@ -107,7 +107,7 @@ class Run:
 
     def _repr_html_(self) -> str:
         """Return what the first screen of the report says, for a notebook."""
-        found = read_json(self.path / "report.json", "run again, which writes it again")
+        found = read_json(self.path / "report.json", "run again to write it")
         states = ", ".join(f"{name} {words}" for name, words in self.status().items())
         head = f"<b>{escape(self.path.name)}</b>: {escape(self._size())}"
         if found is None:
@@ -162,7 +162,7 @@ class Run:
     def _opened(self, name: str) -> xr.Dataset:
         if not self._store.has(name):
             raise StoreError(
-                f"{self.path} has no {name} yet; see what is missing with: pchem status {quoted(self.path)}"
+                f"{self.path} has no {name} yet; for the state of the run: pchem status {quoted(self.path)}"
             )
         for record in filter(None, map(self._store.records.known, STAGES)):
             for file in record.files:
@@ -332,7 +332,7 @@ class Run:
         ny, nx = self.shape
         for y, x in places:
             if not (0 <= y < ny and 0 <= x < nx):
-                raise ConfigError(f"pixel y = {y}, x = {x} lies outside the sensor of {ny} x {nx} pixels")
+                raise ConfigError(f"pixel y = {y}, x = {x} is outside the sensor of {ny} x {nx} pixels")
         maps = self._arrays(
             "maps", [f"{n}{end}" for n in (*PARAMETERS, "read_noise_e") for end in ("", "_stderr")]
         )

@@ -77,15 +77,11 @@ def make_plan(request: PlanRequest) -> str:
     known = _median_pixel(request.run) if request.run is not None else {}
     noise = known.get("read_noise_e") if request.read_noise_e is None else request.read_noise_e
     if noise is None:
-        raise ConfigError(
-            "--read-noise is missing: give it in e-, quantisation included, or a run that has it"
-        )
+        raise ConfigError("--read-noise is missing: give it in e-, quantisation included, or give a run")
     if not request.targets and request.frames is None:
-        raise ConfigError(
-            "--target is missing: say what to reach, such as conversion_gain=1%, or give --frames"
-        )
+        raise ConfigError("--target is missing: give a precision, such as conversion_gain=1%, or --frames")
     if request.figure is not None and request.figure.suffix not in _FIGURES:
-        raise ConfigError(f"--figure {request.figure}: cannot be drawn; end it in {', '.join(_FIGURES)}")
+        raise ConfigError(f"--figure {request.figure}: cannot be drawn; use the suffix {', '.join(_FIGURES)}")
     exposure = known.get("quanta_exposure") if request.quanta_exposure is None else request.quanta_exposure
     gain = known.get("conversion_gain", _DEFAULT_GAIN)
     if request.conversion_gain is not None:
@@ -159,14 +155,14 @@ def _plan_lines(plan: Plan, request: PlanRequest, exposure_given: bool) -> list[
     for need in plan.needs:
         words = f"{need.target!s:<34}{need.bound:>14,.0f} frames"
         if need.seen > max(need.bound, need.certain):
-            words += f"; {need.seen:,.0f} until no other gain is as likely by chance"
+            words += f"; {need.seen:,.0f} to rule out a wrong gain"
         elif need.certain > need.bound:
-            words += f"; {need.certain:,.0f} until electron numbers are not off by one"
+            words += f"; {need.certain:,.0f} to rule out a bias off by one electron"
         lines.append(words)
     if plan.needs and request.frames is not None:
         enough = max(need.frames for need in plan.needs) <= request.frames
         lines.append(f"{request.frames:,} frames are {'enough' if enough else 'too few'}")
-    lines += ["", f"with {plan.frames:,.0f} frames, one standard deviation of a pixel (Cramer-Rao bound):"]
+    lines += ["", f"with {plan.frames:,.0f} frames, 1 sigma error per pixel (Cramer-Rao bound):"]
     for name, value in plan.precision.items():
         unit, size = ("e-", value) if name == "bias" else ("%", 100 * value)
         if name != "dark_current":  # what the charge rate is called in the dark
@@ -174,7 +170,7 @@ def _plan_lines(plan: Plan, request: PlanRequest, exposure_given: bool) -> list[
     if exposure_given and np.isfinite(plan.best_exposure):
         limit = " (the largest allowed)" if plan.best_exposure > 0.99 * request.max_exposure else ""
         best = f"best exposure: {plan.best_exposure:.3g} e-{limit}, {plan.best_frames:,.0f} frames"
-        lines += ["", f"{best}, with no pixel flagged"]
+        lines += ["", f"{best}, no pixel flagged"]
     return lines
 
 
@@ -239,7 +235,7 @@ def _check_line(result: Verification) -> str:
             f"{check.target.name} {scale * check.rmse:.3g} +- {scale * check.rmse_stderr:.1g} {unit}, "
             f"{'reached' if check.reached else 'not reached'}"
         )
-    caution = f", {result.n_flagged} flagged in what was asked for" if result.n_flagged else ""
+    caution = f", {result.n_flagged} flagged" if result.n_flagged else ""
     return (
         f"simulated, {result.n_frames:,} frames, {result.n_pixels:,} pixels fitted "
         f"({result.n_failed} without a value{caution}): rms error of {'; '.join(parts)}"
@@ -268,7 +264,7 @@ def _several(
 ) -> tuple[list[str], dict[str, Any]]:
     """Plan several samples."""
     if not targets:
-        raise ConfigError("--target is missing: say what the samples shall reach, such as conversion_gain=1%")
+        raise ConfigError("--target is missing: give a precision, such as conversion_gain=1%")
     plan = plan_samples(
         targets,
         _exposures(str(request.samples)),
@@ -304,9 +300,7 @@ def _exposures(text: str) -> list[float] | None:
     except ValueError:
         found = []
     if len(found) < 2:
-        raise ConfigError(
-            f"--samples {text}: give two or more exposures in e-, such as 0,2,8, or the word best"
-        )
+        raise ConfigError(f"--samples {text}: give two or more exposures in e-, such as 0,2,8, or best")
     return found
 
 
@@ -323,11 +317,11 @@ def _split_lines(plan: SamplesPlan, targets: Sequence[Target]) -> list[str]:
     lines.append("")
     if plan.certain > plan.split.frames:
         lines.append(
-            f"the bound asks for {plan.split.frames:,.0f}; more are needed until electron numbers are certain"
+            f"Cramer-Rao bound: {plan.split.frames:,.0f}; more are needed to fix the electron numbers"
         )
     if len(plan.split.exposures) > 1 and np.isfinite(plan.even):
         lines.append(
-            f"evenly divided, the bound asks for {plan.even:,.0f} frames instead of {plan.split.frames:,.0f}"
+            f"evenly divided: {plan.even:,.0f} frames instead of {plan.split.frames:,.0f} (Cramer-Rao bound)"
         )
     return lines
 

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 #: Bits of the ADC where the run does not say, and frames where nothing else is asked for.
 _BIT_DEPTH, TWIN_FRAMES = 16, 1000
-_HEAD = """# The camera of {run} as it was measured: pchem run makes its frames and characterises them.
-# What the model of that run had is simulated, and is in the model here too.
+_HEAD = """# Simulated copy of the camera of {run}: pchem run makes its frames and characterises them.
+# The effects of its model are simulated, and are in the model here.
 """
 
 
@@ -49,11 +49,11 @@ def twin_of(target: Target, *, redraw: int | None = None, shape: tuple[int, int]
     check_run(store)
     sensor = SensorInfo.read(store)
     if sensor.kind == "histograms":
-        raise ConfigError(f"{target.store} was made from ready-made histograms: channels are no sensor")
+        raise ConfigError(f"{target.store} was made from ready-made histograms; a run of frames is needed")
     calibration = read_calibration(store)
     usable = calibration.usable & (calibration.quanta_exposure >= 0.0)
     if not usable.any():
-        raise ConfigError(f"{target.store} has no pixel with a fit: there is nothing to simulate")
+        raise ConfigError(f"{target.store} has no pixel with a fit, so there is nothing to simulate")
     maps = tuple(store.read(f"fit/{name}") for name in PARAMETERS)
     if redraw is not None:
         stderr = np.stack([store.read(f"fit/{name}_stderr") for name in PARAMETERS])
@@ -108,7 +108,7 @@ def write_twin(
         InputError: the scene cannot be read.
     """
     if output.suffix.lower() not in (".yaml", ".yml"):
-        raise ConfigError(f"--output {output}: a YAML file is written; give it the suffix .yaml")
+        raise ConfigError(f"--output {output}: give a name with the suffix .yaml")
     maps = output.with_name(f"{output.stem}_maps.npz")
     for path in (output, maps):
         if path.exists() and not force:

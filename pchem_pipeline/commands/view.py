@@ -91,9 +91,9 @@ class RunView:
         if not page.is_file():
             raise StoreError(f"{self.store.path} has no report yet; {cure}")
         if served_page(page.read_text(encoding="utf-8")) is None:
-            raise StoreError(f"{page} is of an earlier version and has no inspector; {cure}")
+            raise StoreError(f"{page} is from an earlier version without inspector; {cure}")
         if not self._is_current("report"):
-            raise StoreError(f"{self.store.path} is not finished, or older than its stages; {cure}")
+            raise StoreError(f"{self.store.path} is incomplete or stale; {cure}")
 
     def _is_current(self, stage: str) -> bool:
         """Return whether a stage is finished, and rests on those before it as they are now."""
@@ -157,10 +157,10 @@ class RunView:
         ny, nx = self._shape
         place = [query.get(name, [""]) for name in ("y", "x")]
         if len(query) != 2 or any(len(each) != 1 or not _NUMBER.fullmatch(each[0]) for each in place):
-            return _text(HTTPStatus.BAD_REQUEST, "ask for a pixel as y=12&x=34")
+            return _text(HTTPStatus.BAD_REQUEST, "give a pixel as y=12&x=34")
         y, x = (int(each[0]) for each in place)
         if y >= ny or x >= nx:
-            return _text(HTTPStatus.NOT_FOUND, f"there is no such pixel; the sensor has {ny} x {nx}")
+            return _text(HTTPStatus.NOT_FOUND, f"no such pixel; the sensor has {ny} x {nx}")
         region = (slice(y, y + 1), slice(x, x + 1))
         index = np.array([y * nx + x])
         model = read_model(self.store)
@@ -197,7 +197,7 @@ def _refusal(method: str, target: str, headers: Mapping[str, str], port: int) ->
         text = b"this server only shows; GET and HEAD are all it knows"
         return Answer(HTTPStatus.METHOD_NOT_ALLOWED, text, headers=allowed)
     if not target.startswith("/"):
-        return _text(HTTPStatus.BAD_REQUEST, "ask for a path, such as /")
+        return _text(HTTPStatus.BAD_REQUEST, "give a path, such as /")
     hosts = {f"{name}:{port}" for name in (ADDRESS, "localhost")}
     if headers.get("host") not in hosts:
         return _text(HTTPStatus.FORBIDDEN, "this server answers to its own address only")
@@ -242,7 +242,7 @@ class _Handler(BaseHTTPRequestHandler):
         headers = {name.lower(): value for name, value in self.headers.items()}
         assert isinstance(self.server, _Server)
         if len(self.headers.get_all("host", [])) > 1:
-            answer = _text(HTTPStatus.BAD_REQUEST, "name one host")
+            answer = _text(HTTPStatus.BAD_REQUEST, "give one host")
         else:
             answer = self.run_view.answer(self.command, self.path, headers, self.server.server_port)
         self.send_response(answer.status)
@@ -285,7 +285,7 @@ def make_server(path: Path, port: int = 0) -> tuple[ThreadingHTTPServer, str]:
         server = _Server((ADDRESS, port), handler)
     except OSError as error:
         raise ConfigError(
-            f"--port {port}: cannot listen there ({error.strerror}); choose another, or 0 for a free one"
+            f"--port {port}: not available ({error.strerror}); choose another port, or 0 for any free port"
         ) from error
     return server, f"http://{ADDRESS}:{server.server_port}/"
 

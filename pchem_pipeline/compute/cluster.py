@@ -54,7 +54,7 @@ class DistributedExecutor:
             import distributed
         except ImportError as error:
             raise MissingDependencyError(
-                f"compute.backend: distributed needs another library: {install_hint('cluster')}"
+                f"compute.backend: distributed needs another package: {install_hint('cluster')}"
             ) from error
         except ValueError as error:
             raise ConfigError(f"{error}; correct that file") from error
@@ -73,8 +73,8 @@ class DistributedExecutor:
                 self._client = distributed.Client(self._cluster)
         except OSError as error:
             raise ConfigError(
-                f"compute.scheduler: no scheduler answers at {settings.scheduler} ({error}); "
-                "start one with: dask scheduler"
+                f"compute.scheduler: no scheduler at {settings.scheduler} ({error}); start one with: dask "
+                "scheduler"
             ) from error
         self._name = f"the dask scheduler {settings.scheduler or 'of this run'}"
         self._seconds, self._notices = settings.wait_for_workers, notices
@@ -112,7 +112,7 @@ class DistributedExecutor:
             raise IncompleteRunError(self._given_up(workers))
         if not self._said and waited >= min(_SAY, seconds / 2):
             self._said = True
-            why = f": all {len(workers)} are paused, their memory is nearly full" if workers else ""
+            why = f": all {len(workers)} are paused, memory nearly full" if workers else ""
             self._notices.say(f"waiting for workers of {self._name}{why}")
         return False
 
@@ -121,11 +121,11 @@ class DistributedExecutor:
         if workers:
             return (
                 f"{self._name}: all {len(workers)} workers were paused {waited}, {_limit(workers[0])} is "
-                f"nearly full; {_MORE_MEMORY}, and run the same command to go on"
+                f"nearly full; {_MORE_MEMORY}, and run the same command to continue"
             )
         return (
-            f"{self._name} had no worker {waited}; finished tiles are kept: start some with dask worker, or "
-            "raise that time, and run the same command to go on"
+            f"{self._name} had no worker {waited}; finished tiles are kept: start workers with dask "
+            "worker, or raise this time, and run the same command to continue"
         )
 
     def _completed(self, futures: Sequence[Any]) -> Iterator[tuple[Any, Outcome]]:
@@ -162,8 +162,8 @@ class DistributedExecutor:
                 on_result(item_of[future.key], outcome)
         except (OSError, CancelledError) as error:  # a lost connection, and what it makes of results
             raise IncompleteRunError(
-                f"{self._name} went away; finished tiles are kept: start it again, and run the same command "
-                "to go on"
+                f"{self._name} stopped; finished tiles are kept: start it again, and run the same command to "
+                "continue"
             ) from error
         except BaseException:
             self._client.cancel(futures)
@@ -258,6 +258,6 @@ def _killed(error: Any) -> str:
     """Say in one line that workers died at an item; the scheduler does not know of what."""
     last, times = error.last_worker, error.allowed_failures + 1
     return (
-        f"{times} worker{'s' * (times > 1)} died at it, the last at {last.address}: killed, or above "
-        f"{_limit({'memory_limit': last.memory_limit})}; {_MORE_MEMORY}, and run the same command to go on"
+        f"{times} worker{'s' * (times > 1)} died on it, the last at {last.address}: killed, or above "
+        f"{_limit({'memory_limit': last.memory_limit})}; {_MORE_MEMORY}, and run the same command to continue"
     )

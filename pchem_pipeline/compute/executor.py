@@ -84,7 +84,7 @@ def out_of_memory(error: MemoryError) -> str:
     """Say in one line that memory was not enough."""
     return (
         f"out of memory{f' ({error})' if str(error) else ''}; use fewer --workers, a smaller --max-memory "
-        "or a smaller run.tile, or a machine with more, and run the same command to go on"
+        "or a smaller run.tile, or a machine with more, and run the same command to continue"
     )
 
 
@@ -177,8 +177,8 @@ class PoolExecutor:
         if self._processes:
             if not can_start_processes():
                 raise ConfigError(
-                    "worker processes need shared memory, and there is none (on Linux: /dev/shm is "
-                    "read-only or full); use --backend threads"
+                    "no shared memory for worker processes (on Linux: /dev/shm is read-only or full); use "
+                    "--backend threads"
                 )
             return ProcessPoolExecutor(self.workers, mp_context=_SPAWN, initializer=_begin_worker)
         return ThreadPoolExecutor(self.workers, thread_name_prefix="tile")
@@ -198,7 +198,7 @@ class PoolExecutor:
         except BrokenProcessPool as error:
             raise IncompleteRunError(
                 "a worker process died (killed, or out of memory); finished tiles are kept: run again to "
-                "resume, with fewer --workers if memory was short"
+                "continue, with fewer --workers if out of memory"
             ) from error
         except Exception:
             raise
@@ -226,7 +226,7 @@ def make_executor(settings: ComputeSettings, notices: Notices | None = None) -> 
     """
     workers = available_workers() if settings.workers == "auto" else settings.workers
     if workers < 1:
-        raise ConfigError(f"compute.workers: {workers} workers cannot do anything; use 1 or more, or auto")
+        raise ConfigError(f"compute.workers: {workers}; give 1 or more, or auto")
     match settings.backend:
         case "serial":
             return SerialExecutor()

@@ -72,8 +72,8 @@ def keep_to_limit(limit: int | None) -> None:
         return
     if limit << 20 < LEAST_BYTES:
         raise ConfigError(
-            f"compute.max_memory (--max-memory): {limit} MiB are less than the {LEAST_BYTES >> 20} that "
-            "the program takes with its libraries; raise it"
+            f"compute.max_memory (--max-memory): {limit} MiB, but the program needs {LEAST_BYTES >> 20} MiB; "
+            "raise it"
         )
     keep_memory_tight()
 
@@ -96,8 +96,8 @@ def affordable(executor: Executor, limit: int, unit_bytes: int, what: str) -> Ex
     enough = (limit - here) // max(each, 1)
     if enough < 1:
         raise ConfigError(
-            f"{what} takes {-(-(here + each) >> 20)} MiB at least, compute.max_memory (--max-memory) allows "
-            f"{limit >> 20}: raise it, and run the same command to go on"
+            f"{what} needs at least {-(-(here + each) >> 20)} MiB, compute.max_memory (--max-memory) allows "
+            f"{limit >> 20}: raise it, and run the same command to continue"
         )
     if isinstance(executor, PoolExecutor) and enough < executor.workers:
         return PoolExecutor(enough, processes=not executor.shares_memory)

@@ -26,14 +26,14 @@ class ClusterSettings(Section):
 
     cls: str = Field(alias="class", description="distributed.LocalCluster, or one of dask_jobqueue")
     kwargs: dict[str, Any] = Field(default_factory=dict, description="arguments of the class: sizes, names")
-    scale: int = Field(default=1, ge=1, description="number of workers to ask for")
+    scale: int = Field(default=1, ge=1, description="number of workers to request")
 
     @field_validator("cls")
     @classmethod
     def _known_class(cls, value: str) -> str:
         if value not in _CLASSES:
             raise ValueError(
-                f"{value} is none of {', '.join(_CLASSES)}; start another cluster yourself, and give its "
+                f"{value} is not one of {', '.join(_CLASSES)}; start other clusters yourself, and give the "
                 "address as compute.scheduler"
             )
         return value
@@ -61,13 +61,14 @@ class ComputeSettings(Section):
         default="threads", description="serial | threads | processes | distributed"
     )
     workers: int | Literal["auto"] = Field(
-        default="auto", description="number of workers; auto: the processors that this process may use"
+        default="auto", description="number of workers; auto: the processors available to this process"
     )
     max_memory: int | None = Field(
         default=None,
         gt=0,
-        description="memory that a run may take on this machine, MiB, 300 or more; null: half of what is "
-        "free. Too little for the whole sensor at once: the camera files are read twice, by bands of rows",
+        description="memory limit of a run on this machine, MiB, at least 300; null: half of the free "
+        "memory. If it is too low for the whole sensor at once, the camera files are read twice, in bands of "
+        "rows",
     )
     scheduler: str | None = Field(
         default=None,
@@ -76,7 +77,7 @@ class ComputeSettings(Section):
     wait_for_workers: float = Field(
         default=300.0,
         gt=0,
-        description="distributed: seconds without a worker that can work after which the run gives up; "
-        "more where jobs wait in a queue",
+        description="distributed: seconds to wait for a worker before the run stops; more if jobs wait in a "
+        "queue",
     )
     cluster: ClusterSettings | None = Field(default=None, description="distributed: {class, kwargs, scale}")

@@ -149,7 +149,7 @@ def _own_config(path: Path) -> RunConfig:
 
 def _text(path: Path) -> str:
     if path.exists() and not path.is_file():
-        raise ConfigError(f"{path}: no regular file; write the settings to one")
+        raise ConfigError(f"{path}: not a regular file; write the settings to a file")
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -185,7 +185,7 @@ def yaml_content(text: str, name: str) -> dict[str, Any]:
     except RecursionError as error:
         raise ConfigError(f"{name}: not valid YAML: brackets within brackets too deep to read") from error
     if not isinstance(content, dict):
-        raise ConfigError(f"{name}: holds no settings; write a commented default with: pchem init")
+        raise ConfigError(f"{name}: no settings; write a commented default with: pchem init")
     if fault := _fault(content):
         raise ConfigError(f"{name}: {fault}")
     return content
@@ -200,13 +200,10 @@ def _fault(content: Any) -> str:
         if isinstance(value, (dict, list)):
             held += value.values() if isinstance(value, dict) else value
         elif isinstance(value, str) and re.search("[\0\ud800-\udfff]", value):
-            return f"holds a text that can be no name: {_shown(ascii(value))}; correct it"
+            return f"a text is no valid name: {_shown(ascii(value))}; correct it"
     if found <= _MOST_VALUES:
         return ""
-    return (
-        f"holds more than {_MOST_VALUES} values, or an alias (*) within what it stands for; write the "
-        "settings out"
-    )
+    return f"more than {_MOST_VALUES} values, or a recursive alias (*); write the settings out"
 
 
 def make_config(content: Mapping[str, Any], name: str, folder: Path | None = None) -> RunConfig:

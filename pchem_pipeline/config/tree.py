@@ -25,19 +25,19 @@ class RunSettings(Section):
     store: Place = Field(
         default="run.zarr",
         min_length=1,
-        description="the run's store (zarr): a folder, or a URL of an object storage: s3://bucket/run.zarr",
+        description="store of the run (zarr): a folder, or a URL of an object storage: s3://bucket/run.zarr",
     )
     title: str = Field(default="", description="title of the report; empty: the name of the store")
     tile: Literal["auto", 8, 16, 32, 64, 128, 256] = Field(
         default="auto",
-        description="side of a tile, pixels: the unit of work and of storage; auto: 64 x 64, "
-        "larger on sensors of more than 80 such tiles",
+        description="side of a tile (unit of work and storage), pixels; auto: 64, larger on sensors of more "
+        "than 80 such tiles",
     )
     allowed_failed_pixels: float = Field(
         default=0.1,
         ge=0,
         le=1,
-        description="fraction of pixels without a value above which the exit code is 3",
+        description="exit code 3 above this fraction of pixels without a value",
     )
 
 
@@ -50,22 +50,22 @@ class RunConfig(Section):
 
     run: RunSettings = Field(default_factory=RunSettings, description="the run as a whole")
     simulate: SimulateSettings | None = Field(
-        default=None, description="simulated camera; remove this section to use files of your own"
+        default=None, description="simulated camera; remove this section to use your own files"
     )
     input: InputSettings = Field(default_factory=InputSettings, description="camera files")
-    histogram: HistogramSettings = Field(default_factory=HistogramSettings, description="counting")
-    model: ModelSettings = Field(default_factory=ModelSettings, description="what is added to the PCD")
-    fit: FitSettings = Field(default_factory=FitSettings, description="PCH-EM")
+    histogram: HistogramSettings = Field(default_factory=HistogramSettings, description="histograms")
+    model: ModelSettings = Field(default_factory=ModelSettings, description="effects added to the PCD")
+    fit: FitSettings = Field(default_factory=FitSettings, description="fit of the pixels (PCH-EM)")
     maps: MapsSettings = Field(default_factory=MapsSettings, description="parameter maps")
     ensemble: EnsembleSettings = Field(default_factory=EnsembleSettings, description="ensemble distributions")
     discrepancy: DiscrepancySettings = Field(
-        default_factory=DiscrepancySettings, description="search for what the model is missing"
+        default_factory=DiscrepancySettings, description="search for effects missing from the model"
     )
     methods: MethodsSettings = Field(
-        default_factory=MethodsSettings, description="other methods beside PCH-EM (pchem methods)"
+        default_factory=MethodsSettings, description="comparison with other methods (pchem methods)"
     )
     report: ReportSettings = Field(default_factory=ReportSettings, description="report.html and figures")
-    compute: ComputeSettings = Field(default_factory=ComputeSettings, description="who does the work")
+    compute: ComputeSettings = Field(default_factory=ComputeSettings, description="backend, workers, memory")
 
     @field_validator(
         "run",
@@ -111,7 +111,5 @@ class RunConfig(Section):
     @model_validator(mode="after")
     def _has_input(self) -> RunConfig:
         if self.simulate is None and not (self.input.files or self.input.samples):
-            raise ValueError(
-                "input.files: there is nothing to read; name camera files, or add a section simulate"
-            )
+            raise ValueError("input.files: no input; give camera files, or add a section simulate")
         return self

@@ -165,15 +165,11 @@ def duration_of(name: str, value: Any, *units: Any, comment: str = "") -> Durati
     scales = {scale for text in stated for scale in _scales(text) or {None}} | _scales(comment)
     words = f"{name} = {seconds:g}" + (f" ({'; '.join(filter(None, [*stated, comment]))})" if scales else "")
     if not scales:
-        return Duration(seconds, f"{words}, no unit stated, taken as s")
+        return Duration(seconds, f"{words}, no unit stated, s assumed")
     scale = scales.pop() if len(scales) == 1 else None
     if scale is not None and not SHORTEST <= seconds * scale <= LONGEST:
         return None
-    return (
-        Duration(None, f"{words}, whose unit is in doubt")
-        if scale is None
-        else Duration(seconds * scale, words)
-    )
+    return Duration(None, f"{words}, unclear unit") if scale is None else Duration(seconds * scale, words)
 
 
 def _scales(text: str) -> set[float | None]:
@@ -254,8 +250,8 @@ def shared_facts(each: Iterable[CameraFacts]) -> tuple[CameraFacts, str]:
     )
     if whole and max(known) - min(known) > 1.0:
         return shared, (
-            f"the sensor's temperature went from {min(known):.4g} to {max(known):.4g} °C between the files: "
-            "offset, gain and dark current may have moved"
+            f"sensor temperature {min(known):.4g} to {max(known):.4g} °C in the files: offset, gain and dark "
+            "current may have changed"
         )
     return shared, ""
 

@@ -54,13 +54,13 @@ def first_look(frames: FrameSequence, settings: InputSettings) -> list[str]:
     unused = _unused_bits(values)
     if unused and settings.bit_shift is None and not frames.bit_shift:
         notes.append(
-            f"{name.name}: the lowest {unused} bits of the samples are 0: left-justified samples; set "
-            f"input.bit_shift: {unused} (--bit-shift {unused}), or DN count {1 << unused} times"
+            f"{name.name}: the lowest {unused} bits of the samples are 0 (left-justified samples); set "
+            f"input.bit_shift: {unused} (--bit-shift {unused}), else all DN are {1 << unused} times too large"
         )
     if frames.order_by_habit and not frames.unwritten and _is_time_last(values):
         notes.append(
-            f"{name.name}: read as {n} frames of {rows} x {columns} pixels, but by its samples the last axis "
-            "looks like time; if it is, save numpy.moveaxis(array, -1, 0)"
+            f"{name.name}: read as {n} frames of {rows} x {columns} pixels, but the last axis looks like "
+            "time; if so, save numpy.moveaxis(array, -1, 0)"
         )
     return notes
 
@@ -81,7 +81,7 @@ def _check_byte_order(values: NDArray[Any], where: str, order: str | None) -> No
     some = steps > 0
     if some.sum() < _FEWEST_STEPS or np.log2(steps[some] / swapped[some]).mean() < _OCTAVES:
         return
-    cure = "write the file again with its bytes swapped (numpy: byteswap)"
+    cure = "write the file again with swapped bytes (numpy: byteswap)"
     if order is not None:
         other = "little" if order == "big" else "big"
         cure = f"set input.byte_order: {other} (--byte-order {other})"

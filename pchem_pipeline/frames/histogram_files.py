@@ -80,7 +80,9 @@ def is_histogram_input(settings: InputSettings, base_dir: Path) -> bool:
         return False
     kinds = {path.suffix.lower() in (".csv", ".npz") for path in resolve_files(settings, base_dir)}
     if len(kinds) > 1:
-        raise InputError("input.files: camera files and ready-made histograms are mixed; read them apart")
+        raise InputError(
+            "input.files: camera files and ready-made histograms are mixed; make one run of each"
+        )
     return kinds == {True}
 
 
@@ -101,7 +103,7 @@ def read_histograms(settings: InputSettings, base_dir: Path) -> HistogramInput:
     for path in paths:
         try:
             if path in used:
-                raise InputError(f"{path}: is named twice in input.files")
+                raise InputError(f"{path}: is listed twice in input.files")
             channels += _read(path)
             used.append(path)
         except InputError as error:
@@ -109,7 +111,7 @@ def read_histograms(settings: InputSettings, base_dir: Path) -> HistogramInput:
     if problems and (settings.on_bad_file == "error" or not channels):
         cure = "" if len(paths) == 1 else "; repair or remove them, or set input.on_bad_file: skip"
         raise InputError("; ".join(problems) + cure)
-    left_out = [f"left out (input.on_bad_file: skip): {problem}" for problem in problems]
+    left_out = [f"skipped (input.on_bad_file: skip): {problem}" for problem in problems]
     return _assemble(channels, used, left_out)
 
 
@@ -117,7 +119,7 @@ def _assemble(channels: Sequence[_Channel], paths: Sequence[Path], notes: Sequen
     bins = max(channel.counts.size for channel in channels)
     if bins * len(channels) > _MOST_BINS_OF_ALL:
         raise InputError(
-            f"{paths[0]} and others: {len(channels)} channels of {bins} bins are too many; give fewer"
+            f"{paths[0]} and others: {len(channels)} channels of {bins} bins, too many; give fewer"
         )
     largest = max(int(channel.counts.max()) for channel in channels)
     counts = np.zeros((1, len(channels), bins), np.uint32 if largest < 1 << 32 else np.uint64)
@@ -132,7 +134,7 @@ def _read(path: Path) -> list[_Channel]:
     """Read the channels of one file."""
     suffix = path.suffix.lower()
     if suffix not in HISTOGRAM_SUFFIXES:
-        raise InputError(f"{path}: histograms are read from .csv, .txt, .npy and .npz files; convert it")
+        raise InputError(f"{path}: give histograms as .csv, .txt, .npy or .npz")
     try:
         if suffix in (".npy", ".npz"):
             dn, columns, names = _read_numpy(path)
@@ -153,7 +155,7 @@ def _read(path: Path) -> list[_Channel]:
         channels.append(_channel(path, name, dn, column))
         if max(each.counts.size for each in channels) * len(channels) > _MOST_BINS_OF_ALL:
             raise InputError(
-                f"{path}: its channels span more than {_MOST_BINS_OF_ALL} DN together; correct the DN "
+                f"{path}: its channels span more than {_MOST_BINS_OF_ALL} DN in total; correct the DN "
                 "column, or give fewer channels"
             )
     return channels
@@ -169,8 +171,8 @@ def _read_numpy(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]
             )
     except (ValueError, EOFError, KeyError) as error:
         raise InputError(
-            f"{path}: not a sound {path.suffix[1:]} file of plain numbers (pickles are never opened); "
-            "save it again"
+            f"{path}: not a valid {path.suffix[1:]} file of plain numbers (pickles are never opened); save "
+            "it again"
         ) from error
     except Exception as error:  # a damaged zip archive raises its own kind
         if isinstance(error, OSError | InputError):
@@ -178,7 +180,7 @@ def _read_numpy(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]
         raise InputError(f"{path}: damaged ({error}); copy it again") from error
     if dn.ndim != 1 or table.ndim != 2 or table.shape[1] != dn.size:
         raise InputError(
-            f"{path}: dn {dn.shape} and counts {table.shape} do not fit; counts is (channels, bins)"
+            f"{path}: shapes dn {dn.shape} and counts {table.shape} do not match; counts is (channels, bins)"
         )
     return dn, list(table), [str(i) for i in range(len(table))]
 
@@ -188,10 +190,10 @@ def _split_npz(path: Path, archive: Any) -> tuple[NDArray[Any], NDArray[Any]]:
     held = set(getattr(archive, "files", ()))
     if not {"dn", "counts"} <= held:
         listed = ", ".join(sorted(held)) or "nothing"
-        raise InputError(f"{path}: needs the arrays dn and counts, holds {listed}; save it with these names")
+        raise InputError(f"{path}: needs arrays dn and counts, has {listed}; save it with these names")
     unpacked = sum(part.file_size for part in archive.zip.infolist())
     if unpacked > max(_MOST_UNPACKED, 100 * path.stat().st_size):
-        raise InputError(f"{path}: {unpacked} bytes unpacked, which cannot be histograms; save it again")
+        raise InputError(f"{path}: {unpacked} bytes unpacked, too large for histograms; save it again")
     return archive["dn"], np.atleast_2d(archive["counts"])
 
 
@@ -216,7 +218,7 @@ def _read_text(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]
         raise InputError(f"{path}: not a text file; histograms as CSV have columns DN, count") from error
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
-        raise InputError(f"{path}: holds no histogram; leave it out")
+        raise InputError(f"{path}: no histogram; omit it")
     mark = next((sign for sign in (",", ";", "\t") if sign in lines[0]), " ")
     rows = [
         [cell.strip() for cell in row]
@@ -226,7 +228,7 @@ def _read_text(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]
     header = None if _is_number(rows[0][0]) else rows.pop(0)
     width = len(header or rows[0])
     if width < 2:
-        raise InputError(f"{path}: needs two columns or more, DN and count; write it so")
+        raise InputError(f"{path}: needs two or more columns, DN and count")
     table = np.empty((len(rows), width))
     for number, row in enumerate(rows, 1 + (header is not None)):
         if len(row) != width or not all(_is_number(cell) for cell in row):
@@ -256,27 +258,25 @@ def _channel(path: Path, name: str, dn: NDArray[Any], counts: NDArray[Any]) -> _
     axis = _integers(where, "DN", dn)
     values = _integers(where, "count", counts)
     if axis.size == 0:
-        raise InputError(f"{where}holds no bins; leave it out")
+        raise InputError(f"{where}no bins; omit it")
     if (values < 0).any():
         raise InputError(f"{where}negative counts (first at DN {axis[values < 0][0]}); counts are 0 or more")
     steps = np.diff(axis)
     if (steps == 0).any():
         raise InputError(f"{where}DN {axis[:-1][steps == 0][0]} occurs twice; add up its counts")
     if (steps < 0).any():
-        raise InputError(f"{where}the DN are not in rising order (at DN {axis[1:][steps < 0][0]}); sort them")
+        raise InputError(f"{where}DN not in increasing order (at DN {axis[1:][steps < 0][0]}); sort them")
     if not values.any():
-        raise InputError(f"{where}all counts are zero; leave it out")
+        raise InputError(f"{where}all counts are zero; omit it")
     filled = np.flatnonzero(values)
     first, last = filled[0], filled[-1]
     low, high = int(axis[first]), int(axis[last])
     if high - low >= _MOST_BINS or not -(2**31) <= low <= high < 2**31:
-        raise InputError(f"{where}DN from {low} to {high} span more than any ADC; correct the DN column")
+        raise InputError(f"{where}DN from {low} to {high}, more than any ADC; correct the DN column")
     full = np.zeros(high - low + 1, np.int64)
     full[axis[first : last + 1] - low] = values[first : last + 1]
     missing = full.size - (last - first + 1)
-    notes = (
-        [f"{path.name}: {missing} DN that are not listed between {low} and {high} count 0"] if missing else []
-    )
+    notes = [f"{path.name}: {missing} unlisted DN between {low} and {high} are taken as 0"] if missing else []
     return _Channel(name, low, full, notes)
 
 
@@ -287,14 +287,14 @@ def _integers(where: str, what: str, values: NDArray[Any]) -> NDArray[np.int64]:
         raise InputError(f"{where}{what} column of type {array.dtype}; numbers are needed")
     if array.dtype.kind == "f":
         if not np.isfinite(array).all():
-            raise InputError(f"{where}{what} column holds NaN or infinity; correct it")
+            raise InputError(f"{where}{what} column has NaN or infinity; correct it")
         broken = array != np.rint(array)
         if broken.any():
             raise InputError(
                 f"{where}{what} {array[broken][0]} is not a whole number; give raw DN and raw counts"
             )
         if (np.abs(array) >= 2.0**53).any():
-            raise InputError(f"{where}{what} column holds numbers too large to be exact; correct it")
+            raise InputError(f"{where}{what} column has numbers too large to be exact; correct it")
     elif array.size and int(array.max()) > np.iinfo(np.int64).max:
-        raise InputError(f"{where}{what} column holds numbers above 2**63; correct it")
+        raise InputError(f"{where}{what} column has numbers above 2**63; correct it")
     return array.astype(np.int64)

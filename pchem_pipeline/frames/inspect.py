@@ -68,7 +68,7 @@ class InputReport:
             listed = "; ".join(f"{file.path}: {file.problem}" for file in bad)
             lines.append((several if len(self.files) > 1 else "") + listed)
             if self.skipped:
-                lines.append("they were left out (input.on_bad_file: skip)")
+                lines.append("skipped (input.on_bad_file: skip)")
         return "; ".join(lines + self.notes)
 
     def raise_if_refused(self, on_bad_file: Literal["error", "skip"]) -> None:
@@ -113,7 +113,7 @@ def _open(entry: FileReport, settings: InputSettings) -> FrameReader | None:
         return None
     entry.shape, entry.dtype = reader.shape, str(reader.dtype)
     if reader.shape[0] == 0 or 0 in reader.shape:
-        entry.problem = "holds no frames; leave it out"
+        entry.problem = "has no frames; omit it"
         return None
     return reader
 
@@ -123,7 +123,7 @@ def _mark_repeated_paths(files: list[FileReport]) -> None:
     for entry in files:
         real = entry.path.resolve()
         if real in seen:
-            entry.problem = entry.problem or "is named twice in input.files"
+            entry.problem = entry.problem or "is listed twice in input.files"
         seen.add(real)
 
 
@@ -136,7 +136,7 @@ def _mark_odd(opened: list[tuple[FileReport, FrameReader]]) -> None:
     for entry, reader in opened:
         kind = (reader.shape[1:], str(reader.dtype))
         if kind != common and not entry.problem:
-            entry.problem = f"has {_words(kind)} frames, where the others have {_words(common)}"
+            entry.problem = f"has {_words(kind)} frames, the others {_words(common)}"
 
 
 def _words(kind: tuple[tuple[int, ...], str]) -> str:

@@ -69,7 +69,7 @@ def _excluded(frames: FrameSequence, settings: InputSettings, base_dir: Path) ->
         mask = mask[y0:y1, x0:x1]
     if mask.shape != excluded.shape:
         raise InputError(
-            f"{path}: mask of shape {mask.shape}, frames of {excluded.shape}; correct input.mask (--mask)"
+            f"{path}: mask of shape {mask.shape}, but frames of {excluded.shape}; correct input.mask (--mask)"
         )
     excluded |= mask
     return excluded

@@ -138,7 +138,7 @@ def check_window(
     n, ny, nx = reader.shape
     y1 = ny if y1 is None else y1
     if not (0 <= t0 <= t1 <= n and 0 <= y0 <= y1 <= ny):
-        raise ValueError(f"window frames {t0}..{t1}, rows {y0}..{y1} is outside of the stack {reader.shape}")
+        raise ValueError(f"window frames {t0}..{t1}, rows {y0}..{y1} is outside the stack {reader.shape}")
     if (
         buffer.shape != (t1 - t0, y1 - y0, nx)
         or buffer.dtype != reader.dtype
@@ -173,11 +173,9 @@ def unwritten_notes(path: Path, missing: int, wanted: int, what: str = "chunks")
         InputError: none was written.
     """
     if missing >= wanted > 0:
-        raise InputError(
-            f"{path}: none of its {wanted} {what} was ever written; copy it again or leave it out"
-        )
+        raise InputError(f"{path}: none of its {wanted} {what} was written; copy it again or omit it")
     were = "was" if missing == 1 else "were"
-    words = f"{path.name}: {missing} of {wanted} {what} {were} never written and read as the fill value"
+    words = f"{path.name}: {missing} of {wanted} {what} {were} not written; read as the fill value"
     return (words,) if missing > 0 else ()
 
 
@@ -199,7 +197,7 @@ def sound(path: Path, what: str) -> Iterator[None]:
             and error.errno in (errno.ENOENT, errno.EACCES, errno.EPERM)
         ):
             raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-        raise InputError(f"{path}: not a sound {what}, or truncated ({error}); copy it again") from error
+        raise InputError(f"{path}: not a valid {what}, or truncated ({error}); copy it again") from error
 
 
 def changed(path: Path, what: str) -> InputError:

@@ -75,7 +75,7 @@ def reader_class(name: str) -> type[FrameReader]:
     plugins = _plugins()
     if name not in plugins:
         known = ", ".join([*_OURS, *plugins, "histogram"])
-        raise ConfigError(f"input.format {name!r} is not known; choose one of: auto, {known}")
+        raise ConfigError(f"unknown input.format {name!r}; choose one of: auto, {known}")
     return _load(plugins[name])
 
 
@@ -119,7 +119,7 @@ def detect_format(path: Path) -> str:
             f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
         ) from error
     if not head and not path.is_dir():
-        raise InputError(f"{path}: the file is empty; copy it again or leave it out")
+        raise InputError(f"{path}: the file is empty; copy it again or omit it")
     names = reader_names()
     for name in names:
         if reader_class(name).recognises(path, head):
@@ -129,8 +129,8 @@ def detect_format(path: Path) -> str:
         check_unpacked(path, head)
     if by_suffix is None:
         raise InputError(
-            f"{path}: not a known camera format ({', '.join(names)}); name it in input.format "
-            "(raw needs input.shape and input.dtype, or a sidecar file)"
+            f"{path}: unknown camera format (known: {', '.join(names)}); set input.format (raw needs "
+            "input.shape and input.dtype, or a sidecar file)"
         )
     return by_suffix
 
@@ -143,7 +143,7 @@ def check_unpacked(path: Path, head: bytes) -> None:
     """
     for magic, program in _PACKED.items():
         if head.startswith(magic):
-            raise InputError(f"{path}: packed by {program}; unpack it first")
+            raise InputError(f"{path}: compressed with {program}; unpack it first")
 
 
 def _head(path: Path) -> bytes:

@@ -46,7 +46,7 @@ def fetch(url: str) -> list[Path]:
         storage, path = fsspec.url_to_fs(url)
     except (ImportError, ValueError) as error:
         raise MissingDependencyError(
-            f"{url}: reading from there needs another library ({error}); install it: {install_hint('s3')}"
+            f"{url}: this address needs another package ({error}); install it: {install_hint('s3')}"
         ) from error
     try:
         storage.invalidate_cache()

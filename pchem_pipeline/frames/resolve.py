@@ -38,7 +38,7 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
             formats.
     """
     if not settings.files:
-        raise ConfigError("input.files is empty; name camera files, a glob such as frames/*.tif, or a folder")
+        raise ConfigError("input.files is empty; give camera files, a glob such as frames/*.tif, or a folder")
     found: list[Path] = []
     for entry in settings.files:
         if is_remote(entry):
@@ -58,9 +58,9 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
             raise InputError(f"{path}: no such file or folder; correct the path (input.files)")
     for path in found:
         if not (path.is_file() or path.is_dir()):
-            raise InputError(f"{path}: no regular file; write what comes from there to a file first")
+            raise InputError(f"{path}: not a regular file; write its content to a file first")
         if not str(path).isascii() and str(path) != os.fsencode(path).decode("utf-8", "replace"):
-            raise InputError(f"{path}: its name is not in UTF-8; rename it")
+            raise InputError(f"{path}: its name is not UTF-8; rename it")
     return sorted(found, key=natural_key)
 
 
@@ -117,13 +117,13 @@ def _folder(folder: Path, settings: InputSettings) -> list[Path]:
     if not files:
         kinds = ", ".join(sorted(suffixes))
         raise InputError(
-            f"{folder}: the folder holds no camera files ({kinds}); correct the path (input.files), or set "
+            f"{folder}: the folder has no camera files ({kinds}); correct the path (input.files), or set "
             "input.format"
         )
     formats = sorted({suffixes.get(path.suffix.lower(), "zarr") for path in files})
     if len(formats) > 1:
         raise InputError(
-            f"{folder}: the folder holds files of several formats ({', '.join(formats)}); "
-            "set input.format, or name the files by a glob"
+            f"{folder}: the folder has files of several formats ({', '.join(formats)}); set input.format, or "
+            "select the files by a glob"
         )
     return files

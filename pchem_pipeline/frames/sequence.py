@@ -53,9 +53,9 @@ class FrameSequence(FrameReader):
         if total < least:
             shape = f" of {readers[0].shape[1]} x {readers[0].shape[2]} pixels" if readers else ""
             raise InputError(
-                f"{_where(self.paths)}: {total} frame{'s' * (total != 1)}{shape} in all; at least {least} "
-                "needed, and some thousands for useful estimates; add frames to input.files (a stack has the "
-                "axes frame, row, column)"
+                f"{_where(self.paths)}: {total} frame{'s' * (total != 1)}{shape} in total; at least {least} "
+                "needed, some thousands for useful estimates; add frames to input.files (axes of a stack: "
+                "frame, row, column)"
             )
         self._first, end = _frame_range(settings, total, least)
         rows, columns = readers[0].shape[1:]
@@ -75,7 +75,7 @@ class FrameSequence(FrameReader):
         size = 8 * self.dtype.itemsize
         if self.bit_shift >= size:
             raise InputError(
-                f"{_where(self.paths)}: input.bit_shift {self.bit_shift} leaves nothing of {self.dtype} "
+                f"{_where(self.paths)}: input.bit_shift {self.bit_shift} removes all bits of {self.dtype} "
                 "samples; correct it"
             )
         depth = settings.bit_depth
@@ -84,8 +84,7 @@ class FrameSequence(FrameReader):
         self.bit_depth = depth
         if depth is not None and depth > size - self.bit_shift:
             raise InputError(
-                f"{_where(self.paths)}: a bit depth of {depth} does not fit into {self.dtype} samples "
-                "shifted by "
+                f"{_where(self.paths)}: a bit depth of {depth} does not fit {self.dtype} samples shifted by "
                 f"{self.bit_shift}; correct input.bit_depth or input.bit_shift"
             )
         times = {reader.integration_time for reader in readers}
@@ -202,19 +201,17 @@ class FrameSequence(FrameReader):
         name = reader.paths[0]
         if used & ((1 << self.bit_shift) - 1):
             raise InputError(
-                f"{name}: the lowest {self.bit_shift} bits are not all zero, so the samples are not "
-                "left-justified "
-                f"by that many; correct input.bit_shift"
+                f"{name}: the lowest {self.bit_shift} bits are not all zero; correct input.bit_shift"
             )
         if self.bit_shift:
             np.right_shift(part, self.bit_shift, out=part)
         if used >> self.bit_shift >> depth:
-            text = f"{name}: values need more than the bit depth of {depth}"
+            text = f"{name}: values exceed the bit depth of {depth}"
             unused = (used & -used).bit_length() - 1
             if self.bit_shift < unused and not used >> unused >> depth:
                 raise InputError(
-                    f"{text}, and their lowest {unused} bits are all zero: left-justified samples, it seems; "
-                    f"set input.bit_shift: {unused} (--bit-shift)"
+                    f"{text}, and their lowest {unused} bits are all zero (left-justified samples?); set "
+                    f"input.bit_shift: {unused} (--bit-shift)"
                 )
             raise InputError(f"{text}; correct input.bit_depth, input.bit_shift or input.byte_order")
 
@@ -229,7 +226,7 @@ def _time_words(first: FrameReader, taken: float | None) -> str:
     if not first.time_words:
         return ""
     if taken is None:
-        words = "integration time unknown; give it by --integration-time SECONDS"
+        words = "unknown integration time; give --integration-time SECONDS"
     else:
         words = f"integration time {taken:g} s"
     return f"{words}: {first.paths[0].name} states {first.time_words}"
@@ -251,7 +248,7 @@ def _check_same_camera(readers: Sequence[FrameReader]) -> None:
     if len(distinct) < 2 or 2 < len(readers) == len(distinct):
         return
     shown = ", ".join(f"serial number {value} in {file}" for file, value in _first_of_each(serials))
-    raise InputError(f"the files are of different cameras: {shown}; read them apart")
+    raise InputError(f"the files are from different cameras: {shown}; make one run of each")
 
 
 def _agreed(readers: Sequence[FrameReader], name: str) -> Any:
@@ -260,7 +257,9 @@ def _agreed(readers: Sequence[FrameReader], name: str) -> Any:
     distinct = set(values.values())
     if len(distinct) > 1 and None not in distinct:
         shown = ", ".join(f"{value} in {file}" for file, value in _first_of_each(values))
-        raise InputError(f"the files state different {name}: {shown}; set input.{name}, or read them apart")
+        raise InputError(
+            f"the files state different {name}: {shown}; set input.{name}, or make one run of each"
+        )
     return distinct.pop() if len(distinct) == 1 else None
 
 
@@ -276,7 +275,7 @@ def _frame_range(settings: InputSettings, total: int, least: int) -> tuple[int, 
     end = total if end is None else end
     if end > total or end - first < least:
         raise InputError(
-            f"input.frame_range [{first}, {end}] does not hold at least {least} of the {total} frames; "
+            f"input.frame_range [{first}, {end}] does not select at least {least} of the {total} frames; "
             "correct it (--frames)"
         )
     return first, end
@@ -288,7 +287,7 @@ def _region(settings: InputSettings, rows: int, columns: int) -> tuple[int, int,
     y0, y1, x0, x1 = settings.roi
     if y1 > rows or x1 > columns:
         raise InputError(
-            f"input.roi {list(settings.roi)} reaches beyond the frames of {rows} rows and {columns} columns "
-            f"(--roi {y0}:{y1},{x0}:{x1}; all of them: 0:{rows},0:{columns}); correct it"
+            f"input.roi {list(settings.roi)} exceeds the frames of {rows} rows and {columns} columns (--roi "
+            f"{y0}:{y1},{x0}:{x1}; all pixels: 0:{rows},0:{columns}); correct it"
         )
     return y0, y1, x0, x1

@@ -14,14 +14,12 @@ class SampleSettings(Section):
     """One exposure of several that are fitted together: an ordinary run of the same pixels."""
 
     run: str = Field(min_length=1, description="config.yaml or store of the run, relative to this file")
-    bias: bool = Field(
-        default=False, description="frames without any electrons, H = 0; they pin the bias and the read noise"
-    )
+    bias: bool = Field(default=False, description="bias frames (H = 0): fix bias and read noise")
     integration_time: float | None = Field(
         default=None,
         ge=0,
         le=LONGEST,
-        description="s; null: what the run says. 0 is allowed: no time to integrate",
+        description="s; 0 is allowed; null: as in the run",
     )
     light_level: float | None = Field(
         default=None, ge=0, description="exposure in any unit, for input.against: light_level"
@@ -52,24 +50,23 @@ class InputSettings(Section):
         default=(),
         max_length=64,
         description="instead of files: several exposures in increasing order, each a run of the same pixels, "
-        "fitted together with one g, mu and sigma for each pixel; entries: run, bias, integration_time, "
-        "light_level",
+        "fitted jointly (one g, mu and sigma per pixel); entries: run, bias, integration_time, light_level",
     )
     against: Literal["integration_time", "light_level", "none"] = Field(
         default="integration_time",
-        description="samples: what their exposures are drawn against. integration_time: the slope of H is "
-        "the charge rate (in the dark the dark current) and its offset the spurious charge. none: no line",
+        description="samples: axis of the exposures. integration_time: the slope of H is the charge rate (in "
+        "the dark the dark current), the offset the spurious charge. none: no line",
     )
     shown_sample: int | None = Field(
         default=None,
         ge=0,
-        description="samples: whose histograms, H and ensemble are shown, counted from 0; null: the last "
-        "that holds electrons",
+        description="samples: the one whose histograms, H and ensemble are shown, counted from 0; null: the "
+        "last with electrons",
     )
     kind: Literal["dark", "light", "unknown"] = Field(
         default="unknown",
-        description="what made the charge: dark (nothing but the sensor: H over time is its dark current), "
-        "light, or unknown; of the last two H over time is called charge rate",
+        description="source of the charge: dark (H / time is the dark current), light or unknown (H / time "
+        "is a charge rate)",
     )
     format: str = Field(
         default="auto",
@@ -78,8 +75,8 @@ class InputSettings(Section):
     )
     mode: Literal["copy", "reference"] = Field(
         default="copy",
-        description="copy: frames go into the store; reference: nothing is copied, the camera files must "
-        "stay",
+        description="copy: copy the frames into the store; reference: read them from the camera files, which "
+        "must stay in place",
     )
     shape: tuple[int, ...] | None = Field(
         default=None,
@@ -87,20 +84,20 @@ class InputSettings(Section):
     )
     dtype: Literal["uint8", "uint16", "uint32"] | None = Field(
         default=None,
-        description="raw: type of a sample; other formats: reads signed samples of that size as unsigned, "
-        "negative values being refused; null: from the file or its sidecar",
+        description="raw: sample type; other formats: unsigned type for signed samples without negative "
+        "values; null: from the file or its sidecar",
     )
     offset: int | None = Field(
         default=None,
         ge=0,
         le=1 << 31,
-        description="DN to be added to signed samples: 32768 where 16 bits are stored as -32768 to 32767; "
-        "null: from the file (FITS: BZERO), else none",
+        description="DN to add to signed samples, such as 32768 for 16 bits stored as -32768 to 32767; null: "
+        "from the file (FITS: BZERO), else 0",
     )
     byte_order: Literal["little", "big"] | None = Field(
         default=None,
-        description="raw and SER: order of the bytes of a sample; null: from the file, else little, "
-        "and refused where the samples look otherwise",
+        description="raw and SER: byte order; null: from the file, else little (an error if the samples look "
+        "byte-swapped)",
     )
     header_bytes: int | None = Field(
         default=None,
@@ -113,46 +110,46 @@ class InputSettings(Section):
     dataset: str | None = Field(
         default=None,
         description="HDF5 and zarr: path of the array inside the file; FITS: number or name of the image; "
-        "null: the only 3-D array, or image, there",
+        "null: the only 3-D array or image",
     )
     bit_shift: int | None = Field(
         default=None,
         ge=0,
         le=31,
-        description="bits to shift right, for left-justified data (12 bits in 16: 4); the bits dropped must "
-        "be zero; null: from the sidecar, else 0",
+        description="bits to shift right, for left-justified samples (12 bits in 16: 4); the dropped bits "
+        "must be zero; null: from the sidecar, else 0",
     )
     bit_depth: int | None = Field(
         default=None,
         ge=1,
         le=32,
-        description="bits of the ADC, after bit_shift; null: from the file, else unknown (then "
-        "saturation at the "
-        "top of the range cannot be told from a clipped histogram)",
+        description="bits of the ADC, after bit_shift; null: from the file, else unknown (saturation cannot "
+        "be detected then)",
     )
     mask: Place | None = Field(
         default=None,
-        description="image file (npy, TIFF, FITS) of the shape of the frames or of roi, relative to this "
-        "YAML file: pixels other than 0 are excluded, and so are those that always hold the marker 2^32-1",
+        description="image file (npy, TIFF, FITS) with the shape of the frames or of roi, relative to this "
+        "YAML file: pixels other than 0 are excluded; pixels that always have the marker 2^32-1 are "
+        "excluded, too",
     )
     roi: tuple[int, int, int, int] | None = Field(
         default=None, description="region of interest [y0, y1, x0, x1] in pixels, ends excluded; null: all"
     )
     frame_range: tuple[int, int | None] | None = Field(
         default=None,
-        description="[first, end] frame over all files together, end excluded, null end: to the last; "
-        "null: all",
+        description="range of frames [first, end] over all files, end excluded, null end: to the last; null: "
+        "all",
     )
     integration_time: float | None = Field(
         default=None,
         gt=0,
         le=LONGEST,
-        description="integration time of a frame, s; null: from the file, else unknown (no charge rate then)",
+        description="integration time per frame, s; null: from the file, else unknown (no charge rate)",
     )
     on_bad_file: Literal["error", "skip"] = Field(
         default="error",
-        description="unreadable, truncated, duplicate or odd-shaped files: error stops and lists them all; "
-        "skip leaves them out and reports them",
+        description="unreadable, truncated, duplicate or odd-shaped files: error: stop and list them; skip: "
+        "ignore and report them",
     )
 
     @model_validator(mode="after")
@@ -160,12 +157,12 @@ class InputSettings(Section):
         if not self.samples:
             return self
         if self.files:
-            raise ValueError("files and samples: give one of them; samples are runs of their own")
+            raise ValueError("files and samples: give only one of them")
         if all(sample.bias for sample in self.samples):
-            raise ValueError("samples: every sample is a bias; list at least one that holds electrons")
+            raise ValueError("samples: every sample is a bias; list at least one with electrons")
         shown = self.shown_sample
         if shown is not None and (shown >= len(self.samples) or self.samples[shown].bias):
-            raise ValueError(f"shown_sample: {shown} is no sample that holds electrons; choose another")
+            raise ValueError(f"shown_sample: {shown} is not a sample with electrons; choose another")
         return self
 
     @model_validator(mode="after")

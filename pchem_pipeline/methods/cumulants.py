@@ -29,7 +29,7 @@ class Cumulants(Method):
     title = "cumulants"
     source = "cumulants of Poisson-Gaussian noise, as in Baehler et al. 2022, arXiv 2210.04866"
     needs = "one sample"
-    remark = "for exposures below about 1 e-; far above, the fourth cumulant is lost in its own scatter"
+    remark = "for exposures below about 1 e-; far above, the fourth cumulant is too noisy"
     order = 40
 
     def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
@@ -45,6 +45,6 @@ class Cumulants(Method):
             out[:, 3] = np.sqrt(np.where(variance > 0, variance, np.nan))
         reasons = {
             "third or fourth cumulant not positive": ~answered,
-            "no variance left for the read noise": answered & ~(variance > 0),
+            "negative variance of the read noise": answered & ~(variance > 0),
         }
         return Estimates.where(out, reasons)

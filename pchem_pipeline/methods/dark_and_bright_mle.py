@@ -29,7 +29,7 @@ class DarkAndBrightMle(Method):
     title = "MLE with a dark sample"
     source = "after Nakamoto and Hotaka 2022, Opt. Express 30, 37493"
     needs = "a dark and a bright sample"
-    remark = "electrons in the dark sample shift everything: it must be free of them"
+    remark = "biased by electrons in the dark sample"
     order = 20
 
     def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
@@ -49,4 +49,4 @@ class DarkAndBrightMle(Method):
         with np.errstate(invalid="ignore"):
             best[:, 0] = best[:, 1] * (pixels.samples[0].moments().mean - best[:, 2])
         bad = ~np.isfinite(best[:, 1])
-        return Estimates.where(best, {"no electrons seen above the dark sample": bad})
+        return Estimates.where(best, {"no electrons above the dark sample": bad})

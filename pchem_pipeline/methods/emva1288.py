@@ -31,7 +31,7 @@ class Emva1288(Method):
     title = "EMVA 1288 (sensor-wide K)"
     source = "EMVA Standard 1288, release 4.0 Linear"
     needs = "a dark and a bright sample"
-    remark = "one gain for all pixels: what differs between them is lost"
+    remark = "one gain for all pixels"
     order = 32
     sensor_wide = True
 
@@ -52,7 +52,7 @@ class Emva1288(Method):
         out = no_estimates(pixels.n_pixels)
         steepness = float((signal * noise)[linear].sum())
         if steepness <= 0:
-            return Estimates(out, {"variance does not rise with the mean": pixels.n_pixels})
+            return Estimates(out, {"variance does not increase with the mean": pixels.n_pixels})
         gain = float((signal**2)[linear].sum()) / steepness
         out[:] = (gain * signal[0], gain, np.nan, np.sqrt(variance[dark]))
         out[:, 2] = found[dark].mean

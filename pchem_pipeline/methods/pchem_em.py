@@ -15,9 +15,9 @@ class PchEm(Method):
 
     name = "pchem_em"
     title = "PCH-EM (this package)"
-    source = "Hendrickson et al. 2023, with several starts and a Newton finish"
+    source = "Hendrickson et al. 2023, with several starts and Newton's method"
     needs = "one sample"
-    remark = "above about 0.5 e- of read noise one sample tells little"
+    remark = "above about 0.5 e- read noise one sample does not suffice"
     order = 10
 
     def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:

@@ -21,7 +21,7 @@ class JointPchEm(Method):
     title = "PCH-EM, all samples jointly"
     source = "Hendrickson et al. 2024, arXiv 2403.04498"
     needs = "a dark and a bright sample"
-    remark = "the darkest sample is taken for bias frames"
+    remark = "uses the darkest sample as bias frames"
     order = 12
 
     def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:

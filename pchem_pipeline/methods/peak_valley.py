@@ -39,7 +39,7 @@ class PeakValley(Method):
     title = "PCH peaks and valleys (VPM)"
     source = "Starkey and Fossum 2016, IEEE J. Electron Devices Soc. 4, 129"
     needs = "one sample"
-    remark = "peaks must be resolved (below about 0.3 e-), and the lowest must be that of no electron"
+    remark = "needs resolved peaks (read noise below about 0.3 e-), the lowest at zero electrons"
     order = 41
 
     def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:

@@ -27,7 +27,7 @@ class TwoSamplePhotonTransfer(Method):
     title = "photon transfer, two samples"
     source = "Hendrickson, Haefner and Preece 2022, J. Opt. Soc. Am. A 39, 2169"
     needs = "a dark and a bright sample"
-    remark = "bias and read noise are those of the dark sample, electrons in it included"
+    remark = "bias and read noise from the dark sample, including its electrons"
     order = 30
 
     def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
@@ -42,7 +42,9 @@ class TwoSamplePhotonTransfer(Method):
         out[good, 0] = out[good, 1] * (first.mean - dark.mean)[good]
         out[good, 2] = dark.mean[good]
         out[good, 3] = np.sqrt(dark.variance[good])
-        return Estimates.where(out, {"bright sample not above the dark one in mean and variance": ~good})
+        return Estimates.where(
+            out, {"mean or variance of the bright sample not above the dark sample": ~good}
+        )
 
 
 def gain_variance(

@@ -29,7 +29,7 @@ class PhotonTransferSeries(Method):
     title = "photon transfer, series"
     source = "Janesick 2007, Photon Transfer; Beecken and Fossum 1996, Appl. Opt. 35, 3471"
     needs = "a series of samples"
-    remark = "bias is the mean of the darkest sample, electrons in it included"
+    remark = "bias from the mean of the darkest sample, including its electrons"
     order = 31
 
     def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
@@ -54,7 +54,7 @@ class PhotonTransferSeries(Method):
         good = rising & positive
         out[good, 3] = np.sqrt(offset[good])
         bad = {
-            "variance does not rise with the mean": ~rising,
+            "variance does not increase with the mean": ~rising,
             "the line gives no read noise": rising & ~positive,
         }
         return Estimates.where(out, bad)

@@ -33,7 +33,7 @@ class PlainEm(Method):
     title = "PCH-EM, plain EM of the paper"
     source = "Hendrickson et al. 2023, eqs. (update_eqns) to (gamma_nk)"
     needs = "one sample"
-    remark = "above about 0.4 e- it stops before it has converged"
+    remark = "does not converge above about 0.4 e- read noise"
     order = 11
 
     def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:

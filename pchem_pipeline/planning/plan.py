@@ -156,11 +156,8 @@ def _refuse(need: Need, point: Point, max_frames: float, best: float, best_frame
             several = best_samples([target, _SEEN], point, max(point.quanta_exposure, 1.0))
             if several.frames <= max_frames:
                 cure = f"; several samples (--samples best) need {several.frames:,.0f}"
-        asked = (
-            f"the bound asks for {need.frames:,.3g}"
-            if np.isfinite(need.frames)
-            else "they tell nothing of it"
-        )
+        # a larger number is as good as none
+        asked = f"{float(f'{need.frames:.2g}'):,.0f} frames" if need.frames < 1e12 else "no number suffices"
         raise ConfigError(
             _hopeless(target, point, f"at an exposure of {point.quanta_exposure:.3g} e-", f" ({asked}){cure}")
         )
@@ -168,8 +165,8 @@ def _refuse(need: Need, point: Point, max_frames: float, best: float, best_frame
 
 def _hopeless(target: Target, point: Point, where: str, more: str) -> str:
     return (
-        f"{target}: no number of frames of one sample within --max-frames reaches it {where} "
-        f"and a read noise of {point.read_noise_e:g} e-{more}"
+        f"{target}: not reached with one sample within --max-frames, {where} and a read noise of "
+        f"{point.read_noise_e:g} e-{more}"
     )
 
 
@@ -239,8 +236,8 @@ def plan_samples(
     if frames > max_frames:
         lights = ", ".join(f"{h:g}" for h in split.exposures)
         raise ConfigError(
-            f"{targets[0]}: no number of frames within --max-frames reaches it with samples of {lights} e- "
-            f"and a read noise of {point.read_noise_e:g} e-; give other exposures, one of them with electrons"
+            f"{targets[0]}: not reached within --max-frames with exposures of {lights} e- and a read noise "
+            f"of {point.read_noise_e:g} e-; give other exposures, at least one above 0"
         )
     total = float(budget) if budget is not None else frames
     even = split_frames(aims, split.exposures, [1.0 / len(split.shares)] * len(split.shares), point)

@@ -38,13 +38,12 @@ class Point:
         }
         for option, (value, low, high, unit) in ranges.items():
             if not low <= value <= high:
-                raise ConfigError(f"{option} {value:g}: give a number of {low:g} to {high:g} {unit}")
+                raise ConfigError(f"{option} {value:g}: give a number from {low:g} to {high:g} {unit}")
         rounding = self.conversion_gain * np.sqrt(QUANTISATION_VARIANCE)
         if self.read_noise_e < rounding:
             raise ConfigError(
-                f"--read-noise {self.read_noise_e:g}: below that of rounding to whole DN, "
-                f"{rounding:.3g} e- at {self.conversion_gain:g} e-/DN; "
-                "it includes the rounding"
+                f"--read-noise {self.read_noise_e:g}: below the rounding noise of {rounding:.3g} e- at "
+                f"{self.conversion_gain:g} e-/DN, which the read noise includes"
             )
 
     @property

@@ -104,13 +104,13 @@ def _check(targets: Sequence[Target], exposures: Sequence[float]) -> None:
     single = [target.name for target in targets if not target.shared]
     if single:
         raise ConfigError(
-            f"--target {single[0]}: several samples are planned for what they share: conversion_gain, bias, "
-            "read_noise_dn, read_noise_e"
+            f"--target {single[0]}: with several samples choose from the shared parameters conversion_gain, "
+            "bias, read_noise_dn, read_noise_e"
         )
     if len(set(exposures)) < len(exposures):
-        raise ConfigError("--samples: one exposure is given twice; give each sample once")
+        raise ConfigError("--samples: an exposure is given twice; give each once")
     if min(exposures) < 0 or not np.isfinite(exposures).all():
-        raise ConfigError("--samples: give numbers of e- from 0 (bias frames) on, such as 0,2,8")
+        raise ConfigError("--samples: give exposures in e-, 0 for bias frames, such as 0,2,8")
 
 
 def _informations(exposures: Sequence[float], point: Point) -> FloatArray:

@@ -88,7 +88,7 @@ def parse_target(text: str) -> Target:
     if name not in TARGET_NAMES:
         close = difflib.get_close_matches(name, TARGET_NAMES, 1)
         hint = f"; did you mean {close[0]}?" if close else f"; choose from {', '.join(TARGET_NAMES)}"
-        raise ConfigError(f"--target {text}: {name or 'nothing'} is no parameter{hint}")
+        raise ConfigError(f"--target {text}: {name or 'nothing'} is not a parameter{hint}")
     units = TARGET_NAMES[name]
     example = f"{name}={_EXAMPLE[units[0]]}"
     match = re.fullmatch(r"\s*([0-9.+\-]+(?:[eE][+\-]?[0-9]+)?)\s*(%|e-/DN|e-|DN)\s*", rest)
@@ -99,7 +99,5 @@ def parse_target(text: str) -> Target:
     if match is None or not math.isfinite(value) or match[2] not in units:
         raise ConfigError(f"--target {text}: give a number in {' or '.join(units)}, such as {example}")
     if value <= 0:
-        raise ConfigError(
-            f"--target {text}: no number of frames reaches it; give a number above 0, such as {example}"
-        )
+        raise ConfigError(f"--target {text}: give a number above 0, such as {example}")
     return Target(name, value, match[2])

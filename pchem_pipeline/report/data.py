@@ -164,7 +164,7 @@ class ReportData:
         status_words: bit of ``fit_status`` to its short sentence, gravest first.
         failed_mask: bits of ``fit_status`` for which the parameters are NaN.
         flagged_mask: bits for which the value of a pixel is open, whatever its standard error says.
-        criteria: what the sensor must meet to be called all right.
+        criteria: limits of the sensor.
         pixels: the shown pixels.
         ensemble: arrays of group ``ensemble``.
         ensemble_facts: numbers that go with them: ``rmse`` (mapping), ``n_frames``, ``error_rate``, ...

@@ -12,19 +12,19 @@ PixelPosition = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 
 
 class Criteria(Section):
-    """Limits within which the report calls a sensor all right; null: no limit.
+    """Limits of the report's criteria; null: no limit.
 
     Flagged pixels (``fit_status``: values open by whole electrons) do not count, but for ``flagged_pixels``.
     """
 
     read_noise_e: float | None = Field(
-        default=0.5, gt=0, description="median read noise, e-; above 0.5 electrons cannot be counted"
+        default=0.5, gt=0, description="median read noise, e-; above 0.5 e- electrons cannot be counted"
     )
     failed_pixels: float | None = Field(
         default=0.01, ge=0, le=1, description="share of pixels without a value"
     )
     flagged_pixels: float | None = Field(
-        default=0.1, ge=0, le=1, description="share of pixels whose value is open by whole electrons"
+        default=0.1, ge=0, le=1, description="share of pixels whose values can be off by whole electrons"
     )
     hot_pixels: float | None = Field(
         default=0.01,
@@ -36,13 +36,13 @@ class Criteria(Section):
         default=0.01,
         ge=0,
         le=1,
-        description="share of outliers in the conversion gain, the bias or the read noise, whichever is more",
+        description="share of outliers in conversion gain, bias or read noise (the largest)",
     )
     gain_nonuniformity: float | None = Field(
         default=0.15,
         gt=0,
-        description="spread of the conversion gain between pixels over its median: robust deviation, "
-        "without what the errors of the pixels add",
+        description="spread of the conversion gain between pixels over its median: robust standard "
+        "deviation, corrected for the errors of the pixels",
     )
 
 
@@ -65,12 +65,10 @@ class ReportSettings(Section):
     )
     map_stretch: Literal["beta", "linear"] = Field(
         default="beta",
-        description="colours of the maps: 'beta' follows the rank of a pixel (Beta(2,2) transform), "
-        "'linear' its value between the 1st and the 99th percentile",
+        description="colours of the maps: 'beta' by rank (Beta(2,2) transform, histogram-equalised), "
+        "'linear' by value from the 1st to the 99th percentile",
     )
-    criteria: Criteria = Field(
-        default_factory=Criteria, description="limits within which the sensor is called all right; null: none"
-    )
+    criteria: Criteria = Field(default_factory=Criteria, description="limits of the sensor; null: no limit")
     histogram_bins: int = Field(
         default=128, ge=8, le=1024, description="largest number of bins in histograms of maps"
     )

@@ -27,11 +27,12 @@ def announced(reporter: Reporter, stage: str, limit: int | None = None) -> Itera
         if took is not None:
             seconds.append(took)
         elif not seconds:
-            reporter.info(f"{stage}: compiling kernels, once after an installation or an update")
+            reporter.info(f"{stage}: compiling kernels (once after an installation or update)")
             if limit is not None and limit << 20 < _COMPILING_BYTES:
                 reporter.warning(
                     f"{stage}: compiling takes up to {_COMPILING_BYTES >> 20} MiB, more than "
-                    f"compute.max_memory (--max-memory) allows ({limit}); what comes after it keeps to that"
+                    f"compute.max_memory (--max-memory) allows ({limit} MiB); later work stays within the "
+                    "limit"
                 )
         reporter.compiling(sum(seconds))
         reporter.event("compiling", stage=stage, kernel=kernel, seconds=took)
@@ -48,6 +49,6 @@ def announced(reporter: Reporter, stage: str, limit: int | None = None) -> Itera
     )
     if not is_writable(cache_folder()):
         reporter.warning(
-            f"{stage}: {cache_folder()} cannot be written, so every command compiles its kernels again; set "
+            f"{stage}: {cache_folder()} is not writable, so every command compiles its kernels again; set "
             "NUMBA_CACHE_DIR to another folder"
         )

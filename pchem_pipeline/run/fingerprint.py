@@ -100,12 +100,12 @@ def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) 
         return "stale", "the run has no input"  # ingest was killed while it was done again
     written = not stage.writes or stage.may_write_nothing or context.store.has(stage.writes[0])
     if done and not written:
-        return "stale", f"{stage.writes[0]} is no longer in the store"  # a hand took it out
+        return "stale", f"{stage.writes[0]} is missing in the store"  # a hand took it out
     for name, digest in record.files.items():
         group = f"{name.partition('/')[0]}/{DESCRIPTION}"
         whole = not name.endswith(DESCRIPTION) or (context.store.path / group).exists()
         if not whole or digest != digest_of_file(context.store.path / name):
-            return "stale", f"{name if whole else group} is missing or was changed"
+            return "stale", f"{name if whole else group} is missing or has changed"
     content = fingerprint_content(stage, context)
     if fingerprint_of(content) != record.fingerprint and not _grew(content, record):
         numbers = {each.digest: each.number for each in (context.model, *model_versions(context.store))}
@@ -175,7 +175,7 @@ def differences(
             words.append(f"{key} {was} -> {now}{keep}")
     for name in new["upstream"]:
         if old.get("upstream", {}).get(name) != new["upstream"][name]:
-            words.append(f"{name} was done again")
+            words.append(f"{name} was run again")
     if old.get("input") != new["input"]:
         words += _input_changes(old.get("input") or {}, new["input"] or {}, models or {})
     return words
@@ -184,7 +184,7 @@ def differences(
 def _input_changes(old: Any, new: Any, models: Mapping[Any, int]) -> list[str]:
     """Say which facts of the input changed; digests are no words."""
     if "content" in {**old, **new}:
-        return ["the content of the input changed"]
+        return ["the input has changed"]
     before, after = (models.get(facts.get("model"), "unknown") for facts in (old, new))
     words = [] if old.get("model") == new.get("model") else [f"model {before} -> {after}"]
     changes = _changes("input", {**old, "model": None}, {**new, "model": None})

@@ -61,7 +61,9 @@ def open_source(context: StageContext) -> FrameSource:
     if sensor.mode == "copy":
         array = store.array("frames/dn")
         if array.shape != expected or array.dtype != np.dtype(sensor.dtype):
-            raise StoreError(f"{store.path}: frames/dn is not what was ingested; {store.cure('frames/dn')}")
+            raise StoreError(
+                f"{store.path}: frames/dn differs from the ingested frames; {store.cure('frames/dn')}"
+            )
         return StoredFrames(store.path, expected, np.dtype(sensor.dtype), array.chunks[1])
     reader = open_frames(context.config.input, context.base_dir, check_duplicates=False)
     files = known_identity(context)["files"]  # hashed again where names, sizes or times changed

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _GROUP = "model"
 _EXPOSURE, _WEIGHT = "added_exposure", "added_weight"
-_CURE = "delete it: the model is taken from the YAML"
+_CURE = "delete it; the model is then taken from the YAML"
 Region = tuple[slice, slice]
 
 
@@ -99,8 +99,8 @@ class ModelVersion:
         except ValidationError as error:
             reason = error.errors()[0]["msg"].removeprefix("Value error, ")
             raise ConfigError(
-                f"model {self.number} of the run: {reason}; install what it needs, or take another one with: "
-                "pchem model --use"
+                f"model {self.number} of the run: {reason}; install the missing package, or use another "
+                "version: pchem model --use"
             ) from error
 
     @property

@@ -132,7 +132,7 @@ class Reporter:
                     self._log.flush()
             except OSError as error:  # it is no result
                 self._end_log()
-                self._line(f"warning: --log-json ends here: {error.strerror or error}")
+                self._line(f"warning: --log-json: no further events written: {error.strerror or error}")
 
     def compiling(self, spent: float) -> None:
         """Take note of how long kernels were compiled so far in this stage, s: no work is done meanwhile."""

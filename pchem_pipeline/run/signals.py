@@ -16,7 +16,9 @@ class InterruptedRunError(PchEmError):
 
     def __init__(self, number: int) -> None:
         name = signal.Signals(number).name
-        super().__init__(f"stopped by {name}; finished tiles are kept, run the same command again to go on")
+        super().__init__(
+            f"stopped by {name}; finished tiles are kept, run the same command again to continue"
+        )
         self.exit_code = ExitCode.SIGTERM if number == signal.SIGTERM else ExitCode.SIGINT
 
 

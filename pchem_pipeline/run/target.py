@@ -53,8 +53,8 @@ def find_run(path: Path) -> Target:
         text = stored_config(path)
         if text is None:
             RunStore.open(path)  # says so where it is no run at all
-            raise StoreError(f"{path} holds no configuration; give the YAML file that made it")
-        cure = "give the run's own YAML file instead of its store, which writes it again"
+            raise StoreError(f"{path} has no configuration; give its YAML file")
+        cure = "give the run's YAML file instead of its store"
         location = read_record(path / ".pchem" / "location.json", cure) or {}
         written = location.get("config")
         return Target(

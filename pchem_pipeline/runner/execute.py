@@ -50,7 +50,7 @@ def execute(name: str, context: StageContext) -> StageState:
         context.reporter.info(f"{name}: {before.words()} -> would run")
         return before
     if before.state == "stale":
-        context.reporter.info(f"{name}: {before.words()} -> done again")
+        context.reporter.info(f"{name}: {before.words()} -> running again")
     prepared = context.prepared.get(name)
     if prepared is not None and prepared.clock is not None:
         clock = prepared.clock

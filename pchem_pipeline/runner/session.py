@@ -75,7 +75,7 @@ def up_to(last: str, stages: Sequence[str]) -> Sequence[str]:
         ConfigError: the run has no such stage.
     """
     if last not in stages:
-        raise ConfigError(f"--until {last}: this run does {', '.join(stages)}")
+        raise ConfigError(f"--until {last}: the stages of this run are {', '.join(stages)}")
     return stages[: stages.index(last) + 1]
 
 
@@ -96,7 +96,7 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
         context.reporter.event("end", states={state.stage: state.words() for state in states})
         failed = [f"{state.stage}: {state.why}" for state in states if state.state == "failed"]
         if failed:
-            raise IncompleteRunError("; ".join(failed) + "; the rest is kept, run again to retry")
+            raise IncompleteRunError("; ".join(failed) + "; finished units are kept, run again to retry")
         for words in filter(None, (STAGES[name].status_words for name in stages)):
             _check_failed_pixels(context, words)
     return states
@@ -276,5 +276,5 @@ def _check_failed_pixels(context: StageContext, name: str) -> None:
         reasons = [(int(((words & int(bit)) != 0).sum()), MEANINGS[bit]) for bit in FAILED]
         raise IncompleteRunError(
             f"{failed} of {words.size} pixels have no value, above run.allowed_failed_pixels ({allowed:g}); "
-            f"the commonest reason: {max(reasons)[1]}"
+            f"most frequent reason: {max(reasons)[1]}"
         )

@@ -125,8 +125,8 @@ def _refuse_impossible(name: str, values: NDArray[np.float64]) -> None:
     lowest = float(values.min())
     if lowest < 0 or (must_be_positive and lowest == 0):
         raise ConfigError(
-            f"simulate.parameters.{name} reaches {lowest:.4g} in some pixels, which is impossible; "
-            f"give it a minimum {'above' if must_be_positive else 'of'} 0"
+            f"simulate.parameters.{name} is {lowest:.4g} in some pixels, which is impossible; set a minimum "
+            f"{'above' if must_be_positive else 'of'} 0"
         )
 
 

@@ -38,8 +38,8 @@ def truncated_quantile(distribution: Distribution, u: NDArray[np.float64]) -> ND
     high = 1.0 if distribution.maximum is None else _cdf(distribution, distribution.maximum)
     if not high - low > 1e-9:
         raise ConfigError(
-            f"simulate: bounds {distribution.minimum} .. {distribution.maximum} leave nothing of the "
-            f"{distribution.kind} distribution; move them to where its values are"
+            f"simulate: bounds {distribution.minimum} .. {distribution.maximum} exclude the whole "
+            f"{distribution.kind} distribution; change them"
         )
     values = _quantile(distribution, low + u * (high - low))
     return np.clip(values, distribution.minimum, distribution.maximum)

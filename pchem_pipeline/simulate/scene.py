@@ -51,11 +51,11 @@ def with_scene(
     values = np.asarray(scene, np.float64)
     if values.ndim not in (0, 2, 3) or (values.ndim and values.shape[-2:] != truth.shape):
         raise ConfigError(
-            f"scene of shape {values.shape}: the sensor has {truth.shape}; give a number, an image of that "
-            "shape, or a sequence of such images"
+            f"scene of shape {values.shape}, but the sensor has {truth.shape}; give a number, an image of "
+            "that shape, or a sequence of such images"
         )
     if not (np.isfinite(values) & (values >= 0.0)).all():
-        raise ConfigError("scene: an exposure is 0 or more e- in each pixel; correct the image")
+        raise ConfigError("scene: negative exposure; give 0 or more e- in each pixel")
     sees = (truth.defect != Defect.DEAD) & (truth.defect != Defect.STUCK)
     if values.ndim < 3:
         return replace(truth, quanta_exposure=np.where(sees, values, 0.0)), settings

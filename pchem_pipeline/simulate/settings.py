@@ -23,7 +23,7 @@ class Correlation(Section):
     """Rank correlation of two parameters over the pixels (Gaussian copula)."""
 
     between: tuple[ParameterName, ParameterName] = Field(
-        description="the two parameters, by the names under which they are given in simulate.parameters"
+        description="names of two parameters in simulate.parameters"
     )
     rank: float = Field(gt=-1, lt=1, description="Spearman's rank correlation, no unit")
 
@@ -40,7 +40,7 @@ class HotPixels(Section):
     fraction: float = Field(default=0.002, ge=0, le=1, description="fraction of pixels that are hot, no unit")
     multiplier: Distribution = Field(
         default=LogNormal(median=4.0, log_std=0.5, minimum=1.0),
-        description="their exposure divided by what it would have been, no unit",
+        description="factor on the exposure of hot pixels, no unit",
     )
 
 
@@ -56,7 +56,7 @@ class ParameterSettings(Section):
         description="quanta exposure H, e- per frame; null if dark_current is given. A distribution is a "
         "kind with its numbers: constant (value), normal (mean, std), lognormal (median, log_std), gamma "
         "(mean, std), uniform or loguniform (low, high); each can have minimum, maximum and patterns of kind "
-        "column, row, radial (amplitude) or gradient (amplitude, angle), relative or not",
+        "column, row, radial (amplitude) or gradient (amplitude, angle), relative or absolute",
     )
     dark_current: Distribution | None = Field(
         default=None, description="H / integration_time, e-/px/s, instead of quanta_exposure"
@@ -80,7 +80,7 @@ class ParameterSettings(Section):
         default=(Correlation(between=("dn_per_electron", "analog_read_noise_e"), rank=-0.4),),
         description="rank correlations between parameters; all other pairs are independent",
     )
-    hot_pixels: HotPixels = Field(default=HotPixels(), description="tail of hot pixels")
+    hot_pixels: HotPixels = Field(default=HotPixels(), description="hot pixels")
     dead_fraction: float = Field(
         default=0.0, ge=0, le=1, description="fraction of pixels without any electron (H = 0), no unit"
     )
@@ -118,7 +118,7 @@ class ParameterSettings(Section):
         pairs = [frozenset(correlation.between) for correlation in self.correlations]
         for pair in pairs:
             for name in pair - self.given().keys():
-                raise ValueError(f"correlations name {name}, which is not given; use the name that is")
+                raise ValueError(f"correlations: unknown parameter {name}; use a given parameter")
             if pairs.count(pair) > 1:
                 raise ValueError(f"correlation of {' and '.join(sorted(pair))} is given twice; keep one")
         if not _positive_definite(self.copula()):
@@ -167,18 +167,18 @@ class SimulateSettings(Section):
 
     shape: tuple[int, int] = Field(default=(64, 64), description="rows and columns of the sensor, px")
     n_frames: int = Field(default=1000, ge=1, description="number of frames")
-    seed: int = Field(
-        default=1, ge=0, lt=2**63, description="root of all random numbers; same seed, same frames"
-    )
+    seed: int = Field(default=1, ge=0, lt=2**63, description="random seed; same seed, same frames")
     sensor_seed: int | None = Field(
         default=None,
         ge=0,
         lt=2**63,
-        description="root of the pixels' parameters; null: seed. With it, another seed gives other frames of "
-        "the same sensor, for example at another integration time",
+        description="random seed of the pixels' parameters; null: seed. With a fixed pixel_seed, another "
+        "seed gives other frames of the same sensor",
     )
-    integration_time: float = Field(default=4.87, gt=0, description="integration time of a frame, s")
-    bit_depth: int = Field(default=14, ge=1, le=24, description="bits of the ADC; DN end at 2**bit_depth - 1")
+    integration_time: float = Field(default=4.87, gt=0, description="integration time per frame, s")
+    bit_depth: int = Field(
+        default=14, ge=1, le=24, description="bits of the ADC; largest DN 2**bit_depth - 1"
+    )
     format: Literal["tiff", "fits", "hdf5", "npy", "raw", "zarr"] = Field(
         default="tiff", description="file format of the frames: tiff, fits, hdf5, npy, raw, zarr"
     )
@@ -186,30 +186,29 @@ class SimulateSettings(Section):
         default=Path("frames"), description="folder for the frames and truth.npz"
     )
     frames_per_file: int | None = Field(
-        default=None, ge=1, description="frames in one file; null: all in one file"
+        default=None, ge=1, description="frames per file; null: all in one file"
     )
     truth_frames: int = Field(
-        default=250, ge=0, description="number of first frames whose true electron numbers are kept"
+        default=250, ge=0, description="number of first frames whose true electron numbers are stored"
     )
     sensor: Path | None = Field(
         default=None,
-        description="npz file with the maps of a sensor, as `pchem twin` writes it, instead of `parameters`",
+        description="npz file with the maps of a sensor (see pchem twin), instead of parameters",
     )
     scene: str | None = Field(
         default=None,
-        description="exposure of the pixels instead of their own: a number, e- per frame, or a file with an "
-        "image or a sequence of images in e- per frame (npy, TIFF, FITS); after its last one a sequence "
-        "begins anew",
+        description="exposure instead of the sensor's: a number, e- per frame, or a file with an image or a "
+        "sequence of images in e- per frame (npy, TIFF, FITS); sequences are repeated",
     )
     parameters: ParameterSettings = Field(default=ParameterSettings(), description="parameters of the pixels")
     effects: EffectList = Field(
-        default=(), description="effects beyond the PCD, in the order in which they act inside a plane"
+        default=(), description="effects added to the PCD, in the order in which they act within a plane"
     )
 
     @model_validator(mode="after")
     def _shape_positive(self) -> Self:
         if min(self.shape) < 1:
-            raise ValueError(f"shape {list(self.shape)} has no pixels; give at least one row and one column")
+            raise ValueError(f"shape {list(self.shape)} has no pixels; give at least one row and column")
         if max(self.shape) > 65535:
             raise ValueError(f"shape {list(self.shape)} is larger than 65535 in one direction")
         return self

@@ -68,7 +68,7 @@ class TruthMaps:
                 y, x = np.argwhere(bad)[0]
                 raise ConfigError(
                     f"truth: {name} is impossible in {bad.sum()} pixels (first: {values[y, x]} at y={y}, "
-                    f"x={x}); give them finite values that a sensor can have"
+                    f"x={x}); give possible, finite values"
                 )
 
     @property

@@ -89,7 +89,7 @@ def run(context: StageContext) -> None:
         context.create("frames/excluded", reader.shape[1:], chunks=reader.shape[1:])
         context.store.write("frames/excluded", (slice(None),) * 2, reader.excluded.astype(np.uint8))
         number = np.count_nonzero(reader.excluded)
-        context.note(f"excluded by the mask or the marker 2^32-1: {number} of {reader.excluded.size} pixels")
+        context.note(f"{number} of {reader.excluded.size} pixels excluded by the mask or the marker 2^32-1")
     keep_ingested(context)
     if settings.mode == "reference":
         _run_whole(context)
@@ -178,8 +178,8 @@ def _warn_of_a_small_disk(context: StageContext, n_bytes: int) -> None:
     free = context.store.free_bytes()
     if context.fresh and n_bytes > free:
         context.note(
-            f"{n_bytes / 1e9:.1f} GB of frames are copied, {free / 1e9:.1f} GB are free; they compress about "
-            "1.8-fold: if that does not fit, set input.mode: reference"
+            f"{n_bytes / 1e9:.1f} GB of frames to copy (about 1.8-fold compression), "
+            f"{free / 1e9:.1f} GB free; if this does not fit, set input.mode: reference"
         )
 
 

@@ -43,11 +43,9 @@ def _tell_time(context: StageContext) -> None:
     time, stated = context.integration_time, context.sensor.integration_time
     if time is None:
         where = "" if context.config_path is None else f" in {context.config_path.name}"
-        context.note(f"integration time is not known: no charge rate; set input.integration_time{where}, s")
+        context.note(f"unknown integration time: no charge rate. Set input.integration_time{where} (s)")
     elif stated is not None and abs(time - stated) > _SAME_TIME * stated:
-        context.note(
-            f"the files say an integration time of {stated:g} s; input.integration_time, {time:g} s, counts"
-        )
+        context.note(f"integration time {time:g} s from input.integration_time; the files state {stated:g} s")
 
 
 def maps_tile(

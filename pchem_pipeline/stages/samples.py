@@ -137,14 +137,14 @@ def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
     depths = [each.bit_depth for each in (mine, first)]
     if None not in depths and depths[0] != depths[1]:
         raise ConfigError(
-            f"{mine.where} has codes of {depths[0]} bits, {first.where} of {depths[1]}; "
-            "all samples must come from one sensor with the same settings"
+            f"{mine.where} has {depths[0]} bits, {first.where} {depths[1]}; all samples must come from one "
+            "sensor with the same settings"
         )
     cameras = [each.sensor.camera.serial for each in (mine, first)]
     if None not in cameras and cameras[0] != cameras[1]:
         raise ConfigError(
-            f"{mine.where} is of the camera of serial number {cameras[0]}, {first.where} of {cameras[1]}; "
-            "all samples must come from one sensor"
+            f"{mine.where} has camera serial number {cameras[0]}, {first.where} {cameras[1]}; all samples "
+            "must come from one sensor"
         )
     regions = [each.target.config.input.roi for each in (mine, first)]
     if regions[0] != regions[1]:
@@ -154,7 +154,7 @@ def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
         )
     for other in others:
         if mine.shares_frames(other):
-            raise ConfigError(f"{mine.where} holds the same frames as {other.where}; list each sample once")
+            raise ConfigError(f"{mine.where} has the same frames as {other.where}; list each sample once")
 
 
 def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> NDArray[np.float64] | None:
@@ -180,9 +180,9 @@ def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> NDArray
         time = sample.integration_time if given.integration_time is None else given.integration_time
         if time is None:
             raise ConfigError(
-                f"{where} has no integration time, so there is no slope for the charge rate; set "
-                "input.integration_time in the YAML of that run, s, or do without the slope: pchem joint "
-                "RUNS --against none (in the YAML of a joint run: input.against: none)"
+                f"{where} has no integration time, needed for the charge rate; set input.integration_time of "
+                "this run, s, or fit without: pchem joint RUNS --against none (in the YAML of a joint run: "
+                "input.against: none)"
             )
         found[i] = time
     return found
@@ -198,12 +198,12 @@ def _check_increasing(settings: InputSettings, samples: Sequence[OpenSample]) ->
     for last, i in itertools.pairwise(exposed):
         if x[i] <= x[last]:
             raise ConfigError(
-                f"{samples[i].where}: {what} {x[i]:g} is not above the {x[last]:g} of input.samples.{last}; "
-                f"list the samples in increasing order, each {what} once"
+                f"{samples[i].where}: {what} {x[i]:g} is not above {x[last]:g} (input.samples.{last}); list "
+                f"the samples in increasing order of {what}"
             )
     if len(exposed) < 2:
         raise ConfigError(
-            f"input.samples: a slope needs two exposures of different {what}, this has {len(exposed)}; "
+            f"input.samples: a slope needs two exposures of different {what}, but there is {len(exposed)}; "
             "add a run or set input.against: none"
         )
 

@@ -81,7 +81,7 @@ def run(context: StageContext) -> None:
     """
     settings = context.config.simulate
     if settings is None:
-        raise ConfigError("the configuration has no section simulate; add one, or run: pchem ingest")
+        raise ConfigError("no section simulate in the configuration; add one, or run: pchem ingest")
     folder = context.base_dir / settings.output
     settings = _with_places(settings, context.base_dir)
     truth = _sensor(settings.model_dump_json())[0]
@@ -197,8 +197,7 @@ def _stored_sensor(settings: SimulateSettings) -> TruthMaps:
             truth = TruthMaps(**{field.name: stored[field.name] for field in fields(TruthMaps)})
     except (OSError, KeyError, ValueError, BadZipFile) as error:
         raise ConfigError(
-            f"simulate.sensor: {settings.sensor} holds no maps of a sensor ({error}); write it "
-            "with: pchem twin"
+            f"simulate.sensor: {settings.sensor} has no maps of a sensor ({error}); write it with: pchem twin"
         ) from error
     if truth.shape != settings.shape:
         raise ConfigError(f"simulate.sensor has {truth.shape} pixels, simulate.shape is {settings.shape}")
@@ -262,8 +261,8 @@ def _prepare(folder: Path, settings: SimulateSettings) -> None:
         raise storage_error(error, folder) from error
     if needed > free:
         raise StoreError(
-            f"{folder}: the frames need {needed / 1e9:.2f} GB and {free / 1e9:.2f} GB are free; "
-            "free some space, or lower simulate.n_frames or simulate.shape"
+            f"{folder}: the frames need {needed / 1e9:.2f} GB, {free / 1e9:.2f} GB are "
+            "free; free space, or lower simulate.n_frames or simulate.shape"
         )
 
 
@@ -273,8 +272,8 @@ def _remove_simulated(folder: Path) -> None:
             names = [str(name) for name in truth["files"]]
     except (FileNotFoundError, KeyError, ValueError, EOFError, BadZipFile):
         raise ConfigError(
-            f"simulate.output: {folder} holds other files (no {TRUTH_FILE} of an earlier simulation); "
-            "choose another folder"
+            f"simulate.output: {folder} has other files (no {TRUTH_FILE} of an earlier simulation); choose "
+            "another folder"
         ) from None
     for name in names:
         plain = Path(name).name

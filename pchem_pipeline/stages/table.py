@@ -54,7 +54,7 @@ _ALL = (
         writes=("truth",),
         run=f"{_HERE}.simulate:run",
         identity=f"{_HERE}.simulate:scene_identity",
-        summary="Write a simulated camera's frames, and its truth.",
+        summary="Simulate a camera: write its frames and true parameters.",
         applies=_is_simulated,
     ),
     Stage(
@@ -86,7 +86,7 @@ _ALL = (
         reads=("frames",),
         writes=("histogram", "summary"),
         run=f"{_HERE}.histogram.histogram:run",
-        summary="Count every pixel's DN; keep summaries in time and space.",
+        summary="Make the histogram of each pixel, and sums in time and space.",
         plan=f"{_HERE}.histogram.dry_run:plan_lines",
     ),
     Stage(
@@ -98,7 +98,7 @@ _ALL = (
         writes=("fit", "samples"),
         run=f"{_HERE}.fit.fit:run",
         identity=f"{_HERE}.identities:fit_inputs",
-        summary="Fit H, g, mu and sigma of every pixel by PCH-EM.",
+        summary="Fit H, g, mu and sigma of each pixel by PCH-EM.",
         status_words="fit/fit_status",
     ),
     Stage(
@@ -110,7 +110,7 @@ _ALL = (
         writes=("maps", *(f"samples/{name}" for name in _LINE)),
         run=f"{_HERE}.maps:run",
         identity=f"{_HERE}.identities:integration_time",
-        summary="Make the maps, with units, standard errors and quality.",
+        summary="Make the parameter maps with standard errors and quality.",
     ),
     Stage(
         "ensemble",
@@ -120,7 +120,7 @@ _ALL = (
         reads=("frames", "histogram", "fit", "truth"),
         writes=("ensemble", "ensemble_tiles"),
         run=f"{_HERE}.ensemble.ensemble:run",
-        summary="Predict the ensemble from the maps; compare with the data.",
+        summary="Predict the ensemble from the maps and compare it with the data.",
         may_write_nothing=True,
     ),
     Stage(
@@ -133,7 +133,7 @@ _ALL = (
         run=f"{_HERE}.report.report:run",
         files=("report.html", "report.json", "discrepancy.html"),
         identity=f"{_HERE}.identities:verdict",
-        summary="Write report.html, report.json and the files of figures that are asked for.",
+        summary="Write report.html, report.json and figure files.",
     ),
     Stage(
         "electrons",
@@ -143,7 +143,7 @@ _ALL = (
         reads=("frames", "fit"),
         writes=("electrons",),
         run=f"{_HERE}.electrons.electrons:run",
-        summary="Write the stack of electron numbers into the store.",
+        summary="Write the electron number of each sample into the store.",
         on_demand=True,
     ),
     Stage(

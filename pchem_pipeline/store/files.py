@@ -20,9 +20,9 @@ from pchem_pipeline.store import disk
 from pchem_pipeline.store.remote_path import RemotePath
 
 _CURES = {
-    errno.ENOSPC: "the disk is full: free some space and run again, finished tiles are kept",
-    errno.EDQUOT: "the disk quota is used up: free some space and run again, finished tiles are kept",
-    errno.EFBIG: "the file would be larger than is allowed there (see ulimit -f): raise that and run again",
+    errno.ENOSPC: "the disk is full: free space and run again, finished tiles are kept",
+    errno.EDQUOT: "the disk quota is exhausted: free space and run again, finished tiles are kept",
+    errno.EFBIG: "the file exceeds the size limit (see ulimit -f): raise it and run again",
     errno.EIO: "the disk reports an error: check it, then run again, finished tiles are kept",
     errno.EROFS: "the file system is read-only: choose another place for the store",
     errno.EACCES: "no permission to write there: choose another place for the store",
@@ -31,13 +31,13 @@ _CURES = {
 
 #: of one place, not of every other as well
 _CURES_OF_A_PLACE = {
-    errno.EEXIST: "there is a file where a folder is meant: choose another place",
-    errno.ENOTDIR: "there is a file where a folder is meant: choose another place",
-    errno.EISDIR: "there is a folder where a file is meant: choose another place",
+    errno.EEXIST: "a file is in place of the folder: choose another place",
+    errno.ENOTDIR: "a file is in place of the folder: choose another place",
+    errno.EISDIR: "a folder is in place of the file: choose another place",
     errno.ENAMETOOLONG: "choose a shorter name",
     **dict.fromkeys(
         (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP),
-        "the file system lacks what a store needs, such as file locks: choose another place for the store",
+        "the file system does not support file locks or similar: choose another place for the store",
     ),
 }
 
@@ -255,10 +255,10 @@ def cure_of(run: Path, name: str) -> str:
     group = name.partition("/")[0]
     stage = _STAGE_OF.get(group, group)
     if stage in _COMMANDS or group in _STAGE_OF:
-        return f"do it again: pchem {stage} {quoted(run)} --force"
+        return f"run it again: pchem {stage} {quoted(run)} --force"
     if group == "model":
-        return f"delete {run / group} and run again: the model is taken from the configuration"
-    return "do it again with --force" if group else "delete it and run again"
+        return f"delete {run / group} and run again; the model is then taken from the configuration"
+    return "run it again with --force" if group else "delete it and run again"
 
 
 def write_record(path: Path, value: dict[str, Any]) -> None:

@@ -107,7 +107,7 @@ def _acquired(run: Path, lock: RemotePath) -> bytes:
             if not _is_left_behind(held):
                 raise LockedError(
                     f"{run} is in use by pchem on {held.get('host')} (process {held.get('pid')}, since "
-                    f"{held.get('time')}); wait for it or use another --store; where that process is gone: "
+                    f"{held.get('time')}); wait for it or use another --store; if this process has ended: "
                     f"{_free(lock)}"
                 )
             lock.unlink(missing_ok=True)
@@ -124,9 +124,7 @@ def _owner(run: Path, lock: RemotePath) -> dict[str, Any]:
         held = json.loads(lock.read_bytes())
         if isinstance(held, dict):
             return held
-    raise LockedError(
-        f"{run}: its lock {lock} is damaged; where no pchem command works on this run: {_free(lock)}"
-    )
+    raise LockedError(f"{run}: its lock {lock} is damaged; if no pchem command uses this run: {_free(lock)}")
 
 
 def _free(lock: RemotePath) -> str:

@@ -60,7 +60,7 @@ def check_work(path: Path) -> None:
         return
     record = work.records.known(work.stage)
     if record is None or record.fingerprint != work.fingerprint:
-        raise LockedError(f"{path}: work was taken over by a later pchem command; it writes no more")
+        raise LockedError(f"{path}: a later pchem command has taken over; this one stops writing")
     work.looked = time.monotonic()
 
 
@@ -120,7 +120,7 @@ class Records:
         Raises:
             StoreError: it is damaged.
         """
-        path, cure = self._folder / "stages" / f"{stage}.json", "run the stage again, which replaces it"
+        path, cure = self._folder / "stages" / f"{stage}.json", "run the stage again to replace it"
         content = read_record(path, cure)
         if content is None:
             return None
@@ -156,7 +156,7 @@ class Records:
             ValueError: the key is no name of a file; its marker would never be found again.
         """
         if "/" in key or key.startswith("."):
-            raise ValueError(f"stage {stage}: the key {key!r} of a unit is no name of a file")
+            raise ValueError(f"stage {stage}: the key {key!r} of a unit is not a file name")
         write_record(self._marker(stage, fingerprint, key), summary)
 
     def unmark(self, stage: str, fingerprint: str, keys: Iterable[str]) -> None:

@@ -40,7 +40,7 @@ class UndefinedError(StoreError, AttributeError):
 def refused(where: object, error: BaseException) -> RemoteError:
     """Translate an error of an object storage into one line with its cure."""
     words = " ".join(str(error).split()) or type(error).__name__
-    return RemoteError(f"{where}: the object storage refused ({words}); check address, keys and network")
+    return RemoteError(f"{where}: object storage error ({words}); check address, keys and network")
 
 
 def place_of(path: Path | str, base_dir: Path | None = None) -> Path:
@@ -66,9 +66,7 @@ def local_path(path: Path) -> Path:
     """
     place = place_of(path)
     if isinstance(place, RemotePath):
-        raise ConfigError(
-            f"{place}: only stores can lie in an object storage; give a path of this machine to copy from"
-        )
+        raise ConfigError(f"{place}: only stores can be in an object storage; give a local path")
     return place
 
 
@@ -110,7 +108,7 @@ class RemotePath(_Pure):
         Raises:
             TypeError: always.
         """
-        raise TypeError(f"{self} is no path of this machine")
+        raise TypeError(f"{self} is not a local path")
 
     @property
     def storage(self) -> Any:
@@ -197,7 +195,7 @@ class RemotePath(_Pure):
             UndefinedError: always.
         """
         if not name.startswith("_") and hasattr(Path, name):
-            raise UndefinedError(f"{self}: an object storage cannot do that ({name}); use a store on a disk")
+            raise UndefinedError(f"{self}: not possible in an object storage ({name}); use a store on a disk")
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def write_text(self, data: str, encoding: str | None = None, *unused: Any, **more: Any) -> int:
@@ -228,5 +226,5 @@ def _storage(protocol: str) -> Any:
         return fsspec.filesystem(protocol, use_listings_cache=False)
     except (ImportError, ValueError) as error:
         raise MissingDependencyError(
-            f"{protocol}://: a store there needs another library ({error}); install it: {install_hint('s3')}"
+            f"{protocol}://: this store needs another package ({error}); install it: {install_hint('s3')}"
         ) from error

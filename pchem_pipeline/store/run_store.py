@@ -108,7 +108,7 @@ class RunStore:
         path = place_of(path)
         if not (path / DESCRIPTION).exists():
             if (path / _PRIVATE / "stages").is_dir():
-                raise StoreError(f"{path / DESCRIPTION} is missing; run again, which writes it")
+                raise StoreError(f"{path / DESCRIPTION} is missing; run again to write it")
             raise StoreError(
                 f"there is no run at {path}; make one with: pchem run FILES --store {quoted(path)}"
             )
@@ -121,13 +121,13 @@ class RunStore:
             raise StoreError(f"{path / DESCRIPTION} is damaged ({error}); {cure_of(path, '')}") from error
         if schema is None:
             raise StoreError(
-                f"{path} is a zarr store but no run; to read its frames: "
-                f"pchem run {quoted(path)} --store run.zarr"
+                f"{path} is a zarr store, but not a run; to read its frames: pchem run {quoted(path)} "
+                "--store run.zarr"
             )
         if schema != SCHEMA_VERSION:
             raise StoreError(
-                f"{path} has schema version {schema}, this program reads version {SCHEMA_VERSION}; "
-                "use the program that made it, or start a new run"
+                f"{path} has schema version {schema}, this program needs {SCHEMA_VERSION}; use the program "
+                "that made it, or start a new run"
             )
         return cls(path, root)
 
@@ -220,10 +220,10 @@ class RunStore:
         if found is None:
             raise StoreError(f"{self.path} has no {name}; {self.cure(name)}")
         if not isinstance(found, zarr.Array):
-            raise StoreError(f"{self.path}: {name} is no array; {self.cure(name)}")
+            raise StoreError(f"{self.path}: {name} is not an array; {self.cure(name)}")
         if foreign := foreign_codecs(found):
             raise StoreError(
-                f"{self.path}: {name} is coded by {', '.join(foreign)}, which this program never writes and "
+                f"{self.path}: {name} is encoded by {', '.join(foreign)}, which this program never uses and "
                 "which may run code; do not use this store"
             )
         return found.with_config({"write_empty_chunks": True})
@@ -391,8 +391,7 @@ def stored_config(path: Path) -> str | None:
         text = content
     elif hashlib.sha256(text).hexdigest() != digest.decode(errors="replace").strip():
         raise StoreError(
-            f"{place} is damaged (checksum mismatch); give the run's own YAML file "
-            "instead of its store, which writes it again"
+            f"{place} is damaged (checksum mismatch); give the run's YAML file instead of its store"
         )
     return text.decode(errors="replace")
 
@@ -402,8 +401,8 @@ def _refuse_links(path: Path) -> None:
     """Raise StoreError where a link leads out of a store: to files that are to be read, or to be replaced."""
     if not isinstance(path, RemotePath) and (link := link_out_of(path)) is not None:
         raise StoreError(
-            f"{path}: {link} is a link out of the store, which this program never makes; put the files that "
-            "it leads to in its place"
+            f"{path}: {link} is a link out of the store, which this program never makes; replace it by its "
+            "files"
         )
 
 

@@ -94,7 +94,7 @@ def _check(effect: Effect, shared: SharedOffset) -> None:
     """
     known = shared.of in (*_AXES, "wave")
     if not known or (shared.variance is not None and not 0.0 <= shared.variance < np.inf):
-        raise PchEmError(f"effect {effect.tag!r}: shared_offset() returned {shared}, which is no offset")
+        raise PchEmError(f"effect {effect.tag!r}: shared_offset() returned {shared}, which is not an offset")
 
 
 @dataclass(frozen=True)

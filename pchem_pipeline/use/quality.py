@@ -24,19 +24,16 @@ class QualityFlag(IntFlag):
 #: A sentence for every bit, those of ``fit_status`` included.
 FLAG_MEANINGS: dict[str, tuple[int, str]] = {
     **{str(bit.name).lower(): (int(bit), text) for bit, text in MEANINGS.items()},
-    "at_adc_limit": (int(QualityFlag.AT_ADC_LIMIT), "these frames hold samples at a limit of the ADC"),
+    "at_adc_limit": (int(QualityFlag.AT_ADC_LIMIT), "samples at a limit of the ADC in these frames"),
     "peaks_overlap": (
         int(QualityFlag.PEAKS_OVERLAP),
-        f"read noise above {PEAKS_OVERLAP_E} e-: the most probable electron number is often wrong, take "
+        f"read noise above {PEAKS_OVERLAP_E} e-: the most probable electron number is often wrong; use "
         "expected_number",
     ),
-    "outside_histogram": (
-        int(QualityFlag.OUTSIDE_HISTOGRAM),
-        "samples far from the others are not in the exposure",
-    ),
+    "outside_histogram": (int(QualityFlag.OUTSIDE_HISTOGRAM), "outlying samples excluded from the exposure"),
     "below_bias": (
         int(QualityFlag.BELOW_BIAS),
-        "mean of these frames below the bias by more than 5 standard errors: the bias has moved",
+        "mean of these frames more than 5 standard errors below the bias: the bias has changed",
     ),
 }
 

@@ -56,7 +56,7 @@ class Twin:
             ConfigError: the scene does not fit the sensor, or is no exposure.
         """
         if n < 1:
-            raise ConfigError(f"{n} frames: ask for 1 or more")
+            raise ConfigError(f"{n} frames: give 1 or more")
         settings = self.settings.model_copy(update={"n_frames": n, "seed": seed})
         truth = self.truth
         if scene is not None:

@@ -121,7 +121,7 @@ def _within(key: str, low: float, high: float) -> Callable[[dict[str, Any]], boo
 
 def pixel_tables(rows: list[dict[str, Any]]) -> str:
     """Return the tables of the pixels by regime, and the wrong ones with their numbers."""
-    head = ["", "pixels", "all four good", "flagged", "failed", "of the flagged right"]
+    head = ["", "pixels", "all four good", "flagged", "failed", "flagged, but correct"]
     head += ["wrong of those with a good value", "%, 95 % interval", "beyond 5 errors"]
     lines = [summary("all", rows)]
     for key, edges in EDGES.items():
@@ -181,8 +181,8 @@ def wrong_pixels(rows: list[dict[str, Any]]) -> str:
 
 def run_table(rows: list[dict[str, Any]]) -> str:
     """Return the table of the runs, by mishap."""
-    head = ["what happened", "runs", "refused", "answer No or none", "wrong, called good", "without a word"]
-    head += ["cure fails", "raw exception", "values beyond 5 errors"]
+    head = ["fault", "runs", "refused", "not reliable or none", "wrong, reported as good", "not reported"]
+    head += ["remedy fails", "raw exception", "values beyond 5 errors"]
     lines = [run_line("all", rows)]
     for name, (title, _) in trust_runs.MISHAPS.items():
         lines.append(run_line(title, [row for row in rows if row["mishap"] == name]))

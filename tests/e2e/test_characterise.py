@@ -35,13 +35,13 @@ def test_an_array_becomes_a_run_and_nothing_is_done_twice(frames, tmp_path):
         assert abs(np.mean((value - true) / error)) < 5 / np.sqrt(value.size)
         assert 0.05 * true / np.median(error) * np.sqrt(value.size) > 10  # off by a twentieth would be seen
     np.testing.assert_allclose(run.maps.dark_current.values, run.maps.quanta_exposure.values / 2.0)
-    assert "Is this sensor all right? <b>" in run._repr_html_()
+    assert "Is the sensor within limits? <b>" in run._repr_html_()
     assert "conversion gain" in run.pixel(2, 3)._repr_html_()
     made = (tmp_path / "night.zarr" / "report.html").stat().st_mtime_ns
     other = again(dask.array.from_array(frames, chunks=(100, 8, 9)))
     assert (tmp_path / "night.zarr" / "report.html").stat().st_mtime_ns == made
     np.testing.assert_array_equal(other.maps.bias.values, run.maps.bias.values)
-    with pytest.raises(ConfigError, match=r"input\.integration_time 2\.0 there, 3\.0 here"):
+    with pytest.raises(ConfigError, match=r"input\.integration_time 2\.0 in the file, 3\.0 here"):
         again(frames, 3.0)
 
 
@@ -60,7 +60,7 @@ def test_without_a_store_it_goes_with_the_run(frames):
     ("stack", "words"),
     [
         (np.zeros((4, 4), np.uint16), "give an array"),
-        (np.zeros((0, 4, 4), np.uint16), "of 2 frames or more"),
+        (np.zeros((0, 4, 4), np.uint16), "of at least 2 frames"),
         ([[[0.5]], [[1.5]]], "give integers"),
         (np.zeros((4, 4, 4)), "give integers"),
         (np.full((4, 4, 4), -1), "from -1 to -1 DN"),

@@ -67,7 +67,7 @@ def test_a_scheduler_that_goes_away_is_one_line(processes, executor, tmp_path):
         if len(found) == 3:
             scheduler.send_signal(signal.SIGKILL)
 
-    with pytest.raises(IncompleteRunError, match="went away; finished tiles are kept") as caught:
+    with pytest.raises(IncompleteRunError, match="stopped; finished tiles are kept") as caught:
         executor.map(functools.partial(slow_square, tmp_path), range(400), on_result)
     assert str(file) in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -101,7 +101,7 @@ def test_a_worker_over_its_memory_is_one_line_and_the_run_goes_on_to_the_same_bi
     killed = shell("fit", "small.yaml", "--tiles", "0.0")
     assert killed.code == 3
     (line,) = [each for each in killed.stderr.splitlines() if each.startswith("pchem: ")]
-    assert "1 worker died at it, the last at tcp://127.0.0.1" in line
+    assert "1 worker died on it, the last at tcp://127.0.0.1" in line
     assert "above their memory of 170 MiB; give each more memory (fewer workers" in line
     assert "Traceback" not in killed.stderr
     shell.ok("fit", "run.yaml")

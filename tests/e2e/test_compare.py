@@ -58,7 +58,7 @@ def test_nothing_changed_is_proven_by_digests(shell, copies):
         f"compare/{name}" for name in ("compare.html", "compare.json", "history.csv")
     ]
     assert result.last.startswith("Nothing changed: ")
-    assert result.last.endswith(" are identical to the bit.")
+    assert result.last.endswith(" are bit-identical.")
     [pair] = numbers(shell)["comparisons"]
     assert (pair["same_data"], pair["changed"], pair["what"]) == (True, False, [])
     rows = {row["name"]: row for row in pair["arrays"]}
@@ -71,7 +71,7 @@ def test_nothing_changed_is_proven_by_digests(shell, copies):
         assert rows[name]["n_values"] == values.size
     page = (shell.folder / "compare" / "compare.html").read_text(encoding="utf-8")
     assert "Nothing changed" in page
-    assert "identical to the bit" in page
+    assert "bit-identical" in page
     assert 'id="figure-tables"' in page  # figures are saved with their numbers, words explained
     assert 'id="term-read-noise"' in page
     for source in re.findall(r'(?:src|srcset|href)="([^"]*)"', page):
@@ -101,11 +101,9 @@ def test_lost_and_new_arrays_settings_and_versions(shell, copies):
     copies.delete("fit/n_iterations")
     shutil.rmtree(shell.folder / "a.zarr" / "ensemble" / "epcd_independent")
     copies.write_config((copies.config_text() or "").replace("gap_threshold: 5.0", "gap_threshold: 7.0"))
-    assert "fit/goodness_p: is not there any more" in here(shell, "a.zarr", "b.zarr")
+    assert "fit/goodness_p: missing" in here(shell, "a.zarr", "b.zarr")
     [pair] = numbers(shell)["comparisons"]
-    assert pair["what"] == [
-        "fit/goodness_p: is not there any more."
-    ]  # what is new, or no result, counts nothing
+    assert pair["what"] == ["fit/goodness_p: missing."]  # what is new, or no result, counts nothing
     assert pair["settings"] == [
         {"name": "fit.gap_threshold", "one": "5.0", "other": "7.0", "stages": ["fit"]}
     ]
@@ -138,7 +136,9 @@ def test_another_capture_agrees_until_it_is_warmer(shell, copies, finished):
     shutil.copytree(finished, shell.folder / "warm <b>.zarr")
     warm = RunStore.open(shell.folder / "warm <b>.zarr", writable=True)
     other_capture(warm, exposure=1.2, seed=2)
-    assert "Against A (a.zarr), C changed; B did not." in here(shell, "a.zarr", "b.zarr", "warm <b>.zarr")
+    assert "Differs from A (a.zarr): C; no difference in B." in here(
+        shell, "a.zarr", "b.zarr", "warm <b>.zarr"
+    )
     same, moved = numbers(shell)["comparisons"]
     assert not same["changed"]
     assert moved["maps"]["charge_rate"]["reasons"]["shifted"]

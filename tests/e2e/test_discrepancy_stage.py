@@ -110,7 +110,7 @@ def test_going_back_to_an_older_model_and_forth_gives_the_same_bits(searched, tm
     beside = other.folder / "run.effects.yaml"
     after, text = read(other, "fit/read_noise_dn"), beside.read_text()
     words = other.ok("model", "run.yaml", "--use", "1").stdout
-    assert "stale: fit; to do them again: pchem run" in words
+    assert "stale: fit; to update: pchem run" in words
     assert not beside.exists()
     assert "fit         stale - model 2 -> 1  model 2" in other.ok("status", "run.yaml").stdout
     other.ok("run", "run.yaml", "--until", "fit")
@@ -118,7 +118,7 @@ def test_going_back_to_an_older_model_and_forth_gives_the_same_bits(searched, tm
     # a search that is up to date is asked for what it named, and nothing is searched again
     again = other.ok("discrepancy", "run.yaml")
     assert "discrepancy: up to date" in again.stderr
-    assert "model 2 is in force" in again.stderr
+    assert "model 2 is now in use" in again.stderr
     assert beside.read_text() == text
     assert np.array_equal(read(other, "fit/read_noise_dn"), after, equal_nan=True)
 

@@ -13,12 +13,12 @@ def test_a_hidden_effect_is_found_and_told(shell):
         "demo", "--hidden", "row_noise", "--output", "out", "--size", "32", "--frames", "3000", "--quiet"
     ).stdout
     assert told.startswith("NAMED: ")
-    assert "hidden was: row_noise" in told
+    assert "hidden effect: row_noise" in told
     run = shell.folder / "out" / "demo.zarr"
     result = json.loads((run / "discrepancy.json").read_text())
     plain, extended = (
         next(line for line in part.splitlines() if line.startswith("read_noise_e")).split()
-        for part in told.split("with the plain model:")[1].split("with the model of the verdict:")
+        for part in told.split("with the plain model:")[1].split("with the model found:")
     )
     # row noise counts as read noise until the model has it; columns: name, unit, true, estimated
     found = result["steps"][0]["parameters"]["row_noise_dn"]["value"]

@@ -510,7 +510,7 @@ def test_figures_are_saved_words_explained_and_folded_parts_opened(tab: Tab, tmp
 def test_addresses_of_nothing_do_no_harm(open_tab: Any, store: RunStore, hash_: str) -> None:
     tab = open_tab(file_url(store) + hash_)
     named = hash_[1:].split("&")[0].replace("=", " ")
-    assert "not have" in tab.text("#inspector-trouble")
+    assert "Not in this run" in tab.text("#inspector-trouble")
     assert named in tab.text("#inspector-trouble")
     assert tab.text("#inspector-status").startswith("✓")
     assert tab.page.get_attribute("#inspector-app", "data-map") == "maps/read_noise_e"

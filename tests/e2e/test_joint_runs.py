@@ -219,7 +219,7 @@ def test_what_looks_at_a_run_looks_at_this_one(joint, kernels, tmp_path):
     thread.join()
     refused = shell("electrons", "dark.zarr")
     assert refused.code == 4
-    assert "was made from samples, which have no frames here" in refused.last
+    assert "was made from samples; electron numbers need" in refused.last
     assert "electrons" not in run.status()
 
 
@@ -272,32 +272,28 @@ def test_a_search_looks_at_all_samples_and_the_fit_takes_what_it_names(joint, ke
         (
             [("dark_2s.zarr", ""), ("dark_1s.zarr", "")],
             {},
-            "integration time 1 is not above the 2 of input.samples.0",
+            "integration time 1 is not above 2 (input.samples.0)",
         ),
         (
             [("dark_1s.zarr", ""), ("dark_2s.zarr", "integration_time: 1")],
             {},
-            "is not above the 1 of input.samples.0",
+            "is not above 1 (input.samples.0)",
         ),
         (
             [("dark_1s.zarr", ""), ("small.yaml", "")],
             {},
             "has 8 x 8 pixels, input.samples.0 (dark_1s.zarr) 8 x 12",
         ),
-        (
-            [("dark_1s.zarr", ""), ("twelve.yaml", "")],
-            {},
-            "has codes of 12 bits, input.samples.0 (dark_1s.zarr) of 14",
-        ),
+        ([("dark_1s.zarr", ""), ("twelve.yaml", "")], {}, "has 12 bits, input.samples.0 (dark_1s.zarr) 14"),
         (
             [("dark_1s.zarr", ""), ("twin.yaml", "")],
             {},
-            "holds the same frames as input.samples.0 (dark_1s.zarr)",
+            "has the same frames as input.samples.0 (dark_1s.zarr)",
         ),
         (
             [("timeless.yaml", ""), ("dark_2s.zarr", "")],
             {},
-            "or do without the slope: pchem joint RUNS --against none (in the YAML",
+            "(timeless.yaml) has no integration time, needed for the charge rate",
         ),
         ([("dark_1s.zarr", ""), ("bias.zarr", "bias: true")], {}, "a slope needs two exposures"),
         (
@@ -343,15 +339,15 @@ def test_a_refused_list_leaves_its_name_free(joint):
 
 
 def test_what_is_no_joint_fit_says_so(joint):
-    with pytest.raises(ConfigError, match=r"dark_1s\.yaml is a single run, and a joint fit needs several"):
+    with pytest.raises(ConfigError, match=r"dark_1s\.yaml is a single run; a joint fit needs several"):
         find_joint([joint / "dark_1s.yaml"])
-    with pytest.raises(ConfigError, match="only for runs"):
+    with pytest.raises(ConfigError, match="only with runs"):
         find_joint([joint / "dark.yaml"], store=joint / "x.zarr")
     with pytest.raises(ConfigError, match="exists with other settings"):
         find_joint([joint / "dark_1s.yaml", joint / "dark_2s.yaml"], store=joint / "dark.zarr")
     with pytest.raises(ConfigError, match="no such file"):
         find_joint([joint / "nothing.yaml"])
-    with pytest.raises(ConfigError, match=r"--against: only for runs; .*input\.against"):
+    with pytest.raises(ConfigError, match=r"--against: only with runs; .*input\.against"):
         find_joint([joint / "dark.yaml"], against="none")
     runs = [joint / "dark_1s.yaml", joint / "dark_2s.yaml"]
     target, _ = find_joint(runs, store=joint / "unordered.zarr", against="none", write=False)

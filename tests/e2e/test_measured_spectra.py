@@ -33,7 +33,7 @@ def measured(tmp_path_factory, kernels):
 def test_ready_made_histograms_go_through_every_stage(measured):
     assert len(SPECTRA) == 6
     shell, result = measured
-    assert "every channel counting the same" in result.stderr
+    assert "with equal weight per channel" in result.stderr
     store = RunStore.open(shell.folder / "sipm.zarr")
     counts = store.read("histogram/counts")
     expected = [np.loadtxt(path, delimiter=",", skiprows=1)[:, 1].sum() for path in SPECTRA]

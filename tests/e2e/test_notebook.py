@@ -86,7 +86,7 @@ def test_a_pixel_is_that_of_the_store(run, store):
 
 @pytest.mark.parametrize("place", [(-1, 0), (20, 0), (0, 28)])
 def test_pixels_outside_are_refused(run, place):
-    with pytest.raises(ConfigError, match="lies outside the sensor of 20 x 28"):
+    with pytest.raises(ConfigError, match="is outside the sensor of 20 x 28"):
         run.pixel(*place)
 
 
@@ -114,7 +114,7 @@ def test_figures_are_those_of_the_report(run, finished, tmp_path):
 
 
 def test_what_is_missing_is_said(run, finished, tmp_path, monkeypatch):
-    with pytest.raises(StoreError, match="has no truth yet; see what is missing with: pchem status"):
+    with pytest.raises(StoreError, match="has no truth yet; for the state of the run: pchem status"):
         _ = run.truth
     with pytest.raises(StoreError, match="does not exist"):
         pchem_pipeline.open_run(tmp_path / "none.zarr")

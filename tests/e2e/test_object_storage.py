@@ -95,7 +95,7 @@ def test_frames_are_read_from_s3_and_fetched_once(cloud, server, camera, finishe
     changed[-1] ^= 1
     put(f"{server}/lab/night/{fetched[0].name}", bytes(changed))
     status = cloud.ok("status", "run.yaml").stdout.splitlines()[0]
-    assert status == "ingest      stale - the content of the input changed"
+    assert status == "ingest      stale - the input has changed"
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_a_store_on_s3_is_locked_for_all_machines(cloud, server, frames):
     put(lock, b"{")
     result = cloud("ingest", "run.yaml")
     assert result.code == 75
-    assert "lock.json is damaged; where no pchem command works on this run: python -c" in result.last
+    assert "lock.json is damaged; if no pchem command uses this run: python -c" in result.last
     code = result.last.partition('python -c "')[2].rstrip('"')
     subprocess.run([sys.executable, "-c", code], env={**os.environ, **cloud.environment}, check=True)
     cloud.ok("ingest", "run.yaml")

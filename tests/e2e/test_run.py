@@ -47,7 +47,7 @@ def test_a_folder_of_tiffs_becomes_a_report(shell, frames):
     again = shell.ok("run", "runs/dark.yaml")
     said = again.stderr.splitlines()
     assert said[:6] == [f"{stage}: up to date" for stage in STAGES]
-    assert any(line.startswith("Can I believe these results? ") for line in said)
+    assert any(line.startswith("Are these results reliable? ") for line in said)
     assert said[-1].startswith("  pchem ")
 
 
@@ -215,4 +215,4 @@ def test_a_run_stops_where_it_was_told_to(shell, frames):
     assert [stage for stage in STAGES if rows[stage] == "complete"] == ["ingest", "histogram"]
     wrong = shell("run", "run.yaml", "--until", "simulate")
     assert wrong.code == 2
-    assert wrong.last == f"pchem: --until simulate: this run does {', '.join(STAGES)}"
+    assert wrong.last == f"pchem: --until simulate: the stages of this run are {', '.join(STAGES)}"

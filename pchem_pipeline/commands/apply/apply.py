@@ -153,7 +153,7 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
     remarks = check_camera(frames, sensor) + check_level(frames, calibration)
     if modes.left and wanted.remove:
         remarks.append(
-            f"{', '.join(modes.left)}: of a time of the characterisation, so it stays in the frames"
+            f"{', '.join(modes.left)}: only at certain times of the characterisation, so not subtracted"
         )
     known = calibration.usable
     noise = (calibration.conversion_gain * calibration.read_noise_dn)[known]
@@ -162,7 +162,7 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
     if numbers and overlap:
         remarks.append(
             f"{overlap} of {known.sum()} pixels have a read noise above {PEAKS_OVERLAP_E} e-: their most "
-            "probable electron number is often wrong, expected_number is the better answer"
+            "probable electron number is often wrong; use expected_number"
         )
     prior_map = _prior_map(wanted.prior, sensor.shape) if numbers else None
     job = Job(
@@ -224,13 +224,11 @@ def _prior_map(prior: str, shape: tuple[int, int]) -> Any:
     except ValueError:
         found = read_image(Path(prior))
         if found.shape != shape:
-            raise ConfigError(f"--prior {prior}: a map of {found.shape}, the sensor is {shape}") from None
+            raise ConfigError(f"--prior {prior}: shape {found.shape}, but the sensor has {shape}") from None
     else:
         found = np.full(shape, value)
     if not (np.isnan(found) | (found >= 0.0)).all():
-        raise ConfigError(
-            f"--prior {prior}: an exposure is 0 or more e-; write frames, flat, run, H or a file"
-        )
+        raise ConfigError(f"--prior {prior}: give frames, flat, run, an exposure of 0 or more e-, or a file")
     return found
 
 
@@ -259,7 +257,7 @@ def _is_done(output: Path, content: dict[str, Any], command: Command) -> bool:
 
 def _exists(output: Path, *, ours: bool) -> ConfigError:
     cure = ", or replace it with --force" if ours else ""
-    what = "was made of other frames or with other settings" if ours else "holds no calibrated frames"
+    what = "was made from other frames or with other settings" if ours else "has no calibrated frames"
     return ConfigError(f"{output} exists and {what}; choose another --output{cure}")
 
 
@@ -352,8 +350,8 @@ def _do(context: StageContext, job: Job, made: _Made) -> None:
     if context.failed:
         key, reason = next(iter(context.failed.items()))
         raise IncompleteRunError(
-            f"{len(context.failed)} pieces failed, first {key}: {reason}; the rest is kept, run again to "
-            "retry"
+            f"{len(context.failed)} pieces failed, first {key}: {reason}; finished pieces are kept, run "
+            "again to retry"
         )
     finish_maps(context.store, job, made.calibration, context.reporter)
     if record is not None:

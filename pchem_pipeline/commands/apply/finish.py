@@ -42,7 +42,7 @@ def finish_maps(output: RunStore, job: Job, calibration: Calibration, reporter: 
     bad = int((~calibration.usable).sum())
     reporter.info(
         f"apply: {n} frames of {ny} x {nx} pixels"
-        + (f"; {bad} pixels without a calibration are NaN, see quality" if bad else "")
+        + (f"; {bad} pixels without a calibration are NaN (see quality)" if bad else "")
     )
 
 
@@ -93,8 +93,8 @@ def _write_noise(
     signal = gain * (sums[0] / n - calibration.bias)
     noise = [float(np.nanmedian(np.sqrt(np.maximum(each - signal, 0.0)))) for each in variances]
     reporter.info(
-        f"apply: {', '.join(job.removed)} taken from the frames: noise beyond that of the electrons' number "
-        f"{noise[0]:.3f} e- before, {noise[1]:.3f} e- after (median)"
+        f"apply: subtracted {', '.join(job.removed)}: median noise without shot noise {noise[0]:.3f} e- "
+        f"before, {noise[1]:.3f} e- after"
     )
 
 

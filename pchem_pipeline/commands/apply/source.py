@@ -45,7 +45,7 @@ def open_like_run(
         ConfigError: no files are named, or the run has no frames.
     """
     if sensor.kind == "histograms":
-        raise ConfigError(f"{target.store} was made from ready-made histograms, whose channels are no frames")
+        raise ConfigError(f"{target.store} was made from ready-made histograms; a run of frames is needed")
     settings = _settings(target).model_copy(
         update={"files": tuple(str(each) for each in files), "frame_range": None, "mask": None, "samples": ()}
     )
@@ -95,7 +95,7 @@ def _with_region(settings: InputSettings, region: list[int], sensor: SensorInfo,
     if sensor.whole is not None and shape != sensor.whole:
         raise InputError(
             f"{name}: frames of {_by(shape)} pixels, the run {run} has the region {region} of frames of "
-            f"{_by(sensor.whole)}; give frames of the same sensor, or of that region alone"
+            f"{_by(sensor.whole)}; give frames of the same sensor, or of this region"
         )
     return settings
 
@@ -124,19 +124,19 @@ def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:
     name = frames.paths[0]
     if here.serial and there.serial and here.serial != there.serial:
         raise InputError(
-            f"{name}: camera of serial number {here.serial}, the run was made with {there.serial}; give "
-            "frames of the same camera, or a run of this one"
+            f"{name}: camera with serial number {here.serial}, but the run has {there.serial}; give frames "
+            "of the same camera, or a run of this camera"
         )
     remarks = []
     if here.name and there.name and here.name.casefold() != there.name.casefold():
-        remarks.append(f"the frames name the camera {here.name}, those of the run {there.name}")
+        remarks.append(f"camera {here.name}, but {there.name} in the run")
     if here.temperature is not None and there.temperature is not None:
         warmer = here.temperature - there.temperature
         if abs(warmer) > _OTHER_TEMPERATURE:
             remarks.append(
-                f"the sensor was at {here.temperature:.4g} °C, in the characterisation at "
-                f"{there.temperature:.4g} °C: offset, gain and hot pixels may differ, take one at the same "
-                "temperature"
+                f"sensor temperature {here.temperature:.4g} °C, but {there.temperature:.4g} °C in the "
+                "characterisation: offset, gain and hot pixels may differ; use a characterisation at the "
+                "same temperature"
             )
     return remarks
 
@@ -155,25 +155,25 @@ def check_level(frames: FrameSequence, calibration: Calibration) -> list[str]:
     mean = np.mean([frames.read(int(t), int(t) + 1)[0] for t in chosen], axis=0, dtype=np.float64)
     known = calibration.usable
     if not known.any():
-        raise InputError("the run has no pixel with a good fit: nothing can be calibrated with it")
+        raise InputError("the run has no pixel with a good fit, so it cannot calibrate frames")
     above = (mean - calibration.bias)[known]
     sigma, gain = calibration.read_noise_dn[known], calibration.conversion_gain[known]
     level = float(np.median(above / sigma))
     if level < -_FAR_BELOW:
         raise InputError(
-            f"{frames.paths[0]}: the mean is {-np.median(above):.1f} DN below the bias of the run; these are "
-            "frames of another sensor, region, offset or temperature"
+            f"{frames.paths[0]}: mean {-np.median(above):.1f} DN below the bias of the run: frames of "
+            "another sensor, region, offset or temperature"
         )
     signal, usual = float(np.median(above * gain)), float(np.median(calibration.quanta_exposure[known]))
     remarks = []
     if level < -0.5:
         remarks.append(
-            f"the mean is {-np.median(above):.2f} DN below the bias of the run: the offset has moved, take a "
+            f"mean {-np.median(above):.2f} DN below the bias of the run: the offset has changed; use a "
             "characterisation at the same temperature"
         )
     if signal > _FAR_ABOVE * max(usual, 0.1):
         remarks.append(
-            f"the mean signal is {signal:.3g} e-, the characterisation was made at {usual:.3g} e-: the gain "
-            "is taken to be the same there"
+            f"mean signal {signal:.3g} e-, but {usual:.3g} e- in the characterisation; the same gain is "
+            "assumed"
         )
     return remarks

@@ -17,9 +17,9 @@ from pchem_pipeline.store.run_store import RunStore
 
 #: Groups that are left out, and why.
 NOT_COMPARED = {
-    "frames": "the digest of the camera files tells that they are the same",
-    "electrons": "it follows from the frames and the maps",
-    "ensemble_tiles": "what each tile adds to the ensemble: it depends on the tiling",
+    "frames": "same digest of the camera files",
+    "electrons": "computed from frames and maps",
+    "ensemble_tiles": "intermediate sums, depend on the tiling",
 }
 #: What a computation counts of itself; no result.
 _BOOKKEEPING = ("fit/n_iterations",)
@@ -60,7 +60,7 @@ def _row(name: str, one: RunStore, other: RunStore, tolerance: float) -> ArrayRo
         state: Any = "lost" if here is one else "new"
         return ArrayRow(name, state, counts, dtype, shape)
     if shape != tuple(other.array(name).shape):
-        why = f"its shape was {shape} and is {tuple(other.array(name).shape)}"
+        why = f"shape {shape} before, {tuple(other.array(name).shape)} now"
         return ArrayRow(name, "changed", counts, dtype, shape, why=why)
     digests, scales = zip(*(_digest(store, name) for store in (one, other)), strict=True)
     n_values = int(np.prod(shape))

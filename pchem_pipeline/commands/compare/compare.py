@@ -24,7 +24,7 @@ from pchem_pipeline.report.pages.compare import (
     render_comparison,
     sentence_of,
 )
-from pchem_pipeline.report.style.wording import count, measured, short, symbol
+from pchem_pipeline.report.style.wording import count, measured, short, signed, symbol
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target, find_run
@@ -104,13 +104,13 @@ def comparison_of(
     if len(paths) < 2:
         raise ConfigError("compare: give two runs or more")
     if not 0 <= tolerance < 1:
-        raise ConfigError(f"--tolerance {tolerance:g}: a relative difference from 0 to below 1 is meant")
+        raise ConfigError(f"--tolerance {tolerance:g}: give a relative difference from 0 to below 1")
     targets = [find_run(path) for path in paths]
     stores = [target.stored() for target in targets]
     for target, store in zip(targets, stores, strict=True):
         if not store.has("maps/conversion_gain"):
             raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
-        warn_if_old(target, ("fit", "maps", "ensemble"), f"{store.path} is compared as it is")
+        warn_if_old(target, ("fit", "maps", "ensemble"), f"{store.path} is compared in its present state")
     names = _told_apart([store.path for store in stores])
     runs = [
         _facts(label, name, store)
@@ -216,7 +216,7 @@ def _words(
     found = []
     if one.shape != other.shape:
         sizes = " and ".join(f"{ny} x {nx}" for ny, nx in (one.shape, other.shape))
-        found.append(f"The sensors have {sizes} pixels.")
+        found.append(f"Different sensors: {sizes} pixels.")
     counted = [row for row in arrays if row.counts and row.state in ("changed", "lost")]
     found += [f"{row.name}: {_array_words(row)}." for row in counted]
     for name, why in reasons.items():
@@ -224,20 +224,20 @@ def _words(
         if why.shifted:
             each = maps[name]
             median = measured(each.median, each.median_stderr, symbol(name)[2])
-            text.append(f"their median is {median}, {each.median_z:+.3g} standard errors of a pixel")
+            text.append(f"median changed by {median} ({signed(each.median_z)} sigma of one pixel)")
         if why.spread:
-            text.append(f"they scatter by {maps[name].spread_z:.3g} standard errors")
+            text.append(f"scatter {short(maps[name].spread_z, 2)} sigma")
         if why.pixels:
-            text.append(f"{count(maps[name].n_far, 'pixel')} moved by more than {LIMIT:g}")
+            text.append(f"{count(maps[name].n_far, 'pixel')} changed by more than {LIMIT:g} sigma")
         if text:
             sign = f"{symbol(name)[1]}{' (DN)' if name == 'read_noise_dn' else ''}"
-            found.append(f"{sign[0].upper()}{sign[1:]}, differences: {', '.join(text)}.")
+            found.append(f"{sign[0].upper()}{sign[1:]}: {', '.join(text)}.")
     return found
 
 
 def _array_words(row: ArrayRow) -> str:
     if row.state == "lost":
-        return "is not there any more"
+        return "missing"
     if row.why:
         return row.why
     share = f"{count(row.n_beyond, 'value')} of {row.n_values:,} changed"

@@ -76,12 +76,12 @@ def history_rows(
     labels, against, rate = wanted.labels, wanted.axis, wanted.rate
     if labels and len(labels) != len(runs):
         raise ConfigError(
-            f"--label: {len(labels)} given for {len(runs)} runs; give one for each, in their order"
+            f"--label: {len(labels)} labels for {len(runs)} runs; give one per run, in the same order"
         )
     if not labels and against == "label":
-        raise ConfigError("--against label: there are none; give --label once for each run")
+        raise ConfigError("--against label: no labels; give --label once per run")
     if not 0.0 < rate < 1.0:
-        raise ConfigError(f"--fdr {rate:g}: a rate between 0 and 1 is meant, such as 0.01")
+        raise ConfigError(f"--fdr {rate:g}: give a rate between 0 and 1, such as 0.01")
     cameras = [SensorInfo.read(store).camera for store in stores]
     silent = [run.name for run, camera in zip(runs, cameras, strict=True) if camera.temperature is None]
     if against == "temperature" and silent:

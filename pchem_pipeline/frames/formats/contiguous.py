@@ -90,7 +90,7 @@ def even_offsets(
     """
     step = frame_bytes if step is None else step
     if n_frames and frame_bytes < 1:
-        raise InputError(f"{path}: holds no frames; leave it out")
+        raise InputError(f"{path}: no frames; omit it")
     if n_frames and start + step * (n_frames - 1) + frame_bytes > size:
         whole = max(0, (size - start - frame_bytes) // step + 1)
         raise _truncated(path, n_frames, start + step * (n_frames - 1) + frame_bytes, size, whole)
@@ -103,7 +103,7 @@ def even_offsets(
 
 def _truncated(path: Path, n_frames: int, needed: int, size: int, whole: int) -> InputError:
     return InputError(
-        f"{path}: truncated: {n_frames} frames need {needed} bytes, the file has {size} ({whole} whole "
+        f"{path}: truncated: {n_frames} frames need {needed} bytes, the file has {size} ({whole} complete "
         "frames); copy the file again"
     )
 
@@ -120,12 +120,12 @@ class OpenedFile:
         try:
             self._handle = os.open(path, os.O_RDONLY)
         except FileNotFoundError as error:
-            raise changed(path, "the file vanished") from error
+            raise changed(path, "the file disappeared") from error
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
         if os.fstat(self._handle).st_size < size:
             os.close(self._handle)
-            raise changed(path, "the file became shorter")
+            raise changed(path, "the file was truncated")
 
     def __enter__(self) -> OpenedFile:
         return self
@@ -142,7 +142,7 @@ class OpenedFile:
             except OSError as error:
                 raise InputError(f"{self._path}: read error ({error.strerror}); check the disk") from error
             if count == 0:
-                raise changed(self._path, "the file became shorter")
+                raise changed(self._path, "the file was truncated")
             done += count
 
     def scatter(self, targets: Sequence[memoryview], offset: int) -> None:
@@ -261,7 +261,7 @@ class ContiguousReader(FrameReader):
             try:
                 self.decode_into(buffer, t0, t1, y0, y1)
             except FileNotFoundError as error:
-                raise changed(path, "the file vanished") from error
+                raise changed(path, "the file disappeared") from error
             except InputError:
                 raise
             except Exception as error:
@@ -310,9 +310,9 @@ def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, pat
         lowest = int(buffer.view(f"i{stored.itemsize}").min()) + offset
         if lowest < 0:
             raise InputError(
-                f"{path}: signed samples with negative values (down to {lowest} DN"
-                f"{f', with the offset of {offset}' if offset else ''}), where 0 or more are needed; set "
-                f"input.offset: {top} (--offset {top}), if 0 DN is stored as -{top}"
+                f"{path}: negative samples (down to {lowest} "
+                f"DN{f', with the offset of {offset}' if offset else ''}), 0 or more needed; set "
+                f"input.offset: {top} (--offset {top}) if 0 DN is stored as -{top}"
             )
     if offset:
         np.add(buffer, buffer.dtype.type(offset), out=buffer)  # modulo 2**bits: right for signed ones

@@ -96,9 +96,7 @@ class FitsReader(ContiguousReader):
             self._read_facts(primary, header)
         if compressed:
             if end > size:
-                raise InputError(
-                    f"{path}: truncated: {end} bytes are needed, the file has {size}; copy it again"
-                )
+                raise InputError(f"{path}: truncated: {end} bytes needed, the file has {size}; copy it again")
             self._compressed, self._size = number, size
             check_coded(path, self.shape, hdu.tile_shape, stored.itemsize, size)
             return
@@ -124,7 +122,7 @@ class FitsReader(ContiguousReader):
 
         path = self.paths[0]
         if path.stat().st_size != self._size:
-            raise changed(path, "the file changed its size")
+            raise changed(path, "the size of the file changed")
         with _LOCK, fits.open(path, memmap=False) as hdus:
             values = hdus[self._compressed].section[full_window(self._full, t0, t1, y0, y1)]
         buffer[...] = np.asarray(values).reshape(buffer.shape)
@@ -142,7 +140,7 @@ def _image(path: Path, hdus: Any, settings: InputSettings) -> tuple[int, Any, An
         ):
             images.append((number, hdu))
     if not images:
-        raise InputError(f"{path}: holds no image; leave it out")
+        raise InputError(f"{path}: no image; omit it")
     if settings.dataset is not None:
         wanted = settings.dataset.strip()
         images = [(n, hdu) for n, hdu in images if wanted in (str(n), hdu.name)]
@@ -150,7 +148,7 @@ def _image(path: Path, hdus: Any, settings: InputSettings) -> tuple[int, Any, An
         names = ", ".join(f"{n} ({hdu.name or 'unnamed'})" for n, hdu in images[:12]) or "none"
         names += f" and {len(images) - 12} more" if len(images) > 12 else ""
         raise InputError(
-            f"{path}: images in the file{' of that name' * (settings.dataset is not None)}: {names}; "
+            f"{path}: images in the file{' with this name' * (settings.dataset is not None)}: {names}; "
             "choose one by its number in input.dataset (--dataset), or write the frames as one cube"
         )
     return *images[0], hdus[0].header
@@ -160,13 +158,10 @@ def _value_notes(path: Path, header: Any, frames: int) -> tuple[str, ...]:
     """Say where pixels may be no samples, or planes no frames."""
     notes = []
     if "BLANK" in header:
-        notes.append(
-            f"{path.name}: BLANK = {header['BLANK']} marks pixels without a value; they are read as stored"
-        )
+        notes.append(f"{path.name}: BLANK = {header['BLANK']} marks pixels without a value; read as stored")
     if frames == 3:
         notes.append(
-            f"{path.name}: its 3 planes are read as frames; if they are colours, write each to a file of its "
-            "own"
+            f"{path.name}: its 3 planes are read as frames; if they are colours, write one file per colour"
         )
     return tuple(notes)
 
@@ -196,13 +191,12 @@ def _coding_notes(path: Path, number: int, piece: int, *, biased: bool) -> tuple
         options = {str(header[f"ZNAME{i}"]).strip(): header.get(f"ZVAL{i}") for i in _numbers(header)}
     if coding.startswith("PLIO") and biased:
         raise InputError(
-            f"{path}: unsigned samples compressed by PLIO, which cannot be decoded reliably; unpack it by "
-            "funpack"
+            f"{path}: unsigned samples compressed by PLIO cannot be decoded reliably; unpack with funpack"
         )
     if coding.startswith("HCOMPRESS") and float(options.get("SCALE") or 0) != 0:
         return (
-            f"{path.name}: HCOMPRESS with scale {options['SCALE']} loses information; noise and histograms "
-            "are no longer those of the camera",
+            f"{path.name}: lossy compression (HCOMPRESS, scale {options['SCALE']}); noise and histograms are "
+            "altered",
         )
     return ()
 
@@ -247,10 +241,7 @@ def _samples(path: Path, header: Any, compressed: bool) -> tuple[np.dtype[Any], 
     top = _UNSIGNED_ZERO.get(bits, 0)
     plain = not compressed and not isinstance(zero, str) and zero == int(zero)
     if scale != 1 or not (zero in (0, top) or (plain and 0 < zero < top)):
-        raise InputError(
-            f"{path}: scaled data (BSCALE {scale}, BZERO {zero}), which are no digital numbers; write raw "
-            "integers"
-        )
+        raise InputError(f"{path}: scaled data (BSCALE {scale}, BZERO {zero}), no raw DN; write raw integers")
     return stored, int(zero)
 
 

@@ -68,9 +68,11 @@ class Hdf5Reader(ContiguousReader):
                 with _LOCK, opened(path) as file:
                     reader._inspect(path, file, settings)
             except OSError as error:
-                words = "is being written, or was never closed; wait for its program"
+                words = "is open for writing or was not closed; wait for the writing program"
                 if "already open for write" in str(error):
-                    raise InputError(f"{path}: {words}, or free it by: h5clear -s {quoted(path)}") from error
+                    raise InputError(
+                        f"{path}: {words}, or clear the flag: h5clear -s {quoted(path)}"
+                    ) from error
                 if isinstance(error, BlockingIOError):
                     raise InputError(f"{path}: {words}") from error
                 raise
@@ -85,7 +87,7 @@ class Hdf5Reader(ContiguousReader):
         def visit(name: str, item: Any) -> None:
             if len(found) > _MOST_ITEMS or name.count("/") > _DEEPEST:
                 raise InputError(
-                    f"{path}: holds more than {_MOST_ITEMS} items, or groups too deep; leave it out"
+                    f"{path}: more than {_MOST_ITEMS} items, or too deeply nested groups; omit it"
                 )
             if isinstance(item, h5py.Dataset):
                 if item.is_virtual and wanted in (None, name, f"/{name}"):
@@ -129,7 +131,7 @@ class Hdf5Reader(ContiguousReader):
         with _LOCK, opened(self.paths[0]) as file:
             dataset = file[self._name]
             if tuple(dataset.shape) != self._full:
-                raise changed(self.paths[0], "the dataset changed its shape")
+                raise changed(self.paths[0], "the shape of the dataset changed")
             if len(self._full) == buffer.ndim and dataset.dtype == buffer.dtype:
                 dataset.read_direct(buffer, window)
             else:
@@ -163,7 +165,7 @@ def _check_chunk_sizes(path: Path, dataset: Any) -> None:
     dataset.id.chunk_iter(lambda chunk: sizes.add(chunk.size))
     if sizes - {size}:
         raise InputError(
-            f"{path}: damaged: a chunk of {min(sizes - {size})} bytes, where {size} are needed; copy it again"
+            f"{path}: damaged: a chunk of {min(sizes - {size})} bytes, {size} needed; copy it again"
         )
 
 
@@ -178,7 +180,7 @@ def _check_deflated(path: Path, dataset: Any) -> None:
     record = dataset.id.get_create_plist()
     codes = [record.get_filter(number)[0] for number in range(record.get_nfilters())]
     if len(codes) > len(set(codes)):
-        raise InputError(f"{path}: {dataset.name} is coded twice by the same filter; write it again")
+        raise InputError(f"{path}: {dataset.name} is encoded twice by the same filter; write it again")
     if [code for code in codes if code != h5z.FILTER_FLETCHER32][-1:] != [h5z.FILTER_DEFLATE] or not hasattr(
         dataset.id, "chunk_iter"
     ):
@@ -274,4 +276,4 @@ def _reversed_axes(path: Path, dataset: Any) -> tuple[str, ...]:
     """Say how the axes of an array of MATLAB are read, which writes them in reverse order."""
     if "MATLAB_class" not in dataset.attrs or dataset.ndim < 2:
         return ()
-    return (f"{path.name}: written by MATLAB: the last axis there is read as frames, columns as rows",)
+    return (f"{path.name}: written by MATLAB: last axis read as frames, columns as rows",)

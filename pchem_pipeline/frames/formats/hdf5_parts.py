@@ -52,8 +52,8 @@ def check_links(path: Path, links: dict[str, str], wanted: str | None) -> None:
         shown = ", ".join(f"{name} in {file}" for name, file in list(asked.items())[:4])
         more = f" and {len(asked) - 4} more" if len(asked) > 4 else ""
         raise InputError(
-            f"{path}: its frames are in other files: {shown}{more}; name those instead, and what this file "
-            "says besides by --integration-time and --bit-depth, or choose a dataset here by --dataset"
+            f"{path}: its frames are in other files: {shown}{more}; give those, with --integration-time and "
+            "--bit-depth from this file, or choose a dataset with --dataset"
         )
 
 
@@ -78,8 +78,8 @@ def check_sources(path: Path, dataset: Any) -> tuple[str, ...]:
     bad = [source.file_name for source in sources if not _is_whole(path, source)]
     if bad:
         raise InputError(
-            f"{path}: {len(bad)} of the {len(sources)} parts of {dataset.name} are missing or too short, the "
-            f"first in {bad[0]}; put the files where they were when it was written"
+            f"{path}: {len(bad)} of the {len(sources)} parts of {dataset.name} are missing or truncated, the "
+            f"first in {bad[0]}; restore these files"
         )
     notes = _elsewhere(path, {source.file_name for source in sources} - {"."})
     try:
@@ -95,15 +95,15 @@ def _check_raw_parts(path: Path, dataset: Any) -> tuple[str, ...]:
     for name, offset, size in dataset.external:
         if not Path(name).exists():  # so the library looks for it: from the current folder
             raise InputError(
-                f"{path}: the samples of {dataset.name} lie in {name}, which is not here; start the command "
-                "in the folder of that file"
+                f"{path}: the samples of {dataset.name} are in {name}, which is not found; start the command "
+                "in the folder of this file"
             )
         found += max(0, min(size, source_file(path, Path(name)).stat().st_size - offset))
     names = {name for name, *_ in dataset.external}
     if found < needed:
         raise InputError(
-            f"{path}: the samples of {dataset.name} lie in {', '.join(sorted(names)[:4])}, truncated: "
-            f"{needed} bytes are needed, {found} are there; copy the file again"
+            f"{path}: the samples of {dataset.name} are in {', '.join(sorted(names)[:4])}, truncated: "
+            f"{needed} bytes needed, {found} found; copy the file again"
         )
     return _elsewhere(path, names)
 
@@ -116,11 +116,9 @@ def source_file(path: Path, other: Path) -> Path:
     """
     home, real = path.resolve().parent, other.resolve()
     if home not in real.parents:
-        raise InputError(
-            f"{path}: names {real} as its source, which is not beside or below it; copy it there"
-        )
+        raise InputError(f"{path}: its source {real} is not in the same folder or below; copy it there")
     if real.exists() and not real.is_file():
-        raise InputError(f"{path}: names {real} as its source, which is no regular file; copy it again")
+        raise InputError(f"{path}: its source {real} is not a regular file; copy it again")
     return real
 
 
@@ -138,7 +136,8 @@ def check_virtual(path: Path, dataset: Any, above: tuple[tuple[Path, str], ...] 
     here = (*above, (path.resolve(), dataset.name.strip("/")))
     if len(here) > _DEEPEST or dataset.id.get_create_plist().get_virtual_count() > _MOST_PARTS:
         raise InputError(
-            f"{path}: the parts of {dataset.name} are too many or too deep; copy its frames together"
+            f"{path}: {dataset.name} has too many or too deeply nested parts; copy its frames into one "
+            "dataset"
         )
     sources = dataset.virtual_sources()
     for source in sources:
@@ -150,7 +149,7 @@ def check_virtual(path: Path, dataset: Any, above: tuple[tuple[Path, str], ...] 
                 source_file(path, each)
             continue
         if (other, source.dset_name.strip("/")) in here:
-            raise InputError(f"{path}: {dataset.name} is a part of itself; write its frames again")
+            raise InputError(f"{path}: {dataset.name} contains itself; write its frames again")
         with suppress(OSError), opened(other) as file:
             part = _plain(file, source.dset_name)
             if getattr(part, "is_virtual", False):
@@ -205,7 +204,7 @@ def opened(path: Path) -> Any:
 
 
 def _elsewhere(path: Path, names: set[str]) -> tuple[str, ...]:
-    words = f"{path.name}: its frames lie in other files ({len(names)}), whose changes are not noticed"
+    words = f"{path.name}: its frames are in {len(names)} other files; changes of these are not detected"
     return (words,) if names else ()
 
 
@@ -252,6 +251,6 @@ def check_filters(path: Path, dataset: Any) -> None:
         except (OSError, ValueError) as error:
             words = name.decode("utf-8", "replace") or "without a name"
             raise InputError(
-                f"{path}: {dataset.name} is coded by HDF5 filter {code} ({words}), which is not installed; "
-                f"install it ({install_hint('hdf5')} has most), or write the file again with gzip"
+                f"{path}: {dataset.name} needs HDF5 filter {code} ({words}), which is not installed; install "
+                f"it ({install_hint('hdf5')} has most), or write the file again with gzip"
             ) from error

@@ -40,7 +40,7 @@ def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> 
     if dtype.kind == "u" and dtype.itemsize in (1, 2, 4):
         if wanted is not None and np.dtype(wanted).itemsize != dtype.itemsize:
             raise InputError(
-                f"{path}: has {dtype.name} samples, input.dtype says {wanted}; correct input.dtype"
+                f"{path}: has {dtype.name} samples, but input.dtype is {wanted}; correct input.dtype"
             )
         if settings.offset is not None:
             raise InputError(f"{path}: has unsigned samples ({dtype.name}); remove input.offset (--offset)")
@@ -49,13 +49,13 @@ def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> 
         unsigned, top = f"uint{8 * dtype.itemsize}", 1 << (8 * dtype.itemsize - 1)
         if wanted not in (None, unsigned) or (settings.offset or 0) > top:
             raise InputError(
-                f"{path}: has {dtype.name} samples; they are read as {unsigned}, with an offset of at most "
-                f"{top} DN; correct input.dtype or input.offset"
+                f"{path}: has {dtype.name} samples, read as {unsigned} with an offset of at most {top} DN; "
+                "correct input.dtype or input.offset"
             )
         if settings.offset is not None or wanted is not None:
             return settings.offset or 0
         raise InputError(
-            f"{path}: signed samples ({dtype.name}); if they are never negative, set input.dtype: {unsigned} "
+            f"{path}: signed samples ({dtype.name}); if none is negative, set input.dtype: {unsigned} "
             f"(--dtype {unsigned}); if 0 DN is stored as -{top}, set input.offset: {top} (--offset {top})"
         )
     if dtype.kind in "fc":
@@ -64,9 +64,7 @@ def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> 
             "uint32) are needed, before any correction or averaging"
         )
     if dtype.kind in "OV" or dtype.hasobject:
-        raise InputError(
-            f"{path}: holds objects, not numbers; save it as a plain array of uint8, uint16 or uint32"
-        )
+        raise InputError(f"{path}: objects instead of numbers; save a plain array of uint8, uint16 or uint32")
     raise InputError(f"{path}: samples of type {dtype.name}; uint8, uint16 or uint32 are needed")
 
 
@@ -80,7 +78,7 @@ def stack_shape(path: Path, shape: Sequence[int], what: str = "array") -> tuple[
     if min(sizes, default=0) < 0 or max(sizes[-2:], default=0) > _MOST_PIXELS:
         raise InputError(f"{path}: damaged header: {what} of shape {tuple(shape)}; copy the file again")
     if len(sizes) < 2:
-        raise InputError(f"{path}: {what} of shape {tuple(shape)}; frames need (frames, rows, columns)")
+        raise InputError(f"{path}: {what} of shape {tuple(shape)}; needed: (frames, rows, columns)")
     leading = [size for size in sizes[:-2] if size != 1]
     if len(leading) > 1:
         raise InputError(
@@ -90,7 +88,7 @@ def stack_shape(path: Path, shape: Sequence[int], what: str = "array") -> tuple[
         )
     if leading and sizes[-1] in (3, 4) and len(sizes) > 3:
         raise InputError(
-            f"{path}: {what} of shape {tuple(shape)} looks like colour images; monochrome is needed"
+            f"{path}: {what} of shape {tuple(shape)} looks like colour images; monochrome frames are needed"
         )
     return (leading[0] if leading else 1), sizes[-2], sizes[-1]
 
@@ -201,12 +199,11 @@ def choose_dataset(path: Path, shapes: Mapping[str, tuple[int, ...]], wanted: st
         if name in shapes:
             return name
         raise InputError(
-            f"{path}: no dataset {wanted!r}; there are: {listed or 'no images'}; correct input.dataset "
-            "(--dataset)"
+            f"{path}: no dataset {wanted!r}, only: {listed or 'no images'}; correct input.dataset (--dataset)"
         )
     if not stacks and not images:
-        raise InputError(f"{path}: holds no dataset of frames (frames, rows, columns); leave it out")
+        raise InputError(f"{path}: no dataset of frames (frames, rows, columns); omit it")
     candidates = stacks or images
     if len(candidates) > 1:
-        raise InputError(f"{path}: holds several datasets: {listed}; choose one by input.dataset (--dataset)")
+        raise InputError(f"{path}: several datasets: {listed}; choose one with input.dataset (--dataset)")
     return candidates[0]

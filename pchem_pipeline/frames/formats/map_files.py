@@ -196,9 +196,9 @@ def read_image(path: Path) -> NDArray[np.float64]:
     kinds |= dict.fromkeys((".fits", ".fit", ".fts"), _read_fits)
     kind = kinds.get(path.suffix.lower())
     if kind is None:
-        raise InputError(f"{path}: an image is read from .npy, .tif or .fits")
+        raise InputError(f"{path}: give an image as .npy, .tif or .fits")
     if path.exists() and not path.is_file():
-        raise InputError(f"{path}: no regular file")
+        raise InputError(f"{path}: not a regular file")
     try:
         values = np.squeeze(np.asarray(kind(path), np.float64))
     except FileNotFoundError as error:
@@ -206,7 +206,7 @@ def read_image(path: Path) -> NDArray[np.float64]:
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"{path}: cannot be read as an image ({error})") from error
     if values.ndim not in (2, 3):
-        raise InputError(f"{path}: an array of {values.ndim} axes; an image has two, a sequence three")
+        raise InputError(f"{path}: an array of {values.ndim} axes; an image needs two, a sequence three")
     return values
 
 

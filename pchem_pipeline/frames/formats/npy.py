@@ -37,23 +37,21 @@ class NpyReader(ContiguousReader):
             start, size = stream.tell(), path.stat().st_size
         if dtype.hasobject:
             raise InputError(
-                f"{path}: an object array, whose pickle is never opened; save a plain array of uint8, "
-                "uint16 or uint32"
+                f"{path}: an object array (pickles are never opened); save a plain array of uint8, uint16 or "
+                "uint32"
             )
         offset = check_samples(path, dtype, settings)
         n, rows, columns = stack_shape(path, shape)
         if fortran and n * rows > 1 and n * columns > 1 and rows * columns > 1:
             raise InputError(
-                f"{path}: in Fortran order; save it by numpy.save(..., numpy.ascontiguousarray(frames))"
+                f"{path}: Fortran order; save it with numpy.save(..., numpy.ascontiguousarray(frames))"
             )
         offsets = even_offsets(path, n, rows * columns * dtype.itemsize, size, start=start)
         reader = cls()
         reader.set_layout(path, Layout(offsets, rows, columns, dtype, offset), size)
         behind = size - max(start, reader._layout.end)
         if behind:
-            reader.notes = (
-                f"{path.name}: {behind} bytes behind the array that its header names are left out",
-            )
+            reader.notes = (f"{path.name}: {behind} bytes after the array are ignored",)
         return reader
 
 

@@ -63,12 +63,14 @@ class ZarrReader(ContiguousReader):
         from pchem_pipeline.store.zarr_store import foreign_codecs
 
         if link := link_out_of(path):
-            raise InputError(f"{path}: {link} is a link out of the store; copy its files into it")
+            raise InputError(f"{path}: {link} is a link out of the store; copy its files into the store")
         parts = [*path.rglob("*")]
         if special := next((part for part in parts if not (part.is_file() or part.is_dir())), None):
-            raise InputError(f"{path}: {special.relative_to(path)} is no regular file; copy the store again")
+            raise InputError(
+                f"{path}: {special.relative_to(path)} is not a regular file; copy the store again"
+            )
         if max((len(part.relative_to(path).parts) for part in parts), default=0) > _DEEPEST:
-            raise InputError(f"{path}: groups more than {_DEEPEST} deep; copy the array out of them")
+            raise InputError(f"{path}: groups nested more than {_DEEPEST} deep; copy the array out of them")
         node = zarr.open(path, mode="r")
         if isinstance(node, zarr.Array):
             array: Any = node
@@ -81,8 +83,8 @@ class ZarrReader(ContiguousReader):
             attributes = {**node.attrs, **array.attrs}
         if foreign := foreign_codecs(array):
             raise InputError(
-                f"{path}: {self._name or 'the array'} is coded by {', '.join(foreign)}, which may run code; "
-                "write it again with blosc, gzip or zstd"
+                f"{path}: {self._name or 'the array'} is encoded by {', '.join(foreign)}, which may run "
+                "code; write it again with blosc, gzip or zstd"
             )
         self.set_stack(path, array.shape, np.dtype(array.dtype), settings, f"array {self._name}".strip())
         self.rows_per_read = min(self.shape[1], int(array.chunks[-2]))
@@ -97,7 +99,7 @@ class ZarrReader(ContiguousReader):
     def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         """See `ContiguousReader.decode_into`."""
         if not self.paths[0].exists():  # missing chunks would read as the fill value
-            raise changed(self.paths[0], "the store vanished")
+            raise changed(self.paths[0], "the store disappeared")
         buffer[...] = np.asarray(self._array[full_window(self._full, t0, t1, y0, y1)]).reshape(buffer.shape)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -112,7 +114,7 @@ class ZarrReader(ContiguousReader):
             node: Any = zarr.open(self.paths[0], mode="r")
             self._array = node[self._name] if self._name else node
         except Exception as error:
-            raise changed(self.paths[0], "the store vanished or broke") from error
+            raise changed(self.paths[0], "the store disappeared or is damaged") from error
 
 
 def _check_chunks(path: Path, folder: Path, array: Any, parts: Sequence[Path]) -> tuple[str, ...]:
@@ -159,7 +161,7 @@ def _channel_notes(path: Path, axes: Sequence[str], shape: Sequence[int]) -> tup
     """Say that channels are read as frames."""
     if "c" not in axes or len(axes) != len(shape) or (channels := shape[axes.index("c")]) < 2:
         return ()
-    return (f"{path.name}: its metadata call the images {channels} channels; they are read as frames",)
+    return (f"{path.name}: its metadata describe the images as {channels} channels; read as frames",)
 
 
 def _shapes(group: Any) -> dict[str, tuple[int, ...]]:

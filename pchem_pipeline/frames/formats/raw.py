@@ -98,7 +98,7 @@ class RawReader(ContiguousReader):
         if facts["shape"] is None or facts["dtype"] is None:
             missing = " and ".join(f"input.{name}" for name in ("shape", "dtype") if facts[name] is None)
             raise InputError(
-                f"{path}: raw frames need {missing}; set it, or write a sidecar {path.name}.json"
+                f"{path}: raw frames need {missing}; set this, or write a sidecar {path.name}.json"
             )
         reader = cls()
         reader.bit_shift = facts["bit_shift"] or 0
@@ -111,8 +111,8 @@ class RawReader(ContiguousReader):
         shape, header, padding = facts["shape"], facts["header_bytes"] or 0, facts["frame_padding_bytes"] or 0
         if len(shape) not in (2, 3) or min(shape) < 1 or header < 0 or padding < 0:
             raise InputError(
-                f"{path}: shape {list(shape)}, header_bytes {header}, frame_padding_bytes {padding} make no "
-                "sense; shape is [rows, columns] or [frames, rows, columns]; correct the sidecar"
+                f"{path}: shape {list(shape)}, header_bytes {header}, frame_padding_bytes {padding} are "
+                "invalid; shape is [rows, columns] or [frames, rows, columns]; correct the sidecar"
             )
         self.byte_order = facts["byte_order"] or "little"
         stored = np.dtype(facts["dtype"])
@@ -130,13 +130,12 @@ class RawReader(ContiguousReader):
         n = shape[0] if len(shape) == 3 else whole
         if len(shape) == 2 and (rest or whole == 0):
             raise InputError(
-                f"{path}: truncated, or not {rows} x {columns} {facts['dtype']}: {size} bytes are a "
-                f"header of {header}, "
-                f"{whole} frames of {step} and {rest} more; copy the file again, or correct input.shape, "
+                f"{path}: truncated, or not {rows} x {columns} {facts['dtype']}: {size} bytes = header of "
+                f"{header} + {whole} frames of {step} + {rest}; copy the file again, or correct input.shape, "
                 "input.dtype, input.header_bytes or input.frame_padding_bytes"
             )
         if n < whole:
-            self.notes = (f"{path.name} holds {whole} frames, of which the first {n} are used (shape)",)
+            self.notes = (f"{path.name} has {whole} frames; the first {n} are used (shape)",)
         offsets = even_offsets(path, n, frame, size, start=header, step=step)
         self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
 

@@ -83,12 +83,10 @@ def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) 
     """Write frames as SER video (uint8 or uint16) without times; see `frames.writing.write_frames`."""
     shape, dtype, _, bit_depth = stack
     if dtype.itemsize > 2:
-        raise InputError(f"{path}: SER holds at most 16 bits, not {dtype.name}; choose another format")
+        raise InputError(f"{path}: SER has at most 16 bits, not {dtype.name}; choose another format")
     n, rows, columns = shape
     depth = bit_depth or 8 * dtype.itemsize
     if (depth > 8) != (dtype.itemsize == 2):
-        raise InputError(
-            f"{path}: SER stores {depth} bits in other samples than {dtype.name}; choose another format"
-        )
+        raise InputError(f"{path}: SER cannot store {depth} bits as {dtype.name}; choose another format")
     header = _HEADER.pack(_MAGIC, 0, 0, 0, columns, rows, depth, n, b"", b"", b"", 0, 0)
     write_plain(path, header, blocks, dtype.newbyteorder("<"))

@@ -94,8 +94,8 @@ class TiffReader(ContiguousReader):
         pages = [page for page in file.pages if not page.is_reduced]
         reduced = len(file.pages) - len(pages)
         if not pages:
-            raise InputError(f"{path}: not a sound TIFF file, or truncated (no pages); copy it again")
-        notes = [f"{path.name}: {reduced} reduced pages (previews) are left out"] if reduced else []
+            raise InputError(f"{path}: not a valid TIFF file, or truncated (no pages); copy it again")
+        notes = [f"{path.name}: {reduced} reduced pages (previews) are ignored"] if reduced else []
         first = pages[0]
         _check_pages(path, pages)
         offset = check_samples(path, np.dtype(first.dtype), settings)
@@ -126,7 +126,7 @@ class TiffReader(ContiguousReader):
         broken = np.flatnonzero(outside.any(axis=1))
         if broken.size:
             raise InputError(
-                f"{path}: truncated: {broken.size} of {len(pages)} pages end behind the end of the file "
+                f"{path}: truncated: {broken.size} of {len(pages)} pages extend beyond the end of the file "
                 f"({size} bytes); copy the file again"
             )
         first = pages[0]
@@ -223,10 +223,10 @@ def _channel_notes(path: Path, channels: int, images: int, pages: int) -> list[s
         return []
     if images == pages > channels:
         raise InputError(
-            f"{path}: its metadata call the {pages} pages {channels} channels of {pages // channels} images "
-            "each; write each channel as a file of its own"
+            f"{path}: its metadata describe the {pages} pages as {channels} channels of {pages // channels} "
+            "images; write one file per channel"
         )
-    return [f"{path.name}: its metadata call the pages {channels} channels; they are read as frames"]
+    return [f"{path.name}: its metadata describe the pages as {channels} channels; read as frames"]
 
 
 def _value_notes(path: Path, pages: Sequence[Any]) -> list[str]:
@@ -238,15 +238,15 @@ def _value_notes(path: Path, pages: Sequence[Any]) -> list[str]:
     lossy = [name for name in names if any(word in name for word in _LOSSY)]
     if lossy:
         notes.append(
-            f"{path.name}: {', '.join(sorted(lossy))} coding can lose information; noise and histograms "
-            "may no longer be those of the camera"
+            f"{path.name}: {', '.join(sorted(lossy))} compression can be lossy; noise and histograms may be "
+            "altered"
         )
     counts = [count for page in pages for count in page.databytecounts]
     notes += unwritten_notes(path, counts.count(0), len(counts), "strips or tiles")
     if getattr(pages[0].photometric, "name", "") == "MINISWHITE":
         notes.append(
-            f"{path.name}: its tags call 0 white; samples are read as stored: if more light makes them "
-            "smaller, invert them first"
+            f"{path.name}: its tags declare 0 as white; samples are read as stored: if more light lowers "
+            "them, invert them first"
         )
     return notes
 
@@ -257,33 +257,33 @@ def _check_pages(path: Path, pages: Sequence[Any]) -> None:
     for number, page in enumerate(pages):
         if page.dtype is None or not all(isinstance(length, int) for length in page.shape):
             raise InputError(
-                f"{path}: page {number} has samples of an unknown type, or a damaged header; write it as "
-                "uint8 or uint16"
+                f"{path}: page {number}: unknown sample type or damaged header; write it as uint8 or uint16"
             )
         if (page.shape, page.dtype) != (first.shape, first.dtype):
             raise InputError(
-                f"{path}: page {number} is {_words(page)}, page 0 is {_words(first)}; frames must be alike"
+                f"{path}: page {number} is {_words(page)}, page 0 is {_words(first)}; all frames must have "
+                "the same shape and type"
             )
     photometric = first.photometric.name if hasattr(first.photometric, "name") else str(first.photometric)
     planes = first.samplesperpixel
     separate = planes > 1 and int(first.planarconfig) == 2 and photometric.startswith("MINIS")
     if photometric not in ("MINISBLACK", "MINISWHITE") or (planes > 1 and not separate):
         raise InputError(
-            f"{path}: colour or multi-channel images ({photometric}, {planes} samples a pixel); "
-            "monochrome raw frames are needed"
+            f"{path}: colour or multi-channel images ({photometric}, {planes} samples per pixel); monochrome "
+            "raw frames are needed"
         )
     if len(first.shape) > (2 if planes == 1 else 3):
-        raise InputError(f"{path}: pages of {_words(first)}, which are volumes; write one frame a page")
+        raise InputError(f"{path}: pages of {_words(first)} are volumes; write one frame per page")
     if planes > 1 and len(pages) > 1:
-        raise InputError(f"{path}: {len(pages)} pages of {planes} planes each; write one frame a page")
+        raise InputError(f"{path}: {len(pages)} pages of {planes} planes each; write one frame per page")
     if planes > 1 and int(first.compression) != 1:
-        raise InputError(f"{path}: one page of {planes} compressed planes; write one frame a page")
+        raise InputError(f"{path}: one page of {planes} compressed planes; write one frame per page")
     for number, page in enumerate(pages):
         offsets, counts = len(page.dataoffsets), len(page.databytecounts)
         if offsets != counts or offsets < math.prod(page.chunked):
             raise InputError(
-                f"{path}: page {number} names {offsets} strips or tiles and {counts} sizes, where "
-                f"{math.prod(page.chunked)} are needed: not written to its end; copy or write it again"
+                f"{path}: page {number} has {offsets} strips or tiles and {counts} sizes, "
+                f"{math.prod(page.chunked)} needed: incomplete file; copy or write it again"
             )
 
 

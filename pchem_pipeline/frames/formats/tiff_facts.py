@@ -56,7 +56,7 @@ def check_chain(path: Path, size: int) -> None:
         order: Literal["little", "big"] = "big" if head[:2] == b"MM" else "little"
         version = int.from_bytes(head[2:4], order)
         if len(head) < 8 or head[:2] not in (b"II", b"MM") or version not in (42, 43):
-            raise InputError(f"{path}: not a sound TIFF file, or truncated (header); copy it again")
+            raise InputError(f"{path}: not a valid TIFF file, or truncated (header); copy it again")
         kind = _BIG if version == 43 else _CLASSIC
         following = int.from_bytes(head[kind.first : kind.first + kind.pointer], order)
         seen: set[int] = set()
@@ -67,8 +67,7 @@ def check_chain(path: Path, size: int) -> None:
                 )
             if following in seen:
                 raise InputError(
-                    f"{path}: damaged: after {len(seen)} pages the chain of pages runs in a circle; copy it "
-                    "again"
+                    f"{path}: damaged: after {len(seen)} pages the list of pages is circular; copy it again"
                 )
             here = following
             stream.seek(here)
@@ -85,9 +84,10 @@ def check_chain(path: Path, size: int) -> None:
 
 def _broken_chain(path: Path, pages: int, size: int) -> InputError:
     if not pages:
-        return InputError(f"{path}: not a sound TIFF file, or truncated (no pages); copy it again")
+        return InputError(f"{path}: not a valid TIFF file, or truncated (no pages); copy it again")
     return InputError(
-        f"{path}: truncated: its {size} bytes end after {pages} page{'s' * (pages != 1)}; copy it again"
+        f"{path}: truncated: the file ({size} bytes) ends after {pages} page{'s' * (pages != 1)}; copy it "
+        "again"
     )
 
 

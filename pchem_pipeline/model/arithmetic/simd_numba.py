@@ -360,8 +360,8 @@ def _simd_width() -> int:
         lanes, compiled = _WIDTH, _VECTOR
     except Exception as error:
         warnings.warn(
-            f"numba {numba.__version__} cannot be taught vectors ({error}): the fit is several times slower; "
-            "install a version that pyproject.toml allows",
+            f"numba {numba.__version__} without vector instructions ({error}): the fit is several times "
+            "slower; install a version that pyproject.toml allows",
             stacklevel=2,
         )
         lanes, compiled = 1, _SCALAR

@@ -19,28 +19,27 @@ class MapsSettings(Section):
     outlier_sigmas: float = Field(
         default=6.0,
         gt=0,
-        description="a pixel is an outlier beyond this many robust standard deviations (1.4826 MAD) "
-        "from the median",
+        description="outliers: beyond this many robust standard deviations (1.4826 MAD) from the median",
     )
 
     false_discovery_rate: float = Field(
         default=0.05,
         gt=0,
         lt=1,
-        description="share of false alarms accepted among the pixels whose histograms are said to disagree "
-        "with the model (Benjamini and Hochberg)",
+        description="false-discovery rate of misfits, pixels whose histograms disagree with the model "
+        "(Benjamini and Hochberg)",
     )
     worst_pixels: int = Field(
-        default=6, ge=0, le=16, description="pixels of the poorest fit that are listed and drawn"
+        default=6, ge=0, le=16, description="number of worst-fitting pixels that are listed and drawn"
     )
 
     @field_validator("percentiles")
     @classmethod
     def _within_0_100(cls, value: tuple[float, ...]) -> tuple[float, ...]:
         if any(not 0 <= p <= 100 for p in value):
-            raise ValueError("every percentile lies in 0..100")
+            raise ValueError("percentiles must be 0 to 100")
         if list(value) != sorted(set(value)):
-            raise ValueError("percentiles increase, none twice")
+            raise ValueError("percentiles must increase, none twice")
         return value
 
 
@@ -49,7 +48,7 @@ class EnsembleSettings(Section):
 
     frames: int | Literal["all"] = Field(
         default=250,
-        description="number of frames in the ensemble histogram, or all; a shorter run gives what it has",
+        description="number of frames in the ensemble histogram, or all; at most all frames of the run",
     )
     first_frame: int = Field(default=0, ge=0, description="first of the frames in the ensemble histogram")
     parameter_bins: int = Field(
@@ -60,19 +59,19 @@ class EnsembleSettings(Section):
     )
     parameter_range: Literal["central", "full"] = Field(
         default="central",
-        description="what the equal-width bins span: the 1st to 99th percentile of each map and half of that "
-        "beyond on either side, with one more bin at each end for the rest; or minimum to maximum, "
-        "which a single hot pixel can stretch",
+        description="range of the equal-width bins: 1st to 99th percentile of each map, extended by half of "
+        "this on either side, with one more bin at each end for the rest; or minimum to maximum, which a "
+        "single hot pixel can stretch",
     )
     cell_representative: Literal["mean", "centre"] = Field(
         default="mean",
-        description="parameters that stand for a bin: mean of the pixels in it, or its centre",
+        description="parameters of a bin: mean of its pixels, or its centre",
     )
     nuced_bin_width: float | None = Field(
         default=None,
         ge=1e-3,
         description="bin width of the NUCed histogram, e-; null: median conversion gain times "
-        "nuced_bin_steps, which keeps the number of DN per bin the same from bin to bin",
+        "nuced_bin_steps (same number of DN in each bin)",
     )
     nuced_bin_steps: int = Field(
         default=1, ge=1, le=100, description="DN per bin of the NUCed histogram when nuced_bin_width is null"
@@ -81,12 +80,12 @@ class EnsembleSettings(Section):
         default=0.999,
         gt=0,
         le=1,
-        description="RMSE and its noise floor are taken over the DN that hold this central part of the data",
+        description="central part of the data over which RMSE and its noise floor are computed",
     )
 
     @field_validator("frames")
     @classmethod
     def _at_least_one(cls, value: int | str) -> int | str:
         if isinstance(value, int) and value < 1:
-            raise ValueError("at least one frame, or all")
+            raise ValueError("give at least one frame, or all")
         return value

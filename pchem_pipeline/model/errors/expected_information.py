@@ -48,7 +48,7 @@ def expected_information(
         ValueError: an argument is not a positive number.
     """
     if not (np.isfinite([quanta_exposure, read_noise_e]).all() and min(quanta_exposure, read_noise_e) > 0):
-        raise ValueError("quanta exposure and read noise are positive numbers")
+        raise ValueError("quanta exposure and read noise must be positive")
     width = 12.0 * np.sqrt(quanta_exposure) + 12.0
     least = max(0, int(quanta_exposure - width))
     k = np.arange(least, int(quanta_exposure + width) + 1, dtype=np.float64)

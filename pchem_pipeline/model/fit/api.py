@@ -185,9 +185,9 @@ def satellite_threshold(law: SampleLaw) -> float:
 
 def _check(samples: Sequence[Counts], origins: Sequence[Counts], dark: Sequence[bool]) -> None:
     if not samples or all(dark):
-        raise ValueError("no sample holds electrons")
+        raise ValueError("no sample has electrons")
     if len(samples) != len(origins) or len(samples) != len(dark):
-        raise ValueError("counts, origins and dark must have one entry for each sample")
+        raise ValueError("counts, origins and dark must have one entry per sample")
     sizes = {sample.shape[0] for sample in samples} | {np.size(origin) for origin in origins}
     if len(sizes) != 1:
         raise ValueError(f"the samples have different numbers of pixels: {sorted(sizes)}")

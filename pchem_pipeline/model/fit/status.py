@@ -103,21 +103,21 @@ def moves_gain(exposure: NDArray[np.float64], noise: NDArray[np.float64]) -> NDA
 MEANINGS: dict[FitStatus, str] = {
     FitStatus.NO_DATA: "too few frames inside the histogram window",
     FitStatus.TOO_FEW_BINS: "fewer than 3 occupied bins",
-    FitStatus.NOT_FITTED: "not fitted: the tile failed or was not chosen",
+    FitStatus.NOT_FITTED: "not fitted: the tile failed or was not selected",
     FitStatus.NOT_CONVERGED: "the fit did not converge",
-    FitStatus.GAIN_NOT_IDENTIFIED: "one Gaussian fits as well: the conversion gain is not identified",
-    FitStatus.EXPOSURE_AT_BOUND: "quanta exposure at its lower bound: no electrons seen",
+    FitStatus.GAIN_NOT_IDENTIFIED: "one Gaussian fits as well: the data do not fix the conversion gain",
+    FitStatus.EXPOSURE_AT_BOUND: "quanta exposure at its lower bound: no electrons",
     FitStatus.BIAS_AMBIGUOUS: "bias ambiguous by one electron or more",
     FitStatus.GAIN_AMBIGUOUS: "gain ambiguous: another gain is nearly as likely",
     FitStatus.NOT_INFORMATIVE: "read noise too high for one sample; take several exposures",
-    FitStatus.ADC_LIMIT: "values at the limits of the ADC",
-    FitStatus.OUTSIDE_WINDOW: "frames outside the histogram window were left out",
+    FitStatus.ADC_LIMIT: "samples at the limits of the ADC",
+    FitStatus.OUTSIDE_WINDOW: "frames outside the histogram window excluded",
     FitStatus.POOR_FIT: "poor goodness of fit: the model does not describe the pixel",
     FitStatus.COARSE_STEPS: "DN too coarse (sigma < 0.6 DN or g > 0.4 e-/DN): rounding biases the estimates",
-    FitStatus.BIAS_UNSURE: "bias clear by chance only: an electron off is as likely in pixels like this one",
-    FitStatus.WEAKLY_IDENTIFIED: "too few frames at this sensor's read noise: the bias is clear by chance "
-    "only, or the standard errors are rough",
-    FitStatus.EXCLUDED: "excluded by input.mask, or by the camera's marker",
+    FitStatus.BIAS_UNSURE: "bias not certain: off by one electron is as likely in such pixels",
+    FitStatus.WEAKLY_IDENTIFIED: "too few frames for this sensor's read noise: bias not certain, standard "
+    "errors approximate",
+    FitStatus.EXCLUDED: "excluded by input.mask or the camera's marker",
 }
 
 

@@ -117,8 +117,8 @@ class HistogramAccumulator:
         update_range(frames, low, high)
         if frames.dtype.itemsize > 2 and int(high.max()) > _LARGEST_DN:
             raise InputError(
-                f"the frames hold DN of {int(high.max())}, more than 24 bits; "
-                "correct input.dtype, input.byte_order or input.bit_shift"
+                f"the frames have DN of {int(high.max())}, more than 24 bits; correct input.dtype, "
+                "input.byte_order or input.bit_shift"
             )
         place_windows(
             frames,

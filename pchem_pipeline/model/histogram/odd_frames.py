@@ -78,7 +78,7 @@ def odd_words(odd: dict[str, IntArray], mean: FloatArray) -> str:
     above = away[far] > 0
     for frames, says in (
         (odd.get("empty", nothing), "empty"),
-        (odd.get("copied", nothing), "equal to an earlier one"),
+        (odd.get("copied", nothing), "equal to an earlier frame"),
         (far[above], "DN above the others"),
         (far[~above], "DN below the others"),
     ):

@@ -21,25 +21,24 @@ class HistogramSettings(Section):
         default=256,
         ge=1,
         le=16384,
-        description="frames that are read at a time; the first of them decide the number of bins",
+        description="frames read at a time; the first of them set the number of bins",
     )
     max_bins: int = Field(
         default=16384,
         ge=32,
         le=65536,
         multiple_of=16,
-        description="largest number of bins of a pixel, DN; fewer where the first frames need fewer. What "
-        "lies outside is counted as under or over",
+        description="largest number of bins per pixel, DN; fewer if the first frames need fewer. Samples "
+        "outside are counted as under or over",
     )
     summaries: bool = Field(
         default=True,
-        description="keep what histograms lose: sums over time blocks, rows and columns, lag-1 and neighbour "
-        "covariances",
+        description="store sums over time blocks, rows and columns, and lag-1 and neighbour covariances",
     )
     band_memory: int = Field(
         default=640,
         ge=16,
-        description="memory of a worker, MiB; decides the rows that it takes at a time, never the result",
+        description="memory per worker, MiB; sets the rows processed at a time, not the result",
     )
 
     def block_length(self, n_frames: int) -> int:

@@ -44,7 +44,7 @@ def draw_histograms(
     exposure, gain, offset, noise = (np.ravel(a) for a in np.broadcast_arrays(*given))
     variance = noise**2 - QUANTISATION_VARIANCE * gain**2
     if (variance < 0).any():
-        raise ValueError("the read noise is below that of rounding to whole DN")
+        raise ValueError("the read noise is below the rounding noise")
     origin = np.floor(offset - 9 * noise / gain).astype(np.int64) - 1
     width = np.ceil((exposure + 11 * np.sqrt(exposure) + 12 * (exposure > 0) + 18 * noise) / gain) + 3
     x = origin[:, None] + np.arange(int(width.max()))

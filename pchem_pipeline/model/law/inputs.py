@@ -87,7 +87,7 @@ def _pack_one(model: SampleLaw, n: int) -> _Part:
     exposures = np.stack(mixture, axis=1)
     for weights in (exposures[:, 0], added[:, 0], peaks[:, 0]):
         if not np.allclose(weights.sum(axis=1), 1.0, rtol=0, atol=1e-6):
-            raise ValueError("the weights of a mixture do not sum to 1")
+            raise ValueError("the weights of a mixture must sum to 1")
     law = model.law
     numbers = (
         _LAWS[law] if isinstance(law, str) else np.array([_LAWS[str(each)] for each in law]),  # type: ignore[index]

@@ -86,7 +86,7 @@ class UsablePixels(PixelParameters):
         if any(column.ndim != 1 or column.shape != self.bias.shape for column in self.maps):
             raise ValueError("the four parameters are one-dimensional and equally long")
         if not usable_pixels(*self.maps).all():
-            raise ValueError("some pixels have no usable parameters: select them with usable_pixels first")
+            raise ValueError("some pixels have no usable parameters: select with usable_pixels first")
 
     def __len__(self) -> int:
         """Return the number of pixels."""

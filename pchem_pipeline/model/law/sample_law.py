@@ -171,7 +171,7 @@ class SampleLaw:
             ValueError: the laws differ in their limits of the scale.
         """
         if (self.clip_low, self.clip_high) != (other.clip_low, other.clip_high):
-            raise ValueError("a limit of the scale in some frames only has no law; leave these frames out")
+            raise ValueError("a limit of the ADC in some frames only is not supported; exclude these frames")
         more = other.extra_variance_dn2 - self.extra_variance_dn2
         more = more + (other.extra_variance_e2 - self.extra_variance_e2) * step_dn**2
         found: dict[str, Any] = {"law": self.law if other.law == "poisson" else other.law}

@@ -28,7 +28,7 @@ from pchem_pipeline.report.figures.maps import image_stack, is_strip, place_of
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.stretch import even_bar, even_edges
-from pchem_pipeline.report.style.wording import count, plain, power_of_ten, short, symbol
+from pchem_pipeline.report.style.wording import count, measured, plain, power_of_ten, short, signed, symbol
 
 FloatArray = NDArray[np.float64]
 
@@ -59,22 +59,21 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
     _, words, unit = symbol(name)
     label = f"{words} ({unit})" if name.startswith("read_noise") else words
     alt = (
-        f"Map and histogram of the difference of the {label} in standard errors: median "
-        f"{short(each.median)} ± {short(each.median_stderr)} {unit}, which is {each.median_z:+.3g} "
-        f"standard errors of a pixel; scatter {each.spread_z:.3g}; "
-        f"{count(each.n_far, 'good pixel')} beyond {FAR:g}."
+        f"Map and histogram of the difference in {label}: median "
+        f"{measured(each.median, each.median_stderr, unit)} ({signed(each.median_z)} sigma of one pixel); "
+        f"scatter {short(each.spread_z, 2)} sigma; {count(each.n_far, 'good pixel')} beyond {FAR:g} sigma."
     )
     caption = (
-        "The line is N(0, 1), what chance alone gives."
+        "Line: N(0, 1), expected from sampling noise alone."
         if not pair.same_data
-        else "Both runs come from the same frames, so that chance plays no part."
+        else "Both runs use the same frames, so there is no sampling noise."
     )
     title = f"{label}: {pair.other.label} − {pair.one.label}"
     return Figure(
         f"difference_{name}_{pair.other.label}",
         "",
         f"{label[0].upper()}{label[1:]}",
-        f"{pair.other.label} − {pair.one.label}, each pixel in its own standard errors. {caption}",
+        f"{pair.other.label} − {pair.one.label}, in standard errors of each pixel. {caption}",
         alt,
         (DataTable({"difference": each.z}, {"difference": "standard errors"}),),
         difference_chart(each.z, each.n_far, title, same_data=pair.same_data),
@@ -93,10 +92,10 @@ def ensembles_figures(runs: Sequence[RunFacts]) -> list[Figure]:
         Figure(
             "ensembles",
             "",
-            "Ensemble histograms over each other",
+            "Ensemble histograms of the runs",
             "All pixels of each run together, raw and after two-point non-uniformity correction. Strips: "
-            f"difference to {runs[0].label} in standard errors of counting; the gray band is ±2.",
-            f"Ensemble histograms of the runs; their highest points lie at {peaks}.",
+            f"difference from {runs[0].label} in counting errors; gray band: ±2.",
+            f"Ensemble histograms of the runs; highest peaks at {peaks}.",
             tables,
             ensembles_chart(tables),
             PAGE_MM,

@@ -41,23 +41,22 @@ _HALVES = (("raw", "dn", "", "epcd_", "DN"), ("nuced", "electrons", "nuced_", "n
 
 _ENSEMBLE_CAPTION = (
     "Histogram of all pixels over the chosen frames (gray), raw at the top and after two-point non-"
-    "uniformity correction at the bottom, where the peaks lie at whole electrons. Lines: prediction "
+    "uniformity correction at the bottom, with peaks at whole electrons. Lines: prediction "
     "from the fitted parameters, as the exact mean over the pixels, with the parameters' joint "
     "histogram (dependent), and with the product of their four histograms (independent). Strips: data"
-    " minus prediction, with two standard deviations of the sampling noise in gray. An RMSE close to "
-    "that of the sampling noise alone means that the model explains the data."
+    " minus prediction; gray: 2 sigma of sampling noise. The model describes the data if the RMSE is "
+    "close to the sampling noise."
 )
 _ELECTRONS_CAPTION = (
-    "Gray: share of each electron number among the estimates. Dots: mass p(k) predicted from the map "
-    "of H. Crosses: mass that the estimator itself should show, which errs between neighbouring "
-    "numbers. Below: estimate minus prediction, with two standard deviations of the "
-    "sampling noise in gray."
+    "Gray: share of each estimated electron number. Dots: probability p(k) from the map of H. Crosses: "
+    "expected share of the estimates, which confuse neighbouring numbers. Below: estimate minus "
+    "expectation; gray: 2 sigma of sampling noise."
 )
 _COMPONENTS_CAPTION = (
     "Standard deviation of the component of electron number k, raw (left or top) and after non-"
-    "uniformity correction (right or bottom). Each line holds a set of parameters constant over the "
-    "pixels; gray lines are the remaining ones of the sixteen sets. Flat lines keep the peaks "
-    "resolved at every signal."
+    "uniformity correction (right or bottom). For each line a set of parameters is constant over the "
+    "pixels; gray: the remaining of the sixteen sets. Where a line is flat the peaks are resolved at "
+    "every signal."
 )
 
 _SYMBOLS = {"mu": "μ", "sigma": "σ", "sigma2": "σ²"}
@@ -139,8 +138,8 @@ def bias_remark(data: ReportData) -> str:
     if lost < 0.05:
         return ""
     return (
-        " Pixels whose bias may be an electron off count less (weight tanh(d/2), d: log-likelihood over that "
-        f"of the best rival), by {short(lost, 2)} {data.noun}s in all."
+        " Pixels whose bias can be off by an electron have a lower weight (tanh(d/2), d: log-likelihood "
+        f"ratio to the next best fit), together {short(lost, 2)} {data.noun}s less."
     )
 
 
@@ -336,7 +335,7 @@ def electrons_chart(table: DataTable) -> Chart:
     rest = scale * (mass - pmf)
     below.append(Points(k, rest, colour="ink", size=3.0, label=above[1].label, listed=False))
     if "electron_pmf_map" in table:
-        expected, words = table["electron_pmf_map"][: last + 1], "mass that the estimator should show"
+        expected, words = table["electron_pmf_map"][: last + 1], "expected share"
         cross = {"colour": "vermilion", "mark": "x", "size": 4.0, "label": words}
         above.append(Points(k, expected, **cross))  # type: ignore[arg-type]
         below.append(Points(k, scale * (mass - expected), listed=False, **cross))  # type: ignore[arg-type]
@@ -384,7 +383,7 @@ def components_chart(table: DataTable, highlight: Sequence[str] = ()) -> Chart:
             lines.append(Line(k, table[name], colour=hue, dash=dash, label=name.removeprefix("sd, ")))
         elif name.startswith("sd, "):
             gray.append(Line(k, table[name], colour="no_value", width=0.7))
-    note = "" if chosen else "every line: one set of parameters held constant"
+    note = "" if chosen else "one line per set of constant parameters"
     stacks = [_component_stack("raw ensemble", "DN", (*gray, *lines), note)]
     if "sd after correction" in table:
         line = Line(k, table["sd after correction"], colour="ink", dots=2.5, label="sd", listed=False)

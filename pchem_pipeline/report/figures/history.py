@@ -58,7 +58,7 @@ def history_figures(rows: Sequence[HistoryRow], against: Against) -> list[Figure
             "history",
             "",
             "The camera over time",
-            "Medians of the maps with their standard errors; the band is the scatter of the pixels.",
+            "Medians of the maps with their standard errors; band: scatter of the pixels.",
             f"From {first.label} to {last.label}: {words}.",
             (table,),
             history_chart(table, tuple(shown), axis, () if ordered else _labels(rows)),

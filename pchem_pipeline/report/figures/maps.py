@@ -54,22 +54,22 @@ _STATUS_COLOURS = (
 )
 
 _CAPTIONS = {
-    "charge_rate": "Charge rate: quanta exposure over integration time; what made the charge is not said.",
-    "dark_current": "Dark current: quanta exposure over integration time, in the dark.",
+    "charge_rate": "Charge rate: quanta exposure / integration time; unknown source of the charge.",
+    "dark_current": "Dark current: quanta exposure / integration time, in the dark.",
     "conversion_gain": "Conversion gain: electrons per digital number.",
     "bias": "Bias: the digital number at zero electrons.",
     "read_noise_e": "Read noise in electrons, quantisation included.",
     "spurious_charge": "Spurious charge: quanta exposure that does not grow with time.",
     "dark_signal": "Dark signal: quanta exposure at light level 0.",
-    "charge_per_level": "Charge per light level: quanta exposure gained with each level.",
+    "charge_per_level": "Charge per light level: slope of the quanta exposure against the light level.",
 }
 _READ_NOISE_CAPTION = (
-    "Read noise, quantisation included. The blue line is the median, the shaded part holds the pixels"
-    " from 5 to 95 %. {below} of the {noun}s with a value lie below 0.4 e⁻."
+    "Read noise, quantisation included. Blue line: median; shaded: 5 to 95 % of the pixels. "
+    "{below} of the {noun}s with a value are below 0.4 e⁻."
 )
 _STATUS_CAPTION = (
-    "Light gray pixels have a good fit. A pixel with several reasons has the colour of the first that"
-    " applies; the numbers count every reason."
+    "Light gray: good fit. A pixel with several reasons has the colour of the first; the numbers count"
+    " every reason."
 )
 
 
@@ -106,7 +106,7 @@ def _map_alt(data: ReportData, name: str, what: str) -> str:
         f"5 to 95 % of the {data.noun}s from {short(low)} to {short(high)} {unit}, "
         f"extremes {short(summary.minimum)} and {short(summary.maximum)} {unit}; "
         f"{count(summary.n_missing, data.noun)} without a value"
-        + (f", {count(summary.n_left_out, f'flagged {data.noun}')} left out." if summary.n_left_out else ".")
+        + (f", {count(summary.n_left_out, f'flagged {data.noun}')} excluded." if summary.n_left_out else ".")
     )
 
 
@@ -124,7 +124,7 @@ def read_noise_figures(data: ReportData, settings: ReportSettings) -> list[Figur
             "Read noise of the pixels",
             _READ_NOISE_CAPTION.format(below=below, noun=data.noun),
             _map_alt(data, "read_noise_e", "Histogram")
-            + f" {below} of the {data.noun}s with a value lie below 0.4 e⁻.",
+            + f" {below} of the {data.noun}s with a value are below 0.4 e⁻.",
             (bins,),
             read_noise_chart(known, bins),
         )

@@ -29,12 +29,12 @@ from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import short
 
 _CAPTION = (
-    "Left or top: simulated pixels at the exposure and gain of this run, as many frames in total for "
-    "every method; hollow symbols: more than a tenth of the pixels got no answer. Lines without symbols "
-    "are the smallest errors possible (Cramer-Rao), from one sample and from a dark and a bright one; the "
-    "dotted line is where photon transfer begins to beat that of one sample. Right or bottom: pixels of "
-    "this run; filled: root mean square error, hollow: robust scatter, bar: bound. "
-    "Errors above 180 % are drawn there."
+    "Left or top: simulated pixels at the exposure and gain of this run, same total number of frames for "
+    "every method; hollow symbols: no answer for more than a tenth of the pixels. Lines without symbols: "
+    "smallest possible errors (Cramer-Rao bound) from one sample, and from a dark and a bright one; dotted "
+    "line: above this read noise photon transfer is more precise than one sample. Right or bottom: pixels "
+    "of this run; filled: root mean square error, hollow: robust scatter, bar: bound. "
+    "Errors are clipped at 180 %."
 )
 
 #: Method to the hue, or colour, of its line, and its marker.
@@ -235,13 +235,13 @@ def crossing_text(study: Sequence[Mapping[str, Any]]) -> str:
     """Say up to which read noise one-sample PCH-EM beats photon transfer with as many frames."""
     expected, measured = bound_crossing(study), measured_crossing(study)
     if expected is None and measured is None:
-        return "one-sample PCH-EM and two-sample photon transfer do not cross in the read noises simulated"
+        return "the errors of one-sample PCH-EM and two-sample photon transfer do not cross in this range"
     parts = []
     if expected is not None:
         parts.append(f"{short(expected, 2)} e- by the Cramer-Rao bound")
     if measured is not None:
         parts.append(f"{short(measured, 2)} e- on the simulated pixels")
     return (
-        "one-sample PCH-EM knows the gain better than two-sample photon transfer with as many frames up to a "
-        f"read noise of {', '.join(parts)}; above it, take several exposures"
+        "one-sample PCH-EM is more precise in the gain than two-sample photon transfer with the same number "
+        f"of frames up to a read noise of {', '.join(parts)}; above it, take several exposures"
     )

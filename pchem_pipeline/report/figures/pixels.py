@@ -51,17 +51,16 @@ _TITLE_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 
 _EXAMPLE_CAPTION = (
     "The example of Hendrickson et al. (2023): density of a PCD with H = 1.8 e⁻ and a read noise of "
-    "0.33 e⁻ (line), and the edges of the cells in which each electron number is the most likely one "
-    "(dashed)."
+    "0.33 e⁻ (line), and the limits between the most probable electron numbers (dashed)."
 )
 _CELLS_CAPTION = (
-    "Histogram of the pixel (gray), its fitted density (line), and the edges of the cells in which each "
-    "electron number is the most likely one (dashed)."
+    "Histogram of the pixel (gray), its fitted density (line), and the limits between the most probable "
+    "electron numbers (dashed)."
 )
 _FITS_CAPTION = (
     "Gray: share of the frames at each digital number. Black: fitted density. Below: (observed − "
-    "expected) / √expected; the gray band is two standard deviations. A good fit has about one line "
-    "in twenty beyond the band and no pattern. Uncertainties are standard errors of the fit."
+    "expected) / √expected; gray band: 2 sigma. In a good fit about one line in twenty is outside the "
+    "band, without a pattern. Uncertainties are standard errors of the fit."
 )
 
 
@@ -233,7 +232,7 @@ def cells_chart(tables: Sequence[DataTable]) -> Chart:
     curve = Line(x, density["density"], colour="ink", label="fitted density" if histogram else "PCD")
     top = 1.28 * max(float(np.max(each)) for each in (curve.y, *(bars.values for bars in frames)))
     ends = np.full(edges.size, 0.86 * top)
-    dashed = Sticks(edges, ends, colour="blue", dash="--", width=0.9, label="edge of a cell")
+    dashed = Sticks(edges, ends, colour="blue", dash="--", width=0.9, label="limit between electron numbers")
     cells = np.concatenate([[low], edges, [high]])
     every = max(1, int(np.ceil(len(cells) / _MOST_NUMBERS)))
     words = [
@@ -281,7 +280,7 @@ def shown_bins(counts: NDArray[Any], *, tail: float = 2e-4) -> slice:
     """
     total = int(counts.sum())
     if total == 0:
-        raise ValueError("the histogram is empty; there is nothing to show")
+        raise ValueError("the histogram is empty")
     cumulative = np.cumsum(counts) / total
     first = int(np.searchsorted(cumulative, tail))
     last = int(np.searchsorted(cumulative, 1.0 - tail))

@@ -35,10 +35,9 @@ _ENDS, _LEVELS = (0.0, 8.0), range(1, 9)
 _EXPOSURES, _FINER = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0), 8
 
 _CAPTION = (
-    "Frames with which one sample reaches the precision in the title, one standard deviation of a pixel, by "
-    "the Cramer-Rao bound. The dot is the median pixel of this run; white dots mark the exposure that needs "
-    "the fewest frames at each read noise, as far as it is drawn. Weak peaks and many electrons (top right) "
-    "need more frames than the bound asks for, until no other gain is as likely by chance."
+    "Number of frames for the precision in the title (1 sigma error per pixel, Cramer-Rao bound). Dot: "
+    "median pixel of this run; white dots: exposure with the fewest frames at each read noise. Weak peaks "
+    "and many electrons (top right) need more frames than the bound, to rule out a wrong gain."
 )
 
 
@@ -55,7 +54,7 @@ def plan_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
         Figure(
             "frames_needed",
             "plan",
-            "Frames that one sample needs",
+            "Frames needed for one sample",
             _CAPTION,
             f"Contours of the frames needed over exposure and read noise. For the median pixel, {words}.",
             (table,),

@@ -24,9 +24,9 @@ _NAMES = ("quanta exposure", "conversion gain", "bias", "read noise")
 
 
 _CAPTION = (
-    "Bias that rounding gives to estimates from the density of the PCD, in standard errors of one pixel, "
-    "at the median quanta exposure and read noise of this run and its number of frames; the worst of all "
-    "places of the bias between two whole DN. Above the dotted line (0.05) the fit takes the exact masses, "
+    "Systematic error from rounding to whole DN if the density of the PCD is fitted, in standard errors per "
+    "pixel, at this run's median quanta exposure, median read noise and number of frames (largest over the "
+    "position of the bias between two DN). Above the dotted line (0.05) exact probabilities are fitted, "
     "unless fit.likelihood is density."
 )
 
@@ -44,9 +44,9 @@ def rounding_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
         Figure(
             "rounding",
             "uncertainty",
-            "Bias by rounding to whole DN",
+            "Systematic error from rounding to whole DN",
             _CAPTION,
-            f"At {short(step)} DN per electron, in standard errors of a pixel: {', '.join(words)}.",
+            f"At {short(step)} DN per electron, in standard errors per pixel: {', '.join(words)}.",
             (table,),
             rounding_chart(table, gain),
         )

@@ -24,12 +24,12 @@ AXES = {
 }
 
 _LINE_CAPTION = (
-    "Quanta exposure against {against} with the median line of the pixels; below, the median "
-    "residual with its standard error."
+    "Quanta exposure against {against}, with the median line of the pixels. Below: median residual "
+    "with its standard error."
 )
 _TRANSFER_CAPTION = (
-    "Medians over the pixels; the curve is that of the joint fit with its median parameters, drawn "
-    "before the points and not through them."
+    "Medians over the pixels. Curve: prediction from the median parameters of the joint fit, not fitted "
+    "to the points."
 )
 
 
@@ -179,7 +179,7 @@ def _residuals(places: NDArray[np.float64], table: DataTable) -> Panel:
     """Return median residuals with their errors; without freedom there are none to speak of."""
     label, zero = "residual (e⁻)", Level(0.0, colour="bars", width=0.8)
     if "residual" not in table:
-        return Panel(Axis(label, -1.0, 1.0), (zero,), note="two exposures: the line goes through both")
+        return Panel(Axis(label, -1.0, 1.0), (zero,), note="two exposures: no residuals")
     found, error = table["residual"], table["residual standard error"]
     most = 1.3 * float(np.nanmax(np.abs(found) + error))
     points = Points(places, found, error=np.stack([error, error]), cap=2.0, label="median residual")

@@ -30,16 +30,16 @@ _AT_ONCE = 1 << 21
 _WIDTH = 1.2533  # standard error of a median over that of a mean
 
 _FRAMES = (
-    "Top: mean of all pixels{averaged}; gray: two standard errors of independent pixels. Below: its power "
-    "spectrum over that of independent pixels (1): mean, and largest, of neighbouring frequencies."
+    "Top: mean of all pixels{averaged}; gray: 2 sigma for independent pixels. Below: power spectrum relative "
+    "to independent pixels (1): mean and maximum of neighbouring frequencies."
 )
 _PROFILES = (
-    "Median over each row and column of the pixels' mean signal; gray: two standard errors about the median "
-    "of the sensor, where unrelated pixels put it."
+    "Median of the pixels' mean signal over each row and column; gray: median of the sensor ± 2 sigma for "
+    "independent pixels."
 )
 _SPECTRA = (
-    "Top: of the fixed pattern, the means of rows and columns over all frames, hot pixels clipped. "
-    "Below: of their noise, what they do from frame to frame. 1 is what unrelated pixels give."
+    "Top: fixed pattern (means of rows and columns over all frames, hot pixels clipped). Below: noise of "
+    "rows and columns from frame to frame. 1: independent pixels."
 )
 
 
@@ -59,8 +59,8 @@ def _frame_figure(sums: StackSums) -> Figure:
     scatter = float(means["mean"].std())
     alt = (
         f"Mean of {count(sums.n_frames, 'frame')}: {short(float(means['mean'].mean()), 5)} DN, scatter "
-        f"{short(scatter)} DN where independent pixels give {short(error)} DN; largest power "
-        f"{short(float(power['largest'].max()), 2)} times chance."
+        f"{short(scatter)} DN ({short(error)} DN for independent pixels); largest power "
+        f"{short(float(power['largest'].max()), 2)} times the expected one."
     )
     return Figure(
         "frame_means", "stability", "Mean of the frames", _FRAMES.format(averaged=averaged), alt,
@@ -77,7 +77,7 @@ def _profile_figure(sums: StackSums) -> Figure | None:
     for table in tables:
         low, high = (table[name] for name in ("chance from", "chance to"))
         outside = int(((table["mean signal"] < low) | (table["mean signal"] > high)).sum())
-        words.append(f"{outside} of {count(low.size, table.part)} outside of what chance does")
+        words.append(f"{outside} of {count(low.size, table.part)} outside 2 sigma")
     return Figure(
         "profiles", "stability", "Profiles of rows and columns", _PROFILES,
         f"Profiles of the mean signal: {'; '.join(words)}.",
@@ -95,7 +95,7 @@ def _spectrum_figure(sums: StackSums) -> Figure | None:
     ]
     return Figure(
         "spatial_spectra", "stability", "Spectra of rows and columns", _SPECTRA,
-        f"Largest power over chance: {', '.join(largest)}.",
+        f"Largest power relative to independent pixels: {', '.join(largest)}.",
         (*fixed, *temporal), spectra_chart(fixed, temporal),
     )  # fmt: skip
 

@@ -44,21 +44,20 @@ _UNCERTAIN = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "re
 _GOODNESS = ("p", "chi2", "dof", "q")
 
 _GOODNESS_CAPTION = (
-    "p-values of the goodness of fit of all pixels (blue); by chance they are uniform (line, with two "
-    "standard deviations in gray), a peak at 0 is made of pixels that the model does not describe. Map: "
-    "chi-square as standard normal deviate, clipped at −4 and 6; circles are the misfits at a rate of "
-    "false discoveries of {rate:g}."
+    "p-values of the goodness of fit of all pixels (blue): uniform where the model holds (line; gray: 2 "
+    "sigma), with a peak at 0 from pixels that the model does not describe. Map: chi-square as standard "
+    "normal deviate, clipped at −4 and 6; circles: misfits at a false-discovery rate of {rate:g}."
 )
 _LEFT_OUT_CAPTION = (
-    "Samples where the fitted model expects fewer than {floor:g} frames per DN are left out of the "
-    "likelihood. Left: pixels by how many they lost. Right: where they are; white pixels lost none. "
-    "Without outliers about one pixel in two hundred loses a single sample by chance."
+    "Samples where the fitted model expects fewer than {floor:g} frames per DN are excluded from the "
+    "likelihood. Left: number of pixels by excluded samples. Right: map; white: none. Without outliers, "
+    "about one pixel in two hundred has an excluded sample."
 )
 _UNCERTAINTY_CAPTION = (
-    "Left: part of the variance of each map over the pixels that is noise of the estimates; near 100 % "
-    "(dotted) the map shows noise alone, and more frames would show more of the sensor. Right: "
-    "predicted density of the ensemble (black), its standard error from those of the maps (blue), and "
-    "the sampling noise of the data it is compared with (light blue)."
+    "Left: share of each map's variance over the pixels that is noise of the estimates; near 100 % "
+    "(dotted) the map shows only noise: take more frames. Right: predicted density of the ensemble "
+    "(black), its standard error from the errors of the maps (blue), and the sampling noise of the "
+    "data (light blue)."
 )
 
 
@@ -73,7 +72,7 @@ def goodness_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
     table = DataTable(columns, {"misfit": "standard deviations"})
     text = (
         f"p-values and misfit of {count(int(facts['tested']), data.noun)}; "
-        f"{count(int(facts['misfits']), 'misfit')} at a rate of false discoveries of {rate:g}."
+        f"{count(int(facts['misfits']), 'misfit')} at a false-discovery rate of {rate:g}."
     )
     return [
         Figure(
@@ -99,9 +98,9 @@ def left_out_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
         Figure(
             "left_out",
             "goodness",
-            "Samples left out of the fit",
+            "Samples excluded from the fit",
             _LEFT_OUT_CAPTION.format(floor=data.misfits["tail_guard"]),
-            f"{count(hit, data.noun)} of {share.size:,} lost samples, at most "
+            f"{count(hit, data.noun)} of {share.size:,} with excluded samples, at most "
             f"{percent(float(np.max(share, initial=0.0)), 1.0)} of their frames.",
             (DataTable({"share left out": share}),),
             left_out_chart(share, data.n_frames),
@@ -128,7 +127,7 @@ def uncertainty_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
             "uncertainty",
             "Noise in the maps and in the prediction",
             _UNCERTAINTY_CAPTION,
-            f"Part of the variance of the maps that is noise of the estimates: {words}.",
+            f"Share of noise in the variance of the maps: {words}.",
             (maps, ensemble),
             uncertainty_chart(maps, ensemble),
             PAGE_MM,
@@ -206,12 +205,12 @@ def left_out_chart(share: FloatArray, n_frames: int | None) -> Chart:
     # nothing is white, a single sample is seen
     lost = share > 0
     samples = np.where(lost, np.rint(share * n_frames) if n_frames else 100.0 * share, np.nan)
-    label = "frames left out" if n_frames else "samples left out (%)"
+    label = "excluded frames" if n_frames else "excluded samples (%)"
     hit = samples[lost]
     top = max(float(np.max(hit, initial=1.0)), 1.0)
     edges = np.arange(0.5, min(top, 60.0) + 1.5) if n_frames else np.linspace(0.0, 1.05 * top, 21)
     counts = np.histogram(np.minimum(hit, edges[-1] - 1e-9), edges)[0]
-    x = Axis(f"{label} of a pixel", float(edges[0]), float(edges[-1]), whole=bool(n_frames))
+    x = Axis(f"{label} per pixel", float(edges[0]), float(edges[-1]), whole=bool(n_frames))
     # room for the words above the bars
     y = Axis("pixels", 0.0, 1.18 * max(float(counts.max()), 1.0), whole=True)
     note = f"{count(int(hit.size), 'pixel')} of {samples.size:,} with any"
@@ -254,7 +253,7 @@ def _noise_stack(maps: DataTable) -> Stack:
 def _error_stack(ensemble: DataTable) -> Stack:
     x, label = Axis("signal (DN)"), "density (1/DN)"
     if "epcd_stderr" not in ensemble:
-        note = "no error of the prediction: the model holds effects"
+        note = "no error of the prediction: the model has effects"
         return Stack((Panel(Axis(label), (), note=note),), x, height_mm=62.0)
     exact, error = ensemble["epcd_exact"], ensemble["epcd_stderr"]
     total = max(float(ensemble["counts"].sum()), 1.0)

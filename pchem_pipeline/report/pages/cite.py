@@ -66,7 +66,7 @@ def citation(data: ReportData) -> Citation:
     sentences.append(f"The analysis was made with pchem_pipeline {version}{used}.")
     digest = data.run.get("digest of the input")
     if digest:
-        sentences.append(f"The input has the digest {digest}.")
+        sentences.append(f"Digest of the input: {digest}.")
     software = f"""@software{{pchem_pipeline,
   title   = {{pchem\\_pipeline}},
   version = {{{version}}}
@@ -103,7 +103,7 @@ def _result_sentence(data: ReportData) -> str:
     counts = f"{pixels.fitted:,} of {count(pixels.total, data.noun)} have a value"
     if flagged:
         share = percent(flagged, pixels.fitted)
-        counts += f"; {flagged:,} of them ({share}) are flagged, since the data leave their electrons open"
+        counts += f"; {flagged:,} of them ({share}) are flagged: the data do not fix their electron number"
     if data.mostly_flagged:
         return f"{counts}; no medians can be given."
     parts = []
@@ -124,6 +124,6 @@ def _quality(data: ReportData) -> str:
     if not p.size:
         return ""
     return (
-        f"The chi-square of {percent(int((p < 1e-3).sum()), p.size)} of the fits has a probability below "
-        "0.001, where 0.10 % are expected by chance."
+        f"{percent(int((p < 1e-3).sum()), p.size)} of the fits fail the chi-square test (p < 0.001; "
+        "0.10 % expected)."
     )

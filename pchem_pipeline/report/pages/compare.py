@@ -51,10 +51,10 @@ def sentence_of(found: Comparison) -> str:
         return _pair_sentence(found.pairs[0], found.tolerance)
     changed = [pair.other.label for pair in found.pairs if pair.changed]
     if not changed:
-        return f"Nothing changed in any of the {len(found.pairs)} runs against {found.runs[0].title}."
+        return f"None of the {len(found.pairs)} runs differs from {found.runs[0].title}."
     same = [pair.other.label for pair in found.pairs if not pair.changed]
-    rest = f"; {', '.join(same)} did not" if same else ""
-    return f"Against {found.runs[0].title}, {', '.join(changed)} changed{rest}."
+    rest = f"; no difference in {', '.join(same)}" if same else ""
+    return f"Differs from {found.runs[0].title}: {', '.join(changed)}{rest}."
 
 
 def _pair_sentence(pair: Pair, tolerance: float) -> str:
@@ -64,25 +64,23 @@ def _pair_sentence(pair: Pair, tolerance: float) -> str:
         return f"{first}{_largest_text(pair)}"
     if not pair.same_data:
         return (
-            f"Nothing changed: on different frames, all maps of {pair.other.title} agree with those of "
-            f"{pair.one.title} within their standard errors."
+            f"Nothing changed: all maps of {pair.other.title} and {pair.one.title} (different frames) agree "
+            "within their standard errors."
         )
     rows = [row for row in pair.arrays if row.counts and row.state in ("identical", "equal")]
     values = sum(row.n_values for row in rows)
     inexact = sum(row.state == "equal" for row in rows)
-    what = "are identical to the bit" if not inexact else f"are equal ({inexact} arrays within {tolerance:g})"
+    what = "are bit-identical" if not inexact else f"are equal ({inexact} arrays within {tolerance:g})"
     return f"Nothing changed: {count(len(rows), 'array')} with {values:,} values {what}."
 
 
 def _largest_text(pair: Pair) -> str:
-    """Say by how many standard errors maps of the same frames moved at most."""
+    """Return the largest change of a good pixel between maps of the same frames, in sigma."""
     counted = {name: each for name, each in pair.maps.items() if each.n_counted}
     if not pair.same_data or not counted:
         return ""
     name, most = max(counted.items(), key=lambda item: item[1].largest_z)
-    return (
-        f" No good pixel moved by more than {short(most.largest_z, 2)} standard errors ({symbol(name)[1]})."
-    )
+    return f" Largest change of a good pixel: {short(most.largest_z, 2)} sigma ({symbol(name)[1]})."
 
 
 def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[str, str]:
@@ -186,10 +184,10 @@ def _pair_numbers(pair: Pair) -> dict[str, Any]:
 
 _GRADES = ("good fit", "use with caution", "no value")
 _STATES = {
-    "identical": "identical to the bit",
+    "identical": "bit-identical",
     "equal": "equal within rounding",
     "changed": "changed",
-    "lost": "not there any more",
+    "lost": "missing",
     "new": "new",
 }
 
@@ -217,10 +215,9 @@ def history_table(found: Comparison) -> Table:
     return Table(
         "history-runs",
         "Run by run",
-        "Moved: pixels with a good fit in both whose value differs from the first run's beyond its errors, "
-        f"at a false-discovery rate of {found.rate:g}. This and all medians are in history.csv, a line "
-        "for each run.",
-        ("label", "date", "°C", "run", "good pixels", "hot", "flags", "effects", "moved", "in"),
+        "Changed: pixels with a good fit in both runs whose value differs significantly from the first run "
+        f"(false-discovery rate {found.rate:g}). All medians: history.csv, one line per run.",
+        ("label", "date", "°C", "run", "good pixels", "hot", "flags", "effects", "changed", "in"),
         tuple(rows),
     )
 
@@ -257,7 +254,7 @@ def run_table(found: Comparison) -> Table:
     for name in dict.fromkeys(each for run in runs for each in run.rmse):
         cells = [scientific(run.rmse[name]) if name in run.rmse else "not known" for run in runs]
         rows.append((f"RMSE, {rmse_words(name)} ({rmse_unit(name)})", *cells))
-    return Table("runs", "The runs", "", ("", *(run.title for run in runs)), tuple(rows))
+    return Table("runs", "Runs", "", ("", *(run.title for run in runs)), tuple(rows))
 
 
 def pair_tables(pair: Pair, tolerance: float) -> list[Table]:
@@ -277,7 +274,7 @@ def _map_table(pair: Pair) -> Table:
     for name, each in pair.maps.items():
         _, words, unit = symbol(name)
         reason = pair.reasons.get(name)
-        verdict = "" if reason is None else "changed" if reason else "as chance allows"
+        verdict = "" if reason is None else "changed" if reason else "within sampling noise"
         rows.append(
             (
                 f"{words} ({unit})",
@@ -290,16 +287,16 @@ def _map_table(pair: Pair) -> Table:
             )
         )
     unit_words = (
-        "Both runs come from the same frames: the unit is the standard error of one fit."
+        "Same frames: sigma is the standard error of one fit."
         if pair.same_data
-        else "Different frames: the unit is the standard error of the difference; chance gives a median of 0 "
-        "and a scatter of 1."
+        else "Different frames: sigma is the standard error of the difference; expected from sampling noise: "
+        "median 0, scatter 1."
     )
     return Table(
         f"maps-{pair.other.label}",
         "Differences of the maps",
-        f"{pair.other.label} − {pair.one.label}, over pixels with a good fit in both. {unit_words}",
-        ("map", "median", "median (std. errors)", "scatter (std. errors)", f"beyond ±{FAR:g}", "largest", ""),
+        f"{pair.other.label} − {pair.one.label}, pixels with a good fit in both runs. {unit_words}",
+        ("map", "median", "median (σ)", "scatter (σ)", f"beyond ±{FAR:g} σ", "largest (σ)", ""),
         tuple(rows),
     )
 
@@ -317,7 +314,7 @@ def _settings(pair: Pair) -> Table:
     return Table(
         f"settings-{pair.other.label}",
         "Settings that differ",
-        "A setting that no stage reads changes no result.",
+        "",
         ("setting", pair.one.label, pair.other.label, "read by"),
         tuple((*_both(each), ", ".join(each.stages) or "no stage") for each in pair.settings),
     )

@@ -1,4 +1,4 @@
-"""The criteria of 'all right': what a sensor must meet, what was found, and whether it does."""
+"""The criteria of the sensor: quantity, value found, limit, and whether it passes."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _hot(data: ReportData) -> _Found:
 
 
 def _outlying(data: ReportData) -> _Found:
-    """Return the largest share of outliers in a map that does not tell of charge."""
+    """Return the largest share of outliers in the maps of gain, bias and read noise."""
     if data.few_channels:
         return None
     shares = []

@@ -68,9 +68,9 @@ def emva_tables(data: ReportData) -> list[Table]:
     return [
         Table(
             "emva1288",
-            "What a data sheet after EMVA 1288 can take",
-            f"Flagged {data.noun}s are left out. As a file: pchem export {data.typed_run} --format emva",
-            ("quantity", "symbol", "value", "here", "where it differs"),
+            "Data sheet quantities of EMVA 1288",
+            f"Flagged {data.noun}s are excluded. As a file: pchem export {data.typed_run} --format emva",
+            ("quantity", "symbol", "value", "definition here", "difference to EMVA 1288"),
             rows,
             "emva",
         )
@@ -101,7 +101,7 @@ def emva_rows(
         EmvaRow(
             "temporal dark noise", "sigma_d", *_root_mean_square(maps["read_noise_e"]), "e-",
             "root mean square over the pixels of the read noise sigma g, quantisation included",
-            "EMVA: of dark frames, so that shot noise of the dark current is in it; here it is not",
+            "EMVA: from dark frames, including shot noise of the dark current; excluded here",
         ),
         EmvaRow(
             "temporal dark noise", "sigma_y.dark", *_root_mean_square(maps["read_noise_dn"]), "DN",
@@ -111,14 +111,14 @@ def emva_rows(
         _prnu(maps, errors, kind),
         EmvaRow(
             "non-uniformity of the gain", "", *_relative_spread(gain, errors["conversion_gain"]), "%",
-            "standard deviation of g between the pixels over its mean, without what their errors add",
-            "EMVA has no such quantity: its K is one number; in PRNU gain and sensitivity are together",
+            "standard deviation of g between the pixels over its mean, corrected for their errors",
+            "not in EMVA: K is one number for the sensor; PRNU combines gain and sensitivity",
         ),
         _dark_current(stored.get("dark_current"), kept, kind),
         EmvaRow(
             "hot pixels", "", 100.0 * hot if kept.any() else np.nan, None, "%",
             f"pixels whose H is above the median by more than {outlier_sigmas:g} robust standard deviations",
-            "EMVA: defect pixels are by a limit that the application sets, on the logarithmic histogram",
+            "EMVA: the application sets the limit of defect pixels, on the logarithmic histogram",
         ),
     ]  # fmt: skip
     missing = "needs calibrated light", "needs exposures up to saturation"
@@ -181,15 +181,15 @@ def _dsnu(maps: _Kept, errors: _Kept, kind: str) -> EmvaRow:
         mean = maps["bias"] + maps["quanta_exposure"] / maps["conversion_gain"]
         # the mean of the samples is known far better than bias and H are: its own error is left in
         value, error = _spread(mean * gain, np.zeros_like(mean))
-        words = "standard deviation between the pixels of mu + H/g, in e- by the median g"
-        differs = "EMVA takes off the temporal noise that is left in the mean; here it is left in"
+        words = "standard deviation of mu + H/g between the pixels, in e- by the median g"
+        differs = "EMVA subtracts the temporal noise of the mean; not subtracted here"
     else:
         value, error = _spread(maps["bias"] * gain, (errors["bias"] * gain) ** 2)
         words = (
-            "standard deviation between the pixels of the bias, in e- by the median g, without their errors"
+            "standard deviation of the bias between the pixels, in e- by the median g, corrected for errors"
         )
         differs = (
-            "EMVA: of dark frames, dark current included; here of the bias alone (input.kind is not dark)"
+            "EMVA: from dark frames, dark current included; here the bias alone (input.kind is not dark)"
         )
     return EmvaRow("dark signal non-uniformity", "DSNU_1288", value, error, "e-", words, differs)
 
@@ -199,10 +199,9 @@ def _prnu(maps: _Kept, errors: _Kept, kind: str) -> EmvaRow:
     if kind == "light":
         value, error = _relative_spread(maps["quanta_exposure"], errors["quanta_exposure"])
     return EmvaRow(
-        "photo response non-uniformity", "PRNU_1288 (like it)", value, error, "%",
-        "standard deviation of H between the pixels over its mean, without their errors (input.kind: light)",
-        "EMVA: at half saturation, dark taken off, trends of the illumination filtered "
-        "out; here none of these",
+        "photo response non-uniformity", "PRNU_1288 (similar)", value, error, "%",
+        "standard deviation of H between the pixels over its mean, corrected for errors (input.kind: light)",
+        "EMVA: at half saturation, dark subtracted, trends of the illumination filtered out; not done here",
     )  # fmt: skip
 
 
@@ -213,6 +212,6 @@ def _dark_current(found: NDArray[Any] | None, kept: NDArray[np.bool_], kind: str
         value, error = _mean(found[kept])
     return EmvaRow(
         "dark current from mean", "mu_I.mean", value, error, "e-/px/s",
-        "mean over the pixels of H over the integration time (input.kind: dark), or of its slope",
+        "mean over the pixels of H / integration time (input.kind: dark), or of its slope",
         "EMVA: slope of the mean dark signal over six or more exposure times",
     )  # fmt: skip

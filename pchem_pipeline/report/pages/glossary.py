@@ -31,7 +31,7 @@ GLOSSARY: tuple[Term, ...] = (
     ),
     Term(
         "charge rate",
-        "Quanta exposure over integration time, electrons per pixel and second, whatever made the charge.",
+        "Quanta exposure divided by integration time, electrons per pixel and second, whatever the source.",
     ),
     Term(
         "conversion gain",
@@ -40,8 +40,7 @@ GLOSSARY: tuple[Term, ...] = (
     ),
     Term(
         "dark current",
-        "Charge rate in the dark, electrons per pixel and second; called so only where the frames were dark "
-        "(input.kind).",
+        "Charge rate in the dark, electrons per pixel and second; only for frames with input.kind: dark.",
     ),
     Term("DN", "Digital number, the unit of raw data; also called ADU, count or LSB."),
     Term(
@@ -56,19 +55,19 @@ GLOSSARY: tuple[Term, ...] = (
     ),
     Term(
         "fixed-pattern noise",
-        "What is the same in every frame: differences of bias (DSNU), dark current and gain between pixels, "
-        "rows and columns.",
+        "Pattern that is the same in every frame: differences of bias (DSNU), dark current and gain between "
+        "pixels, rows and columns.",
         ("fixed pattern",),
     ),
     Term(
         "flagged",
-        "A pixel whose values the data leave open, for example by one electron: its standard errors say too "
-        "little. Flagged pixels are left out of medians.",
+        "A pixel whose values the data do not fix, for example by one electron: the true errors are larger "
+        "than quoted. Flagged pixels are excluded from medians.",
     ),
     Term(
         "gap",
-        "How far the law of the data is from that of the model (Kullback-Leibler divergence), on frames "
-        "that no fit has seen. More data do not change it; they lower its floor, which chance alone makes.",
+        "Kullback-Leibler divergence of the model from the data, on frames not used in the fit. More data do "
+        "not change it, but lower its floor (the value from sampling noise alone).",
         ("floor",),
     ),
     Term(
@@ -79,23 +78,23 @@ GLOSSARY: tuple[Term, ...] = (
     ),
     Term(
         "micronat",
-        "10⁻⁶ nat, the unit of the gap. N samples with a gap of G nats each are exp(N G) times as likely "
-        "under the law of the data as under the model: 1 micronat, a million samples: a factor e.",
+        "10⁻⁶ nat, the unit of the gap. N samples with a gap of G nats each have a likelihood ratio of "
+        "exp(N G) between data and model: a factor e for a million samples with 1 micronat.",
         ("micronats",),
     ),
     Term(
         "misfit",
-        "A pixel whose histogram the fitted density does not describe, by the rate of false discoveries.",
+        "A pixel whose histogram the fitted density does not describe, at a given false-discovery rate.",
         ("misfits",),
     ),
     Term(
         "non-uniformity of the gain",
-        "Spread of the conversion gain between pixels over its mean. PRNU of EMVA 1288 holds gain and "
-        "sensitivity together, measured under light.",
+        "Standard deviation of the conversion gain between pixels, relative to its mean. PRNU of EMVA 1288 "
+        "combines gain and sensitivity, measured under light.",
     ),
     Term(
         "NUCed",
-        "After non-uniformity correction: each value less its pixel's bias, times its gain, in electrons.",
+        "After non-uniformity correction: each value minus its pixel's bias, times its gain, in electrons.",
         ("non-uniformity correction",),
     ),
     Term(
@@ -106,47 +105,46 @@ GLOSSARY: tuple[Term, ...] = (
     ),
     Term(
         "placebo",
-        "The best fit of an effect that has nothing to do with the named one. What it closes of the gap, any "
-        "wrong effect could.",
+        "Control: the best fit of an unrelated effect. A wrong effect can close as much of the gap.",
+        ("control",),
     ),
     Term(
         "PRNU",
-        "Photo response non-uniformity: spread between pixels of the response to light, over its mean. "
-        "Here the spread of H under light stands for it; EMVA 1288 measures at half saturation.",
+        "Photo response non-uniformity: standard deviation of the response to light between pixels, relative "
+        "to its mean. Here computed from H under light; EMVA 1288 measures at half saturation.",
         ("photo response non-uniformity",),
     ),
-    Term("quanta exposure", "Mean number of electrons of a pixel in one frame, H (e⁻)."),
+    Term("quanta exposure", "Mean number of electrons per pixel and frame, H (e⁻)."),
     Term(
         "read noise",
-        "Standard deviation that reading adds to a pixel's signal, σ in DN or σ·g in e⁻, quantisation "
-        "included. Dark shot noise is not in it; in the temporal dark noise of EMVA 1288 it is.",
+        "Standard deviation that the readout adds to a pixel's signal, σ in DN or σ·g in e⁻, quantisation "
+        "included. Excludes dark shot noise, which the temporal dark noise of EMVA 1288 includes.",
     ),
     Term(
         "readout and charge",
-        "Each sample is split by its pixel's fit into the expected number of electrons (charge) and what is "
-        "left (readout). Effects of light show in the first, those of the electronics in the second.",
+        "Each sample is split by its pixel's fit into the expected number of electrons (charge) and the "
+        "remainder (readout). Effects of light appear in charge, effects of the electronics in readout.",
         ("readout residuals", "readout channel", "charge channel"),
     ),
     Term(
         "replicate",
-        "A stack simulated from the fitted model and treated like the data: what chance makes of it.",
+        "A stack simulated from the fitted model and analysed like the data; gives the sampling noise.",
         ("replicates",),
     ),
     Term(
         "RMSE",
-        "Root mean square difference between the predicted and the measured density of the ensemble; "
-        "sampling noise alone leaves some.",
+        "Root mean square difference between predicted and measured density of the ensemble; not 0 even for "
+        "a perfect model, because of sampling noise.",
     ),
     Term(
-        "sd of chance",
-        "Standard deviation of a statistic between stacks simulated from the fitted model. Of a hundred "
-        "statistics the largest lies near 3 by chance.",
-        ("standard deviations of chance", "sd"),
+        "sigma",
+        "Standard deviation of an estimate, or of a statistic between stacks simulated from the fitted "
+        "model. The largest of a hundred statistics is near 3 sigma by chance.",
+        ("sd of chance", "standard deviations of chance", "sd"),
     ),
     Term(
         "standard error",
-        "How far an estimate is from the truth by chance, as a standard deviation; from the curvature of the "
-        "likelihood.",
+        "1 sigma error of an estimate, from the curvature of the likelihood.",
         ("standard errors",),
     ),
     Term(

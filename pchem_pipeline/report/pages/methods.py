@@ -25,7 +25,7 @@ _COLUMNS = (
 
 _HEAD = (
     "method",
-    "pixels with an answer",
+    "pixels with a result",
     "median g (e⁻/DN)",
     "bias of g (%)",
     "rms error of g (%)",

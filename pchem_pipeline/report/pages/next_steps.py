@@ -27,27 +27,27 @@ class Step:
 def next_steps(data: ReportData) -> list[Step]:
     """Return what to do next; the first is the one to begin with."""
     if any(stage.get("state") not in (None, "complete") for stage in data.stages) or data.unfitted.any():
-        return [Step(f"pchem run {RUN}", "finish the run: a part of it is missing")]
+        return [Step(f"pchem run {RUN}", "finish the run")]
     step, status = data.code_step, data.fit.get("fit_status")
     if step > 1 and not step & (step - 1):
         why = (
-            f"with input.bit_shift: {step.bit_length() - 1} in the YAML, which undoes the left justification"
+            f"set input.bit_shift: {step.bit_length() - 1} in the YAML (left-justified samples) and run again"
         )
         return [Step(f"pchem run {RUN}", why)]
     if status is not None and ((status & data.failed_mask) != 0).all():
         return [
             Step(
                 f"pchem joint EXPOSED.yaml --bias {RUN} --store joint.zarr",
-                "if these frames hold no electrons by design: fit them together with frames that do",
+                "if these are bias frames: fit them together with exposed frames",
             ),
-            Step(f"pchem view {RUN}", "look at the histograms"),
+            Step(f"pchem view {RUN}", "view the histograms"),
         ]
     if data.quick_look is not None and any(check.name == "levels" for check in data.quick_look.found):
         return [
             Step(
                 "pchem run FILES_OF_ONE --store one.zarr",
-                "the frames are of several exposures: make a run of each, from its own files, then fit them "
-                "together (pchem joint)",
+                "the frames have several exposures: make one run per exposure, then fit them together "
+                "(pchem joint)",
             )
         ]
     found = []
@@ -55,25 +55,19 @@ def next_steps(data: ReportData) -> list[Step]:
         found += [
             Step(
                 f"pchem joint {RUN} BRIGHTER.yaml --bias BIAS.yaml --store joint.zarr",
-                "fit several exposures together: a second one, or frames without charge, settle what one "
-                "leaves open",
+                "fit several exposures together: a second exposure, or bias frames, fix the electron number",
             ),
             Step(
                 f"pchem plan --read-noise {_read_noise(data)} --samples 0,2,8 --target conversion_gain=1%",
-                "how many frames of which exposures are enough, at the read noise that you expect",
+                "compute how many frames at which exposures are needed, at the read noise that you expect",
             ),
         ]
     if data.mostly_coarse:
-        found.append(
-            Step(
-                f"pchem run {RUN}",
-                "without fit.likelihood: density in the YAML: auto counts rounding",
-            )
-        )
+        found.append(Step(f"pchem run {RUN}", "set fit.likelihood: auto in the YAML and run again"))
     if data.discrepancy is None and not data.often_flagged and (data.n_frames or 0) >= _SEARCHED:
-        found.append(Step(f"pchem discrepancy {RUN}", "look for what the model is missing"))
+        found.append(Step(f"pchem discrepancy {RUN}", "search for effects missing from the model"))
     if not found:
-        found.append(Step(f"pchem view {RUN}", "look at every pixel in the browser"))
+        found.append(Step(f"pchem view {RUN}", "view every pixel in the browser"))
     return found
 
 

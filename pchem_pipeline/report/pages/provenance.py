@@ -39,7 +39,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
 
 def _run(data: ReportData) -> Table:
     rows = _flat(data.run)
-    return Table("run", "Run", "What made this report.", ("item", "value"), tuple(rows))
+    return Table("run", "Run", "Program and settings of this report.", ("item", "value"), tuple(rows))
 
 
 def _stages(data: ReportData) -> Table:

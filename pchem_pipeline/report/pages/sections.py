@@ -31,70 +31,58 @@ OPEN: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
     (
         "exposures",
         "Exposures",
-        "Each exposure has its own H; what grows with {against} is the {noun}, and what does not is the "
-        "{offset} (or a bias stack that holds electrons).",
+        "Each exposure has its own H. Slope against {against}: {noun}; offset: {offset} (or electrons in the "
+        "bias stack).",
         ("samples",),
     ),
     (
         "photon-transfer",
         "Photon transfer",
-        "The same data as moments: points that leave the curve tell of nonlinearity, or of samples of "
-        "different gain.",
+        "Variance against mean. Points off the curve: nonlinearity, or samples of different gain.",
         ("samples",),
     ),
-    (
-        "stability",
-        "Stability and structure",
-        "What moves in time, and what repeats along rows and columns: fixed-pattern noise and row or column "
-        "noise.",
-        (),
-    ),
+    ("stability", "Stability and structure", "Drift in time, fixed-pattern noise, row and column noise.", ()),
     ("status", "Fit status", "", ()),
 )
 FOLDED: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
-    (
-        "pixels",
-        "Single pixels",
-        "Histograms with the photon counting distribution that was fitted to each.",
-        ("pixels",),
-    ),
+    ("pixels", "Single pixels", "Histograms with the fitted photon counting distribution.", ("pixels",)),
     (
         "goodness",
         "Does the model describe each pixel?",
-        "Chi-square of merged bins; misfits are counted at a rate of false discoveries. Samples that the "
-        "model does not expect at all (cosmic rays, glitches) are left out of the fit.",
+        "Chi-square of merged bins; misfits at a given false-discovery rate. Samples far outside the model "
+        "(cosmic rays, glitches) are excluded from the fit.",
         (),
     ),
     (
         "cells",
         "From signal to electron number",
-        "The edges between electron numbers are not half-way between the peaks, since small and large "
+        "The limits between electron numbers are not half-way between the peaks, since small and large "
         "numbers are not equally likely.",
         (),
     ),
     (
         "ensemble",
         "The sensor as a whole",
-        "If the model holds, the pixels' parameters predict the ensemble.",
+        "If the model holds, the parameters of the pixels predict the ensemble.",
         ("ensemble", "nuced"),
     ),
     (
         "electrons",
         "Electron numbers",
-        "Raw values of the ensemble frames as numbers of electrons.",
+        "Most probable electron number of each sample of the ensemble.",
         ("electrons",),
     ),
     (
         "components",
-        "Why the peaks of the ensemble fade",
-        "Where pixels differ in gain, the component of each electron number widens with it.",
+        "Why the peaks of the ensemble blur",
+        "Where pixels differ in gain, the peak of an electron number is the wider, the larger the number.",
         ("components",),
     ),
-    ("uncertainty", "How sure are the numbers?", "", ()),
+    ("uncertainty", "How precise are the numbers?", "", ()),
     (
         "methods",
-        "Other methods beside PCH-EM",
-        "The same pixels by methods of the literature, and the smallest errors that any method could have.",
+        "Comparison with other methods",
+        "The same pixels analysed by methods of the literature, and the smallest possible errors.",
         ("methods",),
     ),
     ("plan", "How many frames are enough?", "", ()),
@@ -103,21 +91,18 @@ FOLDED: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
 #: How to read the figures of the section ``maps``, by how they are drawn.
 MAP_READING: dict[str, str] = {
     "beta": (
-        "Colours follow the rank of a pixel; the colour bar is labelled at the minimum, the 15.6, 50 and "
-        "84.4 % quantiles and the maximum. Blue line: median."
-    ),
-    "linear": (
-        "Colours are linear between the 1st and the 99th percentile; values beyond have the end colours. "
+        "Rank-based colours (histogram-equalised); labels at minimum, median ± 1 sigma and maximum. "
         "Blue line: median."
     ),
+    "linear": ("Linear colours from the 1st to the 99th percentile, clipped beyond. Blue line: median."),
     "channels": (
-        "Each point is a channel with its standard error; crosses at the bottom are channels without a value."
+        "Points: channels with their standard errors; crosses at the bottom: channels without a value."
     ),
 }
 
 #: Sections that only a run of several samples has.
 _OF_SAMPLES = ("exposures", "photon-transfer")
-_NO_LINE = "The samples share g, μ and σ; no line was asked for (input.against: none)."
+_NO_LINE = "The samples share g, μ and σ; no line was fitted (input.against: none)."
 
 
 @dataclass(frozen=True)
@@ -182,13 +167,15 @@ def _summary(material: Material) -> Section:
         "verdict": material.view,
         "effects": data.discrepancy.found.effects if data.discrepancy else (),
     }
-    return Section("summary", "Is this sensor all right, and can I believe it?", "summary", content)
+    return Section(
+        "summary", "Is the sensor within limits, and are these results reliable?", "summary", content
+    )
 
 
 def _inspector(material: Material) -> Section:
     """Say where the inspector is; what it shows lies at the end of the page."""
     shown = material.data.inspector is not None
-    content = {"shown": shown, "why": "No pixel was fitted; there is nothing to look at."}
+    content = {"shown": shown, "why": "No pixel was fitted."}
     return Section("inspector", "Look at pixels", "inspector", content)
 
 
@@ -204,7 +191,7 @@ def _figures(row: tuple[str, str, str, tuple[str, ...]], folded: bool, material:
     if not shown and not tables and not missing:
         if data.samples is not None:
             return None  # a joint fit has less to show
-        missing = ["this run has no data for it."]
+        missing = ["no data in this run."]
     if id_ == "maps":
         reading = "channels" if min(data.shape) < 2 else material.settings.map_stretch
         intro = MAP_READING[reading]
@@ -230,25 +217,25 @@ def _discrepancy(material: Material) -> Section:
 
 def _tables(material: Material) -> Section:
     tables = [table for table in material.tables if table.section == "tables"]
-    nothing = "No pixel has a value; there is nothing to list."
+    nothing = "No pixel has a value."
     return Section("tables", "Tables", "tables", {"tables": tables, "empty": nothing}, folded=True)
 
 
 def _emva(material: Material) -> Section | None:
     tables = [table for table in material.tables if table.section == "emva"]
     content = {"tables": tables, "empty": ""}
-    return Section("emva", "In the words of EMVA 1288", "tables", content, folded=True) if tables else None
+    return Section("emva", "Quantities of EMVA 1288", "tables", content, folded=True) if tables else None
 
 
 def _provenance(material: Material) -> Section:
     tables = provenance_tables(material.data)
     content = {"tables": tables, "empty": "Nothing was recorded."}
-    return Section("provenance", "Origin of the results", "tables", content, folded=True)
+    return Section("provenance", "Provenance", "tables", content, folded=True)
 
 
 def _cite(material: Material) -> Section:
     content = {"citation": citation(material.data)}
-    return Section("cite", "How to describe and cite this", "cite", content, folded=True)
+    return Section("cite", "How to cite", "cite", content, folded=True)
 
 
 def _configuration(material: Material) -> Section:

@@ -1,4 +1,4 @@
-"""The first screen: is the sensor all right, can one believe it, the key numbers, and the remarks."""
+"""The first screen: is the sensor within limits, are the results reliable, key numbers and remarks."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class KeyNumber:
 
 @dataclass(frozen=True)
 class Flag:
-    """One remark on whether the results can be believed, or about the sensor itself."""
+    """One remark on how reliable the results are, or about the sensor itself."""
 
     level: Level
     text: str
@@ -128,9 +128,7 @@ def sentence(data: ReportData) -> str:
     """Return the report in one sentence or two."""
     pixels = pixel_counts(data)
     if pixels.fitted == 0:
-        return (
-            f"None of the {count(pixels.total, data.noun)} could be fitted; the table of fit status says why."
-        )
+        return f"None of the {count(pixels.total, data.noun)} could be fitted: see the table of fit status."
     frames = f" from {count(data.n_frames, 'frame')}" if data.n_frames else ""
     share = f"{percent(pixels.fitted, pixels.total)} of {count(pixels.total, data.noun)} were"
     if pixels.failed == 0 and pixels.total > 1:
@@ -153,8 +151,8 @@ def _medians(data: ReportData) -> str:
     flagged = int(data.flagged.sum())
     if data.mostly_flagged:
         return (
-            f"{percent(flagged, pixel_counts(data).fitted)} of them are flagged, so no medians are given: "
-            "those of the others would be of pixels that chance chose."
+            f"{percent(flagged, pixel_counts(data).fitted)} of them are flagged: no medians, since "
+            "the other pixels are a biased selection."
         )
     parts = []
     for name in ("read_noise_e", "conversion_gain", *CHARGE_RATES):
@@ -162,7 +160,9 @@ def _medians(data: ReportData) -> str:
             summary = data.summary(name)
             unit = symbol(name)[2]
             parts.append(f"{symbol(name)[1]} {measured(summary.median, summary.median_stderr, unit)}")
-    left_out = f" ({count(flagged, 'flagged one')} left out where a flag concerns it)" if flagged else ""
+    left_out = (
+        f" ({count(flagged, 'flagged one')} excluded where a flag concerns the quantity)" if flagged else ""
+    )
     return f"Medians over the {data.noun}s{left_out}: {', '.join(parts)}."
 
 
@@ -185,7 +185,7 @@ def _failed_pixels(data: ReportData) -> list[Flag]:
     text = f"{count(pixels.failed, data.noun)} ({percent(pixels.failed, pixels.total)}) without a value"
     if share > data.allowed_failed:
         allowed = percent(data.allowed_failed, 1.0)
-        text = f"{text}, more than the {allowed} that is allowed{_reasons(data)}."
+        text = f"{text}; {allowed} allowed{_reasons(data)}."
         return [Flag("serious", text, "sensor")]
     if pixels.failed:
         level: Level = "caution" if share > _CAUTION_SHARE else "note"
@@ -200,11 +200,11 @@ def _reasons(data: ReportData) -> str:
         return ""
     rows = [row for row in status_counts(status, data.status_words) if row[0] & data.failed_mask]
     rows.sort(key=lambda row: -row[2])
-    return "".join(f"{'; ' if i else '. Why: '}{text} ({n:,})" for i, (_, text, n) in enumerate(rows))
+    return "".join(f"{'; ' if i else '. Reasons: '}{text} ({n:,})" for i, (_, text, n) in enumerate(rows))
 
 
 def _spaced_codes(data: ReportData) -> list[Flag]:
-    """Say where only every n-th DN occurs: the samples are no plain output of an ADC."""
+    """Report that only every n-th DN occurs: the samples are not the plain output of an ADC."""
     step = data.code_step
     if step < 2:
         return []
@@ -214,46 +214,46 @@ def _spaced_codes(data: ReportData) -> list[Flag]:
         else f"Only every {('second', 'third')[step - 2]} DN occurs"
     )
     if step & (step - 1):
-        return [Flag("serious", f"{text}: the values were multiplied after the ADC; raw ones are needed.")]
+        return [Flag("serious", f"{text}: the samples were multiplied after the ADC. Take raw frames.")]
     shift = step.bit_length() - 1
-    return [Flag("serious", f"{text}: left-justified samples, it seems; set input.bit_shift: {shift}.")]
+    return [Flag("serious", f"{text}: the samples look left-justified. Set input.bit_shift: {shift}.")]
 
 
 def _unfitted(data: ReportData) -> list[Flag]:
     missing = int(data.unfitted.sum())
     if not missing:
         return []
-    return [Flag("serious", f"{count(missing, data.noun)} not fitted yet; continue the run.")]
+    return [Flag("serious", f"{count(missing, data.noun)} not fitted yet. Continue the run.")]
 
 
 def _flagged(data: ReportData) -> list[Flag]:
-    """Say where many pixels are open by whole electrons, and what helps."""
+    """Report where many pixels can be off by whole electrons, and what to take."""
     if not data.often_flagged:
         return []
     share = percent(int(data.flagged.sum()), pixel_counts(data).fitted)
-    cure = "more frames, or more exposures" if data.samples is not None else "several exposures (pchem joint)"
+    cure = "more frames or more exposures" if data.samples is not None else "several exposures (pchem joint)"
     if data.flagged_share("conversion_gain") <= 0.5 * data.flagged_share():
         return [
             Flag(
                 "caution",
-                f"{share} of the {data.noun}s with a value are flagged: exposure and bias of most are open "
-                f"by whole electrons; gain and read noise are known. What helps: {cure}.",
+                f"{share} of the {data.noun}s with a value are flagged: exposure and bias can be off by "
+                f"whole electrons; gain and read noise are known. Take {cure}.",
             )
         ]
     if not data.mostly_flagged:
         return [
             Flag(
                 "caution",
-                f"{share} of the {data.noun}s with a value are flagged and left out. The others are a "
-                "selection, as a rule quieter than the sensor: their median read noise is likely too low, by "
-                f"more than its error says. What helps: {cure}.",
+                f"{share} of the {data.noun}s with a value are flagged and excluded. The others are a biased "
+                "selection: their median read noise is likely too low, by more than its quoted error. "
+                f"Take {cure}.",
             )
         ]
     return [
         Flag(
             "serious",
-            f"{share} of the {data.noun}s with a value are flagged: the data leave their electrons open; "
-            f"gain, bias and read noise may be wrong by far more than their errors say. What helps: {cure}.",
+            f"{share} of the {data.noun}s with a value are flagged: the data do not fix the electron number; "
+            f"gain, bias and read noise can be off by far more than quoted. Take {cure}.",
         )
     ]
 
@@ -262,7 +262,7 @@ def _left_out_words(bit: int) -> str:
     if not bit & int(FLAGGED):
         return ""
     which = "" if bit & int(flags_of("conversion_gain")) else " of exposure and bias"
-    return f" (left out of medians and tables{which})"
+    return f" (excluded from medians and tables{which})"
 
 
 def _cautions(data: ReportData) -> list[Flag]:
@@ -288,23 +288,23 @@ def _goodness(data: ReportData) -> list[Flag]:
     poor = int((p < _POOR_P).sum())
     expected = _POOR_P * p.size
     text = (
-        f"Goodness of fit: {percent(poor, p.size)} of the fitted {data.noun}s have p < {_POOR_P:g}, "
-        f"where the model alone leads to {percent(expected, p.size)}"
+        f"{percent(poor, p.size)} of the {data.noun}s fail the goodness-of-fit test (p < {_POOR_P:g}); "
+        f"{percent(expected, p.size)} expected"
     )
     if poor > 0.05 * p.size:
         return [
             Flag(
                 "serious",
-                f"{text}. {_model(data)} does not describe this sensor; see the residuals of single pixels.",
+                f"{text}. {_model(data)} does not describe this sensor: see the residuals of single pixels.",
             )
         ]
     if poor > 2.0 * expected + 5.0 * np.sqrt(expected):
-        return [Flag("caution", f"{text}. Some pixels are not described by {_model(data, 'the')}.")]
+        return [Flag("caution", f"{text}. {_model(data)} does not describe some pixels.")]
     return [Flag("good", f"{text}.")]
 
 
 def _parts(data: ReportData) -> list[Flag]:
-    """Say where a map has a step or two modes, with the medians of the parts."""
+    """Report a step or two modes of a map, with the medians of the parts."""
     return [
         Flag("note" if name == "bias" else "caution", _parts_sentence(name, parts))
         for name, found in data.parts.items()
@@ -318,11 +318,11 @@ def _parts_sentence(name: str, parts: Parts) -> str:
     if parts.axis == "modes":
         return (
             f"{words.capitalize()} has two modes, {medians[0]} and {medians[1]}: "
-            "its median over the sensor describes neither."
+            "the median over the sensor describes neither."
         )
     ends = zip(pairwise(parts.edges), medians, strict=True)
     places = ", ".join(f"{parts.axis} {a:g} to {b - 1:g}: {median}" for (a, b), median in ends)
-    return f"{words.capitalize()} has a step ({places}); its median over the sensor describes no part."
+    return f"{words.capitalize()} has a step ({places}): the median over the sensor describes no part."
 
 
 def _agreement(data: ReportData) -> list[Flag]:
@@ -338,11 +338,11 @@ def _agreement(data: ReportData) -> list[Flag]:
         text = f"The RMSE of the predicted {words} ensemble is {short(ratio, 2)} times the sampling noise"
         text += tested
         if ratio <= _RMSE_GOOD or (p is not None and p >= _POOR_P):
-            found.append(Flag("good", f"{text}: the model explains the data."))
+            found.append(Flag("good", f"{text}: the model describes the data."))
         elif ratio <= _RMSE_BAD:
-            found.append(Flag("caution", f"{text}: small differences are left."))
+            found.append(Flag("caution", f"{text}: small differences remain."))
         else:
-            found.append(Flag("serious", f"{text}: the model does not explain the data."))
+            found.append(Flag("serious", f"{text}: the model does not describe the data."))
     return found
 
 
@@ -391,19 +391,17 @@ def _conditions(data: ReportData) -> list[Flag]:
     noisy = data.has_values("read_noise_e") and data.summary("read_noise_e").median > _TOO_NOISY
     if data.samples is None and noisy:
         found.append(
-            Flag("caution", "Read noise above 0.5 e⁻: one exposure tells little; take several exposures.")
+            Flag(
+                "caution",
+                "Read noise above 0.5 e⁻: one exposure does not suffice. Combine several exposures.",
+            )
         )
     if data.mostly_coarse:
-        found.append(
-            Flag("caution", "DN too coarse for fit.likelihood: density: rounding biases the estimates.")
-        )
+        found.append(Flag("caution", "Rounding to whole DN biases the estimates: set fit.likelihood: auto."))
     for stage in data.stages:
         if stage.get("state") not in (None, "complete"):
             found.append(
-                Flag(
-                    "serious",
-                    f"Stage {stage.get('stage')} is {stage['state']}: the report shows a part only.",
-                )
+                Flag("serious", f"Stage {stage.get('stage')} is {stage['state']}: the report is incomplete.")
             )
         # why there is no charge rate is said once, with what is missing
         found += [
@@ -414,9 +412,9 @@ def _conditions(data: ReportData) -> list[Flag]:
     return list(dict.fromkeys(found))
 
 
-def _model(data: ReportData, article: str = "The") -> str:
+def _model(data: ReportData) -> str:
     """Return the name of the model that the pixels were fitted with."""
-    return f"{article} model {data.run['model']}" if "model" in data.run else f"{article} PCD"
+    return f"The model {data.run['model']}" if "model" in data.run else "The PCD"
 
 
 #: What looks for remarks; a further check is a further row.
@@ -450,7 +448,7 @@ class Answer:
 
 
 def answers(data: ReportData, remarks: list[Flag] | None = None) -> tuple[Answer, Answer]:
-    """Answer 'is this sensor all right' and 'can I believe it' from the maps and the remarks.
+    """Answer 'is the sensor within limits' and 'are the results reliable' from the maps and the remarks.
 
     Args:
         data: what the run found.
@@ -458,24 +456,24 @@ def answers(data: ReportData, remarks: list[Flag] | None = None) -> tuple[Answer
     """
     sensor, belief = _sensor(data), _belief(data, flags(data) if remarks is None else remarks)
     if belief.level == "serious" and sensor.level == "good":
-        text = f"{sensor.text.rstrip('.')}, by results that are not to be believed as they are."
-        sensor = replace(sensor, level="caution", word="Not known", text=text)
+        text = f"{sensor.text.rstrip('.')}, but the results are not reliable."
+        sensor = replace(sensor, level="caution", word="Unknown", text=text)
     return sensor, belief
 
 
 def _sensor(data: ReportData) -> Answer:
-    question = f"Is this {'set of channels' if data.shape[0] == 1 else 'sensor'} all right?"
+    question = f"{'Are the channels' if data.shape[0] == 1 else 'Is the sensor'} within limits?"
     pixels = pixel_counts(data)
     if pixels.fitted == 0:
-        return Answer(question, "serious", "Not known", f"No {data.noun} could be fitted{_reasons(data)}.")
+        return Answer(question, "serious", "Unknown", f"No {data.noun} could be fitted{_reasons(data)}.")
     judged = tuple(criteria(data))
     if data.mostly_flagged:
         kept = tuple(each for each in judged if each.setting in ("failed_pixels", "flagged_pixels"))
-        text = f"Most {data.noun}s are flagged: their read noise and gain are open, and with them the answer."
-        return Answer(question, "serious", "Not known", text, kept)
+        text = f"Most {data.noun}s are flagged: the data do not fix their gain and read noise."
+        return Answer(question, "serious", "Unknown", text, kept)
     missed = [each for each in judged if not each.met]
     limits = "; ".join(f"{each.words} {each.found} (limit {each.limit[2:]})" for each in missed)
-    met = f"the {len(judged)} criteria are met" if judged else "no limits are set (report.criteria)"
+    met = f"all {len(judged)} criteria pass" if judged else "no limits are set (report.criteria)"
     text = f"{_value_share(data)}; {limits or met}."
     if pixels.failed > data.allowed_failed * pixels.total:
         return Answer(question, "serious", "No", text, judged)
@@ -484,7 +482,7 @@ def _sensor(data: ReportData) -> Answer:
         word = "Too noisy to count electrons" if noisy else "Too noisy"
         return Answer(question, "caution", word, text, judged)
     if data.often_flagged:
-        return Answer(question, "caution", "Known in part only", text, judged)
+        return Answer(question, "caution", "Partly known", text, judged)
     if missed:
         return Answer(question, "caution", "Mostly", text, judged)
     return Answer(question, "good", "Yes", text, judged)
@@ -498,27 +496,26 @@ def _value_share(data: ReportData) -> str:
 
 
 def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
-    question = "Can I believe these results?"
+    question = "Are these results reliable?"
     if pixel_counts(data).fitted == 0:
-        return Answer(question, "serious", "There are none", f"No {data.noun} has a value.")
+        return Answer(question, "serious", "No results", f"No {data.noun} has a value.")
     about = [flag for flag in remarks if flag.about == "results"]
     serious = [flag for flag in about if flag.level == "serious"]
     cautions = [flag for flag in about if flag.level == "caution"]
     if serious:
         more = f" ({len(serious) - 1} more below)" if len(serious) > 1 else ""
-        word = "No" if data.mostly_flagged else "Not as they are"
-        return Answer(question, "serious", word, f"{serious[0].text}{more}")
+        return Answer(question, "serious", "No", f"{serious[0].text}{more}")
     if cautions:
         more = f" ({len(cautions) - 1} more below)" if len(cautions) > 1 else ""
         return Answer(question, "caution", "With caution", f"{cautions[0].text}{more}")
     passed = sum(flag.level == "good" for flag in about)
-    checks = f"{count(passed, 'check')} of the model against the data passed" if passed else "No check failed"
+    checks = f"{count(passed, 'check')} of the model against the data passed" if passed else "No check fails"
     looked = "" if data.discrepancy is not None else _not_looked_for(data)
     pixels = pixel_counts(data)
     if pixels.failed > data.allowed_failed * pixels.total:
         word = f"For the {data.noun}s with a value"
         return Answer(
-            question, "caution", word, f"{checks}; {count(pixels.failed, data.noun)} have none.{looked}"
+            question, "caution", word, f"{checks}; {count(pixels.failed, data.noun)} without a value.{looked}"
         )
     quick = data.discrepancy is None
     return Answer(question, "good", _QUICK_YES if quick else "Yes", f"{checks}.{looked}")
@@ -528,12 +525,12 @@ _QUICK_YES = "No problem found by the quick checks"
 
 
 def _not_looked_for(data: ReportData) -> str:
-    """Say that nobody looked closely at what the model may be missing."""
+    """Say what the quick checks cannot find."""
     if data.quick_look is None or not data.quick_look.checks:
-        return " What the model may be missing was not looked for."
+        return " Missing effects were not searched for."
     missing = data.quick_look.missing
-    parts = f" Not looked at: {', '.join(missing)}." if missing else ""
+    parts = f" Not checked: {', '.join(missing)}." if missing else ""
     return (
-        f"{parts} The quick checks do not see what is alike in all frames and pixels (a nonlinearity, charge "
-        f"that is not Poisson distributed); {data.quick_look.command} compares that, with simulations."
+        f"{parts} The quick checks do not detect what is the same in all frames and pixels (a nonlinearity, "
+        f"charge that is not Poisson distributed): run {data.quick_look.command}."
     )

@@ -109,14 +109,14 @@ def _parameters(data: ReportData) -> Table:
     return Table(
         "parameters",
         "Parameters",
-        f"Median over the {data.noun}s with its standard error, robust standard deviation between them "
-        f"(1.4826 MAD), median standard error of one {data.noun}, percentiles, and outliers beyond "
+        f"Median over the {data.noun}s with its standard error, robust standard deviation between "
+        f"{data.noun}s (1.4826 MAD), median 1 sigma error per {data.noun}, percentiles, and outliers beyond "
         f"{data.outlier_sigmas:g} robust standard deviations.{_left_out(data)}",
         (
             "parameter",
             "median",
             "spread",
-            "error of a pixel",
+            f"error per {data.noun}",
             *(f"{p:g} %" for p in data.percentiles),
             "outliers",
             "pixels",
@@ -127,7 +127,7 @@ def _parameters(data: ReportData) -> Table:
 
 def _left_out(data: ReportData) -> str:
     flagged = int(data.flagged.sum())
-    return f" {count(flagged, f'flagged {data.noun}')} left out: the table below has them." if flagged else ""
+    return f" {count(flagged, f'flagged {data.noun}')} excluded (see the table below)." if flagged else ""
 
 
 def _flagged(data: ReportData) -> Table:
@@ -146,8 +146,8 @@ def _flagged(data: ReportData) -> Table:
     return Table(
         "flagged",
         f"Flagged {data.noun}s",
-        "The data leave these values open by one electron or more, or altogether: they may be far from the "
-        "truth, and their standard errors do not say so. They are left out of the other tables.",
+        "The data do not fix these values: they can be off by an electron or more, far beyond their standard "
+        "errors. Excluded from the other tables.",
         ("parameter", "median", "5 %", "95 %", "smallest", "largest", f"{data.noun}s"),
         tuple(rows),
     )
@@ -221,8 +221,8 @@ def _against_truth(data: ReportData) -> Table:
     return Table(
         "truth",
         "Estimates against the truth",
-        "Simulated data only. Pulls are (estimate − truth) / standard error: mean 0 and standard deviation 1 "
-        f"if estimates are unbiased and errors right.{_left_out(data)}",
+        "Simulated data only. Pull: (estimate − truth) / standard error; mean 0 and standard deviation 1 if "
+        f"estimates are unbiased and errors correct.{_left_out(data)}",
         ("parameter", "true median", "estimated median", "RMSE", "mean pull", "sd of pulls"),
         tuple(rows),
     )
@@ -269,7 +269,7 @@ def _rmse(data: ReportData) -> Table:
     return Table(
         "rmse",
         "Ensemble prediction against data",
-        "Root mean square difference of densities, and what sampling noise alone would give.",
+        "Root mean square difference of densities, and its expectation from sampling noise alone.",
         ("prediction", "RMSE", "sampling noise", "ratio"),
         tuple(rows),
         section="ensemble",
@@ -302,8 +302,8 @@ def _moments(data: ReportData) -> Table:
     return Table(
         "moments",
         "Moments of the ensemble",
-        "From the parameter maps (Hendrickson et al. 2023, Appendix A) and from the data, with "
-        f"the standard error of the data.{_of_bias(data)}",
+        "From the parameter maps (Hendrickson et al. 2023, Appendix A) and from the data with their "
+        f"standard error.{_of_bias(data)}",
         ("moment", "from the maps", "from the data", "difference / standard error"),
         tuple(rows),
         section="ensemble",
@@ -342,15 +342,15 @@ def _electrons(data: ReportData) -> Table:
     words = ""
     if facts.get("error_rate") is not None:
         rate, error = 100.0 * float(facts["error_rate"]), 100.0 * float(facts.get("error_rate_stderr") or 0.0)
-        words += f" Against the true electron numbers, {measured(rate, error)} % are wrong."
+        words += f" {measured(rate, error)} % of the estimates are wrong (truth known)."
     if facts.get("expected_error_rate") is not None:
         expected_errors = percent(float(facts["expected_error_rate"]), 1.0)
-        words += f" The fitted parameters lead one to expect {expected_errors} wrong."
+        words += f" Expected from the fitted parameters: {expected_errors}."
     return Table(
         "electron-table",
         "Electron numbers",
-        f"Share of each estimated electron number, and its predictions.{words}",
-        ("k", "estimated", "predicted p(k)", "estimator should show"),
+        f"Share of each estimated electron number, and its prediction.{words}",
+        ("k", "estimated", "predicted p(k)", "expected share"),
         tuple(rows),
         section="electrons",
     )
@@ -374,9 +374,9 @@ def _misfits(data: ReportData) -> Table:
     return Table(
         "misfits",
         f"Worst {data.noun}s",
-        f"Of {int(facts['tested']):,} tested {data.noun}s, {int(facts['misfits']):,} disagree with the model "
-        f"at a rate of false discoveries of {facts['false_discovery_rate']:g} (Benjamini and Hochberg 1995). "
-        f"{count(int(facts['pixels_with_outliers']), data.noun)} lost samples to the tail guard, at most "
+        f"{int(facts['misfits']):,} of {int(facts['tested']):,} tested {data.noun}s disagree with the model "
+        f"at a false-discovery rate of {facts['false_discovery_rate']:g} (Benjamini and Hochberg 1995). "
+        f"{count(int(facts['pixels_with_outliers']), data.noun)} with excluded samples, at most "
         f"{percent(float(facts['largest_outlier_share']), 1.0)} of their frames.",
         (data.noun, "χ²", "degrees of freedom", "p", "q", "misfit"),
         tuple(rows),
@@ -407,15 +407,15 @@ def _intervals(data: ReportData) -> Table:
             )
         )
     profile = ("profile: below", "profile: above") if data.intervals else ()
-    head = ("quantity", f"error of a {data.noun}", "of the value", "noise in the map", *profile)
+    head = ("quantity", f"error per {data.noun}", "relative error", "noise in the map", *profile)
     words = (
-        f" Ends of the {100 * data.interval_level:g} % profile-likelihood intervals below and above the "
-        "estimate, in standard errors."
+        f" Profile: distance of the ends of the {100 * data.interval_level:g} % profile-likelihood interval "
+        "from the estimate, in standard errors."
     )
     return Table(
         "uncertainties",
         "Uncertainties",
-        f"Median standard error of a {data.noun}, and the part of the map's variance that it makes."
+        f"Median 1 sigma error per {data.noun}, and its share of the map's variance."
         + (words if data.intervals else ""),
         head,
         tuple(rows),
@@ -440,8 +440,8 @@ def _status(data: ReportData) -> Table:
     return Table(
         "failures",
         "Fit status by reason",
-        "A pixel can have several reasons and then counts for each.",
-        ("reason", "pixels", "share", "of them with a value"),
+        "A pixel with several reasons counts for each.",
+        ("reason", "pixels", "share", "with a value"),
         tuple(rows),
         section="status",
     )
@@ -466,7 +466,7 @@ def _samples(data: ReportData) -> Table:
         rows.append((sample.name, x, f"{sample.n_frames:,}", exposure, residual, share))
     p = finite(found.arrays.get("linearity_p", np.empty(0)))
     off = percent(int((p < 0.01).sum()), p.size)
-    remark = f" {off} of the {data.noun}s lie off the line (p < 0.01; 1 % by chance)." if p.size else ""
+    remark = f" {off} of the {data.noun}s are off the line (p < 0.01; 1 % expected)." if p.size else ""
     head = f"{words} ({unit})" if unit else words
     return Table(
         "samples",
@@ -490,8 +490,8 @@ def _plan(data: ReportData) -> Table:
         rows.append((target_text(row["target"]), frames_text(row["frames"]), now))
     exposure, noise = plan["mark"]
     caption = (
-        f"For the median pixel, H = {short(exposure)} e⁻ and read noise {short(noise)} e⁻, by the bound. For "
-        "the best exposure, other sensors, several samples, and a check by simulation: pchem plan."
+        f"Cramer-Rao bound for the median pixel (H = {short(exposure)} e⁻, read noise {short(noise)} e⁻). "
+        "Best exposure, other sensors, several samples, check by simulation: pchem plan."
     )
     head = ("precision", "frames needed", "this run's")
     return Table("plan-table", "Frames for a precision", caption, head, tuple(rows), section="plan")

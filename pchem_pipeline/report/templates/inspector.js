@@ -936,16 +936,16 @@
     const first = edges.slice(0, 4).map(([, dn]) => short(dn, 4)).join(", ");
     const parts = [s.all ? `Histogram of ${frames}` : "Fitted density without a histogram", `${s.low} to ${s.high} DN`];
     if (s.theta) parts.push("fitted density");
-    if (first) parts.push(`first edges of the electron numbers at ${first} DN`);
-    if (off) parts.push(`largest residual ${off} standard deviations`);
+    if (first) parts.push(`first limits between electron numbers at ${first} DN`);
+    if (off) parts.push(`largest residual ${off} sigma`);
     s.figure.setAttribute("aria-label", `${parts.join("; ")}.`);
     const line = facts.model
-      ? `mass under the model ${facts.model}`
-      : "fitted density; thin: its components, one for each electron number";
-    const below = "Below: (observed − expected) / √expected, two standard deviations shaded; largest";
+      ? `probability under the model ${facts.model}`
+      : "fitted density; thin: its components, one per electron number";
+    const below = "Below: (observed − expected) / √expected, 2 sigma shaded; largest";
     const words = [s.all ? `Gray: ${frames}.` : ""];
     if (s.curve.length) words.push(`Line: ${line}.`);
-    if (first) words.push("Dashed: edges between the electron numbers k.");
+    if (first) words.push("Dashed: limits between the electron numbers k.");
     if (off) words.push(`${below} ${off}.`);
     byId("inspector-caption").textContent = words.filter(Boolean).join(" ");
   };
@@ -1010,7 +1010,7 @@
     if (pixel.trouble) notes.push(pixel.trouble);
     if (!pixel.exact) {
       notes.push(`Values to ${facts.keptTo}; this ${facts.noun}'s histogram is not in the file, which`);
-      notes.push(`holds ${whole(facts.sample.n)} of ${whole(n)}. To see every one: ${facts.command}`);
+      notes.push(`holds ${whole(facts.sample.n)} of ${whole(n)}. To see all: ${facts.command}`);
     } else if (facts.model && !pixel.mass && parametersOf(pixel)) {
       notes.push(`The curve of the model ${facts.model} is not in the file for this ${facts.noun}: ${facts.command}`);
     }
@@ -1246,7 +1246,7 @@
   };
   const tellTrouble = ({ trouble }) => {
     if (!trouble.length) return;
-    tell(`The link names what this run does not have: ${trouble.join("; ")}. It may be of another run.`, "inspector-trouble");
+    tell(`Not in this run: ${trouble.join("; ")}. The link may be from another run.`, "inspector-trouble");
   };
   const start = async () => {
     if (typeof DecompressionStream === "undefined") throw new Error("this browser is too old");

@@ -157,7 +157,7 @@ def path_arrays(
             )
         # an effect of others may expect more than a noiseless sensor
         except Exception as error:
-            _log.warning("no path is drawn of %s: %s", effect.tag, error_words(error))
+            _log.warning("no path of %s: %s", effect.tag, error_words(error))
             continue
         if np.allclose(first, second, rtol=1e-6, atol=1e-12) and np.isfinite(first).all():
             exposure += first[0] - first[0].mean()

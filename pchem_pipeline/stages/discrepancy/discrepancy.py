@@ -96,8 +96,8 @@ def _run_frames(
     elsewhere = search.elsewhere(settings, "elsewhere-", window, found)
     if elsewhere is not None and elsewhere.deviates and whole != settings:
         context.note(
-            f"what was found does not hold in {elsewhere.words()}, where {elsewhere.deviates}: as many "
-            "samples are compared as discrepancy.max_samples allows"
+            f"the model found does not hold in {elsewhere.words()}: {elsewhere.deviates}; comparing "
+            "discrepancy.max_samples samples now"
         )
         window, found = search.found(whole, "whole-")
         elsewhere = search.elsewhere(whole, "whole-elsewhere-", window, found)
@@ -155,7 +155,7 @@ class _Search:
         other = other_window(window, self.source.shape, self.roi)
         if other is None or found.verdict.verdict != "named":
             return None
-        self.tell("looking whether that holds elsewhere")
+        self.tell("checking the model in another window")
         frames = FrameStack.of(
             read_window(self.source, other), other.numbers, settings.block_frames, **self._taken(other)
         )
@@ -167,7 +167,7 @@ class _Search:
             by = Simulations(observed, _Mapper(self.context, prefix), settings.seed, effort)
             return there.model_copy(update={"deviates": deviation(by, found.model)})
         except Exception as error:
-            self.context.note(f"not looked at again in {there.words()}: {error_words(error)}")
+            self.context.note(f"not checked in {there.words()}: {error_words(error)}")
             return None
         finally:
             self.work += effort.spent
@@ -212,19 +212,19 @@ def _surveyed(
             less = within_memory(settings, source.shape, roi, codes, limit << 20)
             if less != settings:
                 context.note(
-                    f"compute.max_memory (--max-memory) allows {less.max_pixels} pixels in the comparison "
-                    f"with simulations, {settings.max_pixels} without a limit"
+                    f"compute.max_memory (--max-memory) limits the comparison to {less.max_pixels} pixels "
+                    f"({settings.max_pixels} without this limit)"
                 )
             settings = less
-        tell("looking at every pixel and every frame")
+        tell("scanning all pixels and frames")
         seen = _survey(context, source, settings)
         if seen.left_out:
-            context.note(f"left out, empty or far from the others: {frame_words(np.array(seen.left_out))}")
+            context.note(f"excluded, empty or outlying: {frame_words(np.array(seen.left_out))}")
         most, few = settings, fewer_samples(source, settings, roi, seen) if not before else settings
         if few != settings:
             context.note(
-                f"the disagreement is clear in {few.max_samples:,} samples; raise discrepancy.clear_samples "
-                "to compare more: smaller errors, and weaker effects beside it"
+                f"clear disagreement in {few.max_samples:,} samples, so no more are compared; for smaller "
+                "errors and weaker effects raise discrepancy.clear_samples"
             )
             settings, seen = few, _survey(context, source, few)
         known = {"window": _taken_of(settings), "whole": _taken_of(most), **seen.numbers()}
@@ -282,7 +282,7 @@ def _histograms(store: RunStore) -> SampleHistograms:
     """
     if not store.has("histogram/counts"):
         place = quoted(store.path)
-        raise StoreError(f"{_STAGE} of histograms needs them in the store; run: pchem histogram {place}")
+        raise StoreError(f"{_STAGE}: no histograms in the store; run: pchem histogram {place}")
     counts = store.read("histogram/counts")
     return SampleHistograms(counts.reshape(-1, counts.shape[2]), store.read("histogram/origin").ravel())
 
@@ -354,4 +354,4 @@ def _write(context: StageContext, found: Discrepancy) -> None:
         context.store.write_array(f"{_STAGE}/{name}", array)
     context.store.write_file(VERDICT_FILE, found.verdict.to_json().encode())
     for tag, reason in found.verdict.defects.items():
-        context.note(f"defect in the candidate {tag}, which was not compared: {reason}")
+        context.note(f"effect {tag} failed and was not compared: {reason}")

@@ -269,8 +269,8 @@ def _band_size(store: RunStore, shape: tuple[int, int], memory: int | None) -> t
         rows = max(fewest, min(affordable, rows * 3 // 4))
     lacking = math.ceil((fewest * nx * pixel * 4 / 3 - left) / 2**20)
     raise ConfigError(
-        f"discrepancy looks at {fewest} rows of the sensor at least, and lacks {lacking} MiB "
-        "for them: raise compute.max_memory (--max-memory)"
+        f"discrepancy needs {lacking} MiB more for {fewest} rows of the sensor; raise compute.max_memory "
+        "(--max-memory)"
     )
 
 

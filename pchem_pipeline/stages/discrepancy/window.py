@@ -169,8 +169,8 @@ def within_memory(
         pixels = int((y1 - y0) * (x1 - x0) * _SMALLER)
         if pixels < _FEWEST_PIXELS:
             raise ConfigError(
-                f"discrepancy takes {-(-least >> 20)} MiB for the smallest part of these frames that it "
-                f"compares, compute.max_memory (--max-memory) allows {limit >> 20}: raise it"
+                f"discrepancy needs at least {-(-least >> 20)} MiB, compute.max_memory (--max-memory) allows "
+                f"{limit >> 20}; raise it"
             )
         samples = min(settings.max_samples, pixels * window.numbers.size)
         settings = settings.model_copy(update={"max_samples": samples, "max_pixels": pixels})

@@ -68,8 +68,8 @@ def run(context: StageContext) -> None:
     """
     if context.sensor.kind != "frames":
         raise InputError(
-            f"{context.store.path} was made from {context.sensor.kind}, which have no frames here; "
-            "electron numbers need a run of camera files"
+            f"{context.store.path} was made from {context.sensor.kind}; electron numbers need a run of "
+            "camera files"
         )
     source = open_source(context)
     n_frames, ny, nx = source.shape

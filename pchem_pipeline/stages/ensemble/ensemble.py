@@ -188,12 +188,10 @@ def run(context: StageContext) -> None:
     limits = fitted.limits(context.adc_limits)
     axes = fitted.axes(settings, extended=bool(effects) or limits is not None)
     if sensor.kind == "histograms":
-        context.note(
-            "the input is histograms: the ensemble is of all samples, every channel counting the same"
-        )
+        context.note("input is histograms: the ensemble has all samples, with equal weight per channel")
     if axes is None:
         if ready:
-            context.note("no pixel has a value, so there is no ensemble; fit_status says why for each")
+            context.note("no pixel has a value, so there is no ensemble; for the reasons see fit_status")
         context.run_units(tiles, _leave_out, needs="fit")
         return
     _create(context, axes, len(tiles))
@@ -593,13 +591,11 @@ def _missing(asked: _Asked, totals: EnsembleTotals) -> dict[str, str]:
     """Say which parts of the ensemble this run does not have, and why."""
     missing: dict[str, str] = {}
     if asked.frames is None:
-        missing["frames"] = (
-            f"the input is {asked.sensor.kind}: no choice of frames; the ensemble is of all samples"
-        )
+        missing["frames"] = f"input is {asked.sensor.kind}: the ensemble has all samples"
     if totals.count("compared") == 0:
         missing["truth"] = (
-            "the true electron numbers are not known"
+            "unknown true electron numbers"
             if asked.config.simulate is None
-            else "no true electron numbers were kept for these frames"
+            else "no true electron numbers stored for these frames"
         )
     return missing

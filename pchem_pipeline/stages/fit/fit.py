@@ -106,7 +106,7 @@ def run(context: StageContext) -> None:
         drop_fit(context.store.path)
     biased, pixels = (sum(tile.get(key, 0) for tile in done.values()) for key in ("rounded", "pixels"))
     if biased:
-        share = f"{biased / pixels:.1%}" if biased >= 0.001 * pixels else "fewer than 0.1%"
+        share = f"{100 * biased / pixels:.1f} %" if biased >= 0.001 * pixels else "fewer than 0.1 %"
         context.note(
             f"rounding to whole DN biases {share} of the pixels by more than {LARGEST_BIAS:g} "
             "standard errors; set fit.likelihood: auto"

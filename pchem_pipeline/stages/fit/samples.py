@@ -127,8 +127,8 @@ def fit_samples(context: StageContext) -> None:
     pixels, poor = (sum(tile.get(key, 0) for tile in done.values()) for key in ("pixels", "poor"))
     if poor > _SUSPICIOUS_SHARE * pixels:
         context.note(
-            f"{poor / pixels:.0%} of the pixels do not agree with one g, mu and sigma for all samples: are "
-            "they from one sensor, with the same gain, offset and temperature?"
+            f"{100 * poor / pixels:.0f} % of the pixels disagree with common g, mu and sigma for all "
+            "samples: check that all have the same sensor, gain, offset and temperature"
         )
 
 

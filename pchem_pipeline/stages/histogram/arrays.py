@@ -60,7 +60,7 @@ def create_arrays(context: StageContext, shape: tuple[int, int, int], bins: int)
     create_counts(context, bins, counts_dtype(n_frames))
     context.create_maps([f"histogram/{name}" for name in MAPS])
     if not settings.summaries:
-        context.store.set_attributes("summary", {"missing": "histogram.summaries is off"})
+        context.store.set_attributes("summary", {"missing": "histogram.summaries: false"})
         return
     context.create_maps([f"summary/{name}" for name in COVARIANCES])
     for name, length in (("open_sums", 7), ("open_covariances", 3)):

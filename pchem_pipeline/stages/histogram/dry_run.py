@@ -73,16 +73,16 @@ class Plan:
     def words(self) -> list[str]:
         """Return the plan as ``--dry-run`` prints it."""
         n, ny, nx = self.shape
-        how = "once" if self.single_pass else "twice, by bands of rows (more compute.max_memory: once)"
+        how = "once" if self.single_pass else "twice, in bands of rows (once with more compute.max_memory)"
         return [
             f"plan: {n} frames of {ny} x {nx} pixels, {self.tiles} tile{'s' * (self.tiles > 1)} of "
             f"{min(self.tile[0], ny)} x {min(self.tile[1], nx)}, "
             f"{self.bins} bins, {self.workers} worker{'s' * (self.workers > 1)}",
             f"plan: reads {self.input_bytes / 1e9:.3g} GB of camera files {how}: "
             f"{self.read_bytes / 1e9:.3g} GB in all; writes about {self.written_bytes / 1e9:.2g} GB",
-            f"plan: holds {self.held_bytes / 2**20:.0f} MiB at most, whatever the number of frames; "
-            f"{self.allowed_bytes / 2**20:.0f} MiB are allowed",
-            f"plan: about {max(self.seconds, 1):.0f} s on a quiet machine",
+            f"plan: needs at most {self.held_bytes / 2**20:.0f} MiB of memory, for any number of frames; "
+            f"{self.allowed_bytes / 2**20:.0f} MiB allowed",
+            f"plan: about {max(self.seconds, 1):.0f} s on an idle machine",
         ]
 
 

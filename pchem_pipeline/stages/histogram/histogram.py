@@ -59,7 +59,7 @@ def _bands(context: StageContext, source: FrameSource, bins: int) -> list[Band]:
     highest = max(band.y1 - band.y0 for band in bands)
     if highest > most:
         context.note(
-            f"{highest} rows of {columns} pixels, the least that a worker can take, need "
+            f"{highest} rows of {columns} pixels, the minimum for a worker, need "
             f"{math.ceil(highest * row / 2**20)} MiB, more than histogram.band_memory or compute.max_memory "
             "allow; lower histogram.window_frames, or --workers"
         )
@@ -106,8 +106,8 @@ def _end(context: StageContext, areas: Sequence[Band | Tile]) -> None:
         _write_frame_statistics(context, (context.sensor.n_frames, *context.sensor.shape))
     if number := sum(_pixels_outside(context, area) for area in areas):
         bins = context.store.array("histogram/counts").shape[2]
-        words = "pixels have" if number > 1 else "pixel has"
-        context.note(f"{number} {words} samples outside of the histogram of {bins} bins")
+        words = "pixels have samples outside their" if number > 1 else "pixel has samples outside its"
+        context.note(f"{number} {words} histogram of {bins} bins")
 
 
 def _pixels_outside(context: StageContext, area: Band | Tile) -> int:
@@ -186,7 +186,7 @@ def _copy_histograms(context: StageContext) -> None:
 
     given = read_histograms(context.config.input, context.base_dir)
     task = functools.partial(_copy_tile, store=context.store.path, given=given)
-    _copied(context, given.counts, "the input is histograms, without order in time", task)
+    _copied(context, given.counts, "input is histograms, without order in time", task)
 
 
 def _copy_shown_sample(context: StageContext) -> None:
@@ -199,7 +199,7 @@ def _copy_shown_sample(context: StageContext) -> None:
     """
     place = sample_targets(context.config, context.base_dir)[context.sensor.shown].store
     task = functools.partial(_copy_sample_tile, store=context.store.path, sample=place)
-    _copied(context, RunStore.open(place).array("histogram/counts"), "the samples keep their own", task)
+    _copied(context, RunStore.open(place).array("histogram/counts"), "in the runs of the samples", task)
 
 
 def _copied(context: StageContext, counts: Any, missing: str, task: Callable[[Tile], Any]) -> None:

@@ -108,8 +108,8 @@ def run(context: StageContext) -> None:
     """
     if context.sensor.samples:
         raise InputError(
-            f"{context.store.path} has several samples, fitted together; compare methods in the run of one "
-            "of them, with the others beside it: pchem methods RUN --with OTHER"
+            f"{context.store.path} is a joint fit of several samples; compare methods in the run of one "
+            "sample: pchem methods RUN --with OTHER"
         )
     settings = methods_settings(context)
     others = open_other_runs(context.store, context.base_dir, settings.with_runs)
@@ -252,8 +252,8 @@ def _remarks(stores: Sequence[RunStore], samples: Sequence[Sample], reference: F
     """Say what the comparison lacks."""
     if len(samples) == 1:
         return [
-            "one sample: methods that need dark frames or a series were left out of the run's table; "
-            "give runs of the same pixels at other exposures with --with"
+            "one sample: methods that need dark frames or a series are omitted; add runs of the same pixels "
+            "at other exposures with --with"
         ]
     words = _sample_words(stores, samples, reference)
     darkest = min(
@@ -262,7 +262,7 @@ def _remarks(stores: Sequence[RunStore], samples: Sequence[Sample], reference: F
     exposure = darkest["quanta_exposure"]
     if exposure is not None and exposure > _DARK_LIMIT:
         return [
-            f"the darkest sample, {darkest['run']}, is not free of electrons (H = {exposure:.3g} e-): "
-            "methods that take it for the bias are off by as much"
+            f"the darkest sample, {darkest['run']}, has electrons (H = {exposure:.3g} e-): methods that use "
+            "it as bias are off by this amount"
         ]
     return []

@@ -48,7 +48,7 @@ def open_other_runs(store: RunStore, base_dir: Path, names: tuple[str, ...]) -> 
         path = base_dir / name
         if path.resolve() in paths:
             what = "is the run itself" if path.resolve() == store.path.resolve() else "is listed twice"
-            raise ConfigError(f"methods.with_runs: {name} {what}; give each sample once, at its own exposure")
+            raise ConfigError(f"methods.with_runs: {name} {what}; give each sample once")
         paths.add(path.resolve())
         other = RunStore.open(path)
         if not other.has("histogram/counts"):
@@ -58,7 +58,7 @@ def open_other_runs(store: RunStore, base_dir: Path, names: tuple[str, ...]) -> 
         digest = there.identity.get("digest", "")
         if digest and digest in seen:
             raise InputError(
-                f"{name} holds the same frames as {seen[digest]}; give a sample at another exposure"
+                f"{name} has the same frames as {seen[digest]}; give a sample at another exposure"
             )
         seen[digest] = name
         found.append(other)
@@ -69,11 +69,11 @@ def _same_pixels(here: SensorInfo, there: SensorInfo, name: str) -> None:
     """Refuse samples of other sensors."""
     if here.shape != there.shape:
         raise InputError(
-            f"{name} has {there.ny} x {there.nx} pixels, this run {here.ny} x {here.nx}; "
-            "samples must be of the same pixels (see input.roi)"
+            f"{name} has {there.ny} x {there.nx} pixels, this run {here.ny} x {here.nx}; samples must have "
+            "the same pixels (see input.roi)"
         )
     if None not in (here.bit_depth, there.bit_depth) and here.bit_depth != there.bit_depth:
         raise InputError(
-            f"{name} was read with {there.bit_depth} bits, this run with {here.bit_depth}; "
-            "samples must be of the same sensor"
+            f"{name} has {there.bit_depth} bits, this run {here.bit_depth}; samples must be from the same "
+            "sensor"
         )

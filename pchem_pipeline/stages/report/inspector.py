@@ -51,7 +51,7 @@ _LABELS = {
     "fit/goodness_chi2": "χ² of the fit",
     "fit/goodness_dof": "degrees of freedom of χ²",
     "fit/goodness_p": "goodness of fit p",
-    "fit/outlier_share": "share of frames left out",
+    "fit/outlier_share": "share of excluded frames",
     "summary/lag1_covariance": "covariance with the next frame",
     "summary/neighbour_covariance_x": "covariance with the neighbour in x",
     "summary/neighbour_covariance_y": "covariance with the neighbour in y",

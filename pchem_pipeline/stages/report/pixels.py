@@ -217,7 +217,7 @@ def choose_inspected(
     rng = np.random.default_rng(_SEED)
     reasons = [
         ("shown in the report", _places(shown, nx)),
-        ("named by the discrepancy verdict", _places(suspects, nx)),
+        ("from the search for missing effects", _places(suspects, nx)),
         *_poor(fit, status),
         *_flagged(status, rng),
         *_extreme(maps),

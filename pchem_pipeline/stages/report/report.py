@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
 
 #: Where a version of the model comes from, in words.
-_SOURCES = {"config": "from the configuration", "verdict": "from the verdict on what the model is missing"}
+_SOURCES = {"config": "from the configuration", "verdict": "from the search for missing effects"}
 #: All channels of a line of so few are shown.
 _FEW_CHANNELS = 12
 #: Pixels in full that have the mass of a model with effects.
@@ -80,8 +80,8 @@ def run(context: StageContext) -> None:
     for y, x in context.config.report.pixels:
         if y >= ny or x >= nx:
             raise ConfigError(
-                f"report.pixels: pixel y = {y}, x = {x} lies outside the sensor of {ny} x {nx} pixels; "
-                f"choose y below {ny} and x below {nx}"
+                f"report.pixels: pixel y = {y}, x = {x} is outside the sensor of {ny} x {nx} pixels; choose "
+                f"y below {ny} and x below {nx}"
             )
     task = functools.partial(
         _write,
@@ -373,9 +373,9 @@ def _missing(run: StoredRun, maps: Mapping[str, NDArray[Any]]) -> dict[str, str]
     found: dict[str, str] = {}
     if not set(CHARGE_RATES) & maps.keys():
         found["charge_rate"] = (
-            "no charge rate: the samples are not drawn over their integration time (input.against)"
+            "no charge rate: input.against is not integration_time"
             if run.sensor.samples
-            else "no charge rate, since the integration time is not known; set input.integration_time (s)"
+            else "unknown integration time: no charge rate. Set input.integration_time (s)"
         )
     if not any(np.isfinite(values).any() for values in maps.values()):
         found["maps"] = "no pixel has a value"
@@ -389,10 +389,10 @@ def _missing(run: StoredRun, maps: Mapping[str, NDArray[Any]]) -> dict[str, str]
         if name not in run.ensemble:
             found[part] = f"{_PARTS[part]}: {why}"
     if run.sensor.samples:
-        words = "methods are compared in the run of a sample, with the others beside it (--with)"
+        words = "compare methods in the run of one sample (pchem methods RUN --with OTHER)"
         found["methods"] = words
     elif run.methods is None:
-        found["methods"] = f"not compared in this run; to do so, run: pchem methods {quoted(Path(run.name))}"
+        found["methods"] = f"to compare other methods: pchem methods {quoted(Path(run.name))}"
     return found
 
 

@@ -102,7 +102,7 @@ def test_a_whole_folder_is_written_as_a_pattern(tmp_path):
 
 
 def test_options_for_camera_files_do_not_fit_a_yaml(tmp_path):
-    with pytest.raises(ConfigError, match="--integration-time: only for camera files"):
+    with pytest.raises(ConfigError, match="--integration-time: only with camera files"):
         find_or_start([tmp_path / "c.yaml"], None, {"integration_time": 1})
 
 
@@ -141,7 +141,7 @@ def test_help_has_a_short_name_and_the_package_is_the_command():
 
 @pytest.mark.parametrize("text", ["4:2,0:5", "0:4,5:5", "-1:4,0:5"])
 def test_an_empty_roi_is_told_in_the_words_of_the_option(text):
-    with pytest.raises(ConfigError, match=r"^--roi .* holds no pixel; write y0:y1,x0:x1"):
+    with pytest.raises(ConfigError, match=r"^--roi .* contains no pixel; write y0:y1,x0:x1"):
         invoke("fit", "run.zarr", "--roi", text)
 
 
@@ -190,9 +190,7 @@ def test_a_full_disk_behind_stdout_is_one_line():
             check=False,
         )
     assert found.returncode == ExitCode.INPUT
-    assert (
-        found.stderr == "pchem: stdout cannot be written (No space left on device); check where it goes to\n"
-    )
+    assert found.stderr == "pchem: cannot write to stdout (No space left on device); check where it goes\n"
 
 
 @pytest.mark.parametrize(
@@ -212,7 +210,7 @@ def test_a_full_disk_behind_stdout_is_one_line():
 def test_what_is_written_beside_a_store_lies_on_this_machine(arguments, tmp_path, monkeypatch):
     """As a path of this machine a URL would be a folder called s3:."""
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match=r"^s3://lab/.*: only stores can lie in an object storage; give a"):
+    with pytest.raises(ConfigError, match=r"^s3://lab/.*: only stores can be in an object storage; give a"):
         invoke(*arguments)
     assert list(tmp_path.iterdir()) == []
 

@@ -38,7 +38,7 @@ def test_figures_are_asked_for_as_given(monkeypatch: pytest.MonkeyPatch) -> None
     ("wanted", "words"),
     [
         (Wanted(("pdf", "jpg")), "--format: jpg cannot be drawn; choose from pdf, svg, png"),
-        (Wanted(()), "--format: none is given"),
+        (Wanted(()), "--format: no format"),
         (Wanted(width="88 px"), "--width '88 px': write a length such as 88mm"),
         (Wanted(style="none.mplstyle"), "--style none.mplstyle: no such file"),
     ],
@@ -50,7 +50,7 @@ def test_what_cannot_be_drawn_is_refused_before_anything_is_read(wanted: Wanted,
 
 @pytest.mark.parametrize("option", ["--only", "--format"])
 def test_a_list_of_nothing_does_not_mean_all(option: str) -> None:
-    with pytest.raises(ConfigError, match=f"{option}: ' ,' names none"):
+    with pytest.raises(ConfigError, match=f"{option}: ' ,' is no name"):
         invoke("figures", "run.zarr", option, " ,")
 
 

@@ -45,5 +45,5 @@ def test_the_dataset_of_other_frames_may_be_another(tmp_path, monkeypatch):
         target = Target(config, tmp_path, tmp_path / "run.zarr")
         with open_like_run(target, sensor, ["night.h5"], given) as frames:
             np.testing.assert_array_equal(frames.read(), found)
-    with pytest.raises(InputError, match=r"several datasets: .*; choose one by input\.dataset \(--dataset\)"):
+    with pytest.raises(InputError, match=r"several datasets: .*; choose one with input\.dataset"):
         open_like_run(target, sensor, ["night.h5"])

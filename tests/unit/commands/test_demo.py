@@ -15,7 +15,7 @@ from pchem_pipeline.effects.framework.registry import effect_class, effect_class
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        ("rownoise@columns=2:5", r"'rownoise': there is no such effect; choose one of: adc_dnl, .*row_noise"),
+        ("rownoise@columns=2:5", r"'rownoise': no such effect; choose one of: adc_dnl, .*row_noise"),
         ("row_noise@colums=2:5", "columns=A:B"),
         ("row_noise@columns=2:9000", "the sensor has"),
         ("clipping", "has no typical strength"),

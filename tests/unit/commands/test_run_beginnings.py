@@ -106,9 +106,9 @@ def test_the_same_command_goes_on_with_a_yaml_that_says_more(tmp_path, file, mon
         assert (is_new, again.config.fit.tail_guard, again.config.input.bit_depth) == (True, 0.0, 12)
         assert [effect.tag for effect in again.config.model.effects] == ["row_noise"]
         assert unwritten(again) is None
-    with pytest.raises(ConfigError, match=r"\(input\.bit_depth 12 there, 14 here\); go on"):
+    with pytest.raises(ConfigError, match=r"\(input\.bit_depth 12 in the file, 14 here\); continue"):
         find_or_start([file], place, {"bit_depth": 14})
-    with pytest.raises(ConfigError, match=r"\(input\.roi \[0, 8, 8, 16\] there, \[0, 8, 0, 8\] here\)"):
+    with pytest.raises(ConfigError, match=r"\(input\.roi \[0, 8, 8, 16\] in the file, \[0, 8, 0, 8\] here\)"):
         find_or_start([file], place, {}, (0, 8, 0, 8))
     assert path.read_text() == edited
 
@@ -135,7 +135,7 @@ def test_a_refusal_that_names_a_setting_says_where_settings_are(tmp_path, monkey
     """The YAML of a first try that is refused is taken away: `pchem init` makes it."""
     monkeypatch.chdir(tmp_path)
     np.save("f.npy", np.full((9, 8, 8), (1 << 13) + 1, np.uint16))
-    with pytest.raises(InputError, match=r"; a setting .*: pchem init 'my run.yaml' FILES, then pchem run"):
+    with pytest.raises(InputError, match=r"; for settings .*: pchem init 'my run.yaml' FILES, edit it"):
         CliRunner().invoke(
             app, ["run", "f.npy", "--store", "my run.zarr", "--bit-depth", "12"], catch_exceptions=False
         )
@@ -158,7 +158,7 @@ def test_a_refused_run_says_which_keys_differ_and_the_ways_out(tmp_path, file):
     with pytest.raises(ConfigError) as refused:
         find_or_start([file], place, {"bit_depth": 8, "integration_time": 4.87})
     said = str(refused.value)
-    assert "(input.integration_time 2.0 there, 4.87 here)" in said
+    assert "(input.integration_time 2.0 in the file, 4.87 here)" in said
     assert f"pchem run {target.config_path}" in said
     assert "--store" in said
 

@@ -140,5 +140,5 @@ def test_npz(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("dn.npy", member.getvalue())
         archive.writestr("counts.npy", bytes(BOMB + 1))
-    with refused_at_once(r"bytes unpacked, which cannot be histograms"):
+    with refused_at_once(r"bytes unpacked, too large for histograms"):
         read_histograms(InputSettings(files=("a.npz",)), tmp_path)

@@ -132,7 +132,7 @@ def test_several_files_share_what_they_state_alike(tmp_path: Path) -> None:
         image.writeto(tmp_path / f"{i}.fits")
     with opened(tmp_path / "*.fits") as frames:
         assert frames.camera == CameraFacts("C", None, pytest.approx(-57.4 / 3), TAKEN)
-        assert [note for note in frames.notes if "from -20.4 to -17 °C" in note]
+        assert [note for note in frames.notes if "-20.4 to -17 °C" in note]
     steady, remark = shared_facts([CameraFacts(temperature=1.0), CameraFacts(temperature=1.9)])
     assert (steady.temperature, remark) == (1.45, "")
     assert shared_facts([CameraFacts(temperature=1.0), CameraFacts()])[0].temperature is None
@@ -143,7 +143,7 @@ def test_files_of_two_cameras_are_no_stack(tmp_path: Path) -> None:
         image = fits.PrimaryHDU(STACK[i])
         image.header["SERIALNO"] = serial
         image.writeto(tmp_path / f"{i}.fits")
-    words = r"of different cameras: serial number A1 in 0\.fits, serial number B2 in 2\.fits; read them apart"
+    words = r"different cameras: serial number A1 in 0\.fits, serial number B2 in 2\.fits; make one run"
     for files in (("*.fits",), ("1.fits", "2.fits")):
         with pytest.raises(InputError, match=words.replace("0", files[0][0].replace("*", "0"))):
             open_frames(InputSettings(files=files), tmp_path)

@@ -45,7 +45,7 @@ def test_csv(tmp_path: Path, text: str) -> None:
     assert found.origin.tolist() == [[100]]
     assert found.names == ("a",)
     assert found.shape == (1, 1)
-    assert any("count 0" in note for note in found.notes)
+    assert any("are taken as 0" in note for note in found.notes)
 
 
 def test_several_columns_are_several_channels(tmp_path: Path) -> None:
@@ -91,17 +91,17 @@ def test_several_files_and_large_counts(tmp_path: Path) -> None:
         ("1,2\n2,-3\n", r"negative counts \(first at DN 2\)"),
         ("1,2\n2,2.5\n", "count 2.5 is not a whole number"),
         ("1.5,2\n", "DN 1.5 is not a whole number"),
-        ("1,2\n2,nan\n", "count column holds NaN"),
-        ("inf,2\n", "DN column holds NaN or infinity"),
+        ("1,2\n2,nan\n", "count column has NaN"),
+        ("inf,2\n", "DN column has NaN or infinity"),
         ("1,2\n1,3\n", "DN 1 occurs twice"),
-        ("2,2\n1,3\n", r"not in rising order \(at DN 1\); sort"),
+        ("2,2\n1,3\n", r"not in increasing order \(at DN 1\); sort"),
         ("1,0\n2,0\n", "all counts are zero"),
-        ("DN,count\n", "holds no bins"),
-        ("", "holds no histogram"),
-        ("1\n2\n", "needs two columns"),
+        ("DN,count\n", "no bins"),
+        ("", "no histogram"),
+        ("1\n2\n", "needs two or more columns"),
         ("1,2\n2,x\n", r"row 2 \(2,x\) is not 2 numbers"),
         ("1,2\n2,3,4\n", "row 2"),
-        ("0,1\n999999999,1\n", "span more than any ADC"),
+        ("0,1\n999999999,1\n", "more than any ADC"),
         ("1,1e300\n2,1\n", "too large to be exact"),
     ],
 )
@@ -126,9 +126,9 @@ def test_refusals_of_numpy_files(tmp_path: Path) -> None:
     np.save(tmp_path / "t.npy", np.array(["a", "b"]))
     refused("numbers are needed", "t.npy")
     np.savez(tmp_path / "n.npz", dn=DN, count=COUNTS)
-    refused("needs the arrays dn and counts, holds count, dn", "n.npz")
+    refused("needs arrays dn and counts, has count, dn", "n.npz")
     np.savez(tmp_path / "s.npz", dn=DN, counts=COUNTS[:2])
-    refused("do not fit", "s.npz")
+    refused("do not match", "s.npz")
     np.savez(tmp_path / "b.npz", dn=DN, counts=COUNTS)
     data = (tmp_path / "b.npz").read_bytes()
     (tmp_path / "b.npz").write_bytes(data[: len(data) // 2])
@@ -138,19 +138,19 @@ def test_refusals_of_numpy_files(tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_bytes(b"\xff\xfe\x00\x01")
     refused("not a text file", "x.csv")
     (tmp_path / "x.dat").write_text("1,2")
-    refused("histograms are read from", "x.dat")
+    refused("give histograms as", "x.dat")
 
 
 def test_all_bad_files_in_one_message(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("1,2\n2,3\n")
     (tmp_path / "b.csv").write_text("1,-2\n")
     (tmp_path / "c.csv").write_text("")
-    with pytest.raises(InputError, match=r"b\.csv: negative.*c\.csv: holds no.*input\.on_bad_file: skip"):
+    with pytest.raises(InputError, match=r"b\.csv: negative.*c\.csv: no hist.*input\.on_bad_file: skip"):
         read(tmp_path, "*.csv")
     found = read(tmp_path, "*.csv", on_bad_file="skip")
     assert found.names == ("a",)
     assert len(found.notes) == 2
-    with pytest.raises(InputError, match="named twice"):
+    with pytest.raises(InputError, match="listed twice"):
         read(tmp_path, "a.csv", "a.csv")
     with pytest.raises(ConfigError, match="empty"):
         read(tmp_path)
@@ -191,7 +191,7 @@ def test_tables_that_are_none(tmp_path: Path) -> None:
     cases = {
         "cell": ("DN,count\n1," + "9" * 131_073, "no table of numbers"),
         "number": ("DN,count\n1,1_0\n2,5", r"row 2 \(1,1_0\) is not 2 numbers"),
-        "wide": (f"{wide}\n0{',1' * 1000}\n16000000{',1' * 1000}", "span more than 134217728 DN together"),
+        "wide": (f"{wide}\n0{',1' * 1000}\n16000000{',1' * 1000}", "span more than 134217728 DN in total"),
     }
     for name, (text, words) in cases.items():
         (tmp_path / f"{name}.csv").write_text(text)

@@ -71,7 +71,7 @@ def test_packed_files_are_refused(tmp_path: Path, pack: Any, name: str, given: s
     )
     with pack.open(path, "wb") as stream:
         stream.write((tmp_path / "plain.fits").read_bytes())
-    with pytest.raises(InputError, match=r"packed by (gzip|bzip2|xz); unpack it first"):
+    with pytest.raises(InputError, match=r"compressed with (gzip|bzip2|xz); unpack it first"):
         open_frames(InputSettings(files=(str(path),), format=given), tmp_path)
     samples = tmp_path / "a.raw"
     samples.write_bytes(b"PK\x03\x04" + bytes(20))

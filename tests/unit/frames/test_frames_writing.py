@@ -129,6 +129,6 @@ def test_blocks_must_make_up_the_shape(tmp_path: Path) -> None:
 
 def test_a_folder_in_the_way(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    words = r"cannot use .*a file where a folder is meant: choose another place"
+    words = r"cannot use .*a file is in place of the folder: choose another place"
     with pytest.raises(StoreError, match=words):
         write_frames("npy", tmp_path / "file" / "a", iter([make_stack("uint8")]), SHAPE, "uint8")

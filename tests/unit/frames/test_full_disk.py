@@ -55,4 +55,4 @@ def test_a_file_that_may_not_grow(found: dict[str, str], name: str) -> None:
     if name == "tiff":  # numpy does not say why
         assert words.endswith("written; check the disk: its free space, quota and permissions")
     else:
-        assert words.endswith("larger than is allowed there (see ulimit -f): raise that and run again"), words
+        assert words.endswith("size limit (see ulimit -f): raise it and run again"), words

@@ -61,7 +61,7 @@ def test_a_link_out_of_the_store(tmp_path: Path, link: str) -> None:
     moved = tmp_path / "elsewhere"
     (path / link).rename(moved)
     (path / link).symlink_to(moved)
-    refused(f"{link} is a link out of the store; copy its files into it", path)
+    refused(f"{link} is a link out of the store; copy its files into the store", path)
 
 
 def test_a_link_within_the_store(tmp_path: Path) -> None:

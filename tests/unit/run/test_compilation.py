@@ -26,17 +26,17 @@ def test_the_terminal_says_what_is_compiled(tmp_path, capsys, monkeypatch):
     with announced(Reporter("off"), "fit"):
         heard(("one", None), ("one", 1.5), ("two", None), ("two", 2.5))
     assert said() == [
-        "fit: compiling kernels, once after an installation or an update",
+        "fit: compiling kernels (once after an installation or update)",
         "fit: 2 kernels compiled in 4 s",
     ]
     with announced(Reporter("off"), "maps", 400):
         heard(("one", None), ("one", 1.0))
-    assert "490 MiB, more than compute.max_memory (--max-memory) allows (400)" in said()[1]
+    assert "490 MiB, more than compute.max_memory (--max-memory) allows (400 MiB)" in said()[1]
     monkeypatch.setattr(compilation, "cache_folder", lambda: Path("/proc/nowhere"))
     with announced(Reporter("off"), "maps", 600):
         heard(("one", None), ("one", 1.0))
     assert said()[1:] == [
         "maps: 1 kernel compiled in 1 s",
-        "warning: maps: /proc/nowhere cannot be written, so every command compiles its kernels again; set "
+        "warning: maps: /proc/nowhere is not writable, so every command compiles its kernels again; set "
         "NUMBA_CACHE_DIR to another folder",
     ]

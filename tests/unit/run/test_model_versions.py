@@ -200,7 +200,7 @@ def test_status_tells_the_model_that_each_result_rests_on(run: Path) -> None:
     assert not (run.parent / "run.zarr/model/0002.json").exists()  # a look changes nothing
     run_stages(find_run(path), ["fit"], QUIET)
     assert states(path)["fit"] == ("complete", 2)
-    assert states(path)["maps"] == ("stale - fit was done again", 1)
+    assert states(path)["maps"] == ("stale - fit was run again", 1)
     shown = CliRunner().invoke(app.app, ["status", str(path)], catch_exceptions=False).stdout
     assert "fit         complete  model 2" in shown.splitlines()
     shown = CliRunner().invoke(app.app, ["status", str(path), "--json"], catch_exceptions=False).stdout
@@ -212,7 +212,7 @@ def test_a_verdict_is_put_in_force_and_taken_back(run: Path) -> None:
     verdict(run, ROW)
     target, words = adopt_verdict(find_run(run))
     beside = run.with_name("run.effects.yaml")
-    held = f"model 2 is in force: PCD + row_noise 1.2 DN (in {beside})"
+    held = f"model 2 is now in use: PCD + row_noise 1.2 DN (in {beside})"
     assert words == f"{held}; to go back: pchem model {run} --use 1"
     assert run.read_text(encoding="utf-8") == text
     shown = CliRunner().invoke(app.app, ["fit", str(run)], catch_exceptions=False).stderr
@@ -230,7 +230,7 @@ def test_a_verdict_is_put_in_force_and_taken_back(run: Path) -> None:
         "* 2 verdict on 1 90.0 % fit, maps PCD + row_noise 1.2 DN",
     ]
     words = use_model(find_run(run), 1)
-    assert "stale: fit, maps; to do them again: pchem run" in words
+    assert "stale: fit, maps; to update: pchem run" in words
     assert run.read_text(encoding="utf-8") == text
     assert not beside.exists()
     # through the store, too, whose copy of the YAML goes with it
@@ -238,7 +238,7 @@ def test_a_verdict_is_put_in_force_and_taken_back(run: Path) -> None:
     run_stages(find_run(run), DONE, QUIET)
     for name, values in arrays_of(run.parent / "run.zarr", ("fit", "maps")).items():
         np.testing.assert_array_equal(values, before[name], err_msg=name)
-    assert "was in force already" in use_model(find_run(run), 1)
+    assert "is already in use" in use_model(find_run(run), 1)
     use_model(find_run(run.parent / "run.zarr"), 2)
     assert load_config(run).model == settings(ROW)
     run_stages(find_run(run), DONE, QUIET)
@@ -255,7 +255,7 @@ def test_what_a_new_verdict_withdraws_leaves_the_model(run: Path) -> None:
     store = RunStore.open(run.parent / "run.zarr", writable=True)
     nothing = verdict_of("consistent").model_copy(update={"model_effects": ()})
     store.write_file(VERDICT_FILE, nothing.to_json().encode())
-    assert adopt_verdict(find_run(run))[1].startswith("model 1 is in force")
+    assert adopt_verdict(find_run(run))[1].startswith("model 1 is now in use")
     assert load_config(run).model == settings()
 
 

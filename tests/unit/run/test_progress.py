@@ -162,4 +162,4 @@ def test_a_log_that_cannot_be_written_stops_nothing(capsys):
     reporter.event("start")
     reporter.event("end")
     reporter.close()
-    assert capsys.readouterr().err.count("warning: --log-json ends here: No space left on device") == 1
+    assert capsys.readouterr().err.count("warning: --log-json: no further events written: No space") == 1

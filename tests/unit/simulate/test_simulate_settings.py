@@ -85,7 +85,7 @@ def correlated(*pairs):
     [
         ([("bias", "bias", 0.5)], "with itself"),
         ([("bias", "quanta_exposure", 1.5)], "less than 1"),
-        ([("bias", "dark_current", 0.5)], "not given"),
+        ([("bias", "dark_current", 0.5)], "unknown parameter"),
         ([("bias", "quanta_exposure", 0.5), ("quanta_exposure", "bias", 0.4)], "given twice"),
         (
             [

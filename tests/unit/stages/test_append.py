@@ -174,7 +174,7 @@ def test_what_cannot_be_appended_is_said(tmp_path, frames, monkeypatch):
         append_frames(short, QUIET)
     np.save(tmp_path / "a.npy", frames[:10])
     earlier = target(tmp_path, "run.zarr", files=("a.npy", "f*.npy"))
-    with pytest.raises(InputError, match="come behind them"):
+    with pytest.raises(InputError, match="follow them"):
         append_frames(earlier, QUIET)
     # nothing of that harmed the run; files that were only touched are the same
     (tmp_path / "f0.npy").touch()

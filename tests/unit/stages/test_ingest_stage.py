@@ -178,7 +178,7 @@ def test_identity_is_hashed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     changed[0, 0, 0] ^= 1
     tifffile.imwrite(tmp_path / "cam" / "f8.tif", changed, photometric="minisblack")
     state = status(STAGES["ingest"], make_context(tmp_path))
-    assert (state.state, state.why) == ("stale", "the content of the input changed")
+    assert (state.state, state.why) == ("stale", "the input has changed")
     context = make_context(tmp_path)
     assert run(context).state == "complete"
     assert context.store.read("frames/dn", (slice(0, 1), slice(0, 1), slice(0, 1))).item() == changed[0, 0, 0]
@@ -250,7 +250,7 @@ def test_bad_files_stop_or_are_left_out(tmp_path: Path) -> None:
     record = context.store.records.read("ingest")
     assert record is not None
     assert "truncated" in record.notes[0]
-    assert "left out (input.on_bad_file: skip)" in record.notes[0]
+    assert "skipped (input.on_bad_file: skip)" in record.notes[0]
 
 
 def test_file_that_vanishes_while_copying(
@@ -266,7 +266,7 @@ def test_file_that_vanishes_while_copying(
 
     monkeypatch.setattr(ingest, "_copy", copy)
     with pytest.raises(
-        InputError, match=r"f11\.tif: the file vanished while it was being read; restore"
+        InputError, match=r"f11\.tif: the file disappeared while it was being read; restore"
     ) as caught:
         run(make_context(tmp_path))
     assert caught.value.exit_code == 4

@@ -123,7 +123,7 @@ def test_a_server_that_knows_no_conditions(run, lock, monkeypatch):
 
 def test_what_only_a_disk_can_do_is_one_line(run):
     for name in ("stat", "open", "rename", "touch", "rglob"):
-        with pytest.raises(StoreError, match=f"an object storage cannot do that .{name}.; use a store on a"):
+        with pytest.raises(StoreError, match=f"not possible in an object storage .{name}.; use a store on a"):
             getattr(run, name)()
         assert not hasattr(run, name)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):

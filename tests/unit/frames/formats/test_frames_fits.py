@@ -99,9 +99,9 @@ def test_values_that_may_be_no_samples_are_reported(tmp_path: Path) -> None:
         unit.writeto(tmp_path / f"f{i}.fits")
     with open_frames(InputSettings(files=(str(tmp_path),)), tmp_path) as reader:
         assert reader.report.notes == [
-            "f0.fits and 2 more: BLANK = -32768 marks pixels without a value; they are read as stored",
-            "f0.fits and 2 more: its 3 planes are read as frames; if they are colours, write each to a file "
-            "of its own",
+            "f0.fits and 2 more: BLANK = -32768 marks pixels without a value; read as stored",
+            "f0.fits and 2 more: its 3 planes are read as frames; if they are colours, write one file per "
+            "colour",
         ]
 
 
@@ -134,7 +134,7 @@ def test_several_images_must_be_chosen_from(tmp_path: Path) -> None:
     refused(r"two\.fits: images in the file: 1 \(DARK\), 2 \(FLAT\).*input.dataset", path)
     np.testing.assert_array_equal(read(path, dataset="DARK"), STACK)
     np.testing.assert_array_equal(read(path, dataset="2"), STACK + 1)
-    refused("of that name: none", path, dataset="BIAS")
+    refused("with this name: none", path, dataset="BIAS")
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -150,7 +150,7 @@ def test_signed_samples(tmp_path: Path, compressed: bool) -> None:
     np.testing.assert_array_equal(read(path, dtype="uint16"), values)
     values[2, 3, 4] = -7
     write(values)
-    refused("negative values", path, dtype="uint16")
+    refused("negative samples", path, dtype="uint16")
 
 
 def test_float_and_scaled(tmp_path: Path) -> None:
@@ -168,7 +168,7 @@ def test_truncated_cube(tmp_path: Path, kept: int) -> None:
     path = tmp_path / "cut.fits"
     fits.PrimaryHDU(STACK).writeto(path)
     path.write_bytes(path.read_bytes()[:kept])
-    refused(r"cut\.fits: .*(truncated|not a sound)", path)
+    refused(r"cut\.fits: .*(truncated|not a valid)", path)
 
 
 def test_truncated_compressed_cube(tmp_path: Path) -> None:
@@ -182,4 +182,4 @@ def test_truncated_compressed_cube(tmp_path: Path) -> None:
 def test_no_image(tmp_path: Path) -> None:
     path = tmp_path / "table.fits"
     fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU(np.zeros(3, [("a", "i4")]))]).writeto(path)
-    refused("holds no image", path)
+    refused("no image", path)

@@ -131,7 +131,7 @@ def test_metamorph_stack_with_one_directory(tmp_path: Path) -> None:
 def test_volumes_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "volume.tif"
     tifffile.imwrite(path, STACK, photometric="minisblack", volumetric=True, tile=(2, 16, 16))
-    refused("pages of 6 x 21 x 34 uint16, which are volumes", path)
+    refused("pages of 6 x 21 x 34 uint16 are volumes", path)
 
 
 def test_pages_are_frames_although_metadata_tell_several_series(tmp_path: Path) -> None:
@@ -208,11 +208,11 @@ def test_channels_beside_frames_are_refused(tmp_path: Path) -> None:
     tifffile.imwrite(imagej, mixed, imagej=True, metadata={"axes": "TCYX"})
     tifffile.imwrite(ome, mixed, metadata={"axes": "TCYX"}, photometric="minisblack")
     for path in (imagej, ome):
-        refused("the 6 pages 2 channels of 3 images each", path)
+        refused("the 6 pages as 2 channels of 3 images", path)
     tifffile.imwrite(imagej, STACK, imagej=True, metadata={"axes": "CYX"})
     reader = TiffReader.open(imagej, InputSettings())
     np.testing.assert_array_equal(reader.read(), STACK)
-    assert "6 channels; they are read as frames" in reader.notes[0]
+    assert "6 channels; read as frames" in reader.notes[0]
     text = tifffile.tiffcomment(ome)
     tifffile.imwrite(ome, STACK[:3], description=text.encode(), metadata=None, photometric="minisblack")
     np.testing.assert_array_equal(read(ome), STACK[:3])  # the other channel lies in another file
@@ -230,7 +230,7 @@ def test_strips_that_were_never_written(tmp_path: Path) -> None:
     expected = STACK.copy()
     expected[2] = 0
     np.testing.assert_array_equal(reader.read(), expected)
-    assert "1 of 6 strips or tiles was never written and read as the fill value" in reader.notes[0]
+    assert "1 of 6 strips or tiles was not written; read as the fill value" in reader.notes[0]
 
 
 def test_page_without_its_strips(tmp_path: Path) -> None:
@@ -241,13 +241,13 @@ def test_page_without_its_strips(tmp_path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[place : place + 2] = (40_000).to_bytes(2, "little")  # a tag that no program knows
     path.write_bytes(data)
-    refused(r"unfinished\.tif: page 1 names 0 strips or tiles and 3 sizes", path)
+    refused(r"unfinished\.tif: page 1 has 0 strips or tiles and 3 sizes", path)
 
 
 def test_compressed_planes_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "planes.tif"
     tifffile.imwrite(path, STACK, photometric="minisblack", planarconfig="separate", compression="zlib")
-    refused("one page of 6 compressed planes; write one frame a page", path)
+    refused("one page of 6 compressed planes; write one frame per page", path)
 
 
 def test_samples_that_are_not_as_the_camera_made_them_are_reported(tmp_path: Path) -> None:
@@ -255,7 +255,7 @@ def test_samples_that_are_not_as_the_camera_made_them_are_reported(tmp_path: Pat
     lossy[0].save(tmp_path / "jpeg.tif", save_all=True, append_images=lossy[1:], compression="jpeg")
     tifffile.imwrite(tmp_path / "white.tif", STACK, photometric="miniswhite")
     tifffile.imwrite(tmp_path / "planes.tif", STACK, photometric="minisblack", planarconfig="separate")
-    words = {"jpeg": "JPEG coding can lose information", "white": "0 white", "planes": "the 6 planes"}
+    words = {"jpeg": "JPEG compression can be lossy", "white": "declare 0 as white", "planes": "the 6 planes"}
     for name, said in words.items():
         assert said in TiffReader.open(tmp_path / f"{name}.tif", InputSettings()).notes[0]
 
@@ -264,7 +264,7 @@ def test_colour_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "rgb.tif"
     rgb = np.zeros((2, 8, 9, 3), np.uint8)
     tifffile.imwrite(path, rgb, photometric="rgb")
-    refused(r"rgb\.tif: colour or multi-channel images \(RGB, 3 samples a pixel\)", path)
+    refused(r"rgb\.tif: colour or multi-channel images \(RGB, 3 samples per pixel\)", path)
     tifffile.imwrite(path, np.moveaxis(rgb, -1, 1), photometric="rgb", planarconfig="separate")
     refused("colour", path)
     tifffile.imwrite(path, rgb[..., 0], photometric="palette", colormap=np.zeros((3, 256), np.uint16))
@@ -304,7 +304,7 @@ def test_signed_and_float(tmp_path: Path) -> None:
         negative = STACK.astype(np.int16)
         negative[3, 4, 5] = -1
         tifffile.imwrite(path, negative, photometric="minisblack", compression=compression)
-        refused("negative values", path, dtype="uint16")
+        refused("negative samples", path, dtype="uint16")
     tifffile.imwrite(path, STACK.astype(np.float32), photometric="minisblack")
     refused("floating-point samples", path)
 

@@ -277,9 +277,9 @@ def test_samples_without_any_electrons_do_not_give_a_gain():
 
 def test_what_does_not_fit_together_is_refused():
     series = draw_series(np.random.default_rng(6), [0.6, 2.5], 0.3, 3)
-    with pytest.raises(ValueError, match="no sample holds electrons"):
+    with pytest.raises(ValueError, match="no sample has electrons"):
         fit_histograms(series.counts, series.origins, dark=[True, True])
-    with pytest.raises(ValueError, match="one entry for each sample"):
+    with pytest.raises(ValueError, match="one entry per sample"):
         fit_histograms(series.counts, series.origins[:1])
     with pytest.raises(ValueError, match=r"different numbers of pixels: \[2, 3\]"):
         fit_histograms([series.counts[0], series.counts[1][:2]], series.origins)

@@ -33,7 +33,7 @@ def test_odd_frames_are_found_and_chance_makes_none():
         "far": [0, 1, 2, 3, 4, 600],
     }
     assert odd_words(found, level) == (
-        "frames 700 to 849 are empty; frame 300 is equal to an earlier one; "
+        "frames 700 to 849 are empty; frame 300 is equal to an earlier frame; "
         "frames 0 to 4 are 30 DN above the others; frame 600 is 60 DN below the others"
     )
     assert left_out(found, N).size == 157

@@ -72,11 +72,11 @@ def test_spreads_are_those_of_the_sensor_not_of_its_errors(store):
 def test_what_needs_dark_or_light_is_empty_without(store, kind):
     found = table(store, kind)
     assert (found["mu_I.mean"].value is not None) == (kind == "dark")
-    assert (found["PRNU_1288 (like it)"].value is not None) == (kind == "light")
+    assert (found["PRNU_1288 (similar)"].value is not None) == (kind == "light")
     assert found["eta"].cells()[2:4] == ["", ""]
     assert all(len(row.cells()) == len(COLUMNS) for row in found.values())
     assert all(row.definition_here and row.where_it_differs for row in found.values())
-    assert ("of the bias alone" in found["DSNU_1288"].where_it_differs) == (kind != "dark")
+    assert ("the bias alone" in found["DSNU_1288"].where_it_differs) == (kind != "dark")
 
 
 def test_a_sensor_without_a_value_has_an_empty_table(store):

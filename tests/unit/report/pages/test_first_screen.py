@@ -33,7 +33,7 @@ def table(data: ReportData, name: str):
 def test_where_most_pixels_are_flagged_the_answer_is_no() -> None:
     data = flagged(0.6)
     sensor, belief = answers(data)
-    assert (sensor.level, sensor.word) == ("serious", "Not known")
+    assert (sensor.level, sensor.word) == ("serious", "Unknown")
     assert (belief.level, belief.word) == ("serious", "No")
     assert "pchem joint" in belief.text
     assert key_numbers(data) == []
@@ -59,9 +59,9 @@ def test_a_bias_an_electron_off_leaves_gain_and_read_noise() -> None:
 def test_just_below_half_is_a_caution_and_says_that_the_rest_is_a_selection() -> None:
     data = flagged(0.45)
     sensor, belief = answers(data)
-    assert (sensor.level, sensor.word) == ("caution", "Known in part only")
+    assert (sensor.level, sensor.word) == ("caution", "Partly known")
     assert belief.level == "caution"
-    assert any("a selection, as a rule quieter" in flag.text for flag in flags(data))
+    assert any("a biased selection" in flag.text for flag in flags(data))
     assert key_numbers(data)[0].label == "read noise of unflagged pixels"
     assert next_steps(data)[0].command.startswith("pchem joint")
 
@@ -107,7 +107,7 @@ def test_flagged_pixels_leave_medians_maxima_and_the_truth_table(bit: FitStatus,
     assert (noise["maximum"] < 0.9) == left_out
     assert (numbers["truth"]["read_noise_e"]["rmse"] < 0.01) == left_out
     assert (table(data, "flagged") is not None) == left_out
-    assert ("100 flagged pixels left out" in table(data, "parameters").caption) == left_out
+    assert ("100 flagged pixels excluded" in table(data, "parameters").caption) == left_out
     if left_out:
         row = next(row for row in table(data, "flagged").rows if row[0] == "read noise (e⁻)")
         assert row[1:] == ("0.9000",) * 5 + ("100",)

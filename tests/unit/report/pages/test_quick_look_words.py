@@ -38,15 +38,15 @@ def test_nothing_found_is_a_check_that_passed_with_its_limit(data: ReportData) -
     belief = answers(looked(data, 0.4, 0.05))[1]
     assert (belief.level, belief.word) == ("good", QUICK_YES)
     assert belief.text == (
-        "3 checks of the model against the data passed. Not looked at: codes. The quick checks do not see "
-        "what is alike in all frames and pixels (a nonlinearity, charge that is not Poisson distributed); "
-        "pchem discrepancy run.zarr compares that, with simulations."
+        "3 checks of the model against the data passed. Not checked: codes. The quick checks do not detect "
+        "what is the same in all frames and pixels (a nonlinearity, charge that is not Poisson distributed): "
+        "run pchem discrepancy run.zarr."
     )
     assert any("row noise above 0.12 DN is excluded" in flag.text for flag in flags(looked(data, 0.4, 0.0)))
 
 
 @pytest.mark.parametrize(
-    ("size", "level", "word"), [(1.0, "caution", "With caution"), (2.0, "serious", "Not as they are")]
+    ("size", "level", "word"), [(1.0, "caution", "With caution"), (2.0, "serious", "No")]
 )
 def test_row_noise_of_a_third_of_the_read_noise_is_not_believed(
     data: ReportData, size: float, level: str, word: str

@@ -117,7 +117,7 @@ def test_bands_are_as_high_as_the_memory_allows_and_keep_to_it(tap):
 def test_too_little_memory_for_the_lowest_band_is_told_in_one_line(tap):
     source, store = tap
     for memory in (-1 << 20, 1 << 16, pairs_bytes((8, SHAPE[1]))):
-        with pytest.raises(ConfigError, match=r"8 rows .* lacks \d+ MiB .*--max-memory"):
+        with pytest.raises(ConfigError, match=r"needs \d+ MiB more for 8 rows .*--max-memory"):
             places_of_bands(store, source, memory=memory)
 
 

@@ -90,7 +90,7 @@ def test_the_window_becomes_smaller_with_the_memory(shape):
         assert window.numbers.size == full.numbers.size
         sizes.append(np.ptp(window.rows) * np.ptp(window.columns))
     assert sizes[0] < sizes[1] < sizes[2] or shape == (400, 60, 80)
-    with pytest.raises(ConfigError, match=r"takes \d+ MiB .*--max-memory.* allows 290: raise it"):
+    with pytest.raises(ConfigError, match=r"needs at least \d+ MiB.*--max-memory.* allows 290; raise it"):
         within_memory(settings, shape, None, 100.0, 290 << 20)
 
 
@@ -129,7 +129,7 @@ def test_a_search_that_was_stopped_goes_on_in_the_window_that_it_had(monkeypatch
     first = discrepancy._surveyed(context(400), source, (), None, lambda _: None)
     assert first[0].max_pixels < 8192
     assert first[0].max_samples == 1 << 17
-    assert [note.split()[0] for note in notes] == ["compute.max_memory", "the"]
+    assert [note.split()[0] for note in notes] == ["compute.max_memory", "clear"]
     again = discrepancy._surveyed(context(None), source, (), None, lambda _: None)
     assert again == first
     assert (len(looked), len(notes)) == (2, 2)
@@ -279,7 +279,7 @@ def test_a_verdict_is_not_lost_where_no_pixel_of_the_other_window_can_be_used():
     window = Window(np.arange(400), (12, 24), (12, 24))
     found = SimpleNamespace(verdict=verdict_of("named"), model=())
     assert search.elsewhere(DiscrepancySettings(), "x-", window, found) is None
-    assert notes[0].startswith("not looked at again in rows 0 to 11, columns 0 to 11: ")
+    assert notes[0].startswith("not checked in rows 0 to 11, columns 0 to 11: ")
     in_part = SimpleNamespace(verdict=verdict_of("named_in_part"), model=())
     assert search.elsewhere(DiscrepancySettings(), "x-", window, in_part) is None
     assert len(notes) == 1

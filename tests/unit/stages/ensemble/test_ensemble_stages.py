@@ -327,7 +327,7 @@ def test_tiles_that_the_fit_finishes_later_are_added(
     write_fit(context, tiles=["0.0", "0.1", "0.2"])
     state = execute("ensemble", context)
     assert state.state == "failed"
-    assert "fit has not finished" in state.why
+    assert "fit is not finished" in state.why
     assert context.store.attributes("ensemble")["n_pixels"] == 16 * NX - 1
     write_fit(context)
     again = make_context(tmp_path, frames=250)
@@ -428,7 +428,7 @@ def test_no_pixel_with_a_value(prepared: Path, tmp_path: Path) -> None:
 
 
 def test_no_pixel_with_a_value_so_far(prepared: Path, tmp_path: Path) -> None:
-    """Tiles that the fit has not finished are no reason to call the ensemble done."""
+    """Tiles that the fit is not finished are no reason to call the ensemble done."""
     fresh_copy(prepared, tmp_path)
     context = make_context(tmp_path)
     write_fit(context, tiles=["0.0"])

@@ -94,9 +94,9 @@ def test_the_plan_in_words(camera):
     text = "\n".join(plan.words())
     assert "reads 0.0671 GB of camera files once" in text
     assert "16 tiles of 64 x 64" in text
-    assert "2000 MiB are allowed" in text
+    assert "2000 MiB allowed" in text
     less = config.model_copy(update={"compute": config.compute.model_copy(update={"max_memory": 64})})
-    assert "twice, by bands of rows" in "\n".join(make_plan(less, path.parent).words())
+    assert "twice, in bands of rows" in "\n".join(make_plan(less, path.parent).words())
 
 
 def test_a_plan_compiles_nothing_that_is_missing(camera, monkeypatch, tmp_path):

@@ -222,7 +222,7 @@ def test_a_file_that_shrinks_meanwhile_is_said(tmp_path, frames, monkeypatch):
         real(*arguments)
 
     monkeypatch.setattr(single_pass, "_create", shrink)
-    with pytest.raises(InputError, match="became shorter"):
+    with pytest.raises(InputError, match="was truncated"):
         single_pass.count_in_one_pass(context)
     assert not context.prepared
 

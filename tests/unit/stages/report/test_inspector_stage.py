@@ -72,7 +72,7 @@ def test_words_and_kinds(store: RunStore) -> None:
     assert entries["maps/bias_stderr"].label == "standard error of the bias"
     assert entries["fit/fit_status"].words == {int(bit): text for bit, text in MEANINGS.items()}
     assert entries["maps/quality"].words == {0: "good", 1: "use with caution", 2: "no value"}
-    assert entries["truth/defect"].words == {0: "nothing", 1: "hot", 2: "dead", 3: "stuck"}
+    assert entries["truth/defect"].words == {0: "normal", 1: "hot", 2: "dead", 3: "stuck"}
     assert entries["fit/goodness_p"].label == "goodness of fit p"
 
 
@@ -183,7 +183,7 @@ def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample() -> None:
     reasons = dict(chosen.reasons)
     assert chosen.index.size == np.unique(chosen.index).size == 1500
     assert reasons["shown in the report"] == (1 * 120 + 2,)
-    assert reasons["named by the discrepancy verdict"] == (5 * 120 + 6,)
+    assert reasons["from the search for missing effects"] == (5 * 120 + 6,)
     assert reasons["poorest goodness of fit"][0] == 40 * 120 + 50
     known = np.where(np.isfinite(data.maps["bias"]), data.maps["bias"], -np.inf)
     assert reasons["largest bias"][0] == known.argmax()
@@ -212,12 +212,12 @@ def test_the_choice_repeats() -> None:
 def test_all_right_and_to_be_believed(data: ReportData) -> None:
     clean = replace(report_data((40, 40), failed=0.0), fit={"fit_status": np.zeros((40, 40), np.uint16)})
     sensor, belief = answers(clean)
-    assert (sensor.level, sensor.question) == ("good", "Is this sensor all right?")
-    assert sensor.text == "All 1,600 pixels have a value; the 6 criteria are met."
+    assert (sensor.level, sensor.question) == ("good", "Is the sensor within limits?")
+    assert sensor.text == "All 1,600 pixels have a value; all 6 criteria pass."
     assert [each.found for each in sensor.criteria if each.setting == "read_noise_e"] == ["0.299 e⁻"]
     assert (belief.level, belief.word) == ("good", "No problem found by the quick checks")
     assert belief.text == (
-        "2 checks of the model against the data passed. What the model may be missing was not looked for."
+        "2 checks of the model against the data passed. Missing effects were not searched for."
     )
 
 
@@ -237,8 +237,8 @@ def test_a_wrong_model_is_not_to_be_believed() -> None:
     data = report_data((40, 40), failed=0.0)
     rmse = {"rmse": {"epcd_exact": 5e-4, "noise_floor": 1e-4}}
     belief = answers(replace(data, ensemble_facts=rmse))[1]
-    assert (belief.level, belief.word) == ("serious", "Not as they are")
-    assert "does not explain the data" in belief.text
+    assert (belief.level, belief.word) == ("serious", "No")
+    assert "does not describe the data" in belief.text
 
 
 def test_no_fit_at_all() -> None:

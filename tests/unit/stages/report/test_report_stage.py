@@ -157,7 +157,7 @@ def test_chosen_pixels_are_shown_and_wrong_ones_refused(folder: Path) -> None:
     assert [(pixel.y, pixel.x) for pixel in data.pixels] == [(2, 1), (15, 23)]
     assert data.pixels[0].status == "fewer than 3 occupied bins"
     assert data.pixels[1].counts.sum() == FRAMES
-    with pytest.raises(ConfigError, match="y = 16, x = 0 lies outside the sensor of 16 x 24"):
+    with pytest.raises(ConfigError, match="y = 16, x = 0 is outside the sensor of 16 x 24"):
         execute("report", make_context(folder, {"pixels": [[16, 0]]}))
 
 
