@@ -230,8 +230,6 @@ def test_paused_workers_are_not_waited_for_forever(monkeypatch):
     with pytest.raises(IncompleteRunError, match="all 2 workers were paused") as caught:
         executor._can_work()
     assert "300 MiB" in str(caught.value)
-    assert lines == [
-        "waiting for workers of the dask scheduler x: all 2 are paused, their memory is nearly full"
-    ]
+    assert lines == ["waiting for workers of the dask scheduler x: all 2 are paused, memory nearly full"]
     workers.append({"status": "running", "memory_limit": 0})
     assert executor._can_work()

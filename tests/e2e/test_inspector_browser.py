@@ -179,7 +179,7 @@ def test_a_pixel_that_is_not_in_full_says_so(tab: Tab, store: RunStore) -> None:
     i = next(i for i in range(2000, NX * NY) if i not in in_full(tab) and known[i])
     tab.click(*divmod(i, NX))
     assert (
-        "histogram is not in the file, which holds 2,400 of 6,300. To see every one: pchem view run.zarr"
+        "histogram is not in the file, which holds 2,400 of 6,300. To see all: pchem view run.zarr"
         in tab.text("#inspector-note")
     )
     for name in PANEL:
@@ -539,7 +539,7 @@ def test_everything_has_a_name_for_screen_readers(tab: Tab) -> None:
     )
     assert nameless == []
     assert re.search(
-        r"Histogram of .*DN; fitted density; first edges .* DN",
+        r"Histogram of .*DN; fitted density; first limits .* DN",
         tab.page.get_attribute("#inspector-plot", "aria-label"),
     )
     assert re.search(

@@ -90,7 +90,7 @@ def gone_on(path: Path):
         except StoreError as error:
             words = str(error)
             assert str(path) in words
-            forced = re.search(r"do it again: pchem (\w+) \S+ --force", words)[1]
+            forced = re.search(r"run it again: pchem (\w+) \S+ --force", words)[1]
     raise AssertionError(words)
 
 

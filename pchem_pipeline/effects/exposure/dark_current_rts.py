@@ -28,7 +28,6 @@ from pchem_pipeline.effects.types import (
     PixelMaps,
 )
 from pchem_pipeline.model.arithmetic.robust import chi_square
-from pchem_pipeline.model.law.telegraph import Telegraph
 
 # a pixel stands out beyond this standard normal number: one in 150,000 by chance
 _STANDS_OUT = 4.35
@@ -129,7 +128,7 @@ class DarkCurrentRts(Effect):
 
         Each is fitted by itself, whatever the mean step of all: with up to two defects and their own steps.
         """
-        from pchem_pipeline.model.law.telegraph import find_telegraph
+        from pchem_pipeline.model.law.telegraph import Telegraph, find_telegraph
 
         if self.fraction == 0 or self.step_e == 0:
             return None

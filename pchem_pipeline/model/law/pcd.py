@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaln, logsumexp, ndtr, wrightomega, xlogy
-from scipy.stats import poisson
 
 _Array = NDArray[np.float64]
 
@@ -135,7 +134,8 @@ def pcd_mass(
         off = np.abs(y[:, None] - k)  # the tails above are those below
         with np.errstate(divide="ignore", invalid="ignore"):
             low, high = (off - half[:, None]) / s[:, None], (off + half[:, None]) / s[:, None]
-        return np.asarray((poisson.pmf(k, h[:, None]) * (ndtr(-low) - ndtr(-high))).sum(axis=1))
+        weight = np.exp(xlogy(k, h[:, None]) - h[:, None] - gammaln(np.maximum(k, 0) + 1.0))
+        return np.asarray((np.where(k < 0, 0.0, weight) * (ndtr(-low) - ndtr(-high))).sum(axis=1))
 
     return _by_parts(summed, around.size, *flat).reshape(at.shape)
 

@@ -132,7 +132,7 @@ def test_a_place_counts_from_the_corner_of_the_sensor() -> None:
     moved = inside.shifted((100, 200), (10, 30), (40, 60))
     assert moved.region == {"rows": [[10, 30]], "columns": [[42, 46]]}
     assert inside.shifted((20, 20), (0, 20), (0, 20)) == inside
-    assert moved.spot() == "most in rows 10 to 29, columns 42 to 45, frames 3 to 8"
+    assert moved.spot() == "mainly in rows 10 to 29, columns 42 to 45, frames 3 to 8"
 
 
 def test_pixels_without_a_fit_have_a_place_where_they_come_together_and_else_none() -> None:

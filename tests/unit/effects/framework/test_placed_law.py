@@ -93,7 +93,7 @@ def test_a_share_of_the_frames_mixes_the_laws(effect):
 
 def test_what_cannot_be_said_is_refused_in_one_line():
     clip = make("clipping", low=98)
-    with pytest.raises(ConfigError, match=r"clipping in frames 100 to 199 .* limit of the scale"):
+    with pytest.raises(ConfigError, match=r"clipping in frames 100 to 199 .* limit of the ADC"):
         mass([clip.at_place(None, WHEN)])
     with pytest.raises(ConfigError, match=r"row_noise in columns 2 to 3 .* not known"):
         sample_law([EFFECTS[0].at_place(REGION)], maps())

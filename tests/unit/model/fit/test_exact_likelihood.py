@@ -180,7 +180,7 @@ def test_a_run_says_how_many_pixels_rounding_biases_and_that_a_default_would_do_
     np.savez(tmp_path / "h.npz", dn=dn, counts=drawn.counts)
     gains = {}
     path, common = tmp_path / "run.yaml", "run: {store: run.zarr, tile: 8}\ninput: {files: [h.npz]}\n"
-    for likelihood, words in (("density", "biases 100.0% of the pixels by more than 0.05"), ("auto", "")):
+    for likelihood, words in (("density", "biases 100.0 % of the pixels by more than 0.05"), ("auto", "")):
         path.write_text(common + ("fit: {likelihood: density}\n" if likelihood == "density" else ""))
         run_stages(find_run(path), ["ingest", "histogram", "fit"], Command(progress="off"))
         store = RunStore.open(tmp_path / "run.zarr")

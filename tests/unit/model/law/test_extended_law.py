@@ -212,9 +212,9 @@ def test_laws_that_do_not_fit_the_pixels_are_refused() -> None:
     columns = list(np.transpose(PIXELS))
     with pytest.raises(ValueError, match="extra_variance_e2 has 2 rows for 3 pixels"):
         sample_mass(SampleLaw().with_variance(e2=[0.1, 0.2]), columns, [1, 2])
-    with pytest.raises(ValueError, match="do not sum to 1"):
+    with pytest.raises(ValueError, match="must sum to 1"):
         sample_mass(SampleLaw().with_noise([0.5, 0.4]), columns, [1, 2])
-    with pytest.raises(ValueError, match="do not sum to 1"):
+    with pytest.raises(ValueError, match="must sum to 1"):
         sample_mass(SampleLaw().with_added_exposure([[0, 1]], [[0.5, 0.4]]), columns, [1, 2])
     with pytest.raises(ValueError, match="increase by 1"):
         sample_mass(SampleLaw(), columns, [1, 3])
