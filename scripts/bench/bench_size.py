@@ -17,9 +17,8 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from bench_growth import write_stack
 from process_tree import run_measured
-from running import STAGES, machine
+from running import STAGES, machine, write_stack
 
 from pchem_pipeline.compute.environment import prepare_environment
 from pchem_pipeline.stages.table import STAGES as DECLARED

@@ -13,8 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
+import numpy as np
+
+_SIMULATED, _AT_ONCE = 1000, 100  # frames of `write_stack`
 STAGES = ("ingest", "histogram", "fit", "maps", "ensemble", "report")
 
 
@@ -60,6 +62,27 @@ def evict(path: Path) -> None:
         os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
+def write_stack(path: Path, frames: int, shape: tuple[int, int]) -> None:
+    """Write a raw file of uint16 frames of some rows and columns, with its sidecar.
+
+    The first 1,000 frames are simulated, and repeated from then on: a fit would find that out.
+    """
+    from pchem_pipeline.simulate.chain import simulate_block
+    from pchem_pipeline.simulate.maps import draw_truth
+    from pchem_pipeline.simulate.settings import SimulateSettings
+
+    settings = SimulateSettings(shape=(64, 64), n_frames=_SIMULATED, seed=3)
+    small, _ = simulate_block(draw_truth(settings), settings, (0, _SIMULATED), electron_frames=0)
+    rows, columns = shape
+    times = -(-rows // 64), -(-columns // 64)
+    with path.open("wb") as stream:
+        for start in range(0, frames, _AT_ONCE):
+            first = start % _SIMULATED
+            some = small[first : first + min(_AT_ONCE, frames - start)].astype("<u2")
+            stream.write(np.ascontiguousarray(np.tile(some, (1, *times))[:, :rows, :columns]).data)
+    path.with_name(f"{path.name}.json").write_text(json.dumps({"shape": shape, "dtype": "uint16"}))
+
+
 def read_once(path: Path) -> float:
     """Return the seconds that reading a file once with ``readinto`` takes: the floor of any method."""
     buffer = memoryview(bytearray(64 << 20))
@@ -101,24 +124,6 @@ def run_pchem(config: Path, stages: Sequence[str] = ()) -> Outcome:
         {name: record["cpu_seconds"] for name, record in records.items()},
         {name: record["peak_rss_bytes"] / 2**20 for name, record in records.items()},
     )
-
-
-def plain_numbers(axes: Any, places: Sequence[float], power: int = 1) -> None:
-    """Write plain numbers at logarithmic axes, at the horizontal one those that were measured.
-
-    Args:
-        axes: of matplotlib.
-        places: that were measured.
-        power: 2 for areas, which are written as squares.
-    """
-    from matplotlib.ticker import LogFormatter
-
-    ticks = sorted(set(places))
-    sign = f"$^{power}$" if power > 1 else ""
-    axes.set_xticks(ticks, [f"{place ** (1 / power):,.6g}{sign}" for place in ticks])
-    axes.xaxis.minorticks_off()
-    axes.yaxis.set_major_formatter(LogFormatter())
-    axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.5)))
 
 
 def save_figure(figure: object, folder: Path, name: str) -> None:

@@ -27,9 +27,8 @@ from kills import PCHEM, differences, results
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
-from bench_growth import write_stack
 from helpers.cluster import bytes_read, cluster_processes, counting_reads, signal_group, wait_for_marks
-from running import STAGES, machine
+from running import STAGES, machine, write_stack
 
 from pchem_pipeline.compute.environment import prepare_environment
 

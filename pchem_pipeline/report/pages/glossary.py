@@ -140,7 +140,7 @@ GLOSSARY: tuple[Term, ...] = (
         "sigma",
         "Standard deviation of an estimate, or of a statistic between stacks simulated from the fitted "
         "model. The largest of a hundred statistics is near 3 sigma by chance.",
-        ("sd of chance", "standard deviations of chance", "sd"),
+        ("sd",),
     ),
     Term(
         "standard error",
