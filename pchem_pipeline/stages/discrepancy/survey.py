@@ -104,7 +104,7 @@ class Survey:
         places = {
             name: Suspect(
                 family="",
-                z=math.nan,
+                z=0.0,
                 log_p=math.log(each["p"]),
                 inside=each["inside"],
                 outside=each["outside"],
