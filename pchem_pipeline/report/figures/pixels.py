@@ -29,7 +29,7 @@ from pchem_pipeline.report.charts.chart import (
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.wording import measured, plain, short, stored_unit, symbol
+from pchem_pipeline.report.style.wording import cut, measured, plain, short, stored_unit, symbol
 
 FloatArray = NDArray[np.float64]
 
@@ -361,7 +361,7 @@ def _residual_strip(pixel: PixelFit, where: slice, label: str) -> Panel:
 
 
 def _title(pixel: PixelFit, letter: str) -> str:
-    head = " ".join(part for part in (f"({letter})" if letter else "", plain(_cut(pixel.label))) if part)
+    head = " ".join(part for part in (f"({letter})" if letter else "", plain(cut(pixel.label, 40))) if part)
     lines = [f"{head}: {pixel.place}" if head else pixel.place]
     if has_fit(pixel.parameters):
         words = []
@@ -377,7 +377,3 @@ def _title(pixel: PixelFit, letter: str) -> str:
             f"status: {plain(pixel.status)}", _STATUS_LETTERS, max_lines=5, placeholder=" …"
         )
     return "\n".join(lines)
-
-
-def _cut(text: str, most: int = 40) -> str:
-    return text if len(text) <= most else f"{text[: most - 1]}…"

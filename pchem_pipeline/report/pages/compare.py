@@ -17,7 +17,7 @@ from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
 from pchem_pipeline.report.pages.report_json import json_value
 from pchem_pipeline.report.pages.tables import Table, rmse_unit, rmse_words
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.wording import count, measured, percent, scientific, short, symbol
+from pchem_pipeline.report.style.wording import count, cut, measured, percent, scientific, short, symbol
 
 #: Names of the files.
 COMPARE_PAGE, COMPARE_JSON = "compare.html", "compare.json"
@@ -331,11 +331,7 @@ def _versions(pair: Pair) -> Table:
 
 
 def _both(each: Setting) -> tuple[str, str, str]:
-    return each.name, _cut(each.one), _cut(each.other)
-
-
-def _cut(text: str, most: int = 80) -> str:
-    return text if len(text) <= most else f"{text[: most - 1]}…"
+    return each.name, cut(each.one, 80), cut(each.other, 80)
 
 
 def _arrays(pair: Pair, tolerance: float) -> Table:

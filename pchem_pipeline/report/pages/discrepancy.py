@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from pchem_pipeline.discrepancy.verdict import (
     CONVINCING_PLACEBO,
@@ -225,12 +224,8 @@ def _unfitted_text(found: Verdict) -> str:
     if not seen.unfitted:
         return ""
     spot = next((place for place in seen.places if place.map == "unfitted"), None)
-    where = "" if spot is None else f", clustered in {_words_of(spot.region)}"
+    where = "" if spot is None else f", clustered in {Region.model_validate(spot.region).describe()}"
     return f" Not compared: {count(seen.unfitted, 'pixel')} without a reliable fit{where}."
-
-
-def _words_of(region: dict[str, Any]) -> str:
-    return Region.model_validate(region).describe()
 
 
 def verdict_level(found: Verdict) -> tuple[Level, str]:

@@ -205,3 +205,8 @@ def short_name(text: str) -> str:
     while end > 0 and line[end : end + 1] and unicodedata.category(line[end])[0] == "M":
         end -= 1  # marks stay with their letter
     return f"{visible(line[: end or _LONGEST_NAME].rstrip())} …"
+
+
+def cut(text: str, most: int) -> str:
+    """Return a text of at most ``most`` characters; an ellipsis ends one that was longer."""
+    return text if len(text) <= most else f"{text[: most - 1]}…"

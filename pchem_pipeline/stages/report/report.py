@@ -25,7 +25,7 @@ from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, PixelSample
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
 from pchem_pipeline.report.pages.quick_look import check_sentence
-from pchem_pipeline.report.pages.report import RenderedReport, render_report
+from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.report.style.wording import short_name
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy.result import verdict_data
@@ -49,7 +49,6 @@ from pchem_pipeline.stages.table import pipeline
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.report.pages.pictures import DrawAll
-    from pchem_pipeline.report.settings import ReportSettings
     from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.store.records import StageRecord
     from pchem_pipeline.store.run_store import RunStore
@@ -62,11 +61,6 @@ _FEW_CHANNELS = 12
 _SOME_MASSES = 300
 #: Memory that a pixel takes: the maps are held as a whole. Measured at 2048 x 1152, 940 MiB in all.
 _PIXEL_BYTES = 300
-
-
-def report_tile(data: ReportData, settings: ReportSettings, draw: DrawAll | None = None) -> RenderedReport:
-    """Return the files of the report; pure. ``draw`` draws all figures at once."""
-    return render_report(data, settings, draw)
 
 
 def run(context: StageContext) -> None:
@@ -109,7 +103,7 @@ def _write(
     store = open_store(path)
     with beside(drawing_workers(None, config.compute)) as hand:
         data = gather(store, config, integration_time, stages, hand)
-        rendered = report_tile(data, config.report, draw)
+        rendered = render_report(data, config.report, draw)
     for name, content in rendered.figures.items():
         store.write_file(f"figures/{name}", content)
     for old in (path / "figures").glob("*.*"):

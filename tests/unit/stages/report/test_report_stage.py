@@ -91,7 +91,7 @@ def folder(base: Path, tmp_path: Path) -> Path:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write without drawing: fast."""
     monkeypatch.setattr(
-        report, "report_tile", lambda data, settings, draw: RenderedReport("page", "{}", {"new.svg": b"x"})
+        report, "render_report", lambda data, settings, draw: RenderedReport("page", "{}", {"new.svg": b"x"})
     )
 
 
@@ -170,7 +170,7 @@ def test_a_report_is_the_same_whoever_works_on_it(folder: Path) -> None:
         config = context.config.model_copy(update={"compute": compute})
         with beside(workers) as hand:
             data = gather(context.store, config, 4.87, [], hand)
-            rendered = report.report_tile(data, config.report)
+            rendered = report.render_report(data, config.report)
         pages.append((rendered.html, rendered.json))
     assert 'id="inspector-app"' in pages[0][0]
     assert [len(set(each)) for each in zip(*pages, strict=True)] == [1, 1]  # without pytest's comparison
