@@ -1,5 +1,4 @@
 import errno
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -227,15 +226,15 @@ def test_markers_belong_to_one_fingerprint(tmp_path):
 
 
 def test_markers_that_a_writer_removes_while_they_are_listed_are_no_markers(tmp_path, monkeypatch):
-    records, scandir = Records(tmp_path), os.scandir
+    records, glob = Records(tmp_path), Path.glob
     records.mark("fit", "a" * 64, "0.0", {})
 
-    def removed_first(folder):
-        monkeypatch.setattr(os, "scandir", scandir)
+    def removed_first(folder, pattern):
+        monkeypatch.setattr(Path, "glob", glob)
         records.unmark_all("fit")
-        return scandir(folder)
+        return glob(folder, pattern)
 
-    monkeypatch.setattr(os, "scandir", removed_first)
+    monkeypatch.setattr(Path, "glob", removed_first)
     assert records.done("fit", "a" * 64) == set()
     assert not (tmp_path / "done" / "fit").exists()
 
