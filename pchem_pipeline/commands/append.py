@@ -28,7 +28,7 @@ from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.stages.histogram.single_pass import PREPARED, prepared, stream_rows, whole_mebibytes
 from pchem_pipeline.stages.table import STAGES
-from pchem_pipeline.store.files import remove_file, write_record
+from pchem_pipeline.store.files import remove_files, write_record
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -59,7 +59,7 @@ def append_frames(target: Target, command: Command) -> list[StageState]:
     begun = target.store / _BEGUN
     if begun.exists() and any(state.state != "complete" for state in run_status(target)[: len(PREPARED)]):
         states = run_stages(target, PREPARED, command)
-        remove_file(begun)
+        remove_files(begun)
         return states
     with working_run(target, command) as context:
         clock = time.perf_counter(), cpu_seconds()
@@ -77,7 +77,7 @@ def append_frames(target: Target, command: Command) -> list[StageState]:
         keep_identity(context, quick, {"files": files, "digest": digest_of(files)})
         context.prepared = prepared(frames, clock)
         states = [execute(name, context) for name in PREPARED]
-        remove_file(begun)
+        remove_files(begun)
         return states
 
 

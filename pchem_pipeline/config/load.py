@@ -16,7 +16,7 @@ from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.settings import SECRET, Section
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.effects.framework.settings import ModelSettings
-from pchem_pipeline.store.files import remove_file, write_atomic
+from pchem_pipeline.store.files import remove_files, write_atomic
 
 #: values of a configuration: 100,000 named files are not unusual
 _MOST_VALUES, _MOST_KEYS = 1_000_000, 1000
@@ -124,7 +124,7 @@ def write_model(path: Path, model: ModelSettings) -> Path:
     """
     file, own = effects_file(path), _own_config(path).model
     if model == own:
-        remove_file(file)
+        remove_files(file)
         return path
     content = FoundModel(model=model, instead_of=own).model_dump(mode="json")
     head = f"# The model of {path.name}; delete this file to use the section model there.\n"
@@ -138,7 +138,7 @@ def write_config(path: Path, text: str) -> None:
     Raises:
         StoreError: it cannot be written.
     """
-    remove_file(effects_file(path))
+    remove_files(effects_file(path))
     write_atomic(path, text.encode())
 
 

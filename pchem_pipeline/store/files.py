@@ -139,25 +139,27 @@ def _remove(aside: Path) -> None:
             aside.unlink()
 
 
-def remove_file(path: Path) -> None:
-    """Remove a file or an object, if it is there; no power cut brings it back among what is written next.
+def remove_files(*paths: Path) -> None:
+    """Remove files or objects, those that are there; no power cut brings them back later.
 
     Raises:
         StoreError: the file system, or the object storage, refused.
     """
-    if isinstance(path, RemotePath):
-        path.unlink(missing_ok=True)
-        return
-    try:
-        if path.exists():
+    there = [path for path in paths if isinstance(path, RemotePath) or os.path.lexists(path)]
+    for path in there:
+        try:
             disk.remove(path)
-            disk.sync_folder(path.parent)
-    except OSError as error:
-        raise storage_error(error, path) from error
+        except OSError as error:
+            raise storage_error(error, path) from error
+    for folder in {path.parent for path in there if not isinstance(path, RemotePath)}:
+        try:
+            disk.sync_folder(folder)
+        except OSError as error:
+            raise storage_error(error, folder) from error
 
 
 def remove_folder(path: Path) -> None:
-    """Remove a folder with all that is in it, if it is there; see `remove_file`.
+    """Remove a folder with all that is in it, if it is there; see `remove_files`.
 
     Raises:
         StoreError: the file system, or the object storage, refused.

@@ -15,7 +15,7 @@ from pchem_pipeline.base.errors import LockedError, StoreError
 from pchem_pipeline.store.files import (
     canonical_json,
     read_record,
-    remove_file,
+    remove_files,
     remove_folder,
     write_record,
 )
@@ -142,7 +142,7 @@ class Records:
 
     def forget(self, stage: str) -> None:
         """Drop the record and all markers of a stage."""
-        remove_file(self._folder / "stages" / f"{stage}.json")
+        remove_files(self._folder / "stages" / f"{stage}.json")
         self.unmark_all(stage)
 
     def unmark_all(self, stage: str) -> None:
@@ -161,8 +161,8 @@ class Records:
 
     def unmark(self, stage: str, fingerprint: str, keys: Iterable[str]) -> None:
         """Say that units have to be done again."""
-        for key in sorted(self.done(stage, fingerprint) & set(keys)):
-            remove_file(self._marker(stage, fingerprint, key))
+        gone = sorted(self.done(stage, fingerprint) & set(keys))
+        remove_files(*(self._marker(stage, fingerprint, key) for key in gone))
 
     def done(self, stage: str, fingerprint: str) -> set[str]:
         """Return the keys of the finished units of a stage in its present form."""

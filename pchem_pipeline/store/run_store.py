@@ -35,7 +35,7 @@ from pchem_pipeline.store import disk
 from pchem_pipeline.store.files import (
     cure_of,
     link_out_of,
-    remove_file,
+    remove_files,
     remove_folder,
     storage_error,
     write_atomic,
@@ -92,6 +92,8 @@ class RunStore:
             disk.make_folder(path)
             attributes = {"pchem_schema": SCHEMA_VERSION}
             zarr.create_group(zarr_store(path, writable=True), zarr_format=3, attributes=attributes)
+            if not isinstance(path, RemotePath):
+                disk.sync_folder(path.parent)  # or a power cut would take the whole run
         return cls.open(path, writable=True)
 
     @classmethod
@@ -354,10 +356,8 @@ class RunStore:
         """Remove the half files that a killed process left."""
         if isinstance(self.path, RemotePath):  # which has none
             return
-        for folder, _, names in os.walk(self.path):
-            for name in names:
-                if name.endswith(".partial"):
-                    remove_file(Path(folder) / name)
+        found = (Path(folder) / name for folder, _, names in os.walk(self.path) for name in names)
+        remove_files(*(path for path in found if path.name.endswith(".partial")))
 
     def free_bytes(self) -> int:
         """Return the free space of the disk that holds the store; an object storage is never full."""

@@ -125,15 +125,15 @@ def pcd_mass(
     at, exposure, gain, offset, noise = np.broadcast_arrays(
         *[np.asarray(a, np.float64) for a in (x, quanta_exposure, conversion_gain, bias, analog_read_noise_e)]
     )
-    flat = [np.ravel(a) for a in (gain * (at - offset), exposure, 0.5 * gain, noise)]
-    reach = float(np.max(_REACH * flat[3] + flat[2], initial=0.0))
+    # without noise a number between two cells is half in each
+    flat = [np.ravel(a) for a in (gain * (at - offset), exposure, 0.5 * gain, np.maximum(noise, 1e-200))]
+    reach = float(np.nanmax(_REACH * flat[3] + flat[2], initial=0.0))
     around = np.arange(-int(reach) - 1, int(reach) + 2)
 
     def summed(y: _Array, h: _Array, half: _Array, s: _Array) -> _Array:
         k = np.round(y)[:, None] + around
         off = np.abs(y[:, None] - k)  # the tails above are those below
-        with np.errstate(divide="ignore", invalid="ignore"):
-            low, high = (off - half[:, None]) / s[:, None], (off + half[:, None]) / s[:, None]
+        low, high = (off - half[:, None]) / s[:, None], (off + half[:, None]) / s[:, None]
         weight = np.exp(xlogy(k, h[:, None]) - h[:, None] - gammaln(np.maximum(k, 0) + 1.0))
         return np.asarray((np.where(k < 0, 0.0, weight) * (ndtr(-low) - ndtr(-high))).sum(axis=1))
 

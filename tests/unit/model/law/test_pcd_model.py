@@ -76,3 +76,11 @@ def test_mass_is_the_integral_of_the_density() -> None:
     sigma = 0.3 / 0.09
     integral = np.trapezoid(pcd(x[:, None] + fine, 1.5, 0.09, 100.2, sigma), fine, axis=1)
     np.testing.assert_allclose(pcd_mass(x, 1.5, 0.09, 100.2, 0.3), integral, atol=1e-9)
+
+
+def test_mass_without_noise_is_shared_by_the_cells_beside_and_of_no_parameters_is_nan() -> None:
+    """A comb of 2 DN per electron that begins half-way between 0 and 1 DN."""
+    np.testing.assert_allclose(
+        pcd_mass([0, 1, 2, 3], 1.0, 0.5, 0.5, 0.0), np.exp(-1) * np.array([0.5, 0.5, 0.5, 0.5]), rtol=1e-12
+    )
+    np.testing.assert_array_equal(np.isnan(pcd_mass(100, [np.nan, 1.0], 0.1, 100.0, 0.3)), [True, False])
