@@ -101,11 +101,8 @@ def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) 
     written = not stage.writes or stage.may_write_nothing or context.store.has(stage.writes[0])
     if done and not written:
         return "stale", f"{stage.writes[0]} is missing in the store"  # a hand took it out
-    for name, digest in record.files.items():
-        group = f"{name.partition('/')[0]}/{DESCRIPTION}"
-        whole = not name.endswith(DESCRIPTION) or (context.store.path / group).exists()
-        if not whole or digest != digest_of_file(context.store.path / name):
-            return "stale", f"{name if whole else group} is missing or has changed"
+    if name := changed_file(record, context.store):
+        return "stale", f"{name} is missing or has changed"
     content = fingerprint_content(stage, context)
     if fingerprint_of(content) != record.fingerprint and not _grew(content, record):
         numbers = {each.digest: each.number for each in (context.model, *model_versions(context.store))}
@@ -114,6 +111,17 @@ def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) 
         reason = f"{len(record.failed)} failed: {next(iter(record.failed.values()))}" if record.failed else ""
         return "partial", reason
     return ("complete", "") if record.finished else ("partial", "interrupted")
+
+
+def changed_file(record: StageRecord, store: RunStore) -> str:
+    """Return a file of a stage's result that is missing or not as it was written; empty: none."""
+    for name, digest in record.files.items():
+        group = f"{name.partition('/')[0]}/{DESCRIPTION}"
+        if name.endswith(DESCRIPTION) and not (store.path / group).exists():
+            return group
+        if digest != digest_of_file(store.path / name):
+            return name
+    return ""
 
 
 def rests_on(record: StageRecord, store: RunStore) -> int | None:

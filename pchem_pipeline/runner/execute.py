@@ -12,7 +12,7 @@ from pathlib import Path
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.compute.environment import cpu_seconds, peak_rss_bytes
 from pchem_pipeline.run.declaration import Stage, imported
-from pchem_pipeline.run.fingerprint import StageState, fingerprint_content, rests_on, status
+from pchem_pipeline.run.fingerprint import StageState, changed_file, fingerprint_content, rests_on, status
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import digest_of_file
@@ -49,6 +49,12 @@ def execute(name: str, context: StageContext) -> StageState:
     if context.options.dry_run:
         context.reporter.info(f"{name}: {before.words()} -> would run")
         return before
+    for upstream in stage.upstream:
+        record = context.store.records.known(upstream)
+        if record is not None and (file := changed_file(record, context.store)):
+            raise StoreError(
+                f"{context.store.path}: {file} is missing or has changed; {context.store.cure(file)}"
+            )
     if before.state == "stale":
         context.reporter.info(f"{name}: {before.words()} -> running again")
     prepared = context.prepared.get(name)

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.base.errors import LockedError, StoreError
+from pchem_pipeline.base.errors import LockedError, StoreError, quoted
 from pchem_pipeline.store.files import (
     canonical_json,
     read_record,
@@ -120,7 +120,8 @@ class Records:
         Raises:
             StoreError: it is damaged.
         """
-        path, cure = self._folder / "stages" / f"{stage}.json", "run the stage again to replace it"
+        path = self._folder / "stages" / f"{stage}.json"
+        cure = f"run it again: pchem {stage} {quoted(self._folder.parent)} --force"
         content = read_record(path, cure)
         if content is None:
             return None

@@ -19,6 +19,7 @@ import functools
 import hashlib
 import math
 import os
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
@@ -52,7 +53,7 @@ SCHEMA_VERSION = 1
 
 _PRIVATE = ".pchem"
 DESCRIPTION = "zarr.json"
-_DIGEST_LINE = "# sha256 of the above: "
+_DIGEST_LINE = "# sha256 of the rest: "
 #: what zarr and its codecs raise over wrong content
 _DAMAGE = (ValueError, RuntimeError, TypeError, AttributeError, AssertionError, IndexError)
 _Region = tuple[slice | int, ...]
@@ -330,9 +331,8 @@ class RunStore:
         return path
 
     def write_config(self, text: str) -> None:
-        """Keep the resolved YAML of the run, with a digest behind it."""
-        digest = hashlib.sha256(text.encode()).hexdigest()
-        write_atomic(self.path / _PRIVATE / "config.yaml", f"{text}{_DIGEST_LINE}{digest}\n".encode())
+        """Keep the resolved YAML of the run, its digest before it: no cut file is without one."""
+        write_atomic(self.path / _PRIVATE / "config.yaml", _digest_line(text.encode()) + text.encode())
 
     def config_text(self) -> str | None:
         """Return the resolved YAML that made the run, or None; see `stored_config`."""
@@ -386,14 +386,18 @@ def stored_config(path: Path) -> str | None:
         content = place.read_bytes()
     except FileNotFoundError:
         return None
-    text, mark, digest = content.rpartition(_DIGEST_LINE.encode())
-    if not mark:  # of version 0.2
-        text = content
-    elif hashlib.sha256(text).hexdigest() != digest.decode(errors="replace").strip():
+    if re.match(rb"[a-z_]+:", content):  # of version 0.2
+        return content.decode(errors="replace")
+    head, _, text = content.partition(b"\n")
+    if head + b"\n" != _digest_line(text):
         raise StoreError(
             f"{place} is damaged (checksum mismatch); give the run's YAML file instead of its store"
         )
-    return text.decode(errors="replace")
+    return text.decode()
+
+
+def _digest_line(text: bytes) -> bytes:
+    return f"{_DIGEST_LINE}{hashlib.sha256(text).hexdigest()}\n".encode()
 
 
 @functools.lru_cache(maxsize=64)  # once in a process: it takes 20 ms in the largest stores

@@ -174,7 +174,7 @@ def test_chunks_that_0_2_left_out_are_read(finished, tmp_path):
         content.pop("files", None)
         place.write_text(json.dumps(content))
     place = folder / "run.zarr/.pchem/config.yaml"
-    place.write_text(place.read_text().rpartition("# sha256")[0])
+    place.write_text(place.read_text().partition("\n")[2])
     assert not np.any(expected["histogram/under"])
     shutil.rmtree(folder / "run.zarr/histogram/under/c")
     same(numbers(folder / "run.zarr"), expected)

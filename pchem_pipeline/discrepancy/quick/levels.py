@@ -28,15 +28,18 @@ _MOST_LEVELS = 8
 _SHOWN = 3
 
 
-def levels_check(mean: FloatArray, variance: FloatArray, gain: float) -> Check:
+def levels_check(
+    mean: FloatArray, variance: FloatArray, gain: float, empty: NDArray[np.int64] | tuple[()] = ()
+) -> Check:
     """Test whether the frames are of several exposures.
 
     Args:
         mean: mean of each frame over its pixels, DN, (n,).
         variance: variance of each frame over its pixels, DN^2, (n,).
         gain: median gain, e-/DN.
+        empty: frames without samples of the sensor, which are no exposure.
     """
-    levels, p = _parted(mean, variance, gain)
+    levels, p = _parted(mean, variance, gain, np.setdiff1d(np.arange(mean.size), empty))
     levels.sort(key=lambda frames: float(mean[frames].mean()))
     several = len(levels) > 1
     centres = [float(mean[frames].mean()) for frames in levels]
@@ -46,12 +49,14 @@ def levels_check(mean: FloatArray, variance: FloatArray, gain: float) -> Check:
     return check_of("levels", p, centres[-1] - centres[0], where=where if several else "")
 
 
-def _parted(mean: FloatArray, variance: FloatArray, gain: float) -> tuple[list[NDArray[np.int64]], float]:
+def _parted(
+    mean: FloatArray, variance: FloatArray, gain: float, frames: NDArray[np.int64]
+) -> tuple[list[NDArray[np.int64]], float]:
     """Return the frames of each level, and how probable the growth of the variance between any two is."""
-    levels, p = [np.arange(mean.size)], 1.0
-    if mean.size < _FEWEST_FRAMES:
+    levels, p = [frames], 1.0
+    if frames.size < _FEWEST_FRAMES:
         return levels, p
-    fewest = max(_FEWEST_OF_LEVEL, int(np.ceil(_LEAST_SHARE * mean.size)))
+    fewest = max(_FEWEST_OF_LEVEL, int(np.ceil(_LEAST_SHARE * frames.size)))
     while len(levels) < _MOST_LEVELS:
         for number, frames in enumerate(levels):
             halves = _halves(frames, mean, fewest)

@@ -77,7 +77,7 @@ def quick_look(
     usable = maps.usable
     gain, noise = (median_of(values, ~usable) for values in (maps.conversion_gain, maps.read_noise_dn))
     if sums is not None and sums.freedom > 0:
-        checks.append(levels_check(sums.all_means, sums.all_variances, gain))
+        checks.append(levels_check(sums.all_means, sums.all_variances, gain, sums.odd.get("empty", ())))
         checks += [*_odd_frames(sums), *_stack_checks(sums, maps), *_wave(sums)]
     if codes is not None:
         checks += code_checks(codes)

@@ -249,6 +249,8 @@ def test_offsets_that_jump_or_alternate_and_lamps_that_drift_are_no_two_exposure
     mean, variance = (np.where(np.arange(800) < 300, *values) for values in ((200.0, 210.0), (60.0, 140.0)))
     assert levels_check(mean, variance, GAIN).p < SIGNIFICANCE
     assert levels_check(mean, np.full(800, 60.0), GAIN).p == 1.0
+    # the frames of one of both levels are known to be empty
+    assert levels_check(mean, variance, GAIN, np.flatnonzero(mean < mean.mean())).p == 1.0
     alternating = looked(stack(rng, SHAPE, lambda dn: dn + 5.0 * (-1.0) ** t))
     assert not by_name(alternating)["levels"].found
     lamp = looked(stack(rng, SHAPE, exposure=1.0 + t / 800.0))
