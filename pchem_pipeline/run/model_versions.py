@@ -266,7 +266,12 @@ def model_of(store: RunStore, stage: str) -> ModelVersion | None:
     record = store.records.read(stage)
     if record is None and store.has(stage):
         raise StoreError(f"{store.path}: {stage} has lost its record; {store.cure(stage)}")
-    return None if record is None else model_of_content(store, record.content)
+    if record is None:
+        return None
+    version = model_of_content(store, record.content)
+    if version is None and (record.content.get("input") or {}).get("model"):
+        raise StoreError(f"{store.path / _GROUP}: the model that {stage} rests on is missing; run again")
+    return version
 
 
 def model_of_content(store: RunStore, content: dict[str, Any]) -> ModelVersion | None:

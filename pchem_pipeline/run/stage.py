@@ -405,7 +405,7 @@ class StageContext:
         there = self.tiles_done(needs)
         for unit in units:
             if not set(unit.keys) <= there:
-                self.failed[unit.key] = f"stage {needs} is not finished"
+                self.failed[unit.key] = f"stage {needs} of {self.store.path} is not finished"
         return [unit for unit in units if set(unit.keys) <= there]
 
     def _failed(self, unit: Unit, outcome: Outcome, fatal: list[BaseException]) -> None:

@@ -100,14 +100,16 @@ def check(folder, victim, expected, forced):
 
     for action in (
         lambda: run_status(find_run(folder / "run.zarr")),
-        lambda: same(numbers(folder / "run.zarr"), expected),
+        lambda: same(numbers(folder / "run.zarr"), expected, victim),
         forced_stage,
         lambda: run(place),
     ):
         words = asked(action)
         assert not words or (str(folder) in words and "; " in words and "\n" not in words), words
     for _ in range(8):
-        words = asked(lambda: run(place)) or asked(lambda: same(numbers(folder / "run.zarr"), expected))
+        words = asked(lambda: run(place)) or asked(
+            lambda: same(numbers(folder / "run.zarr"), expected, victim)
+        )
         if not words:
             break
         asked(lambda words=words: cured(folder, words))
@@ -115,10 +117,10 @@ def check(folder, victim, expected, forced):
     assert {state.state for state in run_status(find_run(place))} == {"complete"}, victim
 
 
-def same(found, expected):
-    assert found.keys() == expected.keys()
+def same(found, expected, victim=""):
+    assert found.keys() == expected.keys(), victim
     for name, values in found.items():
-        np.testing.assert_array_equal(values, expected[name], err_msg=name)
+        np.testing.assert_array_equal(values, expected[name], err_msg=f"{victim}: {name}")
 
 
 def files_of(folder):
