@@ -1,6 +1,6 @@
 """The steps of a search for missing effects, from the split of the samples to the verdict.
 
-Split, null, gap, disagree, explain, add, describe, close, verdict.
+Split, null, gap, disagree, explain, add, close, verdict.
 
 They are the same for frames and for ready-made histograms; only the comparison of effects differs. With
 frames, effects are simulated and compared by their shift of many statistics (:mod:`.by_simulation`); with
@@ -43,7 +43,6 @@ class Prepared:
         first: statistics of the model before anything is added, from its replicates.
         z: statistics of the data.
         effort: counts the work.
-        most_rounds: of explaining and adding.
         untestable: effects that such data cannot show, and why.
         doubt: why the pixels are not identified and what would help; empty where they are.
         defects: candidates that failed, and why; more come to them.
@@ -56,19 +55,21 @@ class Prepared:
     first: NullModel
     z: Measured
     effort: Effort
-    most_rounds: int
     untestable: dict[str, str]
     doubt: str = ""
     defects: dict[str, str] = field(default_factory=dict)
 
 
 class Explainer(ABC, Generic[Explanation]):
-    """A way to tell effects apart in one kind of data; it keeps the model and the rounds of the search.
+    """A way to tell effects apart in one kind of data; it keeps the model.
 
-    The last five methods are for one that measures what no effect explains; others leave them as they are.
+    Attributes:
+        prepared: the data and the model before the search.
+        limit: what was not tried when the search had used its budget; empty if it finished.
     """
 
     prepared: Prepared
+    limit: str = ""
 
     @property
     @abstractmethod
@@ -84,7 +85,7 @@ class Explainer(ABC, Generic[Explanation]):
         """Tell whether candidates are worth asking although no statistic deviates beyond chance."""
 
     @abstractmethod
-    def explain(self, null: NullModel, disagrees: bool) -> Explanation | None:
+    def explain(self, null: NullModel, disagreed: bool) -> Explanation | None:
         """Compare the candidates on train and test part; None where none explains anything."""
 
     @abstractmethod
@@ -92,31 +93,12 @@ class Explainer(ABC, Generic[Explanation]):
         """Put effects into the model and draw replicates of it; None where no effect is established."""
 
     @abstractmethod
-    def close(self, before: Gap, null: NullModel, disagrees: bool) -> Added:
+    def close(self, before: Gap, null: NullModel, disagreed: bool) -> Added:
         """Measure the gap on the final part with each added effect, and with rivals in its place."""
 
     @abstractmethod
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
         """Return the parameters of the pixels under the model that the verdict leaves."""
-
-    def replaced(self, null: NullModel) -> NullModel | None:
-        """Put what no effect with a name makes in the place of all that were added, if it leaves less."""
-        return None
-
-    def probable(self) -> NullModel | None:
-        """Put effects into the model that explain the data but are not certain; None: there are none.
-
-        They are told, and leave the model again with the verdict.
-        """
-        return None
-
-    def unfinished(self, before: Gap, null: NullModel) -> bool:
-        """Tell whether so much of the gap is left that what was added gets no name, though the data agree."""
-        return False
-
-    def describe(self, before: Gap, null: NullModel) -> NullModel | None:
-        """Put what no effect explains into the model as it is measured; None where that does not help."""
-        return None
 
     def tolerance(self) -> NDArray[np.float64] | float:
         """Return the deviations that are not held against the added effects, shape (m,)."""
@@ -139,39 +121,22 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
     tell("measuring the gap of the model")
     before = by.gap(first)
     places = locate(data.evidence, first, z.both, significance)
-    null, rounds = first, 0
+    null, limit = first, ""
     still = disagreed = disagrees(null, z, significance)
-    wanted = still or (not data.doubt and by.suspects(null))
-    limit, instead = "", None
-    while wanted and rounds < data.most_rounds:
+    if still or (not data.doubt and by.suspects(null)):
         try:
-            extended = _round(by, null, still, tell)
+            null = _extended(by, null, still, tell) or null
         except EffortSpentError as spent:
             limit = spent.words()
-            break
-        if extended is None:
-            break
-        null, rounds = extended, rounds + 1
-        wanted = still = disagrees(null, z, significance, by.tolerance())
-        instead = _replaced(by, null) if still else None
-        if instead is not None:
-            null, still = instead, disagrees(instead, z, significance, by.tolerance())
-            break
-    if instead is None and (still or (rounds > 0 and by.unfinished(before, null))):
-        tell("describing what no effect explains")
-        try:
-            described = by.describe(before, null)
-        except EffortSpentError as spent:
-            described, limit = None, limit or spent.words()
-        described = described or by.probable()
-        if described is not None:
-            null, still = described, disagrees(described, z, significance, by.tolerance())
+        still = disagrees(null, z, significance, by.tolerance())
     tell("measuring the remaining gap")
     added = by.close(before, null, still)
     if not disagreed and before.at_floor and not any(each.named for each in added.additions):
         # data that agree with the model are not made doubtful by what they do not confirm
         null, still, added = first, False, Added((), before)
-    found = Findings(data.samples, z, first, null, before, places, still, added, data.doubt, limit)
+    found = Findings(
+        data.samples, z, first, null, before, places, still, added, data.doubt, limit or by.limit
+    )
     model = found.model(present, by.model)
     return build_verdict(
         found,
@@ -185,18 +150,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
     )
 
 
-def _replaced(by: Explainer[Explanation], null: NullModel) -> NullModel | None:
-    """Return the null with what replaces the effects that were added; None where nothing does.
-
-    At the limit of the work it is left to the end, for which some of that is kept.
-    """
-    try:
-        return by.replaced(null)
-    except EffortSpentError:
-        return None
-
-
-def _round(
+def _extended(
     by: Explainer[Explanation], null: NullModel, still: bool, tell: Callable[[str], None]
 ) -> NullModel | None:
     """Compare candidates and add the best; return the null of the new model, None where none is established.

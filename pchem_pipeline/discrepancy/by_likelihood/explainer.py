@@ -189,7 +189,7 @@ class HistogramExplainer(Explainer[Explanation]):
         untestable = dict(sorted((found | untestable).items()))
         data = observed.evidence, observed.examined(), first, z, effort
         # what the parameters bend is no evidence against them: each candidate is fitted with them
-        prepared = Prepared(settings, "histograms", *data, 1, untestable, defects=defects)
+        prepared = Prepared(settings, "histograms", *data, untestable, defects=defects)
         return cls(prepared, observed, replicates, sets, both, members, model, both)
 
     @property
@@ -211,7 +211,7 @@ class HistogramExplainer(Explainer[Explanation]):
         """Tell whether several samples fit badly together although no statistic of one deviates."""
         return self.observed.joint and not self._without_effects.at_floor
 
-    def explain(self, null: NullModel, disagrees: bool) -> Explanation | None:
+    def explain(self, null: NullModel, disagreed: bool) -> Explanation | None:
         """Find the set of effects that best predicts the test part, on the codes that are understood.
 
         Raises:
@@ -226,7 +226,7 @@ class HistogramExplainer(Explainer[Explanation]):
             raise EffortSpentError(spent.doing, (t for t in tags if t not in tried)) from spent
         defects = self.prepared.defects
         defects |= self.sets.failed | found.sets.failed
-        if not disagrees:
+        if not disagreed:
             rise, error = found.sets.difference(found.judged, found.sets.fit(()))
             if not found.named or rise < max(CONVINCING, SIGMAS * error):
                 return None
@@ -238,12 +238,12 @@ class HistogramExplainer(Explainer[Explanation]):
         vectors = self.replicates.drawn(_with_effects(explanation))
         return NullModel.from_replicates(null.names, as_matrix(null.names, vectors), effects=True)
 
-    def close(self, before: Gap, null: NullModel, disagrees: bool) -> Added:
+    def close(self, before: Gap, null: NullModel, disagreed: bool) -> Added:
         """Fit train and test part together with each effect, and measure the gap on the final part."""
         if self.found is None:
             return Added((), before)
         closing = AddedSets(self.observed.parts, self.found, self.plain, self._count, self.replicates.rng)
-        added, self.final = closing.close(before, (self.prepared.first, null), self.prepared.z, disagrees)
+        added, self.final = closing.close(before, (self.prepared.first, null), self.prepared.z, disagreed)
         self.code = closing.codes(self.final, self.observed.evidence)
         self.effects = along_chain(self.sets.present, [each.effect for each in added.additions])
         return added

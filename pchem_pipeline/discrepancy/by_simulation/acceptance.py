@@ -61,10 +61,10 @@ class Acceptance:
         """Return the gap of a model that gives a mean, (m,), and scatters as replicates do, (b, m)."""
         return self.gaps.gap(self.z.final, mean, replicates)
 
-    def widens(self, added: Refitted, null: NullModel) -> bool:
-        """Tell whether a set, its strengths as the data ask for, leaves a wider gap than a model without."""
+    def widens(self, added: Refitted) -> bool:
+        """Tell whether a set, its strengths as the data ask for, leaves a wider gap than without it."""
         mean = added.mean + np.expm1(added.change) @ added.parts
-        before = self.gap_at(null.mean, null.replicates)
+        before = self.gap_at(self.first.mean, self.first.replicates)
         return self.gap_at(mean, added.vectors).interval[0] > before.value
 
     def established(self, added: Refitted) -> tuple[Hypothesis, ...]:

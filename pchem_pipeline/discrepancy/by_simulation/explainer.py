@@ -7,8 +7,7 @@ anything; what it does not show at all is not named.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
-from pchem_pipeline.discrepancy.by_simulation.additions import AddedRounds, ExtendedModel
+from pchem_pipeline.discrepancy.by_simulation.additions import Extension
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper, candidate_classes, serial
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Choice, Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screening, noise_of_splits
@@ -25,18 +24,18 @@ from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameSta
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.measured.unexplained import Unexplained
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
-    NotFittedError,
     Refit,
     refit_maps,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
-from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, compare
+from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, chosen, compare
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     HistogramLikelihood,
     PixelLikelihood,
     identifiable_from_histograms,
 )
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
+from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import (
@@ -44,6 +43,7 @@ from pchem_pipeline.discrepancy.null import (
     Measured,
     NullModel,
     as_matrix,
+    disagrees,
     suspicious,
     without_strays,
 )
@@ -59,7 +59,8 @@ from pchem_pipeline.effects.framework.registry import effect_classes
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_CLEARLY_LESS = 0.5  # of the gap that is left without, the most that may stay with what is measured
+_CLEARLY_LESS = 0.5  # of the gap, the most that may stay with what is measured
+_MOST_JUDGED = 5  # sets that are asked for on the final frames
 _LIKELIHOODS = 6  # that are remembered
 
 
@@ -118,7 +119,7 @@ def find_discrepancies(
 
 @dataclass(frozen=True)
 class Explanation:
-    """All hypotheses of a round, and how their sets compare."""
+    """All hypotheses, and how their sets compare."""
 
     hypotheses: tuple[Hypothesis, ...]
     choice: Choice
@@ -134,8 +135,8 @@ class FrameExplainer(Explainer[Explanation]):
         work: fits and simulates them.
         screening: asks the candidates what they would do.
         accept: tells by the statistics of the data what is accepted.
-        extended: the model, with the rounds of the search.
-        doubtful: puts effects into the model that leave nothing but are not certain; None: there are none.
+        given: effects that the model had before the search.
+        extension: the effects that it adds; None: none yet.
     """
 
     prepared: Prepared
@@ -143,8 +144,8 @@ class FrameExplainer(Explainer[Explanation]):
     work: Simulations
     screening: Screening
     accept: Acceptance
-    extended: ExtendedModel
-    doubtful: Callable[[], NullModel] | None = None
+    given: tuple[Effect, ...]
+    extension: Extension | None = None
     _likelihoods: dict[tuple[int, tuple[Effect, ...], tuple[Effect, ...]], PixelLikelihood] = field(
         default_factory=dict, repr=False
     )
@@ -176,7 +177,6 @@ class FrameExplainer(Explainer[Explanation]):
             first,
             z,
             effort,
-            settings.max_rounds,
             untestable,
             observed.doubt(),
         )
@@ -186,13 +186,13 @@ class FrameExplainer(Explainer[Explanation]):
             work,
             Screening(observed, work, z, classes, model, settings.model_error, prepared.defects),
             Acceptance(first, z, StatisticsGap(first, observed.final_samples), settings),
-            ExtendedModel(work, first, model, model),
+            model,
         )
 
     @property
     def model(self) -> tuple[Effect, ...]:
         """The effects that are in the model now."""
-        return self.extended.effects
+        return self.given if self.extension is None else self.extension.model
 
     def gap(self, null: NullModel) -> Gap:
         """Measure the gap in the statistics of the final frames."""
@@ -202,74 +202,79 @@ class FrameExplainer(Explainer[Explanation]):
         """Tell whether some statistic deviates so far that a candidate may explain it with others."""
         return suspicious(null, self.prepared.z)
 
-    def explain(self, null: NullModel, disagrees: bool) -> Explanation | None:
+    def explain(self, null: NullModel, disagreed: bool) -> Explanation | None:
         """Simulate what candidates would do, and choose the set that best predicts held-out frames."""
-        number = len(self.extended.rounds)
-        self.work.effort.check("another round of effects" if number else "the candidates were compared")
-        self.work.effort.tried.clear()
-        hypotheses, choice = self.screening.of(self.model, null, number)
-        if number == 0:
-            self.work.effort.leave_for_fits()
-        if choice is None or not (disagrees or choice.advantage > CONVINCING):
+        self.work.effort.check("the candidates were compared")
+        hypotheses, choice = self.screening.of(self.given, null)
+        self.work.effort.leave_for_fits()
+        if choice is None or not (disagreed or choice.advantage > CONVINCING):
             return None
         return Explanation(hypotheses, choice)
 
     def add(self, explanation: Explanation, null: NullModel) -> NullModel | None:
         """Put the effects of the best refitted set into the model; None where none is established.
 
-        Asked thrice: of the strengths as the data give them, of the final frames, and whether the gap there
-        does not widen. Effects of earlier rounds are fitted anew with the new ones.
-
-        Raises:
-            EffortSpentError: the work is at its limit; nothing was added.
+        Asked of the strengths as the data give them, and of the final frames. Where that fails, what is left
+        of the set is one more that is tried, and the next best is asked; where data and model disagree, one
+        that leaves nothing though nothing of it is certain is told in the end.
         """
-        self.work.forget(self.model)
-        refitter = self._refitter()
-        found = self._compared(explanation, refitter)
-        if found is None:
-            return None
-        # what was chosen is not lost for the little that is left to do: no limit
-        refitter = replace(refitter, allow=lambda _: None)
-        count, held = self.prepared.settings.extended_replicates, {h.tag for h in self.extended.added}
-        added = refitter.sharpened(found.chosen, count)
-        kept = self.accept.established(added)
-        while len(kept) < len(added.hypotheses):
-            if {h.tag for h in kept} <= held:
-                if not held and refitter.passes_goodness_of_fit(added):
-                    put = functools.partial(self.extended.put, found, added, explanation.hypotheses, null)
-                    self.doubtful = functools.partial(put, certain=False)
-                return None
-            try:
-                added = refitter.sharpened(refitter.refined(kept), count)
-            except NotFittedError:
-                return None
-            kept = self.accept.established(added)
-        if self.accept.widens(added, null):
-            return None
-        return self.extended.put(found, added, explanation.hypotheses, null)
-
-    def _compared(self, explanation: Explanation, refitter: Refitter) -> Comparison | None:
-        """Compare sets of effects after the best fit of each; None where none holds."""
-        try:
-            return compare(
-                refitter,
-                self.extended.added,
-                explanation.hypotheses,
-                explanation.choice,
-                self.extended.last,
-                lambda best: self._left_by(best, refitter),
-                HistogramLikelihood(self._likelihood),
-                lambda: self._unexplained.explains_all(),
-                lambda unlisted: self._unexplained.clearest(unlisted),
-            )
-        except EffortSpentError as spent:
+        self.work.forget(self.given)
+        refitter, settings = self._refitter(), self.prepared.settings
+        trials = Trials(refitter, HistogramLikelihood(self._likelihood))
+        own, measured = (explanation.hypotheses, explanation.choice), self._measured(refitter)
+        compare(trials, *own, lambda best: self._left_by(best, refitter), measured, settings.max_rounds)
+        if trials.limit is not None:
             tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
             tried = self.work.effort.tried
-            raise EffortSpentError(spent.doing, (t for t in tags if t not in tried)) from spent
+            self.limit = EffortSpentError(trials.limit.doing, (t for t in tags if t not in tried)).words()
+        # what was found is not lost for the little that is left to do: no limit
+        trials.refitter = refitter = replace(refitter, allow=lambda _: None)
+        told = disagrees(null, self.prepared.z, settings.significance)
+        doubtful: tuple[Comparison, Refitted] | None = None
+        for _ in range(_MOST_JUDGED):
+            found = chosen(trials, explanation.hypotheses)
+            if found is None:
+                break
+            added = refitter.sharpened(found.chosen, settings.extended_replicates)
+            kept = self.accept.established(added)
+            if len(kept) == len(added.hypotheses) and self._closes(added):
+                return self._put(found, added, explanation, certain=True)
+            if told and doubtful is None and not kept and refitter.passes_goodness_of_fit(found.chosen):
+                doubtful = found, added
+            trials.tried.remove(found.chosen)
+            if 0 < len(kept) < len(added.hypotheses):
+                trials.refit(kept)
+        return None if doubtful is None else self._put(*doubtful, explanation, certain=False)
+
+    def _closes(self, added: Refitted) -> bool:
+        """Test whether a set does not widen the gap of the final frames, or closes half if it is measured."""
+        before, after = self.gap(self.prepared.first), self.accept.gap_at(added.mean, added.vectors)
+        if any(type(effect).empirical for effect in added.effects):
+            return after.at_floor or after.value < _CLEARLY_LESS * before.value
+        return not self.accept.widens(added)
+
+    def _put(
+        self, found: Comparison, added: Refitted, explanation: Explanation, *, certain: bool
+    ) -> NullModel:
+        own = self.accept, found, added, explanation.hypotheses, certain
+        self.extension = Extension.of(self.work, self.given, *own)
+        return self.extension.last
+
+    def _measured(self, refitter: Refitter) -> Callable[[tuple[Hypothesis, ...]], Iterator[Refitted]]:
+        """Return what measures samples beside effects, for which some work is kept."""
+        data, proven = self.prepared, self.accept.established
+        replicates = data.settings.extended_replicates
+        unexplained = Unexplained(self.work, refitter, proven, replicates, data.defects)
+
+        def measured(kept: tuple[Hypothesis, ...]) -> Iterator[Refitted]:
+            self.work.effort.release()
+            return unexplained.measured(kept)
+
+        return measured
 
     def _refitter(self) -> Refitter:
         """Return what fits effects beside those that the model had before the search."""
-        present, data = self.extended.present, self.prepared
+        present, data = self.given, self.prepared
         first = data.first
 
         def draw(effects: tuple[Effect, ...], count: int) -> tuple[Refit, FloatArray]:
@@ -286,13 +291,12 @@ class FrameExplainer(Explainer[Explanation]):
         """Compare what candidates would do beside a refitted set: what that hid stands out there."""
         null = NullModel.from_replicates(self.prepared.first.names, best.vectors, self.prepared.first)
         null = null.shifted(np.expm1(best.change) @ best.slopes)
-        model, number = refitter.model(best.effects), len(self.extended.rounds)
-        return self.screening.beside(model, null, best.slopes, number)
+        return self.screening.beside(refitter.model(best.effects), null, best.slopes)
 
     def _likelihood(self, effects: Sequence[Effect], pixels: int) -> PixelLikelihood | None:
         """Return the likelihood of some pixels beside what the model had at first; None: not one law."""
         frames = self.observed.frames
-        present = frames.effects([e for e in self.model if e in self.extended.given])
+        present = frames.effects(self.given)
         if not all(effect.everywhere for effect in (*present, *effects)):
             return None
         # a law has all samples; others may have replaced some
@@ -306,91 +310,13 @@ class FrameExplainer(Explainer[Explanation]):
             )
         return self._likelihoods[key]
 
-    def replaced(self, null: NullModel) -> NullModel | None:
-        """Put what no effect with a name makes in the place of all that were added, if it leaves less.
-
-        Effects that leave something merely mimic it.
-
-        Raises:
-            EffortSpentError: the work is at its limit; nothing was added.
-        """
-        unexplained, left = self._unexplained, self.gap(null)
-        found = unexplained.by_itself()
-        if found is None:
-            return None
-        gap = self.accept.gap_at(found.mean, found.vectors)
-        better = gap.interval[1] < _CLEARLY_LESS * left.value
-        # effects that the final frames do not tell from the truth are known to leave something by the others
-        as_good = gap.at_floor and (not left.at_floor or unexplained.refitter.passes_goodness_of_fit(found))
-        return self.extended.put_measured(found) if better or as_good else None
-
-    def probable(self) -> NullModel | None:
-        """Put the likeliest effects into the model that leave nothing but are too weak to be certain."""
-        return None if self.doubtful is None or self.extended.rounds else self.doubtful()
-
-    def unfinished(self, before: Gap, null: NullModel) -> bool:
-        """Tell whether the final frames prove that too much of the gap is left."""
-        left = self.gap(null)
-        return not left.at_floor and left.too_wide(before.value)
-
-    def describe(self, before: Gap, null: NullModel) -> NullModel | None:
-        """Measure what no effect explains in the samples, and put it into the model.
-
-        Everywhere, and in each part that differs from the rest: what explains most of train and test counts.
-        Without the effects that were added, since one that merely mimics has no place beside it, and with
-        those of them that account for what they move themselves: what closes the gap, then in the fewest
-        forms, and where both do as well with the effects, which have a name. None where it closes less than
-        half of what is left, or of what there was if none of the effects gets a name.
-
-        Raises:
-            EffortSpentError: the work is at its limit; nothing was added.
-        """
-        self.work.effort.release()
-        instead, left = self.replaced(null), self.gap(null)
-        additions = self.close(before, null, disagrees=True).additions
-        if instead is not None or (left.at_floor and any(each.fits for each in additions)):
-            return instead
-        unexplained, sure = self._unexplained, self._added.accounted(null)
-        named = any(each.named for each in additions)
-        best: tuple[tuple[bool, float], Refitted] | None = None
-        for kept in ((), sure) if sure else ((),):
-            try:
-                found = unexplained.measured(kept)
-            except EffortSpentError:
-                if best is None:
-                    raise
-                break
-            if found is None:
-                continue
-            gap = self.accept.gap_at(found.mean, found.vectors)
-            # beside effects that get no name there is nothing to leave less than
-            most = _CLEARLY_LESS * (left.value if kept or named else before.value)
-            forms = sum(e.measured_parts for e in found.effects)
-            rank = (not gap.at_floor, float(forms) if gap.at_floor else gap.value)
-            if (gap.at_floor or gap.value < most) and (best is None or rank <= best[0]):
-                best = rank, found
-            if best is not None and best[0] == (False, 1.0):
-                break
-        return None if best is None else self.extended.put_measured(best[1])
-
-    @functools.cached_property
-    def _unexplained(self) -> Unexplained:
-        """What measures beside effects that the model had before the search; always the same."""
-        data, proven = self.prepared, self.accept.established
-        replicates = data.settings.extended_replicates
-        return Unexplained(self.work, self._refitter(), proven, replicates, data.defects)
-
-    @property
-    def _added(self) -> AddedRounds:
-        return AddedRounds(self.extended.rounds, self.accept)
-
     def tolerance(self) -> FloatArray | float:
         """Return what is not held against effects that were added: a fraction of what they do."""
-        return self._added.tolerance
+        return 0.0 if self.extension is None else self.extension.tolerance
 
-    def close(self, before: Gap, null: NullModel, disagrees: bool) -> Added:
+    def close(self, before: Gap, null: NullModel, disagreed: bool) -> Added:
         """Measure the gap on the final frames after each effect, and with rivals in its place."""
-        return self._added.close(before, null, disagrees)
+        return Added((), before) if self.extension is None else self.extension.close(before, disagreed)
 
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
         """Return the maps under the model, with that taken out of H which effects add to single pixels.
@@ -402,7 +328,7 @@ class FrameExplainer(Explainer[Explanation]):
         frames, plain, expected = self.observed.frames, self.observed.plain, None
         maps = self.work.mapped(self.model).fit.maps
         assert plain.covariance is not None
-        if self.extended.rounds:
+        if self.extension is not None:
             train = frames.numbers[frames.splits.train]
             expected = self.work.expected(self.model, self.prepared.evidence, train)
         model = frames.effects(model)

@@ -328,18 +328,6 @@ class EmpiricalNoise(Effect):
         return (cls(noise_dn=0.5, modes=(mode,)),)
 
     @property
-    def empirical_unnamed(self) -> bool:
-        """Whether it is a gain or noise without a memory, light that a line shares, or an offset in turns."""
-        return all(
-            mode.takes_turns
-            or (
-                not mode.lags
-                and (mode.changes in ("gain", "noise") or (mode.changes == "light" and mode.of != "frame"))
-            )
-            for mode in self.modes
-        )
-
-    @property
     def measured_parts(self) -> int:
         """How many modes there are."""
         return len(self.modes)

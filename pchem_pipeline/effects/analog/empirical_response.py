@@ -169,14 +169,6 @@ class EmpiricalResponse(Effect):
         """Return how many frames before it matter."""
         return max(-term.place[0] for term in self.terms)
 
-    @property
-    def empirical_unnamed(self) -> bool:
-        """Whether samples follow others than neighbours and their own one frame before, or a part of it."""
-        return any(
-            term.of != "sample" or term.mirrored or term.above or sum(map(abs, term.place)) > 1
-            for term in self.terms
-        )
-
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with parts of the charge of other samples about its mean."""
         charge = np.asarray(context.charge, np.float64)

@@ -96,13 +96,6 @@ class EmpiricalElectrons(Effect):
     typical_values = ({"chance": 0.01, "modes": (ElectronMode(fate="followed", place=(1, 0, 0)),)},)
 
     @property
-    def empirical_unnamed(self) -> bool:
-        """Whether electrons go one by one, or bring others to later frames."""
-        return all(
-            mode.fate != "emptied" and (mode.fate != "followed" or mode.place[0]) for mode in self.modes
-        )
-
-    @property
     def measured_parts(self) -> int:
         """How many modes there are."""
         return len(self.modes)

@@ -161,11 +161,6 @@ class Effect(Section):
         return next((m.name for m in marks if isinstance(m, Unit)), "")
 
     @property
-    def empirical_unnamed(self) -> bool:
-        """Whether it is measured, and of a kind that no effect with a name makes."""
-        return False
-
-    @property
     def measured_parts(self) -> int:
         """How many things are told that were measured and have no explanation."""
         return int(type(self).empirical)

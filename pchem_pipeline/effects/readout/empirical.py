@@ -143,12 +143,6 @@ class Empirical(Effect):
         weight = np.array([move.weight for move in self.moves])
         return np.asarray(self.share * weight / weight.sum())
 
-    @property
-    def empirical_unnamed(self) -> bool:
-        """Whether squares come as their mean, or samples come nearer to those of an earlier frame."""
-        of_earlier = any(move.towards[0] for move in self.moves if move.towards)
-        return self.squares is not None or (self.together == "sample" and of_earlier)
-
     def halo(self) -> int:
         """Return how far the neighbours lie across rows, px."""
         reach = max(abs(move.towards[1]) if move.towards else int(bool(self.squares)) for move in self.moves)

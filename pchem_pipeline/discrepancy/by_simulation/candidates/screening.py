@@ -62,20 +62,17 @@ class Screening:
     model_error: float
     defects: dict[str, str] = field(default_factory=dict)
 
-    def of(
-        self, model: tuple[Effect, ...], null: NullModel, number: int
-    ) -> tuple[tuple[Hypothesis, ...], Choice | None]:
-        """Ask what they would do beside the model of a round: everywhere and in the parts, split by split.
+    def of(self, model: tuple[Effect, ...], null: NullModel) -> tuple[tuple[Hypothesis, ...], Choice | None]:
+        """Ask what they would do beside a model: everywhere and in the parts, split by split.
 
         Args:
             model: effects.
             null: of that model.
-            number: of the round.
 
         Returns:
             All hypotheses, the likeliest first, and how their sets compare; None: there are none.
         """
-        simulator = self._simulator(model, null, number, str(number))
+        simulator = self._simulator(model, null, "0")
         evidence = (self.observed.plain, *self.observed.parts[:2])
         histograms = Histograms(
             self.work.own_samples(model),
@@ -98,18 +95,15 @@ class Screening:
         hypotheses += seconds(hypotheses)
         return tuple(hypotheses), self._compared(hypotheses, null)
 
-    def beside(
-        self, model: tuple[Effect, ...], null: NullModel, slopes: FloatArray, number: int
-    ) -> Choice | None:
+    def beside(self, model: tuple[Effect, ...], null: NullModel, slopes: FloatArray) -> Choice | None:
         """Ask the same beside a set that was refitted: what is worth a refit, as the whole shows it.
 
         Args:
             model: effects, the set among them.
             null: of that model.
             slopes: how the statistics go with the strengths of the set, which are doubtful, shape (e, m).
-            number: of the round.
         """
-        simulator = self._simulator(model, null, number, "/".join([str(number), *(e.tag for e in model)]))
+        simulator = self._simulator(model, null, "/".join(["0", *(e.tag for e in model)]))
         guesses = self._guesses(simulator, model, null, (), _MOST_BESIDE)
         hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses)])
         return self._compared(hypotheses, null, _DOUBT * slopes)
@@ -130,16 +124,14 @@ class Screening:
         shifts = (self.z.train - null.mean, self.z.test - null.mean)
         return choose(hypotheses, shifts, noise) if hypotheses else None
 
-    def _simulator(
-        self, model: tuple[Effect, ...], null: NullModel, number: int, purpose: str
-    ) -> ReplicateSimulator:
+    def _simulator(self, model: tuple[Effect, ...], null: NullModel, purpose: str) -> ReplicateSimulator:
         return ReplicateSimulator(
             self.work.mapped(model).sensor.usual(self.work.seed_of(f"sensor/{purpose}")),
             model,
             self.observed.frames.acquisition(),
             null.names,
             self.work.counted,
-            f"r{number}",
+            "r0",
             self.work.seed_of(f"fingerprint/{purpose}"),
             self.defects,
         )

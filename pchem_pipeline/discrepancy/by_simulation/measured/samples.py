@@ -34,11 +34,6 @@ class Measurement(NamedTuple):
     gain: float
     others: tuple[Effect, ...] = ()
 
-    @property
-    def unlisted(self) -> bool:
-        """Whether it may be of a kind that no effect with a name makes."""
-        return any(effect.empirical_unnamed for effect in (self.effect, *self.others))
-
 
 @dataclass(frozen=True, eq=False)
 class PartSamples:

@@ -28,7 +28,6 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import simulate_f
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import FEW, Refitted, Refitter
 from pchem_pipeline.discrepancy.effort import EffortSpentError
-from pchem_pipeline.discrepancy.null import CONVINCING
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.framework.effect import Effect
@@ -38,8 +37,6 @@ from pchem_pipeline.effects.framework.evidence import PixelMaps
 Model = tuple[Effect, ...]
 Measure = Callable[[Part, Model, Model], Measurement | None]
 
-_WORTHWHILE = 0.25  # of the nats of what is clearest: less cannot be all there is
-_AS_CLEAR = 0.5  # of these nats, which are not of the same statistics
 _MOST_TRIED = 3  # of all forms and parts
 _MEASUREMENTS = 2  # of a component: the pixels are refitted with the first one
 
@@ -62,8 +59,7 @@ class Unexplained:
         proven: effects of a set of which the data have certainly some.
         replicates: of what is measured.
         defects: forms that failed, and why.
-        instead: what leaves little by itself, once it is known.
-        alone: what explains most, at its best fit, once it is known; None: it failed or is not certain.
+        known: what was measured, by the effects beside it.
     """
 
     work: Simulations
@@ -71,8 +67,7 @@ class Unexplained:
     proven: Callable[[Refitted], Sequence[Hypothesis]]
     replicates: int
     defects: dict[str, str] = field(default_factory=dict)
-    instead: Refitted | None = None
-    alone: dict[int, Refitted | None] = field(default_factory=dict)
+    known: dict[tuple[Hypothesis, ...], list[Refitted]] = field(default_factory=dict)
     _stacks: dict[Model | None, tuple[NDArray[np.unsignedinteger], PixelMaps]] = field(
         default_factory=dict, repr=False
     )
@@ -90,102 +85,33 @@ class Unexplained:
         }
         return {tag: form for tag, form in forms.items() if tag not in {e.tag for e in self.refitter.present}}
 
-    @functools.cached_property
-    def _of_all(self) -> list[_Likely]:
-        """What explains most without any effect."""
-        return self._likeliest((), self._forms)
+    def measured(self, kept: tuple[Hypothesis, ...]) -> Iterator[Refitted]:
+        """Yield effects with what explains most beside them, each at its best fit, the likeliest first.
 
-    def by_itself(self) -> Refitted | None:
-        """Return what no known effect makes, where it leaves little by itself; None where it does not."""
-        best = self.instead
-        for found in () if best is not None else self._small_alone(_WORTHWHILE, unlisted=True):
-            if found.effects[0].empirical_unnamed and (best is None or found.score > best.score):
-                best = found
-            if best is not None and self.refitter.passes_goodness_of_fit(best):
-                break
-        self.instead = best
-        return best
+        Until one leaves little. Forms that are among the effects are not measured again; none is what fails
+        or is not certain.
 
-    def explains_all(self) -> bool:
-        """Tell whether the clearest of what no known effect makes leaves nothing by itself."""
-        if not self._of_all or not self._of_all[0].measured.unlisted:
-            return False
-        found = self._alone(0)
-        if found is None or not found.effects[0].empirical_unnamed:
-            return False
-        return self.refitter.passes_goodness_of_fit(found)
-
-    def clearest(self, unlisted: bool = False) -> Refitted | None:
-        """Return the clearest by itself, or another that is as clear; None where they leave more than little.
-
-        Several things together are left out: one of them may be an effect that has a name.
-
-        Args:
-            unlisted: only what no known effect makes.
+        Raises:
+            EffortSpentError: the work is at its limit.
         """
-        return next(self._small_alone(_AS_CLEAR, unlisted=unlisted, parts=1), None)
+        if kept in self.known:
+            yield from self.known[kept]
+            return
+        known = self.known[kept] = []
+        have = {h.effect.tag for h in kept}
+        forms = {tag: form for tag, form in self._forms.items() if tag not in have}
+        for likely in self._likeliest(tuple(h.effect for h in kept), forms):
+            one = self._tried(kept, likely)
+            if one is not None:
+                known.append(one)
+                yield one
+                if self.refitter.residual_is_small(one):
+                    return
 
-    def _small_alone(self, share: float, *, unlisted: bool, parts: float = np.inf) -> Iterator[Refitted]:
-        """Yield what leaves little by itself at its best fit, the clearest first.
-
-        Args:
-            share: of the nats of the clearest, that one must have more than.
-            unlisted: only what no known effect makes.
-            parts: the most that one consists of.
-        """
-        for number, likely in enumerate(self._of_all):
-            one = likely.measured
-            clear = one.gain > share * self._of_all[0].measured.gain
-            if not clear or one.effect.measured_parts > parts or (unlisted and not one.unlisted):
-                continue
-            found = self._alone(number)
-            if found is not None and self.refitter.residual_is_small(found):
-                yield found
-
-    def _alone(self, number: int) -> Refitted | None:
-        """Return one of what explains most without any effect, at its best fit; it is fitted once."""
-        if number not in self.alone:
-            self.alone[number] = self._tried((), self._of_all[number], whole=True)
-        return self.alone[number]
-
-    def measured(self, kept: tuple[Hypothesis, ...]) -> Refitted | None:
-        """Return effects with what is best measured beside them, and with other forms beside all of these."""
-        if not kept and self.instead is not None:
-            return self.instead
-        forms = dict(self._forms)
-        found: Refitted | None = None
-        while forms and not (found is not None and self.refitter.residual_is_small(found)):
-            beside, better, score = kept, "", -np.inf
-            if found is not None:
-                beside, score = found.hypotheses, found.score + CONVINCING
-            effects = tuple(h.effect for h in beside)
-            for likely in self._likeliest(effects, forms) if effects else self._of_all:
-                if likely.form not in forms:
-                    continue
-                try:
-                    one = self._tried(beside, likely) if beside else self._first(likely)
-                except EffortSpentError:
-                    if found is None:
-                        raise
-                    return found
-                if one is not None and one.score > score:
-                    found, better, score = one, likely.form, one.score
-                    if self.refitter.residual_is_small(one):
-                        break
-            if not better:
-                break
-            del forms[better]
-        return found
-
-    def _first(self, likely: _Likely) -> Refitted | None:
-        """Return one of what explains most without any effect, as it was fitted by itself if it was."""
-        number = self._of_all.index(likely)
-        return self.alone[number] if number in self.alone else self._tried((), likely)
-
-    def _tried(self, kept: tuple[Hypothesis, ...], likely: _Likely, whole: bool = False) -> Refitted | None:
+    def _tried(self, kept: tuple[Hypothesis, ...], likely: _Likely) -> Refitted | None:
         """Return effects with a form beside them; None where it fails or is not certain."""
         try:
-            return self._described(kept, likely.part, self._forms[likely.form], whole)
+            return self._described(kept, likely.part, self._forms[likely.form])
         except EffortSpentError:
             raise
         # a defect of what is measured must not cost the verdict
@@ -209,12 +135,10 @@ class Unexplained:
                 found.append(_Likely(part, form, one))
         return sorted(found, key=lambda one: -one.measured.gain)[:_MOST_TRIED]
 
-    def _described(
-        self, kept: tuple[Hypothesis, ...], part: Part, measure: Measure, whole: bool
-    ) -> Refitted | None:
+    def _described(self, kept: tuple[Hypothesis, ...], part: Part, measure: Measure) -> Refitted | None:
         """Return effects with what is measured in a part beside them at their best fit, or None.
 
-        Effects of which nothing is certain beside it are left out; ``whole``: see `Refitter.refined`.
+        Effects of which nothing is certain beside it are left out.
         """
         refitter, effects = self.refitter, tuple(h.effect for h in kept)
         measured: tuple[Effect, ...] = ()
@@ -227,10 +151,10 @@ class Unexplained:
             measured = tuple(e.at_place(part.region, part.when) for e in on_sensor)
         best: Refitted | None = None
         for effect in measured:
-            found = self._fitted(kept, effect, whole)
-            if found is not None and (best is None or found.score > best.score):
+            found = self._fitted(kept, effect)
+            if best is None or found.score > best.score:
                 best = found
-            if best is not None and self.refitter.residual_is_small(best):
+            if self.refitter.residual_is_small(best):
                 break
         if best is None:
             return None
@@ -239,16 +163,16 @@ class Unexplained:
             return best
         if measured[0].tag not in proven:
             return None
-        return self._described(tuple(h for h in kept if h.tag in proven), part, measure, whole)
+        return self._described(tuple(h for h in kept if h.tag in proven), part, measure)
 
-    def _fitted(self, kept: tuple[Hypothesis, ...], effect: Effect, whole: bool) -> Refitted | None:
-        """Return effects with what was measured at their best fit; None where that was not gone for."""
+    def _fitted(self, kept: tuple[Hypothesis, ...], effect: Effect) -> Refitted:
+        """Return effects with what was measured at their best fit."""
         refitter = self.refitter
         refitter.allow(effect.tag)
         _, vectors = refitter.draw((*(h.effect for h in kept), effect), FEW)
         shift = vectors.mean(axis=0) - refitter.null.mean - sum(h.fingerprint for h in kept)
-        found = refitter.refined((*kept, Hypothesis(effect, shift)), whole=whole)
-        return None if found.short else refitter.sharpened(found, self.replicates)
+        found = refitter.refined((*kept, Hypothesis(effect, shift)))
+        return refitter.sharpened(found, self.replicates)
 
     def _mixture_shifts(self, part: Part, present: Model, beside: Model) -> Measurement | None:
         """Measure the mixture shifts of a part beside effects, with the pixels as they now are."""

@@ -10,9 +10,8 @@ for where the set leaves nothing.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,9 +44,8 @@ from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
 
 FloatArray = NDArray[np.float64]
-Answer = TypeVar("Answer")
 
-_MOST_SINGLES, _FIRST_SINGLES = 7, 3
+_MOST_SINGLES = 7
 _MOST_OF_ONE = 3  # hypotheses of the same effect
 _MOST_SETS = 5
 # sets that others are grown from, and share of what the best one explains within which another one is as good
@@ -56,9 +54,6 @@ _MOST_SEEDS, _REACH_SHARE = 2, 0.05
 _MOST_GROWN = {1: 2, 2: 1}
 _MOVED = 3.0  # deviations by which an effect must move a statistic that stands out without it
 _UNTOUCHED = 0.5  # of that, the most by which the others may move it
-_NO_WORSE = 10.0  # nats by which fewer replicates may make a set look worse
-_MOST_ALIKE = 3  # look-alikes of a single effect that are refitted before anything beside it
-_NO_LIKELIHOOD = HistogramLikelihood()
 
 
 @dataclass(frozen=True)
@@ -105,6 +100,8 @@ class Comparison:
             hypothesis = next(h for h in one.hypotheses if h.tag == name)
             if name != tag and hypothesis.effect.tag == tag.partition(" ")[0]:
                 continue  # the same effect elsewhere
+            if name != tag and type(hypothesis.effect).empirical:
+                continue  # what has no name is no rival of a name
             if one.tags in self.by_histograms:
                 behind, error = self.by_histograms[one.tags]
                 # neither need be the very law of the samples
@@ -120,122 +117,71 @@ class Comparison:
 
 
 def compare(
-    refitter: Refitter,
-    held: Sequence[Hypothesis],
+    trials: Trials,
     hypotheses: Sequence[Hypothesis],
     choice: Choice,
-    before: Refitted | None = None,
     beside: Callable[[Refitted], Choice | None] = lambda _: None,
-    likelihood: HistogramLikelihood = _NO_LIKELIHOOD,
-    unlisted: Callable[[], bool] = lambda: False,
-    measured: Callable[[bool], Refitted | None] = lambda _: None,
-) -> Comparison | None:
-    """Refit the sets worth it, and choose the simplest that leaves nothing, else the best; None: none holds.
+    measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]] = lambda _: (),
+    steps: int = 3,
+) -> None:
+    """Refit single effects, then sets that grow and shrink, as long as the best one becomes better.
 
-    Where what no known effect makes leaves nothing by itself, only single effects and the likeliest set come
-    before it. What is measured, is one thing and leaves little stands before sets that do not explain more by
-    more than their effects cost, and these do not grow further.
+    Forward selection by the penalised log-likelihood, with backward elimination. What is measured without a
+    name is a member as any other, at the price of its parts; it is asked for where the best set leaves
+    something, and where it takes several effects: one thing that explains as much is the simpler answer.
 
     Args:
-        refitter: fits sets.
-        held: effects that the model was given in earlier rounds; they are fitted anew with the others.
-        hypotheses: all new ones, the likeliest first.
+        trials: refits sets; out: all that were tried.
+        hypotheses: all, the likeliest first.
         choice: how their sets compare by fingerprints.
-        before: the effects held, at their best fit; None: not known.
         beside: compares new hypotheses by what they do beside a refitted set.
-        likelihood: of the pixels' histograms: brings a set near its best, and is asked about sets that the
-            statistics tell badly apart.
-        unlisted: tells whether what no known effect makes leaves nothing by itself.
-        measured: returns what is clearest of all that is measured, or of what no known effect makes (True),
-            where that leaves little by itself.
-
-    Raises:
-        EffortSpentError: the work is at its limit.
+        measured: measures what effects leave, and yields them with it at their best fit.
+        steps: the most by which a set grows.
     """
-    trials = Trials(refitter, tuple(held), likelihood)
-    tried, beside = trials.tried, functools.cache(beside)
-    singles = likelihood.ranked(_singles(hypotheses, choice))
-    # what the likeliest set is made of, then that set: it may leave no others worth a refit
+    beside = functools.cache(beside)
+    singles = trials.likelihood.ranked(_singles(hypotheses, choice))
     first = len(choice.best.hypotheses)
+    # what the likeliest set is made of, then that set: it may leave no others worth a refit
     for hypothesis in _expensive_last(singles[:first]):
         trials.refit((hypothesis,))
-    if trials.nearly:
-        # a strong effect that is not quite this one leaves as little: what stands out beside it is in vain
-        for hypothesis in _look_alikes(choice):
-            trials.refit((hypothesis,), whatever=True)
-        # fingerprints on top of pixels that were fitted without it show its details, not what is beside it
-        trials.tune()
-        if not held and not trials.complete and _within(unlisted):
-            return None
-        _forward_select(trials, beside)
-    if first > 1 and tried and not trials.complete and all(len(one) == 1 for one in trials.asked):
-        if not (held or trials.nearly):
-            trials.measured = _within(lambda: measured(True))
-        trials.refit_set(_sets(choice, tried)[0])
-    # the likeliest in its place, whatever was spent until here: one of them may be all there is
-    ahead = max(first, _FIRST_SINGLES)
-    for hypothesis in _expensive_last(singles[first:ahead]):
-        trials.refit((hypothesis,), whatever=True)
-    if not held and tried and not (trials.complete or trials.nearly or trials.measured):
-        trials.measured = _within(lambda: measured(False))
+    if first > 1 and trials.tried and not trials.complete:
+        trials.refit_set(_sets(choice, trials.tried)[0])
     # the others, expensive ones last: they may be beaten by then
-    for hypothesis in _expensive_last(singles[ahead:]):
-        if not trials.refit((hypothesis,)):
-            break
-    if not tried:
-        return None
-    if before is not None and max(one.score for one in tried) < before.score - _NO_WORSE:
-        return None  # nothing beside the effects held explains more than they do by themselves
-    if first > 1 and not trials.complete:
-        # the same of the kinds that have done best
-        trials.refit_set(_sets(choice, tried)[0])
+    for hypothesis in _expensive_last(singles[first:]):
+        trials.refit((hypothesis,))
     trials.tune()
-    if not held and not trials.complete and (_within(unlisted) or trials.beaten):
-        return None
-    if len(trials.best.hypotheses) > len(held) + 1 or not trials.complete:
-        grown = [] if trials.complete else _grown(trials, beside)
-        for members in _of_different_effects([*grown, *_sets(choice, tried)])[:_MOST_SETS]:
-            if not trials.refit_set(members):
-                break
+    for _ in range(steps):
+        before = trials.best if trials.tried else None
+        if before is not None and not (trials.complete or trials.limit):
+            sets = [*_grown(trials, beside), *_sets(choice, trials.tried)]
+            for members in _of_different_effects(sets)[:_MOST_SETS]:
+                if not trials.refit_set(members):
+                    break
             trials.tune()
-    return _concluded(trials, [] if before is None else [before], hypotheses, measured)
+        if before is None or not trials.complete or len(trials.best.hypotheses) > 1:
+            trials.measure(measured)
+        if not trials.tried or trials.complete or trials.limit or trials.best is before:
+            return
 
 
-def _concluded(
-    trials: Trials,
-    before: Sequence[Refitted],
-    hypotheses: Sequence[Hypothesis],
-    measured: Callable[[bool], Refitted | None],
-) -> Comparison | None:
-    """Choose among the sets that were tried, and fit placebos in the place of its effects; see `compare`."""
+def chosen(trials: Trials, hypotheses: Sequence[Hypothesis]) -> Comparison | None:
+    """Choose among the sets that were tried, and fit placebos in the place of its effects; None: none holds.
+
+    The best of which each effect is seen, or where the statistics tell two sets badly apart the one by which
+    the histograms of the pixels are likelier.
+    """
     tried, likelihood = trials.tried, trials.likelihood
-    # the work that led here must not be lost for the little that is left: no limit
-    to_choose = replace(trials.refitter, allow=lambda _: None)
-    chosen = _chosen(to_choose, tried, before)
-    if chosen is None:
+    best = _best_seen(trials.refitter, tried)
+    if best is None:
         return None
-    if not trials.held and len(chosen.hypotheses) > 1:
-        # one thing that explains as much as several is the simpler answer
-        one = trials.measured or _within(lambda: measured(False))
-        if one is not None and one.penalised_log_likelihood > chosen.penalised_log_likelihood:
-            return None
-    by_histograms = _by_histograms(chosen, tried, likelihood)
-    best = max(tried, key=lambda one: by_histograms.get(one.tags, (0.0, 0.0))[0])
-    if by_histograms.get(best.tags, (0.0, 0.0))[0] > 0.0 and _all_seen(to_choose, best, tried):
-        chosen, by_histograms = best, _by_histograms(best, tried, likelihood)
-    known = {h.tag for h in trials.held}
-    for member in chosen.hypotheses:
-        if member.tag not in known:
-            tried += _placebo(trials, hypotheses, chosen, member)
-    return Comparison(chosen, tuple(tried), by_histograms)
-
-
-def _within(asked: Callable[[], Answer]) -> Answer | None:
-    """Return an answer, None where the work is at its limit: sets that are known are not lost for it."""
-    try:
-        return asked()
-    except EffortSpentError:
-        return None
+    by_histograms = _by_histograms(best, tried, likelihood)
+    other = max(tried, key=lambda one: by_histograms.get(one.tags, (0.0, 0.0))[0])
+    if by_histograms.get(other.tags, (0.0, 0.0))[0] > 0.0 and _all_seen(trials.refitter, other, tried):
+        best, by_histograms = other, _by_histograms(other, tried, likelihood)
+    for member in best.hypotheses:
+        if not type(member.effect).empirical:
+            tried += _placebo(trials, hypotheses, best, member)
+    return Comparison(best, tuple(tried), by_histograms)
 
 
 def _expensive_last(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -243,26 +189,25 @@ def _expensive_last(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     return sorted(hypotheses, key=lambda h: is_expensive([h.effect]))
 
 
-def _chosen(refitter: Refitter, tried: list[Refitted], before: Sequence[Refitted]) -> Refitted | None:
+def _best_seen(refitter: Refitter, tried: list[Refitted]) -> Refitted | None:
     """Return the best set of which each effect is seen; sort all, and fit those that may be it to the end.
 
     Args:
         refitter: fits sets.
         tried: sets; out: the best first, at their best fit where that may be the best of all.
-        before: sets that are known besides.
     """
     while True:
         tried.sort(key=PENALISED, reverse=True)
-        known = [*tried, *before]
-        chosen = next((one for one in tried if _all_seen(refitter, one, known)), None)
-        if chosen is None:
+        known = [*tried]
+        found = next((one for one in tried if _all_seen(refitter, one, known)), None)
+        if found is None:
             return None
-        reach = chosen.promise - chosen.price
+        reach = found.promise - found.price
         short = [i for i, one in enumerate(tried) if one.short and one.promise - one.price >= reach]
         if not short:
-            return chosen
+            return found
         for i in short:
-            tried[i] = refitter.refined(tried[i].hypotheses, chosen.score)
+            tried[i] = refitter.refined(tried[i].hypotheses, found.score)
 
 
 def _by_histograms(
@@ -351,37 +296,6 @@ def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesi
     return chosen
 
 
-def _look_alikes(choice: Choice) -> list[Hypothesis]:
-    """Return the likeliest effects that are known to be confused with the best set, if that is one effect."""
-    best = choice.best.hypotheses
-    if len(best) > 1:
-        return []
-    singles = [one.hypotheses[0] for one in choice.tried if len(one.hypotheses) == 1]
-    others = (h for h in singles if h.tag != best[0].tag and not unrelated(h.effect, best[0].effect))
-    return [h for h in others if not is_expensive([h.effect])][:_MOST_ALIKE]
-
-
-def _forward_select(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> None:
-    """Refit the best set with what stands out beside it, and so on, as long as that is better.
-
-    With the fewest effects that are not far behind: a refit shows what their fingerprints cannot tell.
-    """
-    best: Refitted | None = None
-    while not (trials.best is best or trials.complete):
-        best = trials.best
-        choice = beside(best)
-        if choice is None:
-            return
-        fewest = min(
-            (one for one in choice.tried if not _far_behind(one, choice)),
-            key=lambda one: (len(one.hypotheses), -one.penalised_log_likelihood),
-        )
-        members = (*best.hypotheses[len(trials.held) :], *fewest.at_fit())
-        if not trials.refit_set(members):
-            return
-        trials.tune()
-
-
 def _grown(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> list[tuple[Hypothesis, ...]]:
     """Return sets that hold one of the best so far and what stands out beside it.
 
@@ -391,7 +305,6 @@ def _grown(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> list[
         trials: sets that were refitted.
         beside: compares new hypotheses by what they do beside a refitted set.
     """
-    held = len(trials.held)
     kinds: dict[frozenset[str], Refitted] = {}
     for one in sorted(trials.tried, key=PENALISED, reverse=True):
         kinds.setdefault(one.tags, one)
@@ -405,7 +318,7 @@ def _grown(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> list[
         if one.score >= near and not in_vain and not any(one.tags < better.tags for better in seeds):
             seeds.append(one)
     seeds = seeds[:_MOST_SEEDS]
-    choices = [(one.hypotheses[held:], choice) for one in seeds if (choice := beside(one)) is not None]
+    choices = [(one.hypotheses, choice) for one in seeds if (choice := beside(one)) is not None]
     grown: list[tuple[Hypothesis, ...]] = []
     for size, most in _MOST_GROWN.items():
         found = [
@@ -458,6 +371,8 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
         one: the set.
         known: sets at their best fit, the best first; those that are fitted here come to them.
     """
+    if any(type(effect).empirical for effect in one.effects):
+        return True  # of what is measured beside effects each is proven when it is measured
     if len(one.tags) == 1:
         # the same effect in two places: without it nothing is left to compare with
         return len(one.hypotheses) == 1

@@ -125,8 +125,8 @@ class Refitted:
 
     @property
     def price(self) -> float:
-        """Nats that the effects cost beyond the first one."""
-        return PRICE_OF_MORE * (len(self.hypotheses) - 1)
+        """Nats that the effects cost beyond one with a name; each part of what is measured costs the same."""
+        return PRICE_OF_MORE * (sum(1 + effect.measured_parts for effect in self.effects) - 1)
 
     @property
     def penalised_log_likelihood(self) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,7 +26,6 @@ from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
 )
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import ESTABLISHED, Refitted, Refitter, is_expensive
 from pchem_pipeline.discrepancy.effort import EffortSpentError
-from pchem_pipeline.discrepancy.null import CONVINCING
 
 _MOST_EXPENSIVE = 4  # sets whose refit takes long
 #: Relative error of a fingerprint before its refit.
@@ -44,71 +43,41 @@ class Trials:
 
     Attributes:
         refitter: fits sets.
-        held: effects that are fitted with each.
         likelihood: of the pixels' histograms, which brings a set near its best.
         tried: sets at their best fit, in the order in which they were tried.
         settled: tags of the sets whose numbers were tuned.
         asked: sets as they were begun.
-        measured: what was measured without any of these effects, and leaves little.
+        limit: what was next when the budget was used; None: it is not.
     """
 
     refitter: Refitter
-    held: tuple[Hypothesis, ...]
     likelihood: HistogramLikelihood
     tried: list[Refitted] = field(default_factory=list)
     settled: set[frozenset[str]] = field(default_factory=set)
     asked: list[tuple[Hypothesis, ...]] = field(default_factory=list)
-    measured: Refitted | None = None
+    limit: EffortSpentError | None = None
 
     @property
     def best(self) -> Refitted:
-        """The best so far."""
+        """The set of the highest penalised log-likelihood."""
         return max(self.tried, key=PENALISED)
-
-    @property
-    def beaten(self) -> bool:
-        """Whether what was measured leaves less, and that leaves more than details."""
-        return self.measured is not None and self._bar is self.measured and not self.nearly
-
-    @property
-    def _bar(self) -> Refitted:
-        """What the next one must come near: the best, or what was measured where that is clearly better."""
-        one = self.measured
-        return self.best if one is None or one.score < self.best.score + CONVINCING else one
 
     @property
     def complete(self) -> bool:
         """Whether that leaves nothing."""
         return bool(self.tried) and self.refitter.passes_goodness_of_fit(self.best)
 
-    @property
-    def nearly(self) -> bool:
-        """Whether that leaves little, but something."""
-        return bool(self.tried) and not self.complete and self.refitter.residual_is_small(self.best)
-
-    def refit(self, members: Sequence[Hypothesis], *, whatever: bool = False) -> bool:
-        """Refit a set unless it is in vain; return False at the limit of the work, where sets are known.
-
-        Args:
-            members: effects of the set.
-            whatever: fit it where it stands whatever was spent, unless that takes long.
-
-        Raises:
-            EffortSpentError: at that limit, no set of several has been refitted.
-        """
+    def refit(self, members: Sequence[Hypothesis]) -> bool:
+        """Refit a set unless it is in vain; return False at the limit of the work."""
         if not self._worth_it(members):
             return True
         self.asked.append(tuple(members))
-        best = max(max(one.score for one in self.tried), self._bar.score) if self.tried else -np.inf
+        best = max((one.score for one in self.tried), default=-np.inf)
         try:
-            begun = self.likelihood.begun((*self.held, *members))
-            refitter = self.refitter
-            if whatever and not is_expensive(h.effect for h in begun):
-                refitter = replace(refitter, allow=_but_once(refitter.allow))
-            self.tried.append(refitter.refined(begun, best, whole=len(members) == 1))
-        except EffortSpentError:
-            if all(len(one.hypotheses) <= len(self.held) + 1 for one in self.tried):
-                raise
+            begun = self.likelihood.begun(members)
+            self.tried.append(self.refitter.refined(begun, best, whole=len(members) == 1))
+        except EffortSpentError as spent:
+            self.limit = spent
             return False
         except NotFittedError:
             pass
@@ -116,6 +85,15 @@ class Trials:
         except Exception as error:
             note_defect(self.refitter.defects, " + ".join(h.tag for h in members), error)
         return True
+
+    def measure(self, measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]]) -> None:
+        """Measure what is left without effects and beside the best set; at the limit some is left out."""
+        for beside in ((), self.best.hypotheses) if self.tried else ((),):
+            try:
+                for one in measured(beside):
+                    self.tried += [] if one in self.tried else [one]
+            except EffortSpentError as spent:
+                self.limit = spent
 
     def tune(self) -> None:
         """Tune the numbers of the best set where it leaves something, then of those as good until then."""
@@ -150,7 +128,7 @@ class Trials:
 
         A strong effect alone is nearer to its strength in the set than its fingerprint can tell.
         """
-        tags = {h.tag for h in (*self.held, *members)}
+        tags = {h.tag for h in members}
         common = max(2, len(members) - 1)
         near = [
             one for one in self.tried if one.tags < tags or sum(h.tag in one.tags for h in members) >= common
@@ -176,7 +154,7 @@ class Trials:
         """
         best = self.best
         gone = vanished(best)
-        new = best.hypotheses[len(self.held) :]
+        new = best.hypotheses
         scale = self.refitter.null.std
         for weakest in sorted(new, key=lambda h: float(np.sum((h.fingerprint / scale) ** 2))):
             fewer = [h for h in new if h is not weakest]
@@ -197,44 +175,28 @@ class Trials:
 
     def _worth_it(self, members: Sequence[Hypothesis]) -> bool:
         """Tell whether a set may come near the best one, and was not refitted before."""
-        every = (*self.held, *members)
-        if share_place(h.effect for h in every) or meets_itself(every):
+        if share_place(h.effect for h in members) or meets_itself(members):
             return False
         expensive = [one for one in self.tried if is_expensive(one.effects)]
         if is_expensive(h.effect for h in members) and len(expensive) >= _MOST_EXPENSIVE:
             return False
         if len(members) > 1 and any(same_kinds(members, others) for others in self.asked):
             return False
-        if self.complete and len({h.tag for h in every}) > len(self.best.tags):
+        if self.complete and len({h.tag for h in members}) > len(self.best.tags):
             return False
         alone = len(members) == 1 and bool(self.tried)
         if not (alone or self.complete):
             return True
-        return not (_beaten(self.refitter, every, self._bar) or (alone and self._less_likely(members)))
+        return not (_beaten(self.refitter, members, self.best) or (alone and self._less_likely(members)))
 
     def _less_likely(self, members: Sequence[Hypothesis]) -> bool:
         """Tell whether the histograms of the pixels are clearly less likely with a set than with the best.
 
         Of what they do not tell, nothing is said.
         """
-        effects = [h.effect for h in (*self.held, *members)]
+        effects = [h.effect for h in members]
         answer = self.likelihood.behind(effects, self.best.effects, FEW_PIXELS)
         return answer is not None and answer[0] < -FAR - _CLEARLY * answer[1]
-
-
-def _but_once(allow: Callable[[str], None]) -> Callable[[str], None]:
-    """Return the same, to which what is asked first is no matter of the limit."""
-    asked: list[str] = []
-
-    def allowed(words: str) -> None:
-        asked.append(words)
-        try:
-            allow(words)
-        except EffortSpentError:
-            if len(asked) > 1:
-                raise
-
-    return allowed
 
 
 def vanished(one: Refitted) -> set[str]:

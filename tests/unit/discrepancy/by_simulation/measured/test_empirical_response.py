@@ -121,7 +121,6 @@ def test_what_samples_follow_is_told_with_its_part(
     assert (term.of, term.place, term.columns) == (source, place, None)
     # to first order; refits make it exact
     assert found.effect.response * term.weight == pytest.approx(part, rel=0.3)
-    assert found.unlisted
 
 
 def test_what_only_large_charge_does_is_told_with_how_large() -> None:
@@ -138,7 +137,6 @@ def test_what_follows_its_mirror_image_is_told_in_one() -> None:
     assert (term.of, term.place, term.mirrored) == ("sample", (0, 0, 0), ("rows",))
     assert term.columns == (SHAPE[1] // 2, SHAPE[1])
     assert found.effect.response == pytest.approx(0.05, rel=0.3)
-    assert found.unlisted
     assert "% in columns 9 to 17 of its mirror image along the rows)" in found.effect.describe()
 
 

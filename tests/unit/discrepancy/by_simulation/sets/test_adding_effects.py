@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -15,10 +14,8 @@ from scipy import stats
 from pchem_pipeline.discrepancy.build_verdict import Findings
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
 from pchem_pipeline.discrepancy.by_simulation.additions import (
-    AddedRounds,
-    ExtendedModel,
+    Extension,
     unexplained_of_its_kind,
-    unexplained_of_its_own,
 )
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import ReplicateSimulator
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
@@ -35,6 +32,7 @@ from pchem_pipeline.discrepancy.by_simulation.sets.comparison import (
     _all_seen,
     _far_behind,
     _grown,
+    chosen,
     compare,
     own_signature,
 )
@@ -117,29 +115,24 @@ class World:
         return choose(hypotheses, shifts, self.refitter().noise(self.null.covariance, 40))
 
     def compare(
-        self,
-        *hypotheses: Hypothesis,
-        held: Sequence[Hypothesis] = (),
-        before: Any = None,
-        beside: Sequence[Hypothesis] = (),
-        likelihood: HistogramLikelihood | None = None,
-        unlisted: Callable[[], bool] = lambda: False,
-        measured: Callable[[bool], Refitted | None] = lambda _: None,
+        self, *hypotheses: Hypothesis, beside: Sequence[Hypothesis] = (), **how: Any
     ) -> Comparison | None:
         choice = self.choice(*hypotheses)
         assert choice is not None
         grown = (lambda one: self.choice(*beside, mean=one.mean)) if beside else (lambda _: None)
-        return compare(
-            self.refitter(),
-            held,
-            hypotheses,
-            choice,
-            before,
-            grown,
-            likelihood or HistogramLikelihood(),
-            unlisted,
-            measured,
-        )
+        return self.best_of(hypotheses, choice, beside=grown, **how)
+
+    def best_of(
+        self,
+        hypotheses: Sequence[Hypothesis],
+        choice: Choice,
+        likelihood: HistogramLikelihood | None = None,
+        **how: Any,
+    ) -> Comparison | None:
+        trials = Trials(self.refitter(), likelihood or HistogramLikelihood())
+        compare(trials, hypotheses, choice, **how)
+        trials.refitter = replace(trials.refitter, allow=lambda _: None)
+        return chosen(trials, hypotheses)
 
     def chosen(self, *hypotheses: Hypothesis, **how: Any) -> frozenset[str] | None:
         """Return the tags of the chosen set; None where none holds."""
@@ -303,16 +296,6 @@ def test_a_refit_that_meets_the_limit_keeps_the_steps_before_it(paid: int) -> No
     assert found.score < whole.score
 
 
-def test_the_search_ends_where_no_effect_explains_more_beside_those_held() -> None:
-    world = World([effect("row_noise", 0.5), effect("frame_noise", 0.1)])
-    [held] = world.refitter().refined([hypothesis("row_noise")]).hypotheses
-    before = world.refitter().refined([held], replicates=16)
-    more = world.compare(hypothesis("frame_noise"), held=[held], before=before)
-    assert more.chosen.tags == {"row_noise", "frame_noise"}
-    better = replace(before, score=more.chosen.score + 20.0)
-    assert world.compare(hypothesis("frame_noise"), held=[held], before=better) is None
-
-
 def test_a_choice_among_sets_that_were_refitted_is_made_at_the_limit_too(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -370,7 +353,7 @@ def test_fewer_effects_are_tried_before_rivals_of_a_set_of_more(monkeypatch: pyt
     row, frame, drift, coupling = (hypothesis(tag) for tag in TRUTH)
     drift, coupling = (replace(h, fingerprint=0.02 * h.fingerprint) for h in (drift, coupling))
     choice = world.tried([row, frame, drift], [row, frame, coupling])
-    found = compare(world.refitter(), [], [row, frame, drift, coupling], choice)
+    found = world.best_of([row, frame, drift, coupling], choice)
     assert found.chosen.tags == {"row_noise", "frame_noise"}
     sets = list(dict.fromkeys(words for words in asked if "+" in words))
     assert sets[:2] == ["row_noise + frame_noise + exposure_drift", "row_noise + frame_noise"]
@@ -386,7 +369,7 @@ def test_what_does_not_move_a_statistic_that_stands_out_is_no_rival_of_what_leav
     guesses = [hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.05)]
     likely = world.choice(*guesses)
     assert likely is not None
-    found = compare(world.refitter(), [], [*guesses, twin], likely)
+    found = world.best_of([*guesses, twin], likely)
     assert found.chosen.tags == {"row_noise", "frame_noise"}
     assert "exposure_drift" not in asked  # as near as row noise by itself, which leaves what frame noise does
 
@@ -407,23 +390,13 @@ def test_others_are_not_refitted_where_no_strength_of_theirs_makes_what_an_effec
     assert len({words for words in asked if words.count("+") == 1}) == refits
 
 
-def test_an_effect_of_a_later_round_is_judged_beside_those_held() -> None:
-    world = World([effect("row_noise", 0.9), effect("frame_noise", 0.1), effect("exposure_drift", 0.05)])
-    first = world.refitter().refined([hypothesis("row_noise", 0.9)])
-    likely = world.choice(hypothesis("exposure_drift", 0.05), mean=first.mean)
-    assert likely is not None
-    others = [hypothesis("exposure_drift", 0.05), hypothesis("frame_noise")]
-    found = compare(world.refitter(), first.hypotheses, others, likely, first)
-    assert found.chosen.tags == {"row_noise", "frame_noise"}
-
-
 def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> None:
     world = World([effect("row_noise", 0.5), effect("frame_noise", 0.3)])
     known = world.refitter().refined([hypothesis("row_noise"), hypothesis("frame_noise")])
     drift = hypothesis("exposure_drift")
 
     def begun(members: Sequence[Hypothesis], *tried: Refitted) -> tuple[Hypothesis, ...]:
-        return Trials(world.refitter(), (), HistogramLikelihood(), list(tried)).begun(members)
+        return Trials(world.refitter(), HistogramLikelihood(), list(tried)).begun(members)
 
     first, second = begun([hypothesis("row_noise"), drift], known)
     assert (first.effect, second) == (hypothesis("row_noise").effect, drift)  # one in common is not enough
@@ -501,10 +474,6 @@ def test_what_the_histograms_rule_out_is_not_refitted(
 def test_two_effects_with_signatures_of_their_own_are_found_together() -> None:
     world = World([effect("row_noise", 0.1), effect("frame_noise", 0.06)])
     assert world.chosen(hypothesis("row_noise"), hypothesis("frame_noise")) == {"row_noise", "frame_noise"}
-    later = world.compare(hypothesis("frame_noise"), held=[hypothesis("row_noise")])
-    assert later.chosen.tags == {"row_noise", "frame_noise"}
-    none = world.compare(hypothesis("row_noise"), held=[hypothesis("exposure_drift")])
-    assert none is None  # what was held has nothing in the data
 
 
 def test_what_a_strong_effect_hides_is_asked_for_beside_it() -> None:
@@ -531,7 +500,7 @@ def test_fewer_effects_beside_a_set_are_far_behind_by_more_than_their_fingerprin
 def seeds(refitter: Refitter, *tried: Refitted) -> list[frozenset[str]]:
     """Return the sets, of those that were tried, beside which others are asked for."""
     asked: list[frozenset[str]] = []
-    trials = Trials(refitter, (), HistogramLikelihood(), list(tried))
+    trials = Trials(refitter, HistogramLikelihood(), list(tried))
     _grown(trials, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
     return asked
 
@@ -553,121 +522,33 @@ def test_a_set_with_more_in_vain_is_not_grown_beside_its_part() -> None:
     assert seeds(refitter, alone, replace(more, score=alone.score)) == [{"row_noise"}]
 
 
-def test_what_stands_out_beside_a_set_that_leaves_little_is_fitted_before_others_in_its_place(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    world = World([effect("row_noise", 0.3), effect("frame_noise", 0.04)])
-    twin = replace(hypothesis("row_noise", 0.3), effect=effect("exposure_drift", 0.3))
-    beside = [hypothesis("frame_noise", 0.04)]
-    asked = asked_by_refits(world, monkeypatch)
-    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.trials._beaten", lambda *_: False)
-    assert world.chosen(hypothesis("row_noise", 0.3), twin, beside=beside) == {"row_noise", "frame_noise"}
-    assert asked.index("row_noise + frame_noise") < asked.index("exposure_drift")
-
-
 def test_an_effect_that_its_set_lets_vanish_does_not_take_the_others_with_it() -> None:
     """Of three effects that the fingerprints ask for one is not there, and something is left."""
     true = effect("row_noise", 0.3), effect("frame_noise", 0.3), effect("interpixel_capacitance", 0.1)
     world = World(true)
     row, frame, drift = (hypothesis(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift"))
     choice = world.tried([row, frame, drift])
-    found = compare(world.refitter(), [], [row, frame, drift], choice)
+    found = world.best_of([row, frame, drift], choice)
     assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
-def test_where_what_no_effect_makes_leaves_nothing_no_set_is_grown() -> None:
-    world = World([effect("row_noise", 0.3), effect("frame_noise", 0.04)])
-    beside = [hypothesis("frame_noise", 0.04)]
-    assert world.compare(hypothesis("row_noise"), beside=beside, unlisted=lambda: True) is None
+@pytest.mark.parametrize("behind", [-1.0, 1.0])
+def test_what_is_measured_competes_with_several_effects_at_its_price(behind: float) -> None:
+    """One thing costs less than two effects; a single effect that leaves nothing is not asked about."""
+    world = World([effect("row_noise", 0.3), effect("frame_noise", 0.3)])
+    row, frame = hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.3)
+    best = world.compare(row, frame).chosen
+    noise = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))
+    whole = replace(best, hypotheses=(Hypothesis(noise, best.parts.sum(axis=0)),))
+    assert whole.price == PRICE_OF_MORE
+    whole = replace(whole, score=best.score - behind)
+    found = world.compare(row, frame, measured=lambda kept: [] if kept else [whole])
+    assert (found.chosen is whole) == (behind < 0.0)
 
-    def never() -> bool:
+    def never(_: Any) -> list[Refitted]:
         raise AssertionError("a single effect leaves nothing")
 
-    single = World([effect("row_noise", 0.3)]).compare(hypothesis("row_noise"), unlisted=never)
-    assert single is not None
-
-
-def test_what_is_measured_and_leaves_less_than_the_likeliest_sets_ends_the_search() -> None:
-    """No set of these makes all of it, and none is grown; one that leaves nothing never asks."""
-    world = World([effect("row_noise", 0.3), effect("interpixel_capacitance", 0.2)])
-    whole = world.refitter().refined([hypothesis("row_noise"), hypothesis("interpixel_capacitance")])
-    asked: list[str] = []
-
-    def measured(one: Refitted | None, unlisted: bool) -> Refitted | None:
-        asked.extend([] if unlisted else ["measured"])
-        return None if unlisted else one
-
-    def beside(one: Any) -> Any:
-        asked.append("beside")
-
-    for one, wanted in ((whole, ["measured"]), (None, ["measured", "beside"])):
-        asked.clear()
-        frame = hypothesis("frame_noise", 0.05)
-        choice = world.choice(hypothesis("row_noise"), frame)
-        assert choice is not None
-        found = compare(
-            world.refitter(),
-            [],
-            [hypothesis("row_noise"), frame],
-            choice,
-            beside=beside,
-            measured=functools.partial(measured, one),
-        )
-        assert asked[: len(wanted)] == wanted
-        assert (found is None) is (one is not None)
-
-    def never(unlisted: bool) -> Refitted | None:
-        raise AssertionError("a single effect leaves nothing")
-
-    single = World([effect("row_noise", 0.3)]).compare(hypothesis("row_noise"), measured=never)
-    assert single is not None
-
-
-def test_one_thing_that_is_measured_stands_before_several_that_explain_as_much() -> None:
-    one = World([effect("exposure_drift", 0.3)])
-    whole = one.refitter().refined([hypothesis("exposure_drift", 0.3)])
-    both = [effect("row_noise", 0.3), effect("frame_noise", 0.3)]
-    world = World(both)
-    row, frame = hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.3)
-    best = world.compare(row, frame)
-    for behind, wins in ((PRICE_OF_MORE - 1.0, True), (PRICE_OF_MORE + 1.0, False)):
-        measured = replace(whole, score=best.chosen.score - behind)
-        found = world.compare(row, frame, measured=lambda _, one=measured: one)
-        assert (found is None) is wins
-
-
-def test_what_no_effect_makes_is_asked_for_before_sets() -> None:
-    """Of it sets must come near, which are not fitted to the end in vain then."""
-    world = World([effect(tag, 0.3) for tag in ("exposure_drift", "row_noise", "frame_noise")])
-    row, frame, drift = (hypothesis(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift"))
-    whole = world.refitter().refined([row, frame, drift])
-    asked: list[bool] = []
-
-    def measured(one: Refitted | None, unlisted: bool) -> Refitted | None:
-        asked.append(unlisted)
-        return one
-
-    for one, wanted in ((whole, [True]), (None, [True, False])):
-        asked.clear()
-        found = world.compare(row, frame, measured=functools.partial(measured, one))
-        assert (found is None) is (one is not None)
-        assert asked[:2] == wanted
-
-
-def test_the_likeliest_effects_are_fitted_whatever_was_spent() -> None:
-    """Fitting what seemed likeliest took all of it, and what was there came second."""
-    world = World([effect("frame_noise", 0.3)])
-    row, frame = hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.3)
-    plain, spent = world.refitter(), []
-
-    def allow(words: str) -> None:
-        if spent:
-            raise EffortSpentError(words)
-        spent.append(words)
-
-    world.refitter = lambda: replace(plain, allow=allow)  # type: ignore[method-assign]
-    found = compare(world.refitter(), [], [row, frame], world.tried([row], [frame]))
-    assert found.chosen.tags == {"frame_noise"}
+    assert World([effect("row_noise", 0.3)]).chosen(hypothesis("row_noise"), measured=never) == {"row_noise"}
 
 
 def test_a_signature_is_asked_of_the_same_kind_of_the_others() -> None:
@@ -690,8 +571,6 @@ def test_effects_that_meet_in_one_part_are_one_cause_without_a_name(second: str)
     ]
     found = world.compare(*guesses)
     assert len(found.chosen.tags) == (1 if second == "columns=0:8" else 2)
-    later = world.compare(guesses[1], held=guesses[:1])
-    assert (later is None) == (second == "columns=0:8")
 
 
 @pytest.mark.parametrize(
@@ -718,9 +597,6 @@ def test_what_is_left_in_the_family_of_a_signature_speaks_against_a_name(
     there = np.array([0.0, 0.0, 0.0, 6.0])
     assert not unexplained_of_its_kind(everywhere, part, there, null)
     assert unexplained_of_its_kind(placed, part, there, null).startswith("it leaves a misfit")
-    # of what it moves itself, nothing else
-    assert not unexplained_of_its_own(part, rest, null)
-    assert bool(unexplained_of_its_own(part + 9.0 * np.eye(4)[1], rest, null)) == bool(words)
 
 
 def test_what_the_model_leaves_is_asked_for_guesses_before_what_the_frames_show() -> None:
@@ -782,7 +658,7 @@ def test_a_set_is_fitted_again_with_the_kind_of_an_effect_that_does_better() -> 
     row, frame, other = (
         hypothesis("row_noise"), hypothesis("frame_noise"), hypothesis("frame_noise").effect
     )  # fmt: skip
-    trials = Trials(world.refitter(), (), HistogramLikelihood())
+    trials = Trials(world.refitter(), HistogramLikelihood())
     for members in ((row,), (frame,), (row, frame), (row, frame)):
         trials.refit(members)
     assert len(trials.tried) == 3
@@ -852,19 +728,18 @@ def add(
     final: Any = None,
     mapped: Callable[[tuple[Effect, ...]], Any] = lambda _: UNMOVED,
 ) -> Any:
-    """Return a search to which a round was added, and the null that it came to."""
+    """Return a search that added what it found, and the null that it came to."""
     z = world.z if final is None else Measured(world.z.train, world.z.test, final)
     work: Any = SimpleNamespace(mapped=mapped, forget=lambda _: None, effort=Effort(None))
     unused: Any = None
     settings = DiscrepancySettings()
     judge = Acceptance(world.null, z, StatisticsGap(world.null, 100_000), settings)
-    prepared = Prepared(settings, "frames", unused, unused, world.null, z, work.effort, 3, {})
-    search = FrameExplainer(prepared, unused, work, unused, judge, ExtendedModel(work, world.null, (), ()))
+    prepared = Prepared(settings, "frames", unused, unused, world.null, z, work.effort, {})
+    search = FrameExplainer(prepared, unused, work, unused, judge, ())
     monkeypatch.setattr(search, "_refitter", lambda: world.refitter())
     monkeypatch.setattr(search, "_left_by", lambda *_: None)
     monkeypatch.setattr(search, "_likelihood", lambda *_: None)
-    nothing = SimpleNamespace(explains_all=lambda: False, clearest=lambda unlisted: None)
-    monkeypatch.setattr(FrameExplainer, "_unexplained", nothing)
+    monkeypatch.setattr(search, "_measured", lambda _: lambda kept: ())
     shifts = (z.train - world.null.mean, z.test - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
     assert choice is not None
@@ -881,10 +756,9 @@ def test_what_was_chosen_enters_the_model_though_the_limit_is_reached(
         if spent:
             raise EffortSpentError(words)
 
-    def compared(*given: Any) -> Comparison | None:
-        found = compare(*given)
+    def compared(*given: Any) -> None:
+        compare(*given)
         spent.append(True)
-        return found
 
     plain = world.refitter()
     monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
@@ -902,9 +776,9 @@ def test_slopes_beyond_all_that_an_effect_does_do_not_lift_the_floor() -> None:
     gaps = StatisticsGap(world.null, 100_000)
 
     def floor(slopes: np.ndarray) -> float:
-        model = ExtendedModel(work, world.null, (), ())
         steep = replace(one, slopes=slopes)
-        null = model.put(Comparison(steep, (steep,)), steep, (), world.null)
+        accept = Acceptance(world.null, world.z, gaps, DiscrepancySettings())
+        null = Extension.of(work, (), accept, Comparison(steep, (steep,)), steep, (), certain=True).last
         return gaps.gap(world.z.final, null.mean, null.replicates, null.strengths).floor
 
     assert floor(1e5 * one.slopes) == pytest.approx(floor(one.slopes), rel=0.5)
@@ -926,11 +800,7 @@ def test_what_explains_all_but_is_not_certain_is_told_without_a_name(
     monkeypatch.setattr(Acceptance, "established", lambda *_: ())
     left = rest * np.eye(M)[5]
     world.z = Measured(world.z.train + left, world.z.test + left, world.z.final)
-    unlisted = SimpleNamespace(explains_all=lambda: False)
-    monkeypatch.setattr(FrameExplainer, "_unexplained", unlisted)
-    search, extended = add(world, monkeypatch, hypothesis("row_noise"))
-    assert extended is None
-    told = search.probable()
+    search, told = add(world, monkeypatch, hypothesis("row_noise"))
     assert (told is None) == (rest > 0.0)
     if told is not None:
         before = search.gap(world.null)
@@ -939,18 +809,6 @@ def test_what_explains_all_but_is_not_certain_is_told_without_a_name(
         found = Findings("frames", world.z, world.null, told, before, [], False, added)
         assert found.state == "ambiguous"
         assert found.model((), search.model) == ()
-
-
-def test_only_effects_that_account_for_what_they_move_are_kept_beside_what_is_measured(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    world = World([effect("row_noise", 0.5)])
-    search, extended = add(world, monkeypatch, hypothesis("row_noise"))
-    elsewhere, own = np.eye(M)[5] * 60.0, np.eye(M)[0] * 60.0
-    rounds = AddedRounds(search.extended.rounds, search.accept)
-    for model in (extended, extended.shifted(elsewhere)):
-        assert [h.tag for h in rounds.accounted(model)] == ["row_noise"]
-    assert rounds.accounted(extended.shifted(own)) == ()
 
 
 def established(
@@ -1064,22 +922,22 @@ def test_strong_effects_need_not_add_up_to_be_there() -> None:
     assert found == {"row_noise", "frame_noise"}
 
 
-def test_what_the_final_frames_do_not_show_stays_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_final_frames_do_not_show_gets_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World([effect("row_noise", 0.1)])
     search, extended = add(world, monkeypatch, hypothesis("row_noise"), final=np.zeros(M))
-    assert extended is None
-    assert search.model == ()
+    added = search.close(search.gap(world.null), extended, False).additions
+    assert not any(each.named for each in added)
 
 
-def test_what_widens_the_gap_of_the_final_frames_stays_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_widens_the_gap_of_the_final_frames_gets_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """They have some of it, by what it does to one statistic, and the opposite of what it does to another."""
     monkeypatch.setitem(TRUTH, "row_noise", ((np.eye(M)[0] + np.eye(M)[5]) * 40.0, 1.0))
     world = World([effect("row_noise", 0.1)])
     for of_other, outside in ((-0.5, True), (0.3, False)):
         final = 40.0 * (np.eye(M)[0] + of_other * np.eye(M)[5])
         search, extended = add(world, monkeypatch, hypothesis("row_noise"), final=final)
-        assert (extended is None) == outside
-        assert (search.model == ()) == outside
+        added = search.close(search.gap(world.null), extended, False).additions
+        assert any(each.named for each in added) != outside
 
 
 @pytest.mark.parametrize(
@@ -1146,7 +1004,8 @@ def test_a_correction_that_no_pixel_can_be_fitted_with_is_not_made(monkeypatch: 
     world = World([effect("row_noise", 0.5)])
     search, _ = add(world, monkeypatch, hypothesis("row_noise"))
     [corrected] = search.model
-    added = search.extended.last
+    added = search.extension.compared.chosen
+    added = world.refitter().sharpened(added, DiscrepancySettings().extended_replicates)
 
     def mapped(model: tuple[Effect, ...]) -> Any:
         if model == (corrected,):
@@ -1166,8 +1025,7 @@ def test_an_effect_is_held_to_what_it_moves_only_where_the_data_disagree_with_th
     world = World([effect("interpixel_capacitance", 0.2)])
     search, extended = add(world, monkeypatch, hypothesis("interpixel_capacitance"))
     before = search.gap(world.null)
-    [one] = search.extended.rounds
-    search.extended.rounds = [replace(one, extended=extended.shifted(np.eye(M)[3] * 20.0))]
+    search.extension = replace(search.extension, last=extended.shifted(np.eye(M)[3] * 20.0))
     for still in (False, True):
         [added] = search.close(before, extended, still).additions
         assert added.named == (not still)
