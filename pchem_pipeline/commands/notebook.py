@@ -378,12 +378,15 @@ def lazy_dataset(store: RunStore, group: str) -> xr.Dataset:
             return store.read(self.name, region)
 
     found = {}
-    for name in store.arrays(group):
-        array = store.array(f"{group}/{name}")
-        lazy = LazilyIndexedArray(Lazy(f"{group}/{name}"))
-        dims = variable_at(f"{group}/{name}").dims
-        found[name] = xr.Variable(dims, lazy, dict(array.attrs))
-    return xr.Dataset(found, attrs=store.attributes(group))
+    try:
+        for name in store.arrays(group):
+            array = store.array(f"{group}/{name}")
+            lazy = LazilyIndexedArray(Lazy(f"{group}/{name}"))
+            dims = variable_at(f"{group}/{name}").dims
+            found[name] = xr.Variable(dims, lazy, dict(array.attrs))
+        return xr.Dataset(found, attrs=store.attributes(group))
+    except ValueError as error:  # shapes of other arrays
+        raise StoreError(f"{store.path / group} is damaged ({error}); {store.cure(group)}") from error
 
 
 class Pixel(PixelFit):

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
+    TIME_UNIT,
     CameraFacts,
     StatedFacts,
     bits_of,
@@ -41,7 +42,6 @@ from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 _TIME_KEYWORDS = ("EXPTIME", "EXPOSURE", "TELAPSE", "INTTIME", "ITIME", "XPOSURE")
-_UNIT_KEYWORDS = ("TIMEUNIT", "EXPUNIT", "EXPTUNIT")
 _DEPTH_KEYWORDS = ("BITDEPTH", "ADCBITS")
 _CAMERA_KEYWORDS = ("CAMERA", "DETNAM", "DETECTOR", "INSTRUME")
 _SERIAL_KEYWORDS = ("SERIALNO", "SERNO", "SERIAL", "CAMSERNO", "DETSERNO")
@@ -105,7 +105,7 @@ class FitsReader(ContiguousReader):
     def _read_facts(self, *headers: Any) -> None:
         """Take each fact from the last header that has it."""
         last = [*reversed(headers)]
-        units = [str(header[name]) for name in _UNIT_KEYWORDS for header in last if name in header][:1]
+        units = [str(header[name]) for header in last for name in header if TIME_UNIT.fullmatch(name)][:1]
         times = (
             duration_of(name, header[name], *units, comment=str(header.comments[name]))
             for header in last
