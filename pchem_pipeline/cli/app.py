@@ -10,6 +10,7 @@ import errno
 import os
 import sys
 import threading
+import traceback
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
@@ -421,6 +422,18 @@ def _fail(message: str, code: int) -> NoReturn:
     sys.exit(code)
 
 
+def _not_imported(error: Exception) -> str:
+    """Return the name of the library at whose import an error came up; empty for other errors."""
+    own, found = __name__.partition(".")[0], ""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        package = frame.f_globals.get("__name__", "").partition(".")[0]
+        if package == own:
+            found = ""
+        elif not found and frame.f_code.co_name == "<module>":
+            found = package
+    return found
+
+
 #: What a full or broken disk answers.
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
@@ -457,6 +470,14 @@ def main(arguments: list[str] | None = None) -> None:
         _fail(
             "stopped by SIGINT; finished tiles are kept, run the same command again to continue",
             ExitCode.SIGINT,
+        )
+    except Exception as error:
+        if not (library := _not_imported(error)):
+            raise
+        _fail(
+            f"{library} cannot be imported ({error}); correct the configuration file or the variable of the "
+            "environment that it reads, or install it again",
+            ExitCode.USAGE,
         )
 
 

@@ -112,11 +112,14 @@ class Run:
         head = f"<b>{escape(self.path.name)}</b>: {escape(self._size())}"
         if found is None:
             return f"<p>{head}<br>{escape(states)}</p>"
-        answers = "".join(
-            f"<p>{escape(each['question'])} <b>{escape(each['word'])}</b>. {escape(each['text'])}</p>"
-            for each in found["answers"]
-        )
-        rows = [(each["label"], each["value"], each["spread"]) for each in found["headline"]]
+        try:
+            answers = "".join(
+                f"<p>{escape(each['question'])} <b>{escape(each['word'])}</b>. {escape(each['text'])}</p>"
+                for each in found["answers"]
+            )
+            rows = [(each["label"], each["value"], each["spread"]) for each in found["headline"]]
+        except (KeyError, TypeError) as error:
+            raise StoreError(f"{self.path / 'report.json'} is damaged; run again to write it") from error
         return f"<p>{head}</p>{answers}{html_table(('median', 'value', '5 to 95 %'), rows)}"
 
     def _size(self) -> str:
@@ -378,12 +381,15 @@ def lazy_dataset(store: RunStore, group: str) -> xr.Dataset:
             return store.read(self.name, region)
 
     found = {}
-    for name in store.arrays(group):
-        array = store.array(f"{group}/{name}")
-        lazy = LazilyIndexedArray(Lazy(f"{group}/{name}"))
-        dims = variable_at(f"{group}/{name}").dims
-        found[name] = xr.Variable(dims, lazy, dict(array.attrs))
-    return xr.Dataset(found, attrs=store.attributes(group))
+    try:
+        for name in store.arrays(group):
+            array = store.array(f"{group}/{name}")
+            lazy = LazilyIndexedArray(Lazy(f"{group}/{name}"))
+            dims = variable_at(f"{group}/{name}").dims
+            found[name] = xr.Variable(dims, lazy, dict(array.attrs))
+        return xr.Dataset(found, attrs=store.attributes(group))
+    except ValueError as error:  # shapes of other arrays
+        raise StoreError(f"{store.path / group} is damaged ({error}); {store.cure(group)}") from error
 
 
 class Pixel(PixelFit):

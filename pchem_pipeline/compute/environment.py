@@ -84,7 +84,7 @@ def available_workers() -> int:
     for group in _groups("cpu"):
         for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
             match _integers(*(group / name for name in names)):
-                case [quota, period] if quota > 0:
+                case [quota, period] if quota > 0 and period > 0:
                     most.append(max(1, quota // period))
     return min(most)
 
@@ -100,6 +100,7 @@ def available_memory() -> int | None:
     for group in _groups("memory"):
         for limit, usage, cache in (
             ("memory.max", "memory.current", "inactive_file"),
+            ("memory.high", "memory.current", "inactive_file"),
             ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
         ):
             match _integers(group / limit, group / usage):
@@ -115,8 +116,8 @@ def _groups(controller: str) -> Iterator[Path]:
     except OSError:
         lines = ["0::/"]
     for line in lines:
-        _, names, path = line.split(":", 2)
-        for top in (_CGROUPS, _CGROUPS / "unified") if not names else (_CGROUPS / controller,):
+        _, names, path = (*line.split(":", 2), "", "")[:3]
+        for top in (_CGROUPS / (controller if names else ""), _CGROUPS / (names or "unified")):
             if not names or controller in names.split(","):
                 folder = top / path.lstrip("/")
                 yield from (each for each in (folder, *folder.parents) if each.is_relative_to(top))

@@ -22,6 +22,8 @@ _TIMES = ("start_time", "acquisition_date", "date")
 _DURATIONS = ("integration_time", "exposure_time", "count_time")
 _DEPTHS = ("bit_depth", "bit_depth_readout")
 _UNIT_SUFFIXES = ("_units", "_unit")
+#: names of the unit of whatever time there is
+TIME_UNIT = re.compile(r"(time|exp\w*?|integration(_?time)?|count_?time)_?units?", re.IGNORECASE)
 #: durations whose name says the unit
 _DURATIONS_IN = {
     f"{name}_{unit}": unit for name in ("exposure", *_DURATIONS) for unit in ("s", "ms", "us", "ns")
@@ -43,12 +45,13 @@ _SECONDS = {word: scale for scale, words in _UNITS.items() for word in words.spl
 _IN_SENTENCES = "|".join(
     word for word in _SECONDS if word == "ms" or (len(word) > 2 and word not in ("min", "second"))
 )
-#: where a comment states a unit: in brackets, after "in", at the end after a comma, or in full
+#: where a comment states a unit: in brackets, after "in" (no article), at the end after a comma, or in full
 _STATED = re.compile(
-    rf"[\[(]\s*([a-z]+)\.?\s*[\])]|\bin\s+([a-z]+)\.?\s*$|[,:/]\s*({'|'.join(_SECONDS)})\.?\s*$|\b({_IN_SENTENCES})\b",
+    rf"[\[(]\s*([a-z]+)\.?\s*[\])]|\bin\s+(?:units\s+of\s+)?(?!an?\b|th)([a-z]+)|[,:/]\s*({'|'.join(_SECONDS)})\.?\s*$|\b({_IN_SENTENCES})\b",
     re.IGNORECASE,
 )
-_SCALED = re.compile(rf"\d\s*({'|'.join(_SECONDS)})\b", re.IGNORECASE)
+_SCALED = re.compile(rf"\d\s*({'|'.join(_SECONDS)})\b|\b({'|'.join(_SECONDS)})\s*[/*x]\s*\d", re.IGNORECASE)
+_NUMBER_AND_UNIT = re.compile(r"([-+.\d]+(?:e[-+]?\d+)?)\s*(.*)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -152,9 +155,9 @@ def duration_of(name: str, value: Any, *units: Any, comment: str = "") -> Durati
     """
     if isinstance(value, bool):
         return None
-    number, _, unit = (
-        str(text_of(value) or "").partition(" ") if isinstance(value, str | bytes) else (value, "", "")
-    )
+    number, unit = value, ""
+    if isinstance(value, str | bytes) and (parts := _NUMBER_AND_UNIT.fullmatch(text_of(value) or "")):
+        number, unit = parts.groups()
     try:
         seconds = float(number)
     except (TypeError, ValueError, OverflowError):
@@ -175,6 +178,7 @@ def duration_of(name: str, value: Any, *units: Any, comment: str = "") -> Durati
 def _scales(text: str) -> set[float | None]:
     """Return the units that a word or comment states, in s; None stands for one that is not known."""
     text = re.sub("[\u00b5\u03bc]", "u", text)
+    text = re.sub(r"\b(milli|micro|nano|[mun])[-_ ](?=s)", r"\1", text, flags=re.IGNORECASE).replace("_", " ")
     if text.lower() in _SECONDS:
         return {_SECONDS[text.lower()]}
     if _SCALED.search(text):
@@ -212,8 +216,13 @@ def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] | None 
     temperatures = (celsius(values.get(name), first_of(units_of(name))) for name in _TEMPERATURES)
     # those first whose unit is known by their name; integration_time is in s as sidecars have it
     named = {_DURATIONS[0]: "s", **_DURATIONS_IN}
+    of_any = [unit for name, unit in values.items() if TIME_UNIT.fullmatch(name)]
     durations = (
-        duration_of(name, values.get(name), *(list(filter(None, units_of(name))) or [named.get(name)]))
+        duration_of(
+            name,
+            values.get(name),
+            *([*filter(None, units_of(name))] or of_any * (name in _DURATIONS) or [named.get(name)]),
+        )
         for name in dict.fromkeys((*named, *_DURATIONS))
     )
     camera = CameraFacts(

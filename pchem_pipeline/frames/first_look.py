@@ -86,7 +86,7 @@ def _check_byte_order(values: NDArray[Any], where: str, order: str | None) -> No
         other = "little" if order == "big" else "big"
         cure = f"set input.byte_order: {other} (--byte-order {other})"
     if unused >= 8:
-        cure += f", or, if they are left-justified, input.bit_shift: {unused}"
+        cure += f", or, if they are left-justified, input.bit_shift: {unused} (--bit-shift {unused})"
     raise InputError(f"{where}the samples look byte-swapped: {cure}")
 
 

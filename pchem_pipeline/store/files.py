@@ -302,7 +302,7 @@ def checked(data: bytes, path: Path, cure: str, *, inside: bool = False) -> tupl
         holder = content.get("attributes", {}) if inside else content
         digest = holder.pop(_DIGEST, None)
         same = digest is None or digest == _digest(content)
-    except (ValueError, RecursionError, AttributeError) as error:
+    except (ValueError, RecursionError, AttributeError, TypeError) as error:
         raise StoreError(f"{path} is damaged ({error}); {cure}") from error
     if not same:
         raise StoreError(f"{path} is damaged (checksum mismatch); {cure}")

@@ -121,6 +121,13 @@ class CheckedStore(WrapperStore[Store]):
 
 def foreign_codecs(array: Any) -> list[str]:
     """Return the names of an array's codecs that may do more than turn bytes into numbers."""
+    return sorted(
+        {name for name in codec_names(array) if name not in _PLAIN and not name.startswith("imagecodecs_")}
+    )
+
+
+def codec_names(array: Any) -> list[str]:
+    """Return the names of an array's codecs, those inside of shards, too."""
     content = array.metadata.to_dict()
     coded = [content.get("compressor"), *(content.get("filters") or ()), *(content.get("codecs") or ())]
     names: list[str] = []
@@ -132,7 +139,7 @@ def foreign_codecs(array: Any) -> list[str]:
             coded += [*inside.get("codecs", ()), *inside.get("index_codecs", ())]
         elif codec is not None:  # an object of the library, with its own description
             coded.append(codec.get_config() if hasattr(codec, "get_config") else codec.to_dict())
-    return sorted(set(names) - _PLAIN - {name for name in names if name.startswith("imagecodecs_")})
+    return names
 
 
 def zarr_store(path: Path, *, writable: bool, begins: bool = False) -> Store:

@@ -125,6 +125,17 @@ def test_what_is_missing_is_said(run, finished, tmp_path, monkeypatch):
         pchem_pipeline.open_run(finished)
 
 
+def test_files_of_another_kind_are_damage(finished, tmp_path):
+    path = shutil.copytree(finished, tmp_path / "a.zarr")
+    (path / "report.json").write_text("[1]")
+    shutil.copy(path / "fit/correlation/zarr.json", path / "fit/bias/zarr.json")
+    damaged = pchem_pipeline.open_run(path)
+    with pytest.raises(StoreError, match=r"report\.json is damaged; run again to write it"):
+        damaged._repr_html_()
+    with pytest.raises(StoreError, match=r"fit is damaged \(.*\); run it again: pchem fit .* --force"):
+        _ = damaged.fit
+
+
 def test_the_tutorial_runs(finished, tmp_path):
     (tmp_path / "pchem-demo").mkdir()
     shutil.copytree(finished, tmp_path / "pchem-demo" / "demo.zarr")

@@ -84,7 +84,9 @@ def code_checks(sample: CodeSample) -> list[Check]:
     codes = _sums(sample)
     if codes is None:
         return []
-    ends = [_pile_up(codes, sample, -1), _pile_up(codes, sample, 0)]
+    histograms = PixelHistograms.alone(sample.counts, sample.origin.astype(np.int64))
+    low, high = histograms.extremes(np.ones(len(sample.counts), np.bool_))
+    ends = [_pile_up(codes, sample, high, top=True), _pile_up(codes, sample, low, top=False)]
     # cut off, the law of all codes is another one
     widths = None if any(check.p < 1e-6 for check in ends) else _widths(codes)
     return [check for check in (widths, *ends) if check is not None]
@@ -136,15 +138,20 @@ def _widths(codes: CodeSums) -> Check | None:
     return check_of("codes", p_any, size, limit=limit, where=_WORDS[worst].format(code=code))
 
 
-def _pile_up(codes: CodeSums, sample: CodeSample, end: int) -> Check:
-    """Return whether so many samples are at the lowest (0) or highest (-1) code that it cuts off."""
+def _pile_up(codes: CodeSums, sample: CodeSample, code: int, top: bool) -> Check:
+    """Return whether so many samples are at ``code``, the first or last (DN) of all pixels, that it cuts off.
+
+    ``codes`` leaves out pixels that fit badly, those with the farthest samples too: it ends at no limit.
+    """
     seen, expected = codes.single[:2]
-    at = int(np.flatnonzero(seen)[end])
-    beyond = expected[at + 1 :] if end else expected[:at]
+    at = code - codes.first
+    z = -math.inf
+    if 0 <= at < seen.size and seen[at]:
+        beyond = expected[at + 1 :] if top else expected[:at]
+        on = float(expected[at])
+        # a fit that expects too many beyond is poor; what is cut off is on the code
+        z = min(extreme(int(seen[at]), on, float(beyond.sum())), poisson(int(seen[at]), on))
     bins = sample.origin[:, None] + np.arange(sample.counts.shape[1])
-    on = float(expected[at])
-    # a fit that expects too many beyond is poor; what is cut off is on the code
-    z = min(extreme(int(seen[at]), on, float(beyond.sum())), poisson(int(seen[at]), on))
-    share = float(sample.counts[bins == codes.first + at].sum() / sample.counts.sum())
-    name = "top_code" if end else "bottom_code" if codes.first + at else "zero_code"
-    return check_of(name, normal_p(z), share, where=f"{codes.first + at} DN")
+    share = float(sample.counts[bins == code].sum() / sample.counts.sum())
+    name = "top_code" if top else "bottom_code" if code else "zero_code"
+    return check_of(name, normal_p(z), share, where=f"{code} DN")

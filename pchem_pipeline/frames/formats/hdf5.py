@@ -8,11 +8,11 @@ wait for each other, and the bytes would be read a second time for the hash of t
 
 from __future__ import annotations
 
-import heapq
 import math
 import threading
 from collections.abc import Iterator
 from importlib.util import find_spec
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -33,10 +33,10 @@ from pchem_pipeline.frames.formats.hdf5_parts import (
     virtual_files,
 )
 from pchem_pipeline.frames.formats.kinds import (
-    LARGEST_PIECES,
     check_coded,
     check_unpacked_size,
     choose_dataset,
+    chosen_pieces,
     full_window,
 )
 from pchem_pipeline.frames.reader import changed, sound, unwritten_notes
@@ -48,6 +48,16 @@ from pchem_pipeline.store.files import whole_file
 _LOCK = threading.Lock()
 #: items of a file, and groups within each other
 _MOST_ITEMS, _DEEPEST = 100_000, 64
+_BITSHUFFLE = 32008
+#: filters that compress, by number
+_COMPRESSING = {
+    1: "zlib",
+    307: "bz2",
+    32001: "blosc",
+    32004: "lz4 in blocks",
+    _BITSHUFFLE: "lz4 in blocks",
+    32015: "zstd",
+}
 
 
 class Hdf5Reader(ContiguousReader):
@@ -112,7 +122,7 @@ class Hdf5Reader(ContiguousReader):
         if dataset.chunks is not None:
             check_coded(path, self.shape, dataset.chunks, self.dtype.itemsize, size)
             _check_chunk_sizes(path, dataset)
-            _check_deflated(path, dataset)
+            _check_coded_chunks(path, dataset)
         missing = _missing_chunks(path, dataset)
         self.notes += missing
         self.unwritten = bool(missing)
@@ -169,27 +179,26 @@ def _check_chunk_sizes(path: Path, dataset: Any) -> None:
         )
 
 
-def _check_deflated(path: Path, dataset: Any) -> None:
-    """Refuse chunks that were deflated twice, or that hold more than their shape says.
+def _check_coded_chunks(path: Path, dataset: Any) -> None:
+    """Refuse chunks that were compressed twice, or that hold more than their shape says.
 
     Raises:
         InputError: there is one.
     """
-    from h5py import h5z
-
     record = dataset.id.get_create_plist()
-    codes = [record.get_filter(number)[0] for number in range(record.get_nfilters())]
-    if len(codes) > len(set(codes)):
-        raise InputError(f"{path}: {dataset.name} is encoded twice by the same filter; write it again")
-    if [code for code in codes if code != h5z.FILTER_FLETCHER32][-1:] != [h5z.FILTER_DEFLATE] or not hasattr(
-        dataset.id, "chunk_iter"
-    ):
+    filters = [record.get_filter(number) for number in range(record.get_nfilters())]
+    codecs = [_COMPRESSING.get(code, "") for code, *_ in filters]
+    for number, (code, _, values, _) in enumerate(filters):
+        if code == _BITSHUFFLE and not any(values[4:5]):
+            codecs[number] = ""  # without compression
+    if not any(codecs) or not hasattr(dataset.id, "chunk_iter"):
         return
+    coded = sum(1 << number for number, codec in enumerate(codecs) if codec)
     chunks: list[tuple[int, tuple[int, ...]]] = []
     dataset.id.chunk_iter(lambda chunk: chunks.append((chunk.size, chunk.chunk_offset)))
-    largest = heapq.nlargest(LARGEST_PIECES, chunks)
-    pieces = (dataset.id.read_direct_chunk(place)[1] for _, place in largest)
-    check_unpacked_size(path, pieces, 4 * math.prod(dataset.chunks) * dataset.dtype.itemsize)
+    read = (dataset.id.read_direct_chunk(place) for _, place in chosen_pieces(chunks, itemgetter(0)))
+    pieces = (data for left_out, data in read if not left_out & coded)
+    check_unpacked_size(path, pieces, 4 * math.prod(dataset.chunks) * dataset.dtype.itemsize, codecs)
 
 
 def _plain_offsets(

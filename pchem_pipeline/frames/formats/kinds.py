@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import bz2
+import lzma
 import math
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import imagecodecs
 import numpy as np
 
 from pchem_pipeline.base.errors import InputError
@@ -17,8 +21,21 @@ from pchem_pipeline.frames.settings import InputSettings
 _MOST_PIXELS = 1 << 20
 #: a file of coded frames, and a coded piece of it, that may hold much in little
 _MOST_CODED, _MOST_PIECE, _MOST_RATIO = 1 << 30, 1 << 28, 10_000
-#: the largest coded pieces, as many as are unpacked to see how much they hold
-LARGEST_PIECES = 64
+#: of the largest and of the smallest coded pieces, as many as are unpacked to see how much they hold
+_FEW_PIECES = 32
+#: where coded bytes say how many they hold: first byte, end, order (lz4 and bitshuffle as filters of HDF5)
+_SIZES: dict[str, tuple[int, int, Literal["little", "big"]]] = {
+    "blosc": (4, 8, "little"),
+    "lz4": (0, 4, "little"),
+    "lz4 in blocks": (0, 8, "big"),
+}
+_DECODERS: dict[str, Callable[[], Any]] = {
+    "gzip": partial(zlib.decompressobj, 47),  # gzip or zlib
+    "zlib": partial(zlib.decompressobj, 47),
+    "bz2": bz2.BZ2Decompressor,
+    "lzma": lzma.LZMADecompressor,
+}
+_COMPRESSING = {*_SIZES, *_DECODERS, "zstd"}
 
 
 def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> int | None:
@@ -120,50 +137,53 @@ def check_coded(
         )
 
 
-def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int, codecs: str = "gzip") -> None:
+def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int, codecs: Sequence[str]) -> None:
     """Check that coded pieces hold no more than their shape says, before the library unpacks them whole.
 
     Args:
         path: the file, for the message.
         pieces: coded bytes.
         expected: bytes of a piece by shape and type.
-        codecs: names of those that may be in use; gzip and zlib are unpacked, the headers of others read.
+        codecs: names of those in use; those that do not compress are passed over.
 
     Raises:
-        InputError: one holds more.
+        InputError: one holds more, or is compressed twice.
     """
-    for data in pieces:
-        found = 0
-        if "blosc" in codecs:
-            found = int.from_bytes(data[4:8], "little")
-        elif "zstd" in codecs and data[:4] == b"\x28\xb5\x2f\xfd":
-            found = _zstd_size(data)
-        elif "gzip" in codecs or "zlib" in codecs:
-            found = _inflated(data, expected)
-        if found > expected:
+    used = [codec for codec in codecs if codec in _COMPRESSING]
+    if len(used) > 1:
+        raise InputError(
+            f"{path}: compressed twice, by {' and '.join(used)}; write it again with one of them"
+        )
+    for data in pieces if used else ():
+        if _unpacked_size(data, used[0], expected) > expected:
             raise InputError(
                 f"{path}: damaged: a piece of {len(data)} bytes unpacks to more than the {expected} of its "
                 "shape; copy it again"
             )
 
 
-def _zstd_size(data: bytes) -> int:
-    """Return the bytes that the header of a zstd frame declares (RFC 8878, 3.1.1.1); 0 where it does not."""
-    flags = data[4]
-    single = flags >> 5 & 1
-    length = (single, 2, 4, 8)[flags >> 6]
-    start = 6 - single + (0, 1, 2, 4)[flags & 3]
-    return int.from_bytes(data[start : start + length], "little") + (256 if length == 2 else 0)
+def chosen_pieces(pieces: Iterable[Any], size: Callable[[Any], int]) -> list[Any]:
+    """Return the largest and the smallest coded pieces, as many as are unpacked to see how much they hold."""
+    some = sorted(pieces, key=size)
+    return some[:_FEW_PIECES] + some[_FEW_PIECES:][-_FEW_PIECES:]
 
 
-def _inflated(data: bytes, most: int) -> int:
-    """Return the bytes that gzip or zlib data hold, or one more than ``most``."""
+def _unpacked_size(data: bytes, codec: str, most: int) -> int:
+    """Return the bytes that coded data say or are found to hold, at most one more than ``most``."""
+    if codec in _SIZES:
+        start, end, order = _SIZES[codec]
+        return int.from_bytes(data[start:end], order)
+    if codec == "zstd":
+        try:
+            return len(imagecodecs.zstd_decode(data, out=most))
+        except imagecodecs.ZstdError as error:
+            return most + 1 if "too small" in str(error) else 0
     found = 0
     while data and found <= most:
-        unpack = zlib.decompressobj(wbits=47)  # gzip or zlib
+        unpack = _DECODERS[codec]()
         try:
             found += len(unpack.decompress(data, most + 1 - found))
-        except zlib.error:
+        except (zlib.error, lzma.LZMAError, OSError):
             break  # it is told where the frames are read
         data = unpack.unused_data
     return found

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import heapq
 import math
 import warnings
 from collections.abc import Iterator, Sequence
+from itertools import starmap
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -16,10 +17,10 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader
 from pchem_pipeline.frames.formats.kinds import (
-    LARGEST_PIECES,
     check_coded,
     check_unpacked_size,
     choose_dataset,
+    chosen_pieces,
     full_window,
 )
 from pchem_pipeline.frames.identity import file_size
@@ -60,8 +61,6 @@ class ZarrReader(ContiguousReader):
     def _inspect(self, path: Path, settings: InputSettings) -> None:
         import zarr
 
-        from pchem_pipeline.store.zarr_store import foreign_codecs
-
         if link := link_out_of(path):
             raise InputError(f"{path}: {link} is a link out of the store; copy its files into the store")
         parts = [*path.rglob("*")]
@@ -81,6 +80,8 @@ class ZarrReader(ContiguousReader):
             )
             array = node[self._name]
             attributes = {**node.attrs, **array.attrs}
+        from pchem_pipeline.store.zarr_store import foreign_codecs
+
         if foreign := foreign_codecs(array):
             raise InputError(
                 f"{path}: {self._name or 'the array'} is encoded by {', '.join(foreign)}, which may run "
@@ -122,19 +123,44 @@ def _check_chunks(path: Path, folder: Path, array: Any, parts: Sequence[Path]) -
 
     Not by ``nchunks_initialized`` of the library, whose time grows as the square of their number.
     """
+    from pchem_pipeline.store.zarr_store import codec_names
+
     shards, size = getattr(array, "shards", None), math.prod(array.chunks)
     files = [p for p in parts if folder in p.parents and p.is_file() and p.name not in _DESCRIBED]
-    if shards is None:
-        record = array.metadata.to_dict()
-        some = heapq.nlargest(LARGEST_PIECES, files, lambda part: part.stat().st_size)
-        codecs = str(record.get("codecs", record.get("compressor")))
-        expected = 4 * size * array.dtype.itemsize
-        check_unpacked_size(path, (part.read_bytes() for part in some), expected, codecs)
-    elif math.prod(shards) > _MOST_IN_A_SHARD * size:
+    if shards is not None and math.prod(shards) > _MOST_IN_A_SHARD * size:
         raise InputError(f"{path}: shards of more than {_MOST_IN_A_SHARD} chunks; write larger chunks")
+    places = chosen_pieces(((part, 0, part.stat().st_size) for part in files), itemgetter(2))
+    codecs = codec_names(array)
+    if shards is not None:
+        sharding = array.metadata.codecs[-1]
+        if codecs.count("sharding_indexed") > 1 or not hasattr(sharding, "index_location"):
+            raise InputError(f"{path}: shards within shards, or compressed as a whole; write single shards")
+        chunks = (
+            place for part, _, _ in places for place in _places(part, sharding, math.prod(shards) // size)
+        )
+        places = chosen_pieces(chunks, itemgetter(2))
+    check_unpacked_size(path, starmap(_read, places), 4 * size * array.dtype.itemsize, codecs)
     pairs = zip(array.shape, shards or array.chunks, strict=True)
     wanted = math.prod(-(-length // piece) for length, piece in pairs)
     return unwritten_notes(path, wanted - len(files), wanted)
+
+
+def _places(part: Path, sharding: Any, chunks: int) -> Iterator[tuple[Path, int, int]]:
+    """Yield where the chunks of a shard are: file, first byte and bytes, by the index of the shard."""
+    whole, length = part.stat().st_size, 16 * chunks
+    checksum = 4 * (len(sharding.index_codecs) - 1)
+    first = 0 if sharding.index_location.value == "start" else max(0, whole - length - checksum)
+    index = np.frombuffer(_read(part, first, length)[: length // 16 * 16], "<u8")
+    for start, size in index[: len(index) // 2 * 2].reshape(-1, 2).tolist():
+        if start + size <= whole:  # not those that were never written
+            yield part, start, size
+
+
+def _read(part: Path, start: int, length: int) -> bytes:
+    """Return bytes of a file."""
+    with part.open("rb") as stream:
+        stream.seek(start)
+        return stream.read(length)
 
 
 def _full_resolution(group: Any, settings: InputSettings) -> str | None:

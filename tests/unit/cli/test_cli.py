@@ -1,10 +1,12 @@
 """The command line translates and calls once; what it calls is tested elsewhere."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -180,6 +182,20 @@ def test_out_of_memory_and_ctrl_c_have_their_codes(monkeypatch, capsys):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")
+def test_a_library_that_cannot_be_imported_is_one_line(tmp_path):
+    (tmp_path / "zarr.yaml").write_text("a: [b")
+    npy = tmp_path / "a.npy"
+    np.save(npy, np.zeros((2, 3, 4), np.uint16))
+    found = subprocess.run(
+        [sys.executable, "-m", "pchem_pipeline", "run", npy, "--store", tmp_path / "a.zarr"],
+        env={**os.environ, "ZARR_CONFIG": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+    )
+    assert (found.returncode, len(found.stderr.splitlines())) == (2, 1)
+    assert f"zarr cannot be imported (A config file at '{tmp_path}/zarr.yaml' is malformed" in found.stderr
+
+
 def test_a_full_disk_behind_stdout_is_one_line():
     with Path("/dev/full").open("w") as full:
         found = subprocess.run(

@@ -103,9 +103,19 @@ def test_limits_of_version_1(job):
     write(root / "cpu/slurm/job_7", cpu__cfs_quota_us=-1, cpu__cfs_period_us=100000)
     write(root / "cpu/slurm", cpu__cfs_quota_us=200000, cpu__cfs_period_us=100000)
     assert (available_workers(), available_memory()) == (2, 600 << 20)
+    enter("3:cpuacct,cpu:/job_8\n")  # the controllers in another order, and no link of one of them
+    write(root / "cpuacct,cpu/job_8", cpu__cfs_quota_us=400000, cpu__cfs_period_us=100000)
+    assert available_workers() == 4
     enter("4:memory:/of/the/host\n")  # in a container, which sees its own as the root
     write(root / "memory", memory__limit_in_bytes=500 << 20, memory__usage_in_bytes=100 << 20)
     assert available_memory() == 400 << 20
+
+
+def test_a_limit_from_which_a_job_is_slowed_down_counts(job):
+    root, enter = job
+    enter("damaged\n0::/job\n")
+    write(root / "job", memory__max="max", memory__high=700 << 20, memory__current=100 << 20, cpu__max="1 0")
+    assert (available_workers(), available_memory()) == (16, 600 << 20)
 
 
 def test_what_slurm_gave_is_a_limit_without_cgroups_too(job, monkeypatch):

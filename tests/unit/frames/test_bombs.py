@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import bz2
 import gzip
 import io
+import lzma
 import struct
 import time
 import zipfile
@@ -13,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
+import hdf5plugin
 import numcodecs
 import numpy as np
 import pytest
@@ -54,13 +57,51 @@ def test_zarr(tmp_path: Path, codec: str) -> None:
         read(path)
 
 
+@pytest.mark.parametrize("codec", ["bz2", "lz4", "lzma"])
+def test_zarr_of_other_codecs(tmp_path: Path, codec: str) -> None:
+    path, coder = tmp_path / "a.zarr", {"bz2": bz2, "lz4": numcodecs.LZ4(), "lzma": lzma}[codec]
+    coded = numcodecs.get_codec({"id": codec})
+    zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=coded, zarr_format=2)
+    read(path)
+    bomb = coder.encode(bytes(BOMB)) if codec == "lz4" else coder.compress(bytes(BOMB >> 4))
+    (path / "1.0.0").write_bytes(bomb)
+    with refused_at_once(r"a\.zarr: damaged: a piece of \d+ bytes unpacks to more than"):
+        read(path)
+
+
+def test_zstd_of_many_frames(tmp_path: Path) -> None:
+    path, coder = tmp_path / "a.zarr", numcodecs.Zstd()
+    coded = {"name": "zstd", "configuration": {}}
+    zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=coded)
+    (path / "c/1/0/0").write_bytes(coder.encode(bytes(8)) + coder.encode(bytes(BOMB)))
+    with refused_at_once(r"unpacks to more than"):
+        read(path)
+
+
+def test_zarr_compressed_twice(tmp_path: Path) -> None:
+    coded = [{"name": "gzip", "configuration": {}}, {"name": "zstd", "configuration": {}}]
+    zarr.create_array(tmp_path / "a.zarr", data=STACK, chunks=(20, 16, 16), compressors=coded)
+    with refused_at_once(r"compressed twice, by \w+ and \w+; write it again with one of them"):
+        read(tmp_path / "a.zarr")
+
+
+@pytest.mark.parametrize("place", ["start", "end"])
 @pytest.mark.parametrize("codec", ["gzip", "zstd", "blosc"])
-def test_shards_are_many_pieces(tmp_path: Path, codec: str) -> None:
-    coded = {"name": codec, "configuration": {}}
-    zarr.create_array(
-        tmp_path / "a.zarr", data=STACK, chunks=(2, 16, 16), shards=(40, 16, 16), compressors=coded
-    )
-    read(tmp_path / "a.zarr")
+def test_shards_are_many_pieces(tmp_path: Path, codec: str, place: str) -> None:
+    path, coded = tmp_path / "a.zarr", {"name": codec, "configuration": {}}
+    shards = {"shape": (40, 16, 16), "index_location": place}
+    zarr.create_array(path, data=STACK, chunks=(2, 16, 16), shards=shards, compressors=coded)
+    read(path)
+    data = (path / "c/0/0/0").read_bytes()
+    first, size = (0 if place == "start" else len(data) - 324), 320
+    index = np.frombuffer(data[first : first + size], "<u8").reshape(20, 2).copy()
+    coder = {"gzip": gzip, "zstd": numcodecs.Zstd(), "blosc": numcodecs.Blosc()}[codec]
+    bomb = coder.compress(bytes(BOMB)) if codec == "gzip" else coder.encode(bytes(BOMB))
+    index[7] = (324 if place == "start" else 0), len(bomb)
+    coded_index = index.tobytes() + bytes(4)
+    (path / "c/0/0/0").write_bytes(coded_index + bomb if place == "start" else bomb + coded_index)
+    with refused_at_once(r"unpacks to more than"):
+        read(path)
 
 
 def test_another_array_of_the_store_is_no_piece(tmp_path: Path) -> None:
@@ -77,6 +118,26 @@ def test_zarr_of_many_chunks_in_a_shard(tmp_path: Path) -> None:
     (path / "c/0/0/0").write_bytes(b"")
     with refused_at_once(r"shards of more than 65536 chunks"):
         read(path)
+
+
+@pytest.mark.parametrize("codec", ["bz2", "lz4", "bitshuffle", "zstd", "blosc"])
+def test_hdf5_filters(tmp_path: Path, codec: str) -> None:
+    filters = {
+        "bz2": (hdf5plugin.BZip2(), bz2.compress(bytes(BOMB >> 4))),
+        "lz4": (hdf5plugin.LZ4(), struct.pack(">QI", BOMB, 1 << 12) + bytes(99)),
+        "bitshuffle": (hdf5plugin.Bitshuffle(), struct.pack(">QI", BOMB, 1 << 12) + bytes(99)),
+        "zstd": (hdf5plugin.Zstd(), numcodecs.Zstd().encode(bytes(BOMB))),
+        "blosc": (hdf5plugin.Blosc(), numcodecs.Blosc().encode(bytes(BOMB))),
+    }
+    coded, bomb = filters[codec]
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        dataset = file.create_dataset("frames", data=STACK, chunks=(20, 16, 16), **coded)
+        dataset.id.write_direct_chunk((0, 0, 0), STACK[:20].tobytes(), filter_mask=1)  # left as it is
+        file.flush()
+        read(tmp_path / "a.h5")
+        dataset.id.write_direct_chunk((20, 0, 0), bomb)
+    with refused_at_once("unpacks to more than"):
+        read(tmp_path / "a.h5")
 
 
 @pytest.mark.parametrize("kind", ["deep", "twice", "claims"])
@@ -99,7 +160,7 @@ def test_hdf5(tmp_path: Path, deflated: bytes, kind: str) -> None:
             made = h5py.h5d.create(file.id, b"frames", type_, space, record)
             made.write(h5py.h5s.ALL, h5py.h5s.ALL, STACK)
     write_hdf5(tmp_path / "b.h5", x=STACK)
-    words = {"deep": "unpacks to more than", "twice": "coded twice"}
+    words = {"deep": "unpacks to more than", "twice": "compressed twice, by zlib and zlib"}
     with refused_at_once(words.get(kind, "cannot hold 1000000000 frames")):
         read(path)
 

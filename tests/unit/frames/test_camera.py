@@ -225,6 +225,14 @@ def test_hostile_texts_become_one_short_line() -> None:
         (100, "exposure time of the second frame", 100.0),
         (100, "exposure time in the dark mode", 100.0),
         (100, "exposure time in ticks", None),
+        (100, "exposure time in clock cycles", None),
+        (100, "exposure time in milli-seconds", 0.1),
+        (100, "exposure_ms", 0.1),
+        (100, "m_sec", 0.1),
+        (100, "exposure in us of the shutter", 1e-4),
+        (100, "exposure time [ms/10]", None),
+        ("100ms", None, 0.1),
+        ("1/30 s", None, None),
         (100, "[lines] exposure time", None),
         (100, "[s] exposure time in ms", None),
         (100, "exposure in units of 10 us", None),
@@ -245,12 +253,14 @@ def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path: Path) ->
         image.writeto(tmp_path / f"{name}.fits")
     attributes = {"exposure_time": 100, "exposure_time_unit": "ms"}
     zarr.create_array(tmp_path / "a.zarr", data=STACK, attributes=attributes)
+    named = {"exposure_time": 100, "time_unit": "ms"}
+    zarr.create_array(tmp_path / "b.zarr", data=STACK, attributes=named)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["frames"], file["exposure_ms"] = STACK, 100
     STACK.astype("<u2").tofile(tmp_path / "a.raw")
     side = {"shape": STACK.shape, "dtype": "uint16", "integration_time": 100, "integration_time_unit": "ms"}
     (tmp_path / "a.raw.json").write_text(json.dumps(side))
-    seconds = dict.fromkeys(("unit.fits", "a.zarr", "a.h5", "a.raw"), 0.1)
+    seconds = dict.fromkeys(("unit.fits", "a.zarr", "b.zarr", "a.h5", "a.raw"), 0.1)
     seconds |= {"plain.fits": 100.0, "doubt.fits": None}
     for name, right in seconds.items():
         with opened(tmp_path / name) as stack:

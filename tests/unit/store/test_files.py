@@ -13,7 +13,7 @@ import pytest
 import pchem_pipeline
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.store import disk
-from pchem_pipeline.store.files import whole_file, without_nan, write_atomic
+from pchem_pipeline.store.files import checked, whole_file, without_nan, write_atomic
 
 
 def _fail(*_: object, **__: object) -> None:
@@ -114,6 +114,12 @@ def test_no_other_module_puts_files_in_their_place():
     for name, number in found.items():
         assert name in allowed, name
         assert allowed[name] in (None, number), name
+
+
+@pytest.mark.parametrize("data", [b"[1]", b"null", b"7", b"{", b"\xff", b"[" * 100_000])
+def test_a_record_that_is_no_object_is_damaged(data):
+    with pytest.raises(StoreError, match=r"^a\.json is damaged \(.*\); run it again$"):
+        checked(data, Path("a.json"), "run it again")
 
 
 def test_json_has_no_nan():

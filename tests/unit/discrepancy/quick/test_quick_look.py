@@ -359,6 +359,16 @@ def test_samples_cut_off_at_0_are_the_black_level_and_no_widths() -> None:
     assert not found["top_code"].found
 
 
+def test_frames_below_the_others_do_not_cut_samples_off() -> None:
+    """Pixels in which they lie lowest fit badly; where the codes of the rest end is no limit."""
+    frames = stack(np.random.default_rng(13), SHAPE, lambda dn: dn - dn.mean(axis=0) + 210.0, read_noise=0.22)
+    frames[:8] -= 18
+    found = by_name(looked(frames))
+    assert found["odd_frames"].found
+    assert not found["bottom_code"].found
+    assert found["bottom_code"].where == f"{frames.min()} DN"
+
+
 @pytest.mark.parametrize("n", [700, 1000, 1500])
 def test_a_region_that_is_moved_in_the_middle_of_the_run_is_found(n: int) -> None:
     frames = stack(np.random.default_rng(17), (n, 16, 16))
