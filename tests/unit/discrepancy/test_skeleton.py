@@ -31,12 +31,11 @@ def state_of(before: float, after: float, pull: float, monkeypatch: pytest.Monke
     monkeypatch.setattr(skeleton, "build_verdict", lambda found, *_, **__: found)
     unused: Any = None
     data = skeleton.Prepared(
-        DiscrepancySettings(), "frames", unused, unused, NULL, Measured(z, z, z), Effort(None), 1, {}
+        DiscrepancySettings(), "frames", unused, unused, NULL, Measured(z, z, z), Effort(None), {}
     )
     by: Any = SimpleNamespace(
         prepared=data, model=(), gap=lambda _: gaps[0], suspects=lambda _: True, explain=lambda *_: True,
-        add=lambda *_: NULL, replaced=lambda _: None, unfinished=lambda *_: False,
-        describe=lambda *_: None, probable=lambda: None, tolerance=lambda: 0.0,
+        add=lambda *_: NULL, limit="", tolerance=lambda: 0.0,
         close=lambda *_: Added((addition,), gaps[1]), fitted=lambda _: None,
     )  # fmt: skip
     found: Any = skeleton.search(by)

@@ -125,8 +125,8 @@ class Refitted:
 
     @property
     def price(self) -> float:
-        """Nats that the effects cost beyond one with a name; each part of what is measured costs the same."""
-        return PRICE_OF_MORE * (sum(1 + effect.measured_parts for effect in self.effects) - 1)
+        """Nats beyond those of one effect with a name; each part of what is measured costs as two of these."""
+        return PRICE_OF_MORE * (sum(max(1, 2 * effect.measured_parts) for effect in self.effects) - 1)
 
     @property
     def penalised_log_likelihood(self) -> float:
@@ -415,6 +415,11 @@ class Refitter:
         """Tell whether a set leaves no statistic beyond chance."""
         p = float(self.null.p_of(one.rest, _SPLITS).min())
         return look_elsewhere(p, self.null.effective_tests) > _LEFT
+
+    def rank(self, one: Refitted) -> tuple[bool, float, float]:
+        """Return what sets are compared by: of those that leave nothing the one of fewest parts is the best."""
+        complete = self.passes_goodness_of_fit(one)
+        return complete, -one.price if complete else 0.0, one.penalised_log_likelihood
 
     def residual_is_small(self, one: Refitted) -> bool:
         """Tell whether a set leaves nothing, or so little of what there was that it may be its details."""

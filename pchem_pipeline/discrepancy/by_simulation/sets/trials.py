@@ -59,8 +59,8 @@ class Trials:
 
     @property
     def best(self) -> Refitted:
-        """The set of the highest penalised log-likelihood."""
-        return max(self.tried, key=PENALISED)
+        """The best so far."""
+        return max(self.tried, key=self.refitter.rank)
 
     @property
     def complete(self) -> bool:

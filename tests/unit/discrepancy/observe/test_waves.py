@@ -120,7 +120,6 @@ def test_what_takes_turns_is_measured_and_no_pickup() -> None:
     measured = measured_wave(found(values), found(frames(8)), seen, EVERYWHERE)
     assert measured is not None
     assert isinstance(measured.effect, EmpiricalNoise)
-    assert measured.effect.empirical_unnamed
     assert measured.effect.noise_dn == pytest.approx(0.3, rel=0.09)
     assert measured_wave(found(values), found(values), seen, EVERYWHERE) is None
 

@@ -10,8 +10,10 @@ import pytest
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers, may_be_tuned, tuned
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, choose
-from pchem_pipeline.discrepancy.by_simulation.sets.comparison import compare
+from pchem_pipeline.discrepancy.by_simulation.sets.comparison import chosen, compare
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
+from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -114,7 +116,10 @@ def test_an_effect_that_wrong_numbers_of_another_brought_in_is_not_kept() -> Non
     shifts = (world.parts[0] - world.null.mean, world.parts[1] - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
     assert choice.best.tags == {"dark_current_rts", "row_noise"}
-    found = compare(world.refitter(), [], hypotheses, choice)
+    trials = Trials(world.refitter(), HistogramLikelihood())
+    compare(trials, hypotheses, choice)
+    found = chosen(trials, hypotheses)
+    assert found is not None
     assert found.chosen.tags == {"dark_current_rts"}
 
 
@@ -159,7 +164,8 @@ def test_what_an_effect_of_another_package_raises_ends_no_search(strange: type[D
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
     assert choice is not None
     refitter = world.refitter()
-    found = compare(refitter, [], hypotheses, choice)
-    assert "dark_current_rts" in found.chosen.tags
+    trials = Trials(refitter, HistogramLikelihood())
+    compare(trials, hypotheses, choice)
+    assert "dark_current_rts" in trials.best.tags
     assert refitter.defects
     assert all("dark_current_rts" in failed for failed in refitter.defects)

@@ -101,7 +101,6 @@ def test_frames_that_are_noisier_are_told_with_how_many_they_are() -> None:
     assert mode.burst == pytest.approx(some.mean(), rel=0.1)
     # too small, since loud samples scatter more than the scores should: where a fit to all statistics begins
     assert 0.5 < found.noise_dn / (0.5 * np.sqrt(some.mean()) * 0.25 * STEP) < 1.2
-    assert found.empirical_unnamed
     # of bursts their size in the frames that have them
     size = r"\(\+[34]\d % of the read noise, 1\.\d DN of 3.51 DN, common to"
     assert re.search(f"samples share a variation of the read noise {size}", found.describe())
@@ -179,7 +178,6 @@ def test_a_wave_of_gain_or_light_is_told_by_its_frequencies(
     sine = amplitude * np.sin(2.0 * np.pi * (per_frame * frame + per_line * line) + 0.4)
     stack = frames(11, gain=1.0 + sine) if changes == "gain" else frames(11, light=1.0 + sine)
     found = measured(stack)
-    assert found.empirical_unnamed
     (mode,) = found.modes
     assert (mode.of, mode.changes, mode.lags, mode.burst) == (of, changes, (), None)
     assert mode.wave is not None

@@ -302,8 +302,6 @@ def test_it_is_no_candidate_and_says_what_follows() -> None:
         "samples depend on the charge of other samples (+1 % in column 0, +1 % in columns 2 to 4 of "
         "the sample one column to the right)"
     )
-    near = EmpiricalResponse(response=0.004, terms=(ResponseTerm(place=(0, 0, -1)),))
-    assert not near.empirical_unnamed
 
 
 def test_columns_that_follow_one_across_the_rows_are_told_together() -> None:

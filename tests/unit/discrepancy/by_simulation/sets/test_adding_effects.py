@@ -804,7 +804,7 @@ def test_what_explains_all_but_is_not_certain_is_told_without_a_name(
     assert (told is None) == (rest > 0.0)
     if told is not None:
         before = search.gap(world.null)
-        added = search.close(before, told, disagrees=False)
+        added = search.close(before, told, False)
         assert [(a.effect.tag, a.verdict) for a in added.additions] == [("row_noise", "ambiguous")]
         found = Findings("frames", world.z, world.null, told, before, [], False, added)
         assert found.state == "ambiguous"
@@ -929,15 +929,14 @@ def test_what_the_final_frames_do_not_show_gets_no_name(monkeypatch: pytest.Monk
     assert not any(each.named for each in added)
 
 
-def test_what_widens_the_gap_of_the_final_frames_gets_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_widens_the_gap_of_the_final_frames_is_not_certain(monkeypatch: pytest.MonkeyPatch) -> None:
     """They have some of it, by what it does to one statistic, and the opposite of what it does to another."""
     monkeypatch.setitem(TRUTH, "row_noise", ((np.eye(M)[0] + np.eye(M)[5]) * 40.0, 1.0))
     world = World([effect("row_noise", 0.1)])
     for of_other, outside in ((-0.5, True), (0.3, False)):
         final = 40.0 * (np.eye(M)[0] + of_other * np.eye(M)[5])
-        search, extended = add(world, monkeypatch, hypothesis("row_noise"), final=final)
-        added = search.close(search.gap(world.null), extended, False).additions
-        assert any(each.named for each in added) != outside
+        search, _ = add(world, monkeypatch, hypothesis("row_noise"), final=final)
+        assert (search.extension is not None and search.extension.certain) != outside
 
 
 @pytest.mark.parametrize(
