@@ -164,7 +164,7 @@ class Added:
     """All effects added to the model, and the remaining discrepancy.
 
     Attributes:
-        additions: the effects, the largest of a round first.
+        additions: the effects, the largest first.
         after: gap on the final samples with all of them.
         unfinished: whether the remaining gap is too large for a complete model.
         nearest: tags of the closest effects if none explains the data.

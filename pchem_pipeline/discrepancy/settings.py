@@ -62,7 +62,7 @@ class DiscrepancySettings(Section):
         description="allowed relative error of the predicted shift of the statistics by a candidate, no unit",
     )
     max_rounds: int = Field(
-        default=3, ge=1, le=10, description="largest number of rounds; each may add several effects"
+        default=3, ge=1, le=10, description="largest number of times that the best set of effects is extended"
     )
     effort: float | None = Field(
         default=1.0,

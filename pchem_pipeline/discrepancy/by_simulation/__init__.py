@@ -1,1 +1,1 @@
-"""Identification of effects in frames by simulation: fingerprints, replicates, rounds."""
+"""Identification of effects in frames by simulation: fingerprints, replicates, sets."""

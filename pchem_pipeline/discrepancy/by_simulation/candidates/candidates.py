@@ -127,7 +127,6 @@ class ReplicateSimulator:
         acquisition: of the split that is simulated.
         names: of the statistics.
         mapper: who does the work.
-        prefix: begins the keys of its replicates.
         seed: of the random numbers that all candidates share.
         defects: candidates that failed, and why.
     """
@@ -137,7 +136,6 @@ class ReplicateSimulator:
     acquisition: Acquisition
     names: tuple[str, ...]
     mapper: Mapper
-    prefix: str
     seed: int
     defects: dict[str, str] = field(default_factory=dict)
     _rows: dict[str, FloatArray] = field(default_factory=dict)
@@ -291,11 +289,11 @@ class ReplicateSimulator:
 
     def _replicate(self, effect: Effect | None, repeat: int) -> Replicate:
         effects = self.model if effect is None else along_chain(self.model, (effect,))
-        # of the model and its purpose, too: the same effects come with other strengths in one round
+        # of the model and its purpose, too: the same effects come with other strengths
         text = json.dumps([self.seed, *(each.model_dump(mode="json") for each in effects)], sort_keys=True)
         digest = hashlib.sha256(text.encode()).hexdigest()[:10]
         label = f"{'base' if effect is None else effect.tag}-{digest}-{repeat}"
-        return Replicate(f"{self.prefix}-{label}", self.maps, effects, self.seed + repeat, self.acquisition)
+        return Replicate(label, self.maps, effects, self.seed + repeat, self.acquisition)
 
     def _row(self, vector: Vector) -> FloatArray:
         return np.array([vector.get(name, 0.0) for name in self.names], np.float64)

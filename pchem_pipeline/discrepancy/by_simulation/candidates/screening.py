@@ -131,7 +131,6 @@ class Screening:
             self.observed.frames.acquisition(),
             null.names,
             self.work.counted,
-            "r0",
             self.work.seed_of(f"fingerprint/{purpose}"),
             self.defects,
         )

@@ -125,7 +125,7 @@ class Refitted:
 
     @property
     def price(self) -> float:
-        """Nats beyond those of one effect with a name; each part of what is measured costs as two of these."""
+        """Nats beyond those of one effect with a name; each part that is measured costs as two of these."""
         return PRICE_OF_MORE * (sum(max(1, 2 * effect.measured_parts) for effect in self.effects) - 1)
 
     @property
@@ -417,7 +417,7 @@ class Refitter:
         return look_elsewhere(p, self.null.effective_tests) > _LEFT
 
     def rank(self, one: Refitted) -> tuple[bool, float, float]:
-        """Return what sets are compared by: of those that leave nothing the one of fewest parts is the best."""
+        """Return what sets are compared by: of those that leave nothing, the one of fewest parts is best."""
         complete = self.passes_goodness_of_fit(one)
         return complete, -one.price if complete else 0.0, one.penalised_log_likelihood
 

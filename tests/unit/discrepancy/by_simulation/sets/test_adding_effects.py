@@ -619,7 +619,7 @@ def test_what_the_model_leaves_is_asked_for_guesses_before_what_the_frames_show(
             return [effect("frame_noise", 0.3)]
 
     taken: Any = SimpleNamespace(window=SensorWindow.whole((4, 4)))
-    simulator = ReplicateSimulator(None, (), taken, (), list, "", 1)  # type: ignore[arg-type]
+    simulator = ReplicateSimulator(None, (), taken, (), list, 1)  # type: ignore[arg-type]
     classes: Any = {"seen": Seen, "unseen": Unseen}
     guesses: Any = simulator.guesses
     assert guesses(classes, [frames], (), beside) == [effect("row_noise", 0.1), effect("frame_noise", 0.3)]
@@ -639,7 +639,7 @@ def test_of_guesses_in_parts_those_that_stand_out_most_are_kept() -> None:
             return [effect("row_noise", 0.1), effect("row_noise", 0.2)]
 
     taken: Any = SimpleNamespace(window=SensorWindow.whole((30, 4)))
-    simulator = ReplicateSimulator(None, (), taken, (), list, "", 1)  # type: ignore[arg-type]
+    simulator = ReplicateSimulator(None, (), taken, (), list, 1)  # type: ignore[arg-type]
     classes: Any = {"seen": Seen}
     found = simulator.guesses(classes, [quiet], parts)  # type: ignore[list-item]
     assert found[:2] == [effect("row_noise", 0.1), effect("row_noise", 0.2)]
@@ -669,7 +669,7 @@ def test_a_set_is_fitted_again_with_the_kind_of_an_effect_that_does_better() -> 
 
 def test_a_simulated_stack_is_known_by_all_that_makes_it_under_a_name_that_a_file_can_have() -> None:
     keys = [
-        ReplicateSimulator(None, model, None, (), list, "r0", seed)._replicate(one, 0).key  # type: ignore[arg-type]
+        ReplicateSimulator(None, model, None, (), list, seed)._replicate(one, 0).key  # type: ignore[arg-type]
         for model in ((), (effect("row_noise", 0.1),), (effect("row_noise", 0.2),))
         for one in (None, effect("frame_noise", 0.3))
         for seed in (1, 2)
