@@ -35,6 +35,7 @@ from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, frame_words, odd_words
+from pchem_pipeline.model.histogram.spectrum import SEEN_MIDWAY
 from pchem_pipeline.model.maps.ordered import median_of
 
 if TYPE_CHECKING:
@@ -131,7 +132,7 @@ def _wave(sums: StackSums) -> list[Check]:
     # of so many means of exponential numbers the largest
     sure = (math.sqrt(2.0 * math.log(cells)) + 3.0) / math.sqrt(frames)
     p = look_elsewhere(float(special.gammaincc(frames, frames * line["ratio"])), cells)
-    limit, where = line["unit"] * math.sqrt(sure), ", ".join(cycles)
+    limit, where = line["unit"] * math.sqrt(sure / SEEN_MIDWAY), ", ".join(cycles)
     return [check_of("wave", p, line["size"], limit=limit, where=where)]
 
 

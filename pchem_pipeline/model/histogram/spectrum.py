@@ -16,7 +16,10 @@ from scipy import fft, ndimage
 #: Samples that are looked at, of the first frames, and rows and columns that a spectrum needs.
 _MOST_SAMPLES, _FEWEST_LINES = 1 << 22, 8
 #: Frequencies on either side, along rows or columns, whose median is the noise of the one in their middle.
-_AROUND = 3
+_AROUND = 6
+_PADDED = 2  # times as long with zeros along either axis, which halves the step between frequencies
+#: Of the power of a wave, what is seen at one frequency where it lies midway between two along either axis.
+SEEN_MIDWAY = float(np.sinc(0.5 / _PADDED)) ** 4
 
 
 class FrameSpectrum:
@@ -24,7 +27,8 @@ class FrameSpectrum:
 
     def __init__(self, shape: tuple[int, int]) -> None:
         """Begin with no frames of some rows and columns."""
-        self._power = np.zeros((max(shape[0] - 1, 0), shape[1] // 2))
+        self._shape = _PADDED * shape[0], _PADDED * shape[1]
+        self._power = np.zeros((max(self._shape[0] - 1, 0), self._shape[1] // 2))
         self._left = _MOST_SAMPLES // max(shape[0] * shape[1], 1) if min(shape) >= _FEWEST_LINES else 0
         self._n, self._pixels, self._sd = 0, 0, 0.0
 
@@ -39,7 +43,7 @@ class FrameSpectrum:
         sd = np.sqrt(np.mean(u * u, axis=0))
         u /= np.where(sd > 0, sd, 1.0)
         for frame in u:
-            wave = fft.rfft2(frame)[1:, 1:]
+            wave = fft.rfft2(frame, self._shape)[1:, 1:]
             self._power += wave.real**2 + wave.imag**2
         self._left -= len(frames)
         self._n += len(frames)
@@ -54,9 +58,8 @@ class FrameSpectrum:
         if not self._n or not self._pixels:
             return {}
         power = self._power / (self._n * self._pixels)
-        rows, columns = power.shape[0] + 1, 2 * power.shape[1]
-        if rows % 2 == 0:
-            power[rows // 2 - 1, -1] /= 2.0  # a real wave, of one phase, where the columns are even
+        rows, columns = self._shape
+        power[rows // 2 - 1, -1] /= 2.0  # a real wave, of one phase
         filters = ((2 * _AROUND + 1, 1), (1, 2 * _AROUND + 1))
         noise = np.maximum.reduce(
             [*(ndimage.median_filter(power, size) for size in filters), np.ones_like(power)]
@@ -64,8 +67,8 @@ class FrameSpectrum:
         ratio = power / noise
         y, x = (int(i) for i in np.unravel_index(int(ratio.argmax()), ratio.shape))
         # a wave between two frequencies is in those around both
-        near, wide = (power[max(y - r, 0) : y + r + 1, max(x - r, 0) : x + r + 1] for r in (2, 7))
-        excess = float(near.sum()) - near.size * float(np.median(wide))
+        near, wide = (power[max(y - r, 0) : y + r + 1, max(x - r, 0) : x + r + 1] for r in (4, 14))
+        excess = (float(near.sum()) - near.size * float(np.median(wide))) / _PADDED**2
         unit = self._sd * (2.0 / self._pixels) ** 0.5
         return {
             "ratio": float(ratio[y, x]),

@@ -25,6 +25,7 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.histogram.settings import HistogramSettings
+from pchem_pipeline.model.histogram.spectrum import SEEN_MIDWAY, FrameSpectrum
 
 SHAPE = (800, 32, 32)
 SIGMA = READ_NOISE / GAIN  # DN
@@ -458,3 +459,21 @@ def test_the_codes_of_a_joint_fit_are_judged_by_its_parameters() -> None:
     assert code_checks(none) == []
     bright = CodeSample(codes.counts, codes.origin, given * (1e5, 1.0, 1.0, 1.0))
     assert code_checks(bright) == []
+
+
+def test_a_wave_midway_between_two_frequencies_is_seen_as_stated() -> None:
+    """Frames of 16 x 16, padded to 32 x 32: a wave of 12.5 cycles in 32 rows and columns is the farthest."""
+    rng, side, n = np.random.default_rng(11), 16, 400
+    y, x = np.indices((side, side))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (n, 1, 1))
+    cycles = (6 + 0.25) / side  # a quarter from a frequency of the frame, half of one of the padded frame
+    wave = 3.0 * np.sin(2.0 * np.pi * cycles * (y + x) + phase)
+    frames = np.rint(300.0 + wave + 12.0 * rng.standard_normal((n, side, side))).astype(np.uint16)
+    spectrum = FrameSpectrum((side, side))
+    spectrum.add(frames)
+    line = spectrum.line()
+    power = side**2 / 2.0 * 4.5 / (12.0**2 + 1.0 / 12.0 + 4.5)
+    # the noise is the median of those around, which the wave is in, too; a power scatters by itself
+    error = (1.0 + SEEN_MIDWAY * power) / np.sqrt(n)
+    assert abs(line["ratio"] - 1.0 - SEEN_MIDWAY * power) < 4.0 * error + 0.05 * power
+    assert line["ratio"] > 1.0 + 0.3 * power  # without padding 0.16 of the power would be seen
