@@ -223,7 +223,7 @@ class FrameExplainer(Explainer[Explanation]):
         trials = Trials(refitter, HistogramLikelihood(self._likelihood))
         own, measured = (explanation.hypotheses, explanation.choice), self._measured(refitter)
         compare(trials, *own, lambda best: self._left_by(best, refitter), measured, settings.max_rounds)
-        if trials.limit is not None:
+        if trials.limit is not None and not trials.complete:
             tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
             tried = self.work.effort.tried
             self.limit = EffortSpentError(trials.limit.doing, (t for t in tags if t not in tried)).words()

@@ -88,7 +88,8 @@ class Trials:
 
     def measure(self, measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]]) -> None:
         """Measure what is left without effects and beside the best set; at the limit some is left out."""
-        for beside in ((), self.best.hypotheses) if self.tried else ((),):
+        besides = [()] if not self.tried or self.complete else [(), self.best.hypotheses]
+        for beside in besides:
             try:
                 for one in measured(beside):
                     self.tried += [] if one in self.tried else [one]
