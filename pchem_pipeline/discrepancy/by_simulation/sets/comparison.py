@@ -197,7 +197,7 @@ def _best_seen(refitter: Refitter, tried: list[Refitted]) -> Refitted | None:
         tried: sets; out: the best first, at their best fit where that may be the best of all.
     """
     while True:
-        tried.sort(key=refitter.rank, reverse=True)
+        tried[:] = refitter.ranked(tried)
         known = [*tried]
         found = next((one for one in tried if _all_seen(refitter, one, known)), None)
         if found is None:

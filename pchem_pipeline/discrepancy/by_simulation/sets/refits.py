@@ -9,6 +9,7 @@ by secants): an effect is judged by what is left after its best fit.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
@@ -416,10 +417,12 @@ class Refitter:
         p = float(self.null.p_of(one.rest, _SPLITS).min())
         return look_elsewhere(p, self.null.effective_tests) > _LEFT
 
-    def rank(self, one: Refitted) -> tuple[bool, float, float]:
-        """Return what sets are compared by: of those that leave nothing, the one of fewest parts is best."""
-        complete = self.passes_goodness_of_fit(one)
-        return complete, -one.price if complete else 0.0, one.penalised_log_likelihood
+    def ranked(self, sets: Iterable[Refitted]) -> list[Refitted]:
+        """Return sets, the best first: the likeliest; if it leaves nothing, the smallest that does so."""
+        found = sorted(sets, key=operator.attrgetter("penalised_log_likelihood"), reverse=True)
+        if found and self.passes_goodness_of_fit(found[0]):
+            found.sort(key=lambda one: one.price if self.passes_goodness_of_fit(one) else np.inf)
+        return found
 
     def residual_is_small(self, one: Refitted) -> bool:
         """Tell whether a set leaves nothing, or so little of what there was that it may be its details."""

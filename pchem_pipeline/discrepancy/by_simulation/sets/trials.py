@@ -60,7 +60,7 @@ class Trials:
     @property
     def best(self) -> Refitted:
         """The best so far."""
-        return max(self.tried, key=self.refitter.rank)
+        return self.refitter.ranked(self.tried)[0]
 
     @property
     def complete(self) -> bool:
