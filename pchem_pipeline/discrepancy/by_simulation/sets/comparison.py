@@ -371,8 +371,6 @@ def _all_seen(refitter: Refitter, one: Refitted, known: list[Refitted]) -> bool:
         one: the set.
         known: sets at their best fit, the best first; those that are fitted here come to them.
     """
-    if any(type(effect).empirical for effect in one.effects):
-        return True  # of what is measured beside effects each is proven when it is measured
     if len(one.tags) == 1:
         # the same effect in two places: without it nothing is left to compare with
         return len(one.hypotheses) == 1
