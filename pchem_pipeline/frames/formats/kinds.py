@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import imagecodecs
 import numpy as np
 
 from pchem_pipeline.base.errors import InputError
@@ -174,6 +173,8 @@ def _unpacked_size(data: bytes, codec: str, most: int) -> int:
         start, end, order = _SIZES[codec]
         return int.from_bytes(data[start:end], order)
     if codec == "zstd":
+        import imagecodecs  # slow to import
+
         try:
             return len(imagecodecs.zstd_decode(data, out=most))
         except imagecodecs.ZstdError as error:
