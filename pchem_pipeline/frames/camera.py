@@ -223,7 +223,7 @@ def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] | None 
         duration_of(
             name,
             values.get(name),
-            *([*filter(None, units_of(name))] or of_any * (name in _DURATIONS) or [named.get(name)]),
+            *([*filter(None, units_of(name))] or (of_any if name in _DURATIONS else []) or [named.get(name)]),
         )
         for name in dict.fromkeys((*named, *_DURATIONS))
     )

@@ -162,7 +162,7 @@ def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int, code
 
 
 def chosen_pieces(pieces: Iterable[Any], size: Callable[[Any], int]) -> list[Any]:
-    """Return the largest and the smallest coded pieces, as many as are unpacked to see how much they hold."""
+    """Return the largest and the smallest coded pieces: what hides much in little is among either."""
     some = sorted(pieces, key=size)
     return some[:_FEW_PIECES] + some[_FEW_PIECES:][-_FEW_PIECES:]
 
