@@ -270,7 +270,7 @@ def model_of(store: RunStore, stage: str) -> ModelVersion | None:
         return None
     version = model_of_content(store, record.content)
     if version is None and (record.content.get("input") or {}).get("model"):
-        raise StoreError(f"{store.path / _GROUP}: the model that {stage} rests on is missing; run again")
+        raise StoreError(f"{store.path / _GROUP}: the model used by {stage} is missing; run again")
     return version
 
 

@@ -148,7 +148,7 @@ def test_without_the_model_of_the_fit_nothing_is_expected_of_a_pixel(finished, t
     folder = tmp_path / "run"
     shutil.copytree(finished, folder)
     (folder / "run.zarr/model/0001.json").unlink()
-    with pytest.raises(StoreError, match="the model that fit rests on is missing; run again"):
+    with pytest.raises(StoreError, match="the model used by fit is missing; run again"):
         open_run(folder / "run.zarr").pixel(3, 5)
     run(folder / "run.yaml")
     same(numbers(folder / "run.zarr"), numbers(finished / "run.zarr"))
