@@ -118,7 +118,7 @@ class Run:
                 for each in found["answers"]
             )
             rows = [(each["label"], each["value"], each["spread"]) for each in found["headline"]]
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, AttributeError) as error:
             raise StoreError(f"{self.path / 'report.json'} is damaged; run again to write it") from error
         return f"<p>{head}</p>{answers}{html_table(('median', 'value', '5 to 95 %'), rows)}"
 

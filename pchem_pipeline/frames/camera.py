@@ -216,12 +216,14 @@ def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] | None 
     temperatures = (celsius(values.get(name), first_of(units_of(name))) for name in _TEMPERATURES)
     # those first whose unit is known by their name; integration_time is in s as sidecars have it
     named = {_DURATIONS[0]: "s", **_DURATIONS_IN}
-    of_any = [unit for name, unit in values.items() if TIME_UNIT.fullmatch(name)]
+    # a plain unit may be that of the samples
+    plain = (unit for name in ("unit", "units") if (unit := values.get(name)) and text_of(unit) in _SECONDS)
+    of_any = [*(unit for name, unit in values.items() if TIME_UNIT.fullmatch(name)), *plain]
     durations = (
         duration_of(
             name,
             values.get(name),
-            *([*filter(None, units_of(name))] or of_any * (name in _DURATIONS) or [named.get(name)]),
+            *([*filter(None, units_of(name))] or (of_any if name in _DURATIONS else []) or [named.get(name)]),
         )
         for name in dict.fromkeys((*named, *_DURATIONS))
     )

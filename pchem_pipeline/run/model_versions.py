@@ -264,13 +264,13 @@ def model_of(store: RunStore, stage: str) -> ModelVersion | None:
         StoreError: the result is there, but not what it rests on.
     """
     record = store.records.read(stage)
-    if record is None and store.has(stage):
-        raise StoreError(f"{store.path}: {stage} has lost its record; {store.cure(stage)}")
     if record is None:
+        if store.has(stage):
+            raise StoreError(f"{store.path}: {stage} has lost its record; {store.cure(stage)}")
         return None
     version = model_of_content(store, record.content)
     if version is None and (record.content.get("input") or {}).get("model"):
-        raise StoreError(f"{store.path / _GROUP}: the model that {stage} rests on is missing; run again")
+        raise StoreError(f"{store.path / _GROUP}: the model used by {stage} is missing; run again")
     return version
 
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from pchem_pipeline import open_run
-from pchem_pipeline.base.errors import PchEmError
+from pchem_pipeline.base.errors import PchEmError, StoreError
 from pchem_pipeline.model.maps.maps import NO_VALUE
 from pchem_pipeline.run.stage import Options, open_store
 from pchem_pipeline.run.target import find_run
@@ -141,6 +141,17 @@ def test_any_file_is_damaged(finished, tmp_path, step):
         shutil.copytree(finished, folder)
         damaged(folder / victim, kind, rng)
         check(folder, f"{victim} {kind}", expected, FORCED[i % len(FORCED)])
+
+
+def test_without_the_model_of_the_fit_nothing_is_expected_of_a_pixel(finished, tmp_path):
+    """It was expected of the plain PCD, without a word."""
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    (folder / "run.zarr/model/0001.json").unlink()
+    with pytest.raises(StoreError, match="the model used by fit is missing; run again"):
+        open_run(folder / "run.zarr").pixel(3, 5)
+    run(folder / "run.yaml")
+    same(numbers(folder / "run.zarr"), numbers(finished / "run.zarr"))
 
 
 def test_pixels_of_a_tile_that_failed_have_no_value(finished, tmp_path, monkeypatch):

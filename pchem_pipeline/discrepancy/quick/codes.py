@@ -139,9 +139,9 @@ def _widths(codes: CodeSums) -> Check | None:
 
 
 def _pile_up(codes: CodeSums, sample: CodeSample, code: int, top: bool) -> Check:
-    """Return whether so many samples are at ``code``, the first or last (DN) of all pixels, that it cuts off.
+    """Test whether samples are cut off at ``code``, the lowest or highest of all pixels, DN.
 
-    ``codes`` leaves out pixels that fit badly, those with the farthest samples too: it ends at no limit.
+    That of ``codes`` is no limit: it leaves out pixels that fit badly, often those with the farthest samples.
     """
     seen, expected = codes.single[:2]
     at = code - codes.first

@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import imagecodecs
 import numpy as np
 
 from pchem_pipeline.base.errors import InputError
@@ -163,7 +162,7 @@ def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int, code
 
 
 def chosen_pieces(pieces: Iterable[Any], size: Callable[[Any], int]) -> list[Any]:
-    """Return the largest and the smallest coded pieces, as many as are unpacked to see how much they hold."""
+    """Return the largest and the smallest coded pieces: what hides much in little is among either."""
     some = sorted(pieces, key=size)
     return some[:_FEW_PIECES] + some[_FEW_PIECES:][-_FEW_PIECES:]
 
@@ -174,6 +173,8 @@ def _unpacked_size(data: bytes, codec: str, most: int) -> int:
         start, end, order = _SIZES[codec]
         return int.from_bytes(data[start:end], order)
     if codec == "zstd":
+        import imagecodecs  # slow to import
+
         try:
             return len(imagecodecs.zstd_decode(data, out=most))
         except imagecodecs.ZstdError as error:

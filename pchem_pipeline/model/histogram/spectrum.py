@@ -15,10 +15,11 @@ from scipy import fft, ndimage
 
 #: Samples that are looked at, of the first frames, and rows and columns that a spectrum needs.
 _MOST_SAMPLES, _FEWEST_LINES = 1 << 22, 8
+#: Factor by which zeros lengthen either axis of a frame: the step between frequencies is so much smaller.
+_PADDED = 2
 #: Frequencies on either side, along rows or columns, whose median is the noise of the one in their middle.
-_AROUND = 6
-_PADDED = 2  # times as long with zeros along either axis, which halves the step between frequencies
-#: Of the power of a wave, what is seen at one frequency where it lies midway between two along either axis.
+_AROUND = 3 * _PADDED
+#: Fraction of the power of a wave midway between two frequencies, along either axis, that one of them shows.
 SEEN_MIDWAY = float(np.sinc(0.5 / _PADDED)) ** 4
 
 
@@ -67,7 +68,9 @@ class FrameSpectrum:
         ratio = power / noise
         y, x = (int(i) for i in np.unravel_index(int(ratio.argmax()), ratio.shape))
         # a wave between two frequencies is in those around both
-        near, wide = (power[max(y - r, 0) : y + r + 1, max(x - r, 0) : x + r + 1] for r in (4, 14))
+        near, wide = (
+            power[max(y - r, 0) : y + r + 1, max(x - r, 0) : x + r + 1] for r in (2 * _PADDED, 7 * _PADDED)
+        )
         excess = (float(near.sum()) - near.size * float(np.median(wide))) / _PADDED**2
         unit = self._sd * (2.0 / self._pixels) ** 0.5
         return {

@@ -181,7 +181,6 @@ def test_out_of_memory_and_ctrl_c_have_their_codes(monkeypatch, capsys):
         assert capsys.readouterr().err.startswith("pchem: ")
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")
 def test_a_library_that_cannot_be_imported_is_one_line(tmp_path):
     (tmp_path / "zarr.yaml").write_text("a: [b")
     npy = tmp_path / "a.npy"
@@ -196,6 +195,7 @@ def test_a_library_that_cannot_be_imported_is_one_line(tmp_path):
     assert f"zarr cannot be imported (A config file at '{tmp_path}/zarr.yaml' is malformed" in found.stderr
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")
 def test_a_full_disk_behind_stdout_is_one_line():
     with Path("/dev/full").open("w") as full:
         found = subprocess.run(

@@ -255,13 +255,16 @@ def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path: Path) ->
     zarr.create_array(tmp_path / "a.zarr", data=STACK, attributes=attributes)
     named = {"exposure_time": 100, "time_unit": "ms"}
     zarr.create_array(tmp_path / "b.zarr", data=STACK, attributes=named)
+    for name, unit in (("c", "ms"), ("d", "DN")):  # that of the samples says nothing about the time
+        attributes = {"exposure_time": 100, "unit": unit}
+        zarr.create_array(tmp_path / f"{name}.zarr", data=STACK, attributes=attributes)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["frames"], file["exposure_ms"] = STACK, 100
     STACK.astype("<u2").tofile(tmp_path / "a.raw")
     side = {"shape": STACK.shape, "dtype": "uint16", "integration_time": 100, "integration_time_unit": "ms"}
     (tmp_path / "a.raw.json").write_text(json.dumps(side))
-    seconds = dict.fromkeys(("unit.fits", "a.zarr", "b.zarr", "a.h5", "a.raw"), 0.1)
-    seconds |= {"plain.fits": 100.0, "doubt.fits": None}
+    seconds = dict.fromkeys(("unit.fits", "a.zarr", "b.zarr", "c.zarr", "a.h5", "a.raw"), 0.1)
+    seconds |= {"plain.fits": 100.0, "d.zarr": 100.0, "doubt.fits": None}
     for name, right in seconds.items():
         with opened(tmp_path / name) as stack:
             assert stack.integration_time == (None if right is None else pytest.approx(right)), name
