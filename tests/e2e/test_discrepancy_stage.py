@@ -197,7 +197,7 @@ def test_effects_beside_one_that_is_no_candidate_are_named_in_part_and_a_killed_
     markers = other.folder / "run.zarr" / ".pchem" / "done" / "discrepancy"
 
     def asked_beside():
-        return len({path.name.split("-")[2] for path in markers.glob("*/r0-base-*")}) > 1
+        return len({path.name.split("-")[1] for path in markers.glob("*/base-*")}) > 1
 
     with other.start("discrepancy", "run.yaml", "--no-refit") as process:
         while process.poll() is None and not asked_beside():

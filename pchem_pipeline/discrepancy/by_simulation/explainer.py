@@ -207,9 +207,7 @@ class FrameExplainer(Explainer[Explanation]):
         self.work.effort.check("the candidates were compared")
         hypotheses, choice = self.screening.of(self.given, null)
         self.work.effort.leave_for_fits()
-        if choice is None or not (disagreed or choice.advantage > CONVINCING):
-            return None
-        return Explanation(hypotheses, choice)
+        return Explanation(hypotheses, choice) if disagreed or choice.advantage > CONVINCING else None
 
     def add(self, explanation: Explanation, null: NullModel) -> NullModel | None:
         """Put the effects of the best refitted set into the model; None where none is established.
@@ -287,7 +285,7 @@ class FrameExplainer(Explainer[Explanation]):
         events = np.asarray(noise_of_splits(first, 2, data.settings.model_error).events)
         return Refitter(draw, first, data.z.both, events, present, allow=allow, defects=data.defects)
 
-    def _left_by(self, best: Refitted, refitter: Refitter) -> Choice | None:
+    def _left_by(self, best: Refitted, refitter: Refitter) -> Choice:
         """Compare what candidates would do beside a refitted set: what that hid stands out there."""
         null = NullModel.from_replicates(self.prepared.first.names, best.vectors, self.prepared.first)
         null = null.shifted(np.expm1(best.change) @ best.slopes)

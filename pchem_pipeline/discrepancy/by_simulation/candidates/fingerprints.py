@@ -244,16 +244,16 @@ class Choice:
 
     Attributes:
         tried: all that improve on no effect at all, the best first.
-        advantage: held-out log score of the best one over no effect, less its price, nats.
+        advantage: held-out log score of the best one over no effect, less its price, nats; 0: there is none.
     """
 
-    tried: tuple[ScoredSet, ...]
-    advantage: float
+    tried: tuple[ScoredSet, ...] = ()
+    advantage: float = 0.0
 
     @property
-    def best(self) -> ScoredSet:
-        """The best set."""
-        return self.tried[0]
+    def best(self) -> tuple[Hypothesis, ...]:
+        """The best set; empty if none improves."""
+        return self.tried[0].hypotheses if self.tried else ()
 
 
 def score_set(
@@ -306,10 +306,8 @@ def firsts(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     return [h for h in hypotheses if (h.effect.tag, h.number - 1) not in tags]
 
 
-def choose(
-    hypotheses: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise
-) -> Choice | None:
-    """Compare all sets of up to three of the most promising hypotheses; None where none improves on nothing.
+def choose(hypotheses: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise) -> Choice:
+    """Compare all sets of up to three of the most promising hypotheses.
 
     Args:
         hypotheses: candidates; several may be of one effect.
@@ -327,10 +325,8 @@ def choose(
                     sets.append(scored)
     base = sum(log_density(shift, noise.covariance) for shift in shifts)
     sets = [s for s in sets if s.penalised_log_likelihood > base]
-    if not sets:
-        return None
     sets.sort(key=lambda s: s.penalised_log_likelihood, reverse=True)
-    return Choice(tuple(sets), sets[0].penalised_log_likelihood - base)
+    return Choice(tuple(sets), sets[0].penalised_log_likelihood - base if sets else 0.0)
 
 
 def _shortlist(

@@ -62,7 +62,7 @@ class Screening:
     model_error: float
     defects: dict[str, str] = field(default_factory=dict)
 
-    def of(self, model: tuple[Effect, ...], null: NullModel) -> tuple[tuple[Hypothesis, ...], Choice | None]:
+    def of(self, model: tuple[Effect, ...], null: NullModel) -> tuple[tuple[Hypothesis, ...], Choice]:
         """Ask what they would do beside a model: everywhere and in the parts, split by split.
 
         Args:
@@ -70,7 +70,7 @@ class Screening:
             null: of that model.
 
         Returns:
-            All hypotheses, the likeliest first, and how their sets compare; None: there are none.
+            All hypotheses, the likeliest first, and how their sets compare.
         """
         simulator = self._simulator(model, null, "0")
         evidence = (self.observed.plain, *self.observed.parts[:2])
@@ -95,7 +95,7 @@ class Screening:
         hypotheses += seconds(hypotheses)
         return tuple(hypotheses), self._compared(hypotheses, null)
 
-    def beside(self, model: tuple[Effect, ...], null: NullModel, slopes: FloatArray) -> Choice | None:
+    def beside(self, model: tuple[Effect, ...], null: NullModel, slopes: FloatArray) -> Choice:
         """Ask the same beside a set that was refitted: what is worth a refit, as the whole shows it.
 
         Args:
@@ -116,13 +116,13 @@ class Screening:
 
     def _compared(
         self, hypotheses: Sequence[Hypothesis], null: NullModel, doubt: FloatArray | None = None
-    ) -> Choice | None:
+    ) -> Choice:
         """Compare sets on the splits; ``doubt`` are modes of scatter beside chance, (k, m)."""
         noise = noise_of_splits(null, 1, self.model_error)
         if doubt is not None:
             noise = replace(noise, covariance=noise.covariance.with_modes(doubt))
         shifts = (self.z.train - null.mean, self.z.test - null.mean)
-        return choose(hypotheses, shifts, noise) if hypotheses else None
+        return choose(hypotheses, shifts, noise)
 
     def _simulator(self, model: tuple[Effect, ...], null: NullModel, purpose: str) -> ReplicateSimulator:
         return ReplicateSimulator(

@@ -120,7 +120,7 @@ def compare(
     trials: Trials,
     hypotheses: Sequence[Hypothesis],
     choice: Choice,
-    beside: Callable[[Refitted], Choice | None] = lambda _: None,
+    beside: Callable[[Refitted], Choice] = lambda _: Choice(),
     measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]] = lambda _: (),
     steps: int = 3,
 ) -> None:
@@ -139,8 +139,8 @@ def compare(
         steps: the most by which a set grows.
     """
     beside = functools.cache(beside)
-    singles = trials.likelihood.ranked(_singles(hypotheses, choice))
-    first = len(choice.best.hypotheses)
+    singles = trials.likelihood.ranked(_singles(hypotheses, choice)) if choice.tried else []
+    first = len(choice.best)
     # what the likeliest set is made of, then that set: it may leave no others worth a refit
     for hypothesis in _expensive_last(singles[:first]):
         trials.refit((hypothesis,))
@@ -287,7 +287,7 @@ def own_signature(own: FloatArray, others: FloatArray, left: FloatArray, noise: 
 
 def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesis]:
     """Return hypotheses to be refitted alone: those of the best set, and the likeliest of all."""
-    chosen = firsts(choice.best.hypotheses)
+    chosen = firsts(choice.best)
     for hypothesis in firsts(hypotheses):
         same = sum(h.tag == hypothesis.tag for h in chosen)
         most = 1 if type(hypothesis.effect).random_realisation else _MOST_OF_ONE
@@ -296,7 +296,7 @@ def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesi
     return chosen
 
 
-def _grown(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> list[tuple[Hypothesis, ...]]:
+def _grown(trials: Trials, beside: Callable[[Refitted], Choice]) -> list[tuple[Hypothesis, ...]]:
     """Return sets that hold one of the best so far and what stands out beside it.
 
     One that is strong hides or distorts what the frames show of the others.
@@ -318,7 +318,7 @@ def _grown(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> list[
         if one.score >= near and not in_vain and not any(one.tags < better.tags for better in seeds):
             seeds.append(one)
     seeds = seeds[:_MOST_SEEDS]
-    choices = [(one.hypotheses, choice) for one in seeds if (choice := beside(one)) is not None]
+    choices = [(one.hypotheses, beside(one)) for one in seeds]
     grown: list[tuple[Hypothesis, ...]] = []
     for size, most in _MOST_GROWN.items():
         found = [
@@ -334,7 +334,7 @@ def _grown(trials: Trials, beside: Callable[[Refitted], Choice | None]) -> list[
 
 def _far_behind(one: ScoredSet, choice: Choice) -> bool:
     """Tell whether the fingerprints beside a refitted set say that another one explains far more."""
-    best = choice.best.penalised_log_likelihood
+    best = choice.tried[0].penalised_log_likelihood
     return one.penalised_log_likelihood < best - FAR - _REACH_SHARE * choice.advantage
 
 

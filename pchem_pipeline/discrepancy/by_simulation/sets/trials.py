@@ -47,7 +47,7 @@ class Trials:
         tried: sets at their best fit, in the order in which they were tried.
         settled: tags of the sets whose numbers were tuned.
         asked: sets as they were begun.
-        limit: what was next when the budget was used; None: it is not.
+        limit: what was next when the budget was first used; None: it is not.
     """
 
     refitter: Refitter
@@ -94,7 +94,7 @@ class Trials:
                 for one in measured(beside):
                     self.tried += [] if one in self.tried else [one]
             except EffortSpentError as spent:
-                self.limit = spent
+                self.limit = self.limit or spent
 
     def tune(self) -> None:
         """Tune the numbers of the best set where it leaves something, then of those as good until then."""

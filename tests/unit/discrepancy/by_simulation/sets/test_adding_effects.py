@@ -110,17 +110,15 @@ class World:
     def refitter(self) -> Refitter:
         return Refitter(self.draw, self.null, self.z.both, np.zeros(M))
 
-    def choice(self, *hypotheses: Hypothesis, mean: np.ndarray | float = 0.0) -> Choice | None:
+    def choice(self, *hypotheses: Hypothesis, mean: np.ndarray | float = 0.0) -> Choice:
         shifts = (self.z.train - self.null.mean - mean, self.z.test - self.null.mean - mean)
         return choose(hypotheses, shifts, self.refitter().noise(self.null.covariance, 40))
 
     def compare(
         self, *hypotheses: Hypothesis, beside: Sequence[Hypothesis] = (), **how: Any
     ) -> Comparison | None:
-        choice = self.choice(*hypotheses)
-        assert choice is not None
-        grown = (lambda one: self.choice(*beside, mean=one.mean)) if beside else (lambda _: None)
-        return self.best_of(hypotheses, choice, beside=grown, **how)
+        grown = (lambda one: self.choice(*beside, mean=one.mean)) if beside else (lambda _: Choice())
+        return self.best_of(hypotheses, self.choice(*hypotheses), beside=grown, **how)
 
     def best_of(
         self,
@@ -367,9 +365,7 @@ def test_what_does_not_move_a_statistic_that_stands_out_is_no_rival_of_what_leav
     twin = replace(hypothesis("row_noise", 0.3), effect=effect("exposure_drift", 0.3))
     asked = asked_by_refits(world, monkeypatch)
     guesses = [hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.05)]
-    likely = world.choice(*guesses)
-    assert likely is not None
-    found = world.best_of([*guesses, twin], likely)
+    found = world.best_of([*guesses, twin], world.choice(*guesses))
     assert found.chosen.tags == {"row_noise", "frame_noise"}
     assert "exposure_drift" not in asked  # as near as row noise by itself, which leaves what frame noise does
 
@@ -742,7 +738,6 @@ def add(
     monkeypatch.setattr(search, "_measured", lambda _: lambda kept: ())
     shifts = (z.train - world.null.mean, z.test - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
-    assert choice is not None
     return search, search.add(Explanation(hypotheses, choice), world.null)
 
 
