@@ -260,9 +260,7 @@ class FrameExplainer(Explainer[Explanation]):
 
     def _measured(self, refitter: Refitter) -> Callable[[tuple[Hypothesis, ...]], Iterator[Refitted]]:
         """Return what measures samples beside effects, for which some work is kept."""
-        data, proven = self.prepared, self.accept.established
-        replicates = data.settings.extended_replicates
-        unexplained = Unexplained(self.work, refitter, proven, replicates, data.defects)
+        unexplained = Unexplained(self.work, refitter, self.prepared.defects)
 
         def measured(kept: tuple[Hypothesis, ...]) -> Iterator[Refitted]:
             self.work.effort.release()

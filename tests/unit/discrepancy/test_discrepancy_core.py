@@ -186,9 +186,9 @@ def test_the_right_one_of_three_is_named() -> None:
     noise = Noise(UNIT, 0.1)
     shifts = tuple(3.0 * prints["frame_noise"] + rng.normal(size=40) for _ in range(2))
     choice = choose(hypotheses, (shifts[0], shifts[1]), noise)
-    assert choice.best.tags == {"frame_noise"}
+    assert {h.tag for h in choice.best} == {"frame_noise"}
     others = [one for one in choice.tried if "frame_noise" not in one.tags]
-    assert all(one.score < choice.best.score - 5.0 for one in others)
+    assert all(one.score < choice.tried[0].score - 5.0 for one in others)
 
 
 def test_two_at_once_are_both_named() -> None:
@@ -198,7 +198,7 @@ def test_two_at_once_are_both_named() -> None:
     mean = 3.0 * prints["row_noise"] + 2.0 * prints["exposure_drift"]
     shifts = tuple(mean + rng.normal(size=40) for _ in range(2))
     choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(UNIT, 0.05))
-    assert choice.best.tags == {"row_noise", "exposure_drift"}
+    assert {h.tag for h in choice.best} == {"row_noise", "exposure_drift"}
 
 
 def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_sensor() -> None:
@@ -214,10 +214,10 @@ def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_senso
     assert [h.tag for h in hypotheses] == ["row_noise", "row_noise", "row_noise", "row_noise 2"]
     shifts = tuple(3.0 * left + 2.0 * right + rng.normal(size=40) for _ in range(2))
     choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(UNIT, 0.05))
-    assert [h.effect.region for h in choice.best.hypotheses] == regions
+    assert [h.effect.region for h in choice.best] == regions
     assert all(not meets_itself(one.hypotheses) for one in choice.tried)
     assert all("row_noise" in one.tags for one in choice.tried)  # none is a second one alone
-    keys = {h.effect.key for h in choice.best.hypotheses}
+    keys = {h.effect.key for h in choice.best}
     assert len(keys) == 2
 
 
@@ -235,7 +235,7 @@ def test_nothing_is_chosen_where_nothing_is() -> None:
         )
         for _ in range(50)
     ]
-    assert sum(choice is not None for choice in chosen) <= 2
+    assert sum(choice.advantage > 0.0 for choice in chosen) <= 2
 
 
 def test_a_wrong_effect_scores_below_the_right_one_on_frames_that_it_did_not_see() -> None:

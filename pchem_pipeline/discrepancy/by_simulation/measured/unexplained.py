@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -56,16 +56,12 @@ class Unexplained:
     Attributes:
         work: fits and simulates the frames; train and test frames are measured.
         refitter: fits effects to their statistics.
-        proven: effects of a set of which the data have certainly some.
-        replicates: of what is measured.
         defects: forms that failed, and why.
         known: what was measured, by the effects beside it.
     """
 
     work: Simulations
     refitter: Refitter
-    proven: Callable[[Refitted], Sequence[Hypothesis]]
-    replicates: int
     defects: dict[str, str] = field(default_factory=dict)
     known: dict[tuple[Hypothesis, ...], list[Refitted]] = field(default_factory=dict)
     _stacks: dict[Model | None, tuple[NDArray[np.unsignedinteger], PixelMaps]] = field(
@@ -88,8 +84,7 @@ class Unexplained:
     def measured(self, kept: tuple[Hypothesis, ...]) -> Iterator[Refitted]:
         """Yield effects with what explains most beside them, each at its best fit, the likeliest first.
 
-        Until one leaves little. Forms that are among the effects are not measured again; none is what fails
-        or is not certain.
+        Until one leaves little. Forms that are among the effects are not measured again; none is what fails.
 
         Raises:
             EffortSpentError: the work is at its limit.
@@ -109,7 +104,7 @@ class Unexplained:
                     return
 
     def _tried(self, kept: tuple[Hypothesis, ...], likely: _Likely) -> Refitted | None:
-        """Return effects with a form beside them; None where it fails or is not certain."""
+        """Return effects with a form beside them; None where it fails."""
         try:
             return self._described(kept, likely.part, self._forms[likely.form])
         except EffortSpentError:
@@ -136,10 +131,7 @@ class Unexplained:
         return sorted(found, key=lambda one: -one.measured.gain)[:_MOST_TRIED]
 
     def _described(self, kept: tuple[Hypothesis, ...], part: Part, measure: Measure) -> Refitted | None:
-        """Return effects with what is measured in a part beside them at their best fit, or None.
-
-        Effects of which nothing is certain beside it are left out.
-        """
+        """Return effects with what is measured in a part beside them at their best fit, or None."""
         refitter, effects = self.refitter, tuple(h.effect for h in kept)
         measured: tuple[Effect, ...] = ()
         for _ in range(_MEASUREMENTS):
@@ -156,14 +148,7 @@ class Unexplained:
                 best = found
             if self.refitter.residual_is_small(best):
                 break
-        if best is None:
-            return None
-        proven = {h.tag for h in self.proven(best)}
-        if proven == best.tags:
-            return best
-        if measured[0].tag not in proven:
-            return None
-        return self._described(tuple(h for h in kept if h.tag in proven), part, measure)
+        return best
 
     def _fitted(self, kept: tuple[Hypothesis, ...], effect: Effect) -> Refitted:
         """Return effects with what was measured at their best fit."""
@@ -171,8 +156,7 @@ class Unexplained:
         refitter.allow(effect.tag)
         _, vectors = refitter.draw((*(h.effect for h in kept), effect), FEW)
         shift = vectors.mean(axis=0) - refitter.null.mean - sum(h.fingerprint for h in kept)
-        found = refitter.refined((*kept, Hypothesis(effect, shift)))
-        return refitter.sharpened(found, self.replicates)
+        return refitter.refined((*kept, Hypothesis(effect, shift)))
 
     def _mixture_shifts(self, part: Part, present: Model, beside: Model) -> Measurement | None:
         """Measure the mixture shifts of a part beside effects, with the pixels as they now are."""

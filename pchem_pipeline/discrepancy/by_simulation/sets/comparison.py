@@ -20,6 +20,7 @@ from scipy import special
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     FAR,
+    PRICE_OF_MORE,
     STANDS_OUT,
     Choice,
     Hypothesis,
@@ -128,7 +129,7 @@ def compare(
 
     Forward selection by the penalised log-likelihood, with backward elimination. What is measured without a
     name is a member as any other, at the price of its parts; it is asked for where the best set leaves
-    something, and where it takes several effects: one thing that explains as much is the simpler answer.
+    something, or costs more than it would.
 
     Args:
         trials: refits sets; out: all that were tried.
@@ -158,7 +159,7 @@ def compare(
                 if not trials.refit_set(members):
                     break
             trials.tune()
-        if before is None or not trials.complete or len(trials.best.hypotheses) > 1:
+        if before is None or not trials.complete or trials.best.price > PRICE_OF_MORE:
             trials.measure(measured)
         if not trials.tried or trials.complete or trials.limit or trials.best is before:
             return

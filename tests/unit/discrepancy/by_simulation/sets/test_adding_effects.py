@@ -489,7 +489,7 @@ def test_fewer_effects_beside_a_set_are_far_behind_by_more_than_their_fingerprin
     behind: float, explained: float, far: bool
 ) -> None:
     best, one = (SimpleNamespace(penalised_log_likelihood=explained - off) for off in (0.0, behind))
-    choice: Any = SimpleNamespace(best=best, advantage=explained)
+    choice: Any = SimpleNamespace(tried=[best], advantage=explained)
     assert _far_behind(one, choice) is far  # type: ignore[arg-type]
 
 
@@ -497,7 +497,7 @@ def seeds(refitter: Refitter, *tried: Refitted) -> list[frozenset[str]]:
     """Return the sets, of those that were tried, beside which others are asked for."""
     asked: list[frozenset[str]] = []
     trials = Trials(refitter, HistogramLikelihood(), list(tried))
-    _grown(trials, lambda one: asked.append(one.tags))  # type: ignore[func-returns-value]
+    _grown(trials, lambda one: asked.append(one.tags) or Choice())  # type: ignore[func-returns-value]
     return asked
 
 
@@ -528,23 +528,27 @@ def test_an_effect_that_its_set_lets_vanish_does_not_take_the_others_with_it() -
     assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
-@pytest.mark.parametrize("behind", [-1.0, 1.0])
-def test_what_is_measured_competes_with_several_effects_at_its_price(behind: float) -> None:
-    """One thing costs less than two effects; a single effect that leaves nothing is not asked about."""
-    world = World([effect("row_noise", 0.3), effect("frame_noise", 0.3)])
-    row, frame = hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.3)
-    best = world.compare(row, frame).chosen
+@pytest.mark.parametrize("left", [0.0, 9.0])
+def test_what_is_measured_competes_with_several_effects_at_its_price(left: float) -> None:
+    """One thing is simpler than three effects, if it leaves nothing either; with two it is not compared."""
+    tags = ("row_noise", "frame_noise", "exposure_drift")
+    guesses = [hypothesis(tag, 0.3) for tag in tags]
+    best = World([effect(tag, 0.3) for tag in tags]).compare(*guesses).chosen
+    assert len(best.tags) == 3
     noise = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))
     whole = replace(best, hypotheses=(Hypothesis(noise, best.parts.sum(axis=0)),))
     assert whole.price == PRICE_OF_MORE
-    whole = replace(whole, score=best.score - behind)
-    found = world.compare(row, frame, measured=lambda kept: [] if kept else [whole])
-    assert (found.chosen is whole) == (behind < 0.0)
+    whole = replace(whole, score=best.score - 10.0, rest=best.rest + left)
+    world = World([effect(tag, 0.3) for tag in tags])
+    found = world.compare(*guesses, measured=lambda kept: [] if kept else [whole])
+    assert (found.chosen is whole) == (left == 0.0)
 
     def never(_: Any) -> list[Refitted]:
-        raise AssertionError("a single effect leaves nothing")
+        raise AssertionError("two effects leave nothing")
 
-    assert World([effect("row_noise", 0.3)]).chosen(hypothesis("row_noise"), measured=never) == {"row_noise"}
+    for some in (tags[:1], tags[:2]):
+        world = World([effect(tag, 0.3) for tag in some])
+        assert world.chosen(*guesses[: len(some)], measured=never) == set(some)
 
 
 def test_a_signature_is_asked_of_the_same_kind_of_the_others() -> None:
@@ -733,7 +737,7 @@ def add(
     prepared = Prepared(settings, "frames", unused, unused, world.null, z, work.effort, {})
     search = FrameExplainer(prepared, unused, work, unused, judge, ())
     monkeypatch.setattr(search, "_refitter", lambda: world.refitter())
-    monkeypatch.setattr(search, "_left_by", lambda *_: None)
+    monkeypatch.setattr(search, "_left_by", lambda *_: Choice())
     monkeypatch.setattr(search, "_likelihood", lambda *_: None)
     monkeypatch.setattr(search, "_measured", lambda _: lambda kept: ())
     shifts = (z.train - world.null.mean, z.test - world.null.mean)
