@@ -48,8 +48,7 @@ class Goodness:
 
 def unexplained_beside(fit: Goodness, work: Any = None) -> Unexplained:
     """Return what measures frames, with fits of which so much is said."""
-    nothing: Any = None
-    return Unexplained(work, fit, nothing, 0)  # type: ignore[arg-type]
+    return Unexplained(work, fit)  # type: ignore[arg-type]
 
 
 def test_the_form_and_part_that_explain_most_come_first() -> None:
@@ -91,11 +90,9 @@ def test_what_is_measured_is_fitted_where_it_is_on_the_sensor(monkeypatch: pytes
     unexplained = unexplained_beside(Goodness(), SimpleNamespace(frames=frames))
     effect = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(0, 0, -1), columns=(0, 2)),))
     fitted: list[Any] = []
-    refitted = SimpleNamespace(score=0.0, tags={"empirical_response"})
+    refitted = SimpleNamespace(score=0.0)
     monkeypatch.setattr(unexplained, "_fitted", lambda _, one: fitted.append(one) or refitted)
-    unexplained.proven = lambda _: ()
-    found = unexplained._described((), TAP, lambda *_: Measurement(effect, 9.0))
-    assert found is None
+    assert unexplained._described((), TAP, lambda *_: Measurement(effect, 9.0)) is refitted
     [one] = fitted
     assert one.terms[0].columns == (4, 6)
     assert one.region == TAP.region
