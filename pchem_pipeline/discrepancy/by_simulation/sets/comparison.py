@@ -20,7 +20,6 @@ from scipy import special
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     FAR,
-    PRICE_OF_MORE,
     STANDS_OUT,
     Choice,
     Hypothesis,
@@ -159,8 +158,7 @@ def compare(
                 if not trials.refit_set(members):
                     break
             trials.tune()
-        if before is None or not trials.complete or trials.best.price > PRICE_OF_MORE:
-            trials.measure(measured)
+        trials.measure(measured)
         if not trials.tried or trials.complete or trials.limit or trials.best is before:
             return
 

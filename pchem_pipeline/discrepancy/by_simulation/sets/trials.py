@@ -12,6 +12,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numb
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     FAR,
     FAR_SHARE_OF_PART,
+    PRICE_OF_MORE,
     STANDS_OUT,
     Hypothesis,
     fit_set,
@@ -87,9 +88,14 @@ class Trials:
         return True
 
     def measure(self, measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]]) -> None:
-        """Measure what is left without effects and beside the best set; at the limit some is left out."""
-        besides = [()] if not self.tried or self.complete else [(), self.best.hypotheses]
-        for beside in besides:
+        """Measure what is left without effects, then beside the best set; at the limit some is left out.
+
+        Unless that leaves nothing at the price of two effects, which is that of one measured part.
+        """
+        best = self.best.hypotheses if self.tried else ()
+        for beside in ((), best) if best else ((),):
+            if self.complete and (beside or self.best.price <= PRICE_OF_MORE):
+                return
             try:
                 for one in measured(beside):
                     self.tried += [] if one in self.tried else [one]
