@@ -1,7 +1,6 @@
 """What a command imports decides how fast it answers: lists are compared here, no clock."""
 
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -11,7 +10,6 @@ import pytest
 from pchem_pipeline.cli.app import app
 from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.stages.table import STAGES
-from pchem_pipeline.store.run_store import RunStore
 
 COMMAND = """
 import sys
@@ -68,16 +66,6 @@ def test_fit_imports_its_kernels_and_not_those_who_draw_or_read_cameras(librarie
     found = libraries("fit", "{store}", "--force", "--quiet", "--backend", "serial")
     assert "numba" in found
     assert not found & (HEAVY - {"numba", "scipy"})
-
-
-def test_a_report_without_files_of_figures_imports_nobody_who_draws(libraries, tmp_path):
-    store = RunStore.open(tmp_path / "run.zarr")
-    text = store.config_text()
-    assert text is not None
-    store.write_config(re.sub(r"figure_formats:\s*(\[svg\]|- svg)", "figure_formats: []", text))
-    found = libraries("report", "{store}", "--force", "--quiet", "--backend", "serial")
-    assert "jinja2" in found
-    assert not found & {"matplotlib", "PIL", "contourpy", "fontTools"}
 
 
 def test_a_command_that_knows_of_effects_does_not_import_what_few_of_them_call():

@@ -1,8 +1,8 @@
 """What a chart shows: marks in panels, panels over each other in stacks, stacks in columns.
 
-A figure is described once, in these words. ``on_paper`` draws it with matplotlib, ``on_page`` writes it as
-the numbers that the page's script draws, ``picture`` as the plain picture of a page without scripts. A colour
-is the name of one in the ``Palette``, or ``#rrggbb``; texts may hold mathtext.
+A figure is described once, in these words. ``on_paper`` draws it with matplotlib, for files and for pages
+without scripts; ``on_page`` writes it as the numbers that the page's script draws. A colour is the name of
+one in the ``Palette``, or ``#rrggbb``; texts may hold mathtext.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Charts drawn with matplotlib, for files and papers."""
+"""Charts drawn with matplotlib, for files, papers and pages without scripts."""
 
 from __future__ import annotations
 
@@ -39,8 +39,9 @@ from pchem_pipeline.report.charts.chart import (
 from pchem_pipeline.report.style.palette import Palette
 from pchem_pipeline.report.style.style import Drawing, Look, colours_of, inches, look_of, note, styled
 
-#: Height of a further line of a title or of a legend, mm; letters of a title on a millimetre.
-_LINE_MM, _LETTERS = 3.5, 0.66
+#: Height of a further line of a title or of a legend, mm; letters of a title on a millimetre; room beside a
+#: panel, left of its title, mm.
+_LINE_MM, _LETTERS, _BESIDE_MM = 3.5, 0.66, 12.0
 #: Rows or columns of a map up to which a vector file keeps each pixel.
 _MOST_KEPT = 800
 _DASHES: dict[Dash, Any] = {"-...": (0, (5, 1, 1, 1, 1, 1)), "..": (0, (1, 1))}
@@ -62,7 +63,7 @@ def draw_chart(look: Look, chart: Chart) -> Drawing:
     columns = len(chart.widths) if look.wide else 1
     stacks = [stack for stack in chart.stacks if look.wide or not stack.wide]
     rows = [stacks[i : i + columns] for i in range(0, len(stacks), columns)]
-    titles = {id(stack): _broken(stack.title, look.width_mm / columns) for stack in stacks}
+    titles = {id(stack): _broken(stack.title, look.width_mm / columns - _BESIDE_MM) for stack in stacks}
     heights = [
         max(
             height_of(stack, look.width_mm / columns) + _LINE_MM * titles[id(stack)].count("\n")
@@ -258,7 +259,7 @@ def _draw_mark(axes: Axes, mark: Mark, order: int) -> Handle:
 
 def _draw_image(axes: Axes, mark: Image) -> None:
     """Draw a map with its bar of colours; those pixels that the resolution can show."""
-    look, figure = look_of(axes), axes.figure
+    look = look_of(axes)
     beside = axes.get_subplotspec()
     columns = 1 if beside is None else beside.get_topmost_subplotspec().get_gridspec().ncols
     values, x, y = mark.shown(inches(look.width_mm) * look.dpi / columns)
@@ -274,7 +275,7 @@ def _draw_image(axes: Axes, mark: Image) -> None:
     )  # fmt: skip
     if mark.bar:
         places, texts = zip(*mark.bar, strict=True)
-        bar = figure.colorbar(image, ax=axes, ticks=list(places), fraction=0.06, pad=0.02, aspect=25)
+        bar = axes.figure.colorbar(image, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), ticks=list(places))
         bar.ax.set_yticklabels(list(texts))
         bar.ax.minorticks_off()
         bar.set_label(mark.unit)

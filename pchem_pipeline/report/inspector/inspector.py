@@ -16,7 +16,7 @@ from markupsafe import Markup, escape
 from pchem_pipeline.report.data import MAP_NAMES, ReportData
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
 from pchem_pipeline.report.inspector.packing import PackedMap, pack_counts
-from pchem_pipeline.report.style.palette import MAP_COLOURS, shades
+from pchem_pipeline.report.style.palette import shades
 from pchem_pipeline.report.style.wording import symbol, unit_text
 
 #: The part of the policy that forbids every connection, and that of a page which ``pchem view`` serves.
@@ -122,7 +122,7 @@ def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
         "model": data.run.get("model", ""),
         "command": shown.command,
         "keptTo": shown.kept_to,
-        "colours": shades(MAP_COLOURS).tobytes().hex(),
+        "colours": shades().tobytes().hex(),
         "maps": [map_facts(entry) for entry in shown.maps],
         "panel": list(PANEL_MAPS),
         "sample": {

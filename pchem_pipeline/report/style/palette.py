@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 MAP_COLOURS = "viridis"
 DIVERGING = "RdBu_r"
 
-#: Colours of matplotlib's scales at equal distances; between them they are linear, to 2 of 255.
-_SCALES = {
-    "viridis": "440154471164482071472e7c443b843f488939558c34618d2f6c8e2a768e26818e228b8d"
-    "1f958b1fa08824aa832fb47c40bd7256c66770cf578bd646a8db34c5e021e2e418fde725",
-    "RdBu": "67001fb2182bd6604df4a582fddbc7f7f7f7d1e5f092c5de4393c32166ac053061",
-}
+#: Colours of that scale of matplotlib at equal distances; between them they are linear, to 2 of 255.
+_SHADES = (
+    "440154471164482071472e7c443b843f488939558c34618d2f6c8e2a768e26818e228b8d"
+    "1f958b1fa08824aa832fb47c40bd7256c66770cf578bd646a8db34c5e021e2e418fde725"
+)
 #: Hues in the order in which lines without a colour of their own take them.
 CYCLE = ("blue", "vermilion", "green", "orange", "sky", "purple", "yellow", "ink")
 
@@ -90,16 +89,9 @@ DARK = Palette(
 )
 
 
-def shades(name: str, n: int = 256) -> NDArray[np.uint8]:
-    """Return the colours of a scale in equal steps, red, green and blue, shape (n, 3).
-
-    Args:
-        name: as matplotlib calls it; ``_r``: from its end to its beginning.
-        n: number of steps.
-    """
-    known = np.frombuffer(bytes.fromhex(_SCALES[name.removesuffix("_r")]), np.uint8).reshape(-1, 3)
-    if name.endswith("_r"):
-        known = known[::-1]
-    places = np.linspace(0.0, len(known) - 1.0, n)
+def shades() -> NDArray[np.uint8]:
+    """Return the colours of maps in equal steps, red, green and blue, shape (256, 3)."""
+    known = np.frombuffer(bytes.fromhex(_SHADES), np.uint8).reshape(-1, 3)
+    places = np.linspace(0.0, len(known) - 1.0, 256)
     colours = [np.interp(places, np.arange(len(known)), column) for column in known.T]
     return np.rint(np.stack(colours, axis=1)).astype(np.uint8)
