@@ -210,4 +210,4 @@ def test_a_picture_is_saved_from_the_page(open_page: Callable[..., Any], tmp_pat
         figure.get_by_role("button", name="Save ensemble as SVG").click()
     path = tmp_path / "ensemble.svg"
     download.value.save_as(path)
-    assert path.read_text().startswith("<svg")
+    assert "<svg" in path.read_text()
