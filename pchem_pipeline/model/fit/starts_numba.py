@@ -422,7 +422,7 @@ def longer_steps(
     a = best[1 + STEP]
     if not histogram.variance < _SPARSE * a * a or _holds_one(histogram, best):
         return used
-    for multiple in (2.0, 3.0, 4.0, 5.0):
+    for multiple in (1.3, 1.6, 2.0, 2.5, 3.0, 4.0, 5.0):
         if multiple * a < histogram.n_bins:
             lobe = ecf_at(histogram, 1.0 / (multiple * a))
             used += _keep_lobe(pixel, evaluate, cells, multiple * a, lobe, scratch)

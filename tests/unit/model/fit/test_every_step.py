@@ -56,6 +56,20 @@ def test_dark_and_clean_pixels_have_the_right_gain(exposure, noise, frames, step
     assert (np.abs(ratio - 1.0) > min(few, 0.6)).sum() == 0
 
 
+@pytest.mark.parametrize(
+    "codes",
+    [
+        {98: 2, 99: 22, 100: 168, 101: 94, 102: 7, 105: 1, 106: 3, 107: 1, 108: 2},
+        {99: 31, 100: 160, 101: 96, 102: 8, 105: 1, 106: 2, 107: 1, 113: 1},
+        {99: 23, 100: 170, 101: 93, 102: 7, 105: 1, 106: 4, 108: 2},
+    ],
+)
+def test_a_handful_of_electrons_has_the_right_step(codes):
+    """Electrons of 6 DN, spread over four codes, were taken for one and two of 4.6 DN, 10 nats behind."""
+    dn = np.repeat(list(codes), list(codes.values()))
+    assert fitted(dn[None]).conversion_gain[0] == pytest.approx(1 / 6.0, rel=0.1)
+
+
 @pytest.mark.parametrize("exposure", [0.06, 1.0])
 @pytest.mark.parametrize("bias", [3, 6, 9])
 def test_samples_at_a_limit_are_censored(exposure, bias):
