@@ -517,8 +517,8 @@ def fill_far_enough(
     Returns:
         Number of electron numbers in use, and how many standard deviations a component reaches.
     """
-    count = stage = np.int64(0)
-    while stage < len(_REACH):
+    count = np.int64(0)
+    for stage in range(len(_REACH)):  # the last one is taken whatever the masses are, NaN too
         count = fill_masses(theta, cells, stage, what, numbers, edges, room)
         lowest = 1.0
         for i in range(cells.n_bins):
@@ -526,7 +526,6 @@ def fill_far_enough(
                 lowest = min(lowest, room[MASS, i])
         if lowest >= _OUTLIER[stage]:
             break
-        stage += 1
     return int(count), _REACH[stage]
 
 
