@@ -114,11 +114,15 @@ def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) 
 
 
 def changed_file(record: StageRecord, store: RunStore) -> str:
-    """Return a file of a stage's result that is missing or not as it was written; empty: none."""
+    """Return a file of a stage's result that is missing or not as it was written; empty: none.
+
+    Raises:
+        StoreError: the description of a group is damaged.
+    """
+    for group in sorted({name.partition("/")[0] for name in record.files if name.endswith(DESCRIPTION)}):
+        if not store.has(group):
+            return f"{group}/{DESCRIPTION}"
     for name, digest in record.files.items():
-        group = f"{name.partition('/')[0]}/{DESCRIPTION}"
-        if name.endswith(DESCRIPTION) and not (store.path / group).exists():
-            return group
         if digest != digest_of_file(store.path / name):
             return name
     return ""

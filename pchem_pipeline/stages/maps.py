@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.variables import INTERVALS, PARAMETERS, interval_names
 from pchem_pipeline.model.checks.multiple_testing import false_discovery, poorest
 from pchem_pipeline.model.errors.fisher import covariance_from
-from pchem_pipeline.model.fit.status import FAILED, flags_of
+from pchem_pipeline.model.fit.status import FAILED, FitStatus, flags_of
 from pchem_pipeline.model.maps.maps import (
     derived_maps,
     electron_shifts,
@@ -36,6 +36,8 @@ _SUMMARISED = (*PARAMETERS, "read_noise_e", "analog_read_noise_e")
 _PIXEL_BYTES = 80 * 8
 #: Relative; times are written with few digits.
 _SAME_TIME = 1e-3
+#: Where the width of the law alone tells the number of electrons, and the window cuts it, H has no error.
+_CUT = int(FitStatus.BIAS_AMBIGUOUS | FitStatus.OUTSIDE_WINDOW)
 
 
 def _tell_time(context: StageContext) -> None:
@@ -72,6 +74,7 @@ def maps_tile(
     if n_frames is not None:
         m, p = electron_shifts(fit["quanta_exposure"].ravel(), fit["likelihood_gap"].ravel(), n_frames)
         off = np.sqrt(p @ m**2).reshape(fit["bias"].shape)
+        off[(fit["fit_status"] & _CUT) == _CUT] = np.nan
         stderr[..., 0] = np.hypot(stderr[..., 0], off)
         stderr[..., 2] = np.hypot(stderr[..., 2], off / fit["conversion_gain"])
     maps |= {f"{name}_stderr": stderr[..., i] for i, name in enumerate(PARAMETERS)}

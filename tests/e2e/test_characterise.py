@@ -20,6 +20,26 @@ def frames():
     return np.rint(100 + electrons / TRUTH["conversion_gain"]).astype(np.int64)
 
 
+@pytest.mark.parametrize(("noise", "exposure", "n"), [(0.3, 3.0, 500), (0.22, 6.0, 300)])
+def test_pixels_whose_gain_or_bias_is_open_do_not_widen_the_components(noise, exposure, n, tmp_path):
+    """Of a few the gain is off by 2, of some the bias by several electrons: 34 DN at k = 12 in place of 5."""
+    rng, shape = np.random.default_rng(1001), (20, 26)
+    step, bias = 9.0 * (1 + 0.012 * rng.standard_normal(shape)), 170 + 4.0 * rng.standard_normal(shape)
+    light = exposure * rng.lognormal(0.0, 0.4, shape)
+    signal = rng.poisson(light, (n, *shape)) + noise * rng.standard_normal((n, *shape))
+    frames = np.rint(bias + step * signal).astype(np.uint16)
+    found = pchem_pipeline.characterise(
+        frames, store=tmp_path / "run.zarr", settings=FAST, integration_time=1.0
+    )
+    width = np.sqrt(found.group("ensemble").component_variance.values[0])
+    for k in (8, 12, 16):
+        weight = np.exp(-light) * light**k
+        centre = bias + k * step
+        mean = np.average(centre, weights=weight)
+        right = np.average((centre - mean) ** 2 + (noise * step) ** 2, weights=weight) ** 0.5
+        assert width[k] == pytest.approx(right, rel=0.3)
+
+
 def test_an_array_becomes_a_run_and_nothing_is_done_twice(frames, tmp_path):
     def again(stack, seconds=2.0):
         return pchem_pipeline.characterise(

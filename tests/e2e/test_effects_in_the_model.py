@@ -14,6 +14,7 @@ from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
 from pchem_pipeline.commands.view import RunView
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.model.fit.status import flags_of
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import Command, run_stages, run_status
 from pchem_pipeline.store.run_store import RunStore
@@ -127,6 +128,7 @@ def test_ensemble_is_predicted_with_the_extended_law(both) -> None:
     # the total has the variance of all biases, its term leaves out that they may be an electron off
     bias, gain, gap = (store.read(f"fit/{name}") for name in ("bias", "conversion_gain", "likelihood_gap"))
     weight = np.tanh(gap / 2)
+    weight[(store.read("fit/fit_status") & int(flags_of("conversion_gain"))) != 0] = 0.0
     square = (bias - np.average(bias, weights=weight)) ** 2 - (1 - weight**2) / (2 * gain) ** 2
     expected = pytest.approx(np.average(square, weights=weight), rel=1e-12)
     assert rows["variance_of_bias"]["predicted"] == expected

@@ -97,8 +97,8 @@ _WORDS: dict[str, tuple[str, str, str]] = {
     "codes": ("LSB", "unequal code widths (DNL)",
               "the histograms of all pixels deviate from the model at the same DN"),
     "top_code": ("1", "saturation",
-                 "larger signals are cut off there: the exposure of bright pixels is too low. If the fit "
-                 "does not know this limit, add the effect clipping with this high to model.effects"),
+                 "larger signals are cut off there: lower the exposure. If the fit does not know this "
+                 "limit, add the effect clipping with this high to model.effects"),
     "bottom_code": ("1", "clipping at the lowest code", "values are cut off there: raise the black level. If "
                     "the camera clips, add the effect clipping with this low to model.effects"),
     "zero_code": ("1", "clipping at 0 DN", "the black level is too low: raise it. The fit treats them as "

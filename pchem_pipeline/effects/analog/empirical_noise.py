@@ -128,11 +128,6 @@ class NoiseMode(Section):
             raise ValueError(f"wave: at most half a cycle, and 0 within a {self.of}; no lags, no burst")
         return self
 
-    @property
-    def takes_turns(self) -> bool:
-        """Whether it is an offset that changes its sign from sample to sample and frame to frame."""
-        return self.of == "sample" and self.wave is not None and root_mean_square(self.wave) == 1.0
-
     def describe(self, rms: float | None) -> str:
         """Return in words what varies by so many DN (None: that is said elsewhere), and who shares it."""
         own = self.of == "sample" and (self.lags or self.wave is not None)

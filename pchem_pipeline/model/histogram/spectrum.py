@@ -40,7 +40,9 @@ class FrameSpectrum:
             return
         u = frames.astype(np.float32)
         u -= u.mean(axis=0)
-        u -= u.mean(axis=(1, 2), keepdims=True)
+        variance = np.mean(u * u, axis=0)
+        weight = np.divide(1.0, variance, where=variance > 0, out=np.zeros_like(variance))  # none is a frame
+        u -= (u * weight).sum(axis=(1, 2), keepdims=True) / max(float(weight.sum()), 1e-30)
         sd = np.sqrt(np.mean(u * u, axis=0))
         u /= np.where(sd > 0, sd, 1.0)
         for frame in u:

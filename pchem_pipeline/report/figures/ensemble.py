@@ -139,7 +139,8 @@ def bias_remark(data: ReportData) -> str:
         return ""
     return (
         " Pixels whose bias can be off by an electron have a lower weight (tanh(d/2), d: log-likelihood "
-        f"ratio to the next best fit), together {short(lost, 2)} {data.noun}s less."
+        "ratio to the next best fit; 0 if it can be off by more or the gain is open), together "
+        f"{short(lost, 2)} {data.noun}s less."
     )
 
 

@@ -30,6 +30,7 @@ from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, nuced_a
 from pchem_pipeline.model.ensemble.error_sample import WANTED, PixelErrors
 from pchem_pipeline.model.ensemble.moments import moment_rows
 from pchem_pipeline.model.ensemble.totals import ERROR_SIZES, EnsembleAxes, EnsembleTotals
+from pchem_pipeline.model.fit.status import flags_of
 from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.law.parameters import UsablePixels
@@ -547,7 +548,12 @@ def _write_result(
         per_pixel = counts.sum(axis=1, dtype=np.int64)[fitted.mask]
     weight = np.ones(len(pixels))
     if store.has("fit/likelihood_gap"):
-        weight = bias_weight(_pixels_of(store, "fit/likelihood_gap", tiles)[fitted.mask])
+        gap, words = (
+            _pixels_of(store, f"fit/{name}", tiles)[fitted.mask] for name in ("likelihood_gap", "fit_status")
+        )
+        with np.errstate(divide="ignore"):  # one whose H, or gain, is more open may be off by any number
+            wide = np.minimum(2.0 * pixels.maps[0] ** 2 / per_pixel, 0.5 / gap) > 0.25
+        weight = bias_weight(np.where(wide | (words & int(flags_of("conversion_gain")) != 0), 0.0, gap))
     true = _true_pixels(store, asked, tiles, fitted.mask)
     arrays, found = curves(totals, pixels, settings, asked.limits)
     numbers, electron_facts = electron_numbers_of(totals, pixels, settings)

@@ -108,6 +108,10 @@ def test_what_a_hand_took_out_of_the_store_is_made_again(make, monkeypatch):
     context.store.delete("maps")
     monkeypatch.setitem(FAKES, "maps", replace(FAKES["maps"], may_write_nothing=True))
     assert status(FAKES["maps"], context).words() == "stale - maps/zarr.json is missing or has changed"
+    (context.store.path / "maps").mkdir()  # nor with another description than was written
+    (context.store.path / "maps/zarr.json").write_text('{"zarr_format": 3')
+    assert "maps/zarr.json is damaged" in status(FAKES["maps"], context).words()
+    context.store.delete("maps")
     record = context.store.records.read("maps")
     context.store.records.write(replace(record, files={}))
     assert status(FAKES["maps"], context).state == "complete"

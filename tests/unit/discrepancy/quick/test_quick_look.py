@@ -461,6 +461,13 @@ def test_the_codes_of_a_joint_fit_are_judged_by_its_parameters() -> None:
     assert code_checks(bright) == []
 
 
+def test_a_pixel_of_wild_noise_makes_no_wave() -> None:
+    """Its samples moved the mean of the frame, and with it all the others."""
+    frames = stack(np.random.default_rng(6), (300, 16, 20))
+    frames[:, 5, 5] = np.random.default_rng(7).integers(5000, 12000, 300)
+    assert not by_name(looked(frames))["wave"].found
+
+
 def test_a_wave_midway_between_two_frequencies_is_seen_as_stated() -> None:
     """Frames of 16 x 16, padded to 32 x 32: a wave of 12.5 cycles in 32 rows and columns is the farthest."""
     rng, side, n = np.random.default_rng(11), 16, 400

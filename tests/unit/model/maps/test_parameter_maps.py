@@ -97,6 +97,13 @@ def test_the_error_of_h_holds_the_chance_of_being_electrons_off(
     assert 0.65 < np.sqrt(np.mean(off**2)) < 1.3
     assert maps["charge_rate_stderr"] == pytest.approx(maps["quanta_exposure_stderr"] / 2, rel=0.05)
     np.testing.assert_array_equal(maps["conversion_gain_stderr"], errors[:, 1])
+    # the width of the law, which tells the electrons, is not that of a law cut by the window
+    stored["fit_status"] |= int(FitStatus.OUTSIDE_WINDOW)
+    ambiguous = (stored["fit_status"] & int(FitStatus.BIAS_AMBIGUOUS)) != 0
+    cut = maps_tile(stored, 2.0, n_frames=n_frames)
+    assert ambiguous.any()
+    for name in ("quanta_exposure_stderr", "bias_stderr", "charge_rate_stderr"):
+        np.testing.assert_array_equal(np.isnan(cut[name]), ambiguous)
 
 
 def test_no_chance_of_being_off_where_the_gap_is_large() -> None:

@@ -232,7 +232,6 @@ def test_a_wave_is_below_half_a_cycle_along_its_own_axes_and_nothing_else(wrong:
 
 def test_an_offset_that_takes_turns_is_told_as_that() -> None:
     mode = NoiseMode(of="sample", share=1.0, wave=(0.5, 0.5, -0.5))
-    assert mode.takes_turns
     assert mode.describe(0.3) == (
         "0.3 DN, alternating from frame to frame, from row to row, from column to column"
     )
