@@ -146,20 +146,22 @@ def compare(
         trials.refit((hypothesis,))
     if first > 1 and trials.tried and not trials.complete:
         trials.refit_set(_sets(choice, trials.tried)[0])
+    trials.measure(measured)
     # the others, expensive ones last: they may be beaten by then
     for hypothesis in _expensive_last(singles[first:]):
         trials.refit((hypothesis,))
     trials.tune()
     for _ in range(steps):
         before = trials.best if trials.tried else None
-        if before is not None and not (trials.complete or trials.limit):
-            sets = [*_grown(trials, beside), *_sets(choice, trials.tried)]
-            for members in _of_different_effects(sets)[:_MOST_SETS]:
-                if not trials.refit_set(members):
-                    break
-            trials.tune()
         trials.measure(measured)
-        if not trials.tried or trials.complete or trials.limit or trials.best is before:
+        if not trials.tried or trials.complete or trials.limit:
+            return
+        sets = [*_grown(trials, beside), *_sets(choice, trials.tried)]
+        for members in _of_different_effects(sets)[:_MOST_SETS]:
+            if not trials.refit_set(members):
+                break
+        trials.tune()
+        if trials.best is before:
             return
 
 

@@ -99,6 +99,8 @@ class Trials:
             try:
                 for one in measured(beside):
                     self.tried += [] if one in self.tried else [one]
+                    if one.score < self._far_below(0.0):
+                        break  # those that promise less come next
             except EffortSpentError as spent:
                 self.limit = self.limit or spent
 
@@ -194,7 +196,36 @@ class Trials:
         alone = len(members) == 1 and bool(self.tried)
         if not (alone or self.complete):
             return True
-        return not (_beaten(self.refitter, members, self.best) or (alone and self._less_likely(members)))
+        return not (self._beaten(members) or (alone and self._less_likely(members)))
+
+    def _beaten(self, members: Sequence[Hypothesis]) -> bool:
+        """Tell whether a refit of hypotheses is in vain: far behind the best set, or blind where that is not.
+
+        By their fingerprints at the best strengths; how far these are trusted goes with what there is to
+        explain, and is less where the best set leaves something, or has more effects. Where that leaves
+        nothing, a statistic that stands out and that they hardly move says enough: a refit does not change
+        them so much.
+        """
+        refitter, complete = self.refitter, self.complete
+        shift = refitter.target - refitter.null.mean
+        noise = refitter.noise(refitter.null.covariance, refitter.null.n_replicates)
+        noise = replace(noise, model_error=LOOSE)
+        fit = fit_set(members, shift, noise)
+        parts = fit.parts
+        left = np.abs(shift - parts.sum(axis=0)) / np.sqrt(noise.of(parts).variances)
+        blind = (left > STANDS_OUT) & (np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift))
+        if complete and np.any(blind):
+            return True
+        trust = _FAR_SHARE if complete and len(members) >= len(self.best.hypotheses) else FAR_SHARE_OF_PART
+        return fit.log_score(shift, noise) < self._far_below(trust)
+
+    def _far_below(self, trust: float) -> float:
+        """Return a score below which a set is far behind the best one, nats.
+
+        Args:
+            trust: share of what there is to explain by which a score may be misjudged.
+        """
+        return self.best.score - FAR - trust * (self.best.score - self.refitter.nothing)
 
     def _less_likely(self, members: Sequence[Hypothesis]) -> bool:
         """Tell whether the histograms of the pixels are clearly less likely with a set than with the best.
@@ -210,26 +241,6 @@ def vanished(one: Refitted) -> set[str]:
     """Return the tags of the effects of a set of which its best fit leaves no more than their error."""
     gone = np.exp(one.change) < ESTABLISHED * one.stderr
     return {h.tag for h, is_gone in zip(one.hypotheses, gone, strict=True) if is_gone and h.effect.strength}
-
-
-def _beaten(refitter: Refitter, members: Sequence[Hypothesis], best: Refitted) -> bool:
-    """Tell whether a refit of hypotheses is in vain: far behind the best set, or blind where that is not.
-
-    By their fingerprints at the best strengths; how far these are trusted goes with what there is to explain,
-    and is less where the best set leaves something, or has more effects. Where that leaves nothing, a
-    statistic that stands out and that they hardly move says enough: a refit does not change them so much.
-    """
-    complete = refitter.passes_goodness_of_fit(best)
-    trust = _FAR_SHARE if complete and len(members) >= len(best.hypotheses) else FAR_SHARE_OF_PART
-    shift = refitter.target - refitter.null.mean
-    noise = replace(refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=LOOSE)
-    fit = fit_set(members, shift, noise)
-    parts = fit.parts
-    left = np.abs(shift - parts.sum(axis=0)) / np.sqrt(noise.of(parts).variances)
-    if complete and np.any((left > STANDS_OUT) & (np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift))):
-        return True
-    score = fit.log_score(shift, noise)
-    return score < best.score - FAR - trust * (best.score - refitter.nothing)
 
 
 def alike(one: Hypothesis, other: Hypothesis) -> bool:

@@ -347,7 +347,7 @@ def test_fewer_effects_are_tried_before_rivals_of_a_set_of_more(monkeypatch: pyt
     world = World([effect("row_noise", 0.1), effect("frame_noise", 0.1)])
     asked = asked_by_refits(world, monkeypatch)
     # nothing is in vain
-    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.trials._beaten", lambda *_: False)
+    monkeypatch.setattr(Trials, "_beaten", lambda *_: False)
     row, frame, drift, coupling = (hypothesis(tag) for tag in TRUTH)
     drift, coupling = (replace(h, fingerprint=0.02 * h.fingerprint) for h in (drift, coupling))
     choice = world.tried([row, frame, drift], [row, frame, coupling])
