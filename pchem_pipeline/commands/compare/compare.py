@@ -12,7 +12,13 @@ import numpy as np
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError, quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.commands.compare.arrays import compare_arrays
-from pchem_pipeline.commands.compare.history import HISTORY_CSV, HistorySettings, history_csv, history_rows
+from pchem_pipeline.commands.compare.history import (
+    HISTORY_CSV,
+    HistorySettings,
+    HotPixels,
+    history_csv,
+    history_rows,
+)
 from pchem_pipeline.commands.compare.settings import settings_that_differ, versions_that_differ
 from pchem_pipeline.commands.figures import warn_if_old
 from pchem_pipeline.model.checks.run_differences import LIMIT, compare_maps, reasons_of_change
@@ -116,12 +122,13 @@ def comparison_of(
         _facts(label, name, store)
         for label, name, store in zip(_letters(len(names)), names, stores, strict=True)
     ]
-    pairs = [
-        _pair((runs[0], targets[0], stores[0]), (run, target, store), tolerance, reporter)
-        for run, target, store in zip(runs[1:], targets[1:], stores[1:], strict=True)
+    hot = [
+        HotPixels.of(store, target.config.maps.outlier_sigmas)
+        for store, target in zip(stores, targets, strict=True)
     ]
-    sigmas = [target.config.maps.outlier_sigmas for target in targets]
-    rows = history_rows(runs, stores, pairs, history, sigmas)
+    sides = list(zip(runs, targets, stores, hot, strict=True))
+    pairs = [_pair(sides[0], side, tolerance, reporter) for side in sides[1:]]
+    rows = history_rows(runs, stores, pairs, history, hot)
     return Comparison(runs, pairs, tolerance, rows, history.axis, history.rate)
 
 
@@ -131,7 +138,7 @@ def _letters(n: int) -> list[str]:
     return [(singles[i // 26 - 1] if i >= 26 else "") + singles[i % 26] for i in range(n)]
 
 
-_Side = tuple[RunFacts, Target, RunStore]
+_Side = tuple[RunFacts, Target, RunStore, HotPixels]
 
 
 def _told_apart(paths: Sequence[Path]) -> list[str]:
@@ -179,7 +186,7 @@ def _data_digest(store: RunStore, sensor: SensorInfo) -> str:
 
 
 def _pair(first: _Side, second: _Side, tolerance: float, reporter: Reporter) -> Pair:
-    (one, one_target, one_store), (other, other_target, other_store) = first, second
+    (one, one_target, one_store, one_hot), (other, other_target, other_store, other_hot) = first, second
     same_data = one.digest == other.digest
     maps: dict[str, Any] = {}
     transitions: list[list[int]] = []
@@ -201,6 +208,9 @@ def _pair(first: _Side, second: _Side, tolerance: float, reporter: Reporter) -> 
     arrays = compare_arrays(one_store, other_store, tolerance, reporter) if same_data else []
     reasons = {} if same_data else {name: reasons_of_change(found) for name, found in maps.items()}
     words = _words(one, other, arrays, maps, reasons)
+    new, gone = other_hot.new_since(one_hot), one_hot.new_since(other_hot)
+    if new or gone:
+        words.append(f"Hot pixels: {len(new):,} new, {len(gone):,} gone.")
     return Pair(
         one, other, same_data, arrays, maps, reasons, transitions,
         settings_that_differ(one_target.config, other_target.config),

@@ -17,7 +17,7 @@ from scipy.special import erfc
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.checks.multiple_testing import false_discovery
-from pchem_pipeline.model.checks.run_differences import MapDifference
+from pchem_pipeline.model.checks.run_differences import LIMIT, MapDifference
 from pchem_pipeline.model.fit.status import FitStatus, flags_of
 from pchem_pipeline.model.maps.maps import GOOD, hot_pixels
 from pchem_pipeline.report.comparison import Against, HistoryRow, Pair, RunFacts
@@ -58,7 +58,7 @@ def history_rows(
     stores: Sequence[RunStore],
     pairs: Sequence[Pair],
     wanted: HistorySettings,
-    outlier_sigmas: Sequence[float],
+    hot: Sequence[HotPixels],
 ) -> list[HistoryRow]:
     """Return a row for each run, in the order given.
 
@@ -67,7 +67,7 @@ def history_rows(
         stores: of them.
         pairs: the first with each of the others.
         wanted: labels, what they are drawn against, and the false-discovery rate.
-        outlier_sigmas: of each run, beyond which a pixel is hot.
+        hot: hot pixels of each run.
 
     Raises:
         ConfigError: there are labels, but not one for each run; or the frames of a run state no
@@ -89,13 +89,11 @@ def history_rows(
             f"--against temperature: the frames of {', '.join(silent)} state none; give --label with the "
             "temperatures"
         )
-    hot = [_hot(store, sigmas) for store, sigmas in zip(stores, outlier_sigmas, strict=True)]
     rows = []
     for i, (run, store) in enumerate(zip(runs, stores, strict=True)):
         moved, any_moved, compared = _moved(pairs[i - 1], stores[0], store, rate) if i else ({}, 0, 0)
         date, temperature = _date(store, cameras[i]), cameras[i].temperature
         warmth = "" if temperature is None else f"{temperature:.4g} °C"
-        same_pixels = hot[i].shape == hot[0].shape
         label = labels[i] if labels else warmth if against == "temperature" else date
         rows.append(
             HistoryRow(
@@ -104,9 +102,9 @@ def history_rows(
                 temperature,
                 {"date": _days(date), "temperature": _number(warmth), "label": _number(label)}[against],
                 run,
-                int(hot[i].sum()),
-                _places(hot[i] & ~hot[0]) if same_pixels else (),
-                _places(hot[0] & ~hot[i]) if same_pixels else (),
+                int(hot[i].hot.sum()),
+                hot[i].new_since(hot[0]),
+                hot[0].new_since(hot[i]),
                 _flags(store),
                 _effects(store),
                 moved,
@@ -140,15 +138,32 @@ def _number(label: str) -> float:
     return float(match[1]) if match else float("nan")
 
 
-def _hot(store: RunStore, sigmas: float) -> NDArray[np.bool_]:
-    """Tell which pixels are hot, as the report of the run does."""
-    flagged = (store.read("fit/fit_status") & int(flags_of("quanta_exposure"))) != 0
-    exposure, stderr = (store.read(f"maps/quanta_exposure{end}") for end in ("", "_stderr"))
-    return hot_pixels(exposure, stderr, flagged, sigmas)
+@dataclass(frozen=True)
+class HotPixels:
+    """The hot pixels of a run, as its report has them.
 
+    Attributes:
+        hot: which they are, shape (y, x).
+        exposure, stderr: the maps of H, e-, shape (y, x).
+    """
 
-def _places(where: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
-    return tuple((int(y), int(x)) for y, x in np.argwhere(where))
+    hot: NDArray[np.bool_]
+    exposure: NDArray[np.floating]
+    stderr: NDArray[np.floating]
+
+    @classmethod
+    def of(cls, store: RunStore, sigmas: float) -> HotPixels:
+        """Read those of a run; ``sigmas`` is its ``maps.outlier_sigmas``."""
+        flagged = (store.read("fit/fit_status") & int(flags_of("quanta_exposure"))) != 0
+        exposure, stderr = (store.read(f"maps/quanta_exposure{end}") for end in ("", "_stderr"))
+        return cls(hot_pixels(exposure, stderr, flagged, sigmas), exposure, stderr)
+
+    def new_since(self, first: HotPixels) -> tuple[tuple[int, int], ...]:
+        """Return the places of those that were not hot, and whose H differs by more than its error."""
+        if self.hot.shape != first.hot.shape:
+            return ()
+        apart = np.abs(self.exposure - first.exposure) > LIMIT * np.hypot(self.stderr, first.stderr)
+        return tuple((int(y), int(x)) for y, x in np.argwhere(self.hot & ~first.hot & apart))
 
 
 def _flags(store: RunStore) -> dict[str, int]:
