@@ -114,6 +114,26 @@ def scan_pairs(samples: Samples, *, significance: float = SIGNIFICANCE, most: in
     return successive(best, samples.usable, most)
 
 
+def shared_elsewhere(samples: Samples, place: Shared, *, significance: float = SIGNIFICANCE) -> Region | None:
+    """Return all pixels outside a place if they share noise among themselves as those inside do; else None.
+
+    Args:
+        samples: standardised frames.
+        place: found among them.
+        significance: largest probability of a chance.
+    """
+    left = samples.usable & ~place.region.mask((samples.usable.shape[0], samples.usable.shape[1]))
+    if left.sum() <= 2 * FEWEST_PIXELS:
+        return None
+    pairs = pairs_of(replace(samples, usable=left))[place.channel][place.mode]
+    every = np.array([0]), np.array([pairs.across.size - 1])
+    total, number = (
+        float(pairs.from_line(pairs.boxes(table, *every), 0)[-1, 0]) for table in (pairs.sums, pairs.counts)
+    )
+    z = total / math.sqrt(max(2.0 * number, 1.0))
+    return Region.of_mask(left) if special.log_ndtr(-z) <= math.log(significance) else None
+
+
 def _most_significant(samples: Samples, log_limit: float) -> Shared | None:
     """Return the place of the smallest probability that holds against the scatter of the frames, too."""
     shape = samples.usable.shape[0], samples.usable.shape[1]

@@ -12,7 +12,7 @@ import pytest
 from helpers.standardised import samples_of
 
 from pchem_pipeline.discrepancy.observe.pairs import PERIOD, pairs_of
-from pchem_pipeline.discrepancy.scan_pairs import Side, scan_pairs, sharpened
+from pchem_pipeline.discrepancy.scan_pairs import Side, scan_pairs, shared_elsewhere, sharpened
 from pchem_pipeline.effects.framework.region import Region
 
 SHAPE, FRAMES = (32, 32), 1000
@@ -81,6 +81,20 @@ def test_a_place_is_found_from_twelve_standard_errors_of_its_pairs_on(
     assert found[0].region.overlap(region, SHAPE) > 0.7
     # the scatter of the noise put in and the root take up to half of it, the best of all places adds
     assert 6.0 < found[0].z < 16.0
+
+
+@pytest.mark.parametrize(("second", "told"), [(0.0, False), (0.1, True)])
+def test_what_a_second_tap_shares_is_told_beside_the_first(second: float, told: bool) -> None:
+    """Two taps of one noise each look alike outside of the first, where no contrast is left."""
+    rng = np.random.default_rng(9)
+    rows = rng.standard_normal((2, FRAMES, 32, 1)) * np.array([0.2, second])[:, None, None, None]
+    frames = rng.standard_normal((FRAMES, *SHAPE)) + np.repeat(np.concatenate([*rows], axis=2), 16, axis=2)
+    samples = samples_of(np.clip(frames, -6, 6))
+    [place] = scan_pairs(samples, most=1)
+    assert place.region.columns == ((0, 16),)
+    rest = shared_elsewhere(samples, place)
+    assert (rest is not None) is told
+    assert rest is None or rest.columns == ((16, 32),)
 
 
 @pytest.mark.parametrize("mode", ["row", "column"])

@@ -34,7 +34,13 @@ from pchem_pipeline.discrepancy.scan import (
     scan_series,
     sharpest_range,
 )
-from pchem_pipeline.discrepancy.scan_pairs import FEWEST_PIXELS, LARGEST, Shared, scan_pairs
+from pchem_pipeline.discrepancy.scan_pairs import (
+    FEWEST_PIXELS,
+    LARGEST,
+    Shared,
+    scan_pairs,
+    shared_elsewhere,
+)
 from pchem_pipeline.discrepancy.where import frame_series, pixel_maps, suspected_regions
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import Region, When
@@ -72,6 +78,9 @@ def suspected_parts(evidence: Evidence, frames: NDArray[np.unsignedinteger[Any]]
     places = [
         Part(each.region) for each in _apart(regions, lambda one: _mask(one.region, usable), binary_dilation)
     ]
+    # of what all outside share, too, but not with those inside, a second tap say, no map shows anything
+    rest = shared_elsewhere(samples, shared[0]) if shared else None
+    places += [] if rest is None or len(places) == _MOST else [Part(rest)]
     stretches = [*_stretches(evidence, time), *_stretches_of_rare(evidence, time)]
     ranges = [
         with_ends(Part(None, each.when), evidence)
