@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.special import logsumexp
 
 from pchem_pipeline.model.law.pcd import log_pcd
 from pchem_pipeline.planning.point import FloatArray
@@ -19,6 +20,8 @@ from pchem_pipeline.planning.point import FloatArray
 _OFFSETS = (1.0, 0.75, 0.5, 1.25)  # e- off at the brightest sample; the rival lies near 1
 _GAIN_CHANGES = (0.1, 0.2)  # of ln g
 _LEAST_EXPOSURE = 0.02
+_FEW_STEP = 3.0  # DN per electron, below which a DN is no small part of an electron
+_PHASE = 0.3  # DN from a whole number to the bias
 
 
 @dataclass(frozen=True)
@@ -80,29 +83,39 @@ def ambiguity(exposures: Sequence[float], shares: Sequence[float], read_noise_e:
 
 
 def gain_rival(
-    exposures: Sequence[float], shares: Sequence[float], read_noise_e: float, nearest: float = 0.1
+    exposures: Sequence[float],
+    shares: Sequence[float],
+    read_noise_e: float,
+    nearest: float = 0.1,
+    gain: float = 0.0,
 ) -> Ambiguity:
     """Return how well samples tell the truth from laws with quite another gain, per frame.
 
     The bound looks at the peak of the likelihood alone. Where peaks of the histogram are weak and electrons
-    many, chance makes other gains as likely, and a fit ends there.
+    many, chance makes other gains as likely, and a fit ends there. Whole numbers show a comb of g cycles per
+    DN at ``1 - g`` as well: near 2 DN per electron that is another one.
 
     Args:
         exposures: H of the samples, e-; 0 for bias frames.
         shares: of the frames that each has, adding up to 1.
         read_noise_e: s_e, e-.
         nearest: smallest change of ln g to look at.
+        gain: g, e-/DN; matters where a DN is no small part of an electron.
     """
-    lights, laws, dark = _split_off_bias(exposures, shares, read_noise_e)
-    found = Ambiguity(float("inf"), 0.0)
-    for change in (side * offset for offset in _GAIN_CHANGES for side in (-1.0, 1.0)):
-        if abs(change) < nearest - 1e-9:
-            continue
+    few = gain > 1.0 / _FEW_STEP
+    lights, laws, dark = _split_off_bias(exposures, shares, read_noise_e, gain if few else 0.0)
+    found, top = Ambiguity(float("inf"), 0.0), lights[-1]
+    changes = [side * offset for offset in _GAIN_CHANGES for side in (-1.0, 1.0) if offset > nearest - 1e-9]
+    # the same means and variances: H g^-2 and, without bias frames, mu + H/g stay
+    starts = [(c, 0.0 if dark > 0 else float(np.mean(lights) * (1 - np.exp(c)))) for c in changes]
+    if few and gain < 1.0:
+        # its peaks lie on the same whole numbers
+        nearly = _PHASE + top * (2 * gain - 1) * (1 - gain) / gain**2
+        numbers = np.round(nearly) + np.array([-1.0, 0.0, 1.0])
+        starts += [(np.log(1 / gain - 1), float((m - _PHASE) * gain / (1 - gain))) for m in numbers]
+    for change, bias in starts:
         rival = _Rival(laws, dark, read_noise_e, 0, change)
-        gain = np.exp(change)
-        # the same means and variances: H g^-2 and, without bias frames, mu + H/g stay
-        others = [h * gain**2 for h in lights]
-        bias = 0.0 if dark > 0 else float(np.mean(lights) * (1 - gain))
+        others = [(h - bias) * np.exp(change) for h in lights]
         start = rival.free([change, bias, np.log(read_noise_e), *_logs(others)])
         step, height = _descend(rival.cost, start)
         if height < found.mean:
@@ -111,13 +124,13 @@ def gain_rival(
 
 
 def _split_off_bias(
-    exposures: Sequence[float], shares: Sequence[float], noise: float
+    exposures: Sequence[float], shares: Sequence[float], noise: float, step: float = 0.0
 ) -> tuple[list[float], list[_Law], float]:
     """Return the exposures with electrons, rising, their laws, and the share of bias frames."""
     pairs = list(zip(map(float, exposures), map(float, shares), strict=True))
     lit = sorted((h, p) for h, p in pairs if h > 0 and p > 0)
     dark = sum(p for h, p in pairs if h == 0)
-    return [h for h, _ in lit], [_Law.of(h, p, noise) for h, p in lit], dark
+    return [h for h, _ in lit], [_Law.of(h, p, noise, step) for h, p in lit], dark
 
 
 def _logs(exposures: Sequence[float]) -> list[float]:
@@ -126,7 +139,7 @@ def _logs(exposures: Sequence[float]) -> list[float]:
 
 @dataclass(frozen=True)
 class _Law:
-    """The true density of a sample in electrons, on nodes."""
+    """The true density of a sample in electrons, on nodes: so close that sums are integrals, or whole DN."""
 
     y: FloatArray
     weights: FloatArray
@@ -134,9 +147,12 @@ class _Law:
     share: float
 
     @classmethod
-    def of(cls, exposure: float, share: float, noise: float) -> _Law:
+    def of(cls, exposure: float, share: float, noise: float, step: float = 0.0) -> _Law:
         width = 9 * np.sqrt(exposure) + 9
-        y = np.arange(max(0.0, exposure - width) - 8 * noise, exposure + width + 8 * noise, noise / 2.5)
+        low, high = max(0.0, exposure - width) - 8 * noise, exposure + width + 8 * noise
+        y = np.arange(low, high, noise / 2.5)
+        if step:
+            y = step * (np.arange(np.floor(low / step), np.ceil(high / step)) - _PHASE)
         log_density = log_pcd(y, exposure, 1.0, 0.0, noise)
         weights = np.exp(log_density)
         keep = weights > 1e-14 * weights.max()
@@ -161,10 +177,11 @@ class _Rival:
         """Return the log-likelihood ratios of truth and rival on the nodes of every sample, and the rival."""
         theta = np.insert(step, self.place, self.value)
         gain, bias, sigma = np.exp(theta[0]), theta[1], np.exp(theta[2])
-        gaps = [
-            law.log_density - log_pcd(law.y, h, gain, bias, sigma)
-            for law, h in zip(self.laws, np.exp(theta[3:]), strict=True)
-        ]
+        gaps = []
+        for law, h in zip(self.laws, np.exp(theta[3:]), strict=True):
+            other = log_pcd(law.y, h, gain, bias, sigma)
+            # on whole numbers a density need not add up to 1
+            gaps.append(law.log_density - other - logsumexp(law.log_density) + logsumexp(other))
         return gaps, theta
 
     def cost(self, step: FloatArray) -> float:

@@ -138,7 +138,8 @@ def _gain_certain(
     """Return the frames until no other gain, farther away than what is wanted of it, is as likely."""
     wanted = [target.wanted(point) for target in targets if target.name == "conversion_gain"]
     nearest = max(0.1, 4 * min(wanted, default=0.0))
-    return gain_rival(exposures, shares, point.read_noise_e, min(nearest, 0.2)).frames()
+    gap = gain_rival(exposures, shares, point.read_noise_e, min(nearest, 0.2), point.conversion_gain)
+    return gap.frames()
 
 
 def _refuse(need: Need, point: Point, max_frames: float, best: float, best_frames: float) -> None:

@@ -314,6 +314,17 @@ def test_weak_peaks_need_more_frames_than_the_bound_asks_for():
     assert easy.seen <= easy.bound
 
 
+def test_near_two_dn_per_electron_another_comb_has_the_same_codes():
+    """At 0.47 e-/DN whole numbers show a comb of 0.53 e-/DN as well; at 0.5 no frames tell which it is."""
+    there = point(1.0, 0.2, 0.47)
+    need = one(["conversion_gain=1%"], there).needs[0]
+    assert need.seen > 2 * need.bound
+    spoilt, good = (verify([ONE_PERCENT], there, int(n), 150, 1).n_flagged for n in (need.bound, need.seen))
+    assert spoilt > 0.2 * 150 > 2 * good
+    assert gain_rival([1.0], [1.0], 0.2, gain=0.5).frames() > 1e9
+    assert gain_rival([1.0], [1.0], 0.2, gain=0.1).frames() == gain_rival([1.0], [1.0], 0.2).frames()
+
+
 def test_the_section_of_the_report_is_of_the_median_pixel():
     maps = {
         "quanta_exposure": np.array([[2.0, 2.0], [2.0, np.nan]]),
