@@ -148,7 +148,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=8,
+        version=9,
         upstream=("ingest",),
         settings=("discrepancy",),
         reads=("frames", "summary", "histogram", "fit"),

@@ -90,11 +90,11 @@ class Trials:
     def measure(self, measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]]) -> None:
         """Measure what is left without effects, then beside the best set; at the limit some is left out.
 
-        Unless that leaves nothing at the price of two effects, which is that of one measured part.
+        Unless that leaves nothing at no higher price than that of one measured part beside the same effects.
         """
         best = self.best.hypotheses if self.tried else ()
         for beside in ((), best) if best else ((),):
-            if self.complete and (beside or self.best.price <= PRICE_OF_MORE):
+            if self.complete and self.best.price <= PRICE_OF_MORE * (len(beside) + 1):
                 return
             try:
                 for one in measured(beside):

@@ -468,6 +468,7 @@ def test_ready_made_histograms(tmp_path: Path, n_samples: tuple[int, int]) -> No
     for i, name in enumerate(PARAMETERS):
         context.store.write_array(f"fit/{name}", truth[None, :, i])
     context.store.write_array("fit/likelihood_gap", np.full((1, len(truth)), 50.0))
+    context.store.write_array("fit/fit_status", np.zeros((1, len(truth)), np.uint32))
     context.store.records.write(StageRecord("fit", 1, "truth", {}, keys=1))
     context.store.records.mark("fit", "truth", "0.0", {})
     assert execute("ensemble", context).state == "complete"
