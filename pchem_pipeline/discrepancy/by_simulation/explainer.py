@@ -241,7 +241,7 @@ class FrameExplainer(Explainer[Explanation]):
                 doubtful = found, added
             trials.tried.remove(found.chosen)
             if 0 < len(kept) < len(added.hypotheses):
-                trials.refit(kept)
+                trials.refit(kept, proven=True)
         return None if doubtful is None else self._put(*doubtful, explanation, certain=False)
 
     def _closes(self, added: Refitted) -> bool:

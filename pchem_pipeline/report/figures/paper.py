@@ -13,7 +13,7 @@ from matplotlib.style import library
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.report.figures.figure import Figure, csv_text
-from pchem_pipeline.report.style.style import Look, drawing_bytes, without_collector
+from pchem_pipeline.report.style.style import Look, drawing_bytes
 
 #: File formats of figures for papers.
 FORMATS = ("pdf", "svg", "png")
@@ -50,7 +50,6 @@ class PaperFigure:
     sheet: Mapping[str, Any] = field(default_factory=dict)
 
 
-@without_collector()
 def draw_paper_figure(wanted: PaperFigure) -> dict[str, bytes]:
     """Draw a figure and return its files and those of its tables by name; pure."""
     figure, files = wanted.figure, {}

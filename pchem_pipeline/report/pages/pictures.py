@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from string import ascii_letters, digits
+from urllib.parse import quote
 
 from pchem_pipeline.report.charts.chart import COLUMN_MM
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.settings import ReportSettings
 
 _MM = 4.5  # px on a page of a millimetre on paper
-#: Characters that need no escape in a data URL within an attribute.
-_AS_IT_IS = frozenset(" !$()*+,-./:;=?@[]^_`{|}~" + ascii_letters + digits)
+_SAFE = " !$()*+,-./:;=?@[]^_`{|}~"  # needs no escape in a data URL within an attribute
 
 
 @dataclass(frozen=True)
@@ -57,29 +56,19 @@ def draw_figure(figure: Figure, settings: ReportSettings) -> Drawn:
         figure: the figure.
         settings: formats and resolution.
     """
-    from pchem_pipeline.report.style.style import Look, drawing_bytes, without_collector
+    from pchem_pipeline.report.style.style import Look, drawing_bytes
 
-    with without_collector():
-        look = Look(figure.width_mm, dpi=settings.dpi)
-        drawing = figure.draw(look)
-        drawing.look = replace(look, sheet={"svg.fonttype": "none"})
-        picture = drawing_bytes(drawing, "svg", dpi=settings.dpi)
-        drawing.look = look
-        files = {
-            f"{figure.name}.{kind}": drawing_bytes(drawing, kind, dpi=settings.dpi, title=figure.title)
-            for kind in settings.figure_formats
-        }
+    look = Look(figure.width_mm, dpi=settings.dpi)
+    drawing = figure.draw(look)
+    drawing.look = replace(look, sheet={"svg.fonttype": "none"})
+    picture = drawing_bytes(drawing, "svg", dpi=settings.dpi)
+    drawing.look = look
+    files = {
+        f"{figure.name}.{kind}": drawing_bytes(drawing, kind, dpi=settings.dpi, title=figure.title)
+        for kind in settings.figure_formats
+    }
     width, height = (round(_MM * 25.4 * side) for side in drawing.get_size_inches())
-    return Drawn(f"data:image/svg+xml,{escaped(picture)}", width, height, files)
-
-
-def escaped(content: bytes) -> str:
-    """Return bytes as the text of a data URL: as `urllib.parse.quote`, in a fifth of the time."""
-    text = content.decode("latin-1")
-    # the escapes' own sign first
-    for character in ("%", *(set(text) - _AS_IT_IS - {"%"})):
-        text = text.replace(character, f"%{ord(character):02X}")
-    return text
+    return Drawn(f"data:image/svg+xml,{quote(picture, safe=_SAFE)}", width, height, files)
 
 
 def draw_here(figures: Sequence[Figure], settings: ReportSettings) -> dict[str, Drawn]:

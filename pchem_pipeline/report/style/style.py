@@ -8,30 +8,23 @@ from __future__ import annotations
 import base64
 import contextlib
 import functools
-import gc
 import io
 import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Concatenate, ParamSpec, cast
+from typing import Any, Concatenate, ParamSpec
 
 import matplotlib as mpl
-import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure as MatplotlibFigure
-from matplotlib.lines import Line2D
-from matplotlib.markers import TICKDOWN, TICKLEFT
-from matplotlib.ticker import Formatter, LogFormatterSciNotation, NullLocator
-from numpy.typing import NDArray
 from PIL import Image
 
 from pchem_pipeline.report.charts.chart import COLUMN_MM
 from pchem_pipeline.report.style.palette import CYCLE, DARK, LIGHT, MAP_COLOURS, Palette
-from pchem_pipeline.report.style.wording import SUPERSCRIPT
 
 _STYLE: Any = {
     "axes.axisbelow": True,
@@ -70,12 +63,6 @@ _METADATA: dict[str, dict[str, Any]] = {
 
 #: Of PNG files: those of maps are within 3 % as small as at levels 6 and 9, in three quarters of the time.
 _COMPRESSION = 4
-
-#: Side of the ticks of an axis, and their mark.
-_MARKS = {"x": ("bottom", TICKDOWN), "y": ("left", TICKLEFT)}
-
-#: A power of ten as matplotlib labels a tick with it: sign, factor, exponent.
-_POWER = re.compile(r"\$\\mathdefault\{(-)?(?:([\d.]+)\\times)?10\^\{(-?\d+)\}\}\$")
 
 P = ParamSpec("P")
 
@@ -164,22 +151,6 @@ def _in(look: Look) -> Iterator[None]:
         yield
 
 
-@contextlib.contextmanager
-def without_collector() -> Iterator[None]:
-    """Let no search for cyclic garbage interrupt the drawing of a figure: a seventh of its time.
-
-    A drawing makes many objects, none of which is garbage before it is done; each search goes through all
-    that the libraries hold.
-    """
-    before = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if before:
-            gc.enable()
-
-
 def styled(draw: Callable[Concatenate[Look, P], Drawing]) -> Callable[Concatenate[Look, P], Drawing]:
     """Decorate a drawing function, whose first argument is the look: it draws in it and lays out once.
 
@@ -190,95 +161,10 @@ def styled(draw: Callable[Concatenate[Look, P], Drawing]) -> Callable[Concatenat
     def wrapper(look: Look, /, *args: P.args, **kwargs: P.kwargs) -> Drawing:
         with _in(look):
             drawing = draw(look, *args, **kwargs)
-            if not _own_fonts(look):
-                _write_powers_plainly(drawing)
-            _join_minor_ticks(drawing)
             _lay_out(drawing)
             return drawing
 
     return wrapper
-
-
-class _PlainPowers(Formatter):
-    """Labels of another formatter, formulas of powers of ten as characters: ``10⁻³``.
-
-    Each formula would be parsed once to lay it out and once to draw it: a twelfth of the time of a figure.
-    """
-
-    def __init__(self, formatter: Formatter) -> None:
-        self._formatter = formatter
-
-    def __call__(self, x: float, pos: int | None = None) -> str:
-        """Return the label of one tick."""
-        return _without_formula(self._formatter(x, pos))
-
-    def format_ticks(self, values: Any) -> list[str]:
-        """Return the labels of all ticks."""
-        return [_without_formula(label) for label in self._formatter.format_ticks(values)]
-
-
-def _without_formula(label: str) -> str:
-    """Return the label of a tick as text where its formula is a power of ten, or a number times one."""
-    found = _POWER.fullmatch(label)
-    if found is None:
-        return label
-    sign, factor, exponent = found.groups(default="")
-    times = f"{factor}×" if factor else ""
-    return f"{sign.replace('-', '−')}{times}10{exponent.translate(SUPERSCRIPT)}"
-
-
-def _own_fonts(look: Look) -> bool:
-    """Tell whether a style sheet has fonts of its own, which may lack the characters."""
-    return any(key.startswith(("font.", "mathtext.", "text.usetex")) for key in look.sheet)
-
-
-def _write_powers_plainly(drawing: Drawing) -> None:
-    """Write the powers of ten at logarithmic axes as characters."""
-    for axis in (each for axes in drawing.axes for each in (axes.xaxis, axes.yaxis)):
-        if isinstance(major := axis.get_major_formatter(), LogFormatterSciNotation):
-            axis.set_major_formatter(_PlainPowers(major))
-        if isinstance(minor := axis.get_minor_formatter(), LogFormatterSciNotation):
-            axis.set_minor_formatter(_PlainPowers(minor))
-
-
-def _join_minor_ticks(drawing: Drawing) -> None:
-    """Draw the minor ticks of each logarithmic axis as one line of marks that looks the same.
-
-    Each tick of matplotlib is five artists, and the layout asks for all of them again and again: an eighth of
-    the time of a report. Ticks with labels stay, and those that a style sheet draws otherwise.
-    """
-    parameters: Any = mpl.rcParams
-    found = [(axes, kind, _bare_minor_ticks(axes, kind)) for axes in drawing.axes for kind in _MARKS]
-    for axes, kind, places in found:  # all were found before: axes share their locators
-        if not places.size:
-            continue
-        getattr(axes, f"{kind}axis").set_minor_locator(NullLocator())
-        ends = np.zeros(places.size)
-        marks = Line2D(
-            *((places, ends) if kind == "x" else (ends, places)),
-            linestyle="none",
-            marker=cast(Any, _MARKS[kind][1]),
-            markersize=parameters[f"{kind}tick.minor.size"],
-            markeredgewidth=parameters[f"{kind}tick.minor.width"],
-            color=parameters[f"{kind}tick.color"],
-            transform=axes.get_xaxis_transform() if kind == "x" else axes.get_yaxis_transform(),
-            clip_on=False,
-            in_layout=False,
-        )
-        drawing.add_artist(marks)  # not of the axes, whose lines are data
-
-
-def _bare_minor_ticks(axes: Axes, kind: str) -> NDArray[np.float64]:
-    """Return the places of a logarithmic axis' minor ticks, if they are outside and none has a label."""
-    axis, parameters = getattr(axes, f"{kind}axis"), cast(Any, mpl.rcParams)
-    outside = parameters[f"{kind}tick.direction"] == "out"
-    shown = axis.get_tick_params("minor").get(_MARKS[kind][0], True)
-    if axis.get_scale() != "log" or not outside or not shown:
-        return np.empty(0)
-    low, high = sorted(axis.get_view_interval())
-    places = np.asarray(axis.get_minorticklocs())
-    places = places[(places >= low) & (places <= high)]
-    return np.empty(0) if any(axis.get_minor_formatter().format_ticks(list(places))) else places
 
 
 def _lay_out(drawing: Drawing) -> None:

@@ -68,9 +68,9 @@ class Trials:
         """Whether that leaves nothing."""
         return bool(self.tried) and self.refitter.passes_goodness_of_fit(self.best)
 
-    def refit(self, members: Sequence[Hypothesis]) -> bool:
-        """Refit a set unless it is in vain; return False at the limit of the work."""
-        if not self._worth_it(members):
+    def refit(self, members: Sequence[Hypothesis], *, proven: bool = False) -> bool:
+        """Refit a set unless it is in vain, which one that is proven never is; return False at the limit."""
+        if not (proven or self._worth_it(members)):
             return True
         self.asked.append(tuple(members))
         best = max((one.score for one in self.tried), default=-np.inf)

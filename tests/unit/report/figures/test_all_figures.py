@@ -37,7 +37,6 @@ from pchem_pipeline.report.figures.pixels import (
     pixels_chart,
     shown_bins,
 )
-from pchem_pipeline.report.style import style
 from pchem_pipeline.report.style.palette import DARK, LIGHT
 from pchem_pipeline.report.style.style import Drawing, Look, drawing_bytes, palette_of, small_png
 
@@ -352,48 +351,3 @@ def test_dark_paper_has_light_ink() -> None:
     assert dark.axes[0].lines[0].get_color() == DARK.ink
     assert palette_of(mpl.style.library["dark_background"]).ink == "#ffffff"
     assert palette_of({}) == LIGHT
-
-
-@pytest.mark.parametrize("direction", ["out", "in"])
-def test_joined_minor_ticks_look_as_those_of_matplotlib(
-    monkeypatch: pytest.MonkeyPatch, direction: str
-) -> None:
-    def draw(look: style.Look) -> style.Drawing:
-        figure = look.empty(60.0)
-        for axes in figure.subplots(1, 2, sharey=True):
-            axes.loglog([1.0, 3e3], [1e-4, 20.0])
-        return figure
-
-    def pixels() -> np.ndarray:
-        drawing = style.styled(draw)(style.Look(sheet={"ytick.direction": direction}))
-        with Image.open(io.BytesIO(style.drawing_bytes(drawing, "png", dpi=200))) as image:
-            return np.asarray(image.convert("L"), dtype=np.int64)
-
-    joined = pixels()
-    monkeypatch.setattr(style, "_join_minor_ticks", lambda drawing: None)
-    plain = pixels()
-    differ = np.abs(joined - plain) > 40
-    assert differ.mean() < 1e-4
-    monkeypatch.setitem(style._STYLE, "xtick.minor.size", 0.0)  # the test can fail
-    assert (np.abs(joined - pixels()) > 40).mean() > 3e-4
-
-
-def test_powers_of_ten_are_written_without_formulas() -> None:
-    @style.styled
-    def draw(look: style.Look) -> style.Drawing:
-        figure = look.empty(60.0)
-        left, middle, right = figure.subplots(1, 3)
-        left.loglog([1.0, 3e3], [1e-4, 20.0])
-        middle.set_xscale("symlog", linthresh=4.0)
-        middle.plot([-1e3, 1e4], [1.0, 2.0])
-        right.semilogy([1.0, 2.0], [2.2, 7.7])  # less than a decade: minor ticks have the labels
-        return figure
-
-    left, middle, right = draw(style.Look(PAGE_MM)).axes
-    assert {"10⁰", "10³"} <= {label.get_text() for label in left.get_xticklabels()}
-    assert "10⁻³" in {label.get_text() for label in left.get_yticklabels()}
-    assert {"−10³", "10⁴"} <= {label.get_text() for label in middle.get_xticklabels()}
-    assert "3×10⁰" in {label.get_text() for label in right.get_yticklabels(minor=True)}
-    # fonts of one's own may lack these characters
-    left, *_ = draw(style.Look(PAGE_MM, sheet={"font.family": "STIXGeneral"})).axes
-    assert not {"10⁰", "10³"} & {label.get_text() for label in left.get_xticklabels()}

@@ -501,6 +501,18 @@ def seeds(refitter: Refitter, *tried: Refitted) -> list[frozenset[str]]:
     return asked
 
 
+def test_what_is_proven_is_refitted_whatever_its_fingerprints_promise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of three effects that left nothing two were proven, and not refitted: 'unexplained'."""
+    trials = Trials(World([effect("row_noise", 0.3)]).refitter(), HistogramLikelihood())
+    monkeypatch.setattr(Trials, "_worth_it", lambda *_: False)
+    trials.refit([hypothesis("row_noise", 0.3)])
+    assert not trials.tried
+    trials.refit([hypothesis("row_noise", 0.3)], proven=True)
+    assert [one.tags for one in trials.tried] == [{"row_noise"}]
+
+
 def test_a_part_of_a_better_set_is_not_grown_again() -> None:
     refitter = World([effect(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift")]).refitter()
     row, frame, drift = (hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift"))
