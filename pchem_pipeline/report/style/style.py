@@ -224,6 +224,7 @@ _PATH = re.compile(rb' d="[^"]*"')
 _DIGITS = re.compile(rb"(\.\d\d)\d+")
 _BLANKS = re.compile(rb"(?<=[MLQC]) | ?\n")
 _BETWEEN = re.compile(rb">\s+<")
+_CLIP = re.compile(rb'<clipPath id="(p[0-9a-f]{10})"')
 _IMAGE = re.compile(rb"(?<=data:image/png;base64,)[A-Za-z0-9+/=\s]+")
 
 
@@ -242,7 +243,12 @@ def drawing_bytes(drawing: Drawing, kind: str, *, dpi: int = 300, title: str = "
 
 
 def _compact(svg: bytes) -> bytes:
-    """Return an SVG with paths to 0.01 pt, images of 256 colours, no blanks: a quarter less."""
+    """Return an SVG with paths to 0.01 pt, images of 256 colours, no blanks: a quarter less.
+
+    Clip paths are numbered: matplotlib's names for them depend on which objects were collected.
+    """
+    for number, name in enumerate(_CLIP.findall(svg)):
+        svg = svg.replace(name, b"clip%d" % number)
     svg = _IMAGE.sub(lambda image: base64.b64encode(small_png(base64.b64decode(image.group()))), svg)
     short = _PATH.sub(lambda path: _BLANKS.sub(b"", _DIGITS.sub(rb"\1", path.group())), svg)
     return _BETWEEN.sub(b"><", short)
