@@ -14,13 +14,13 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
+from pchem_pipeline.base.units import FEW_STEP
 from pchem_pipeline.model.law.pcd import log_pcd
 from pchem_pipeline.planning.point import FloatArray
 
 _OFFSETS = (1.0, 0.75, 0.5, 1.25)  # e- off at the brightest sample; the rival lies near 1
 _GAIN_CHANGES = (0.1, 0.2)  # of ln g
 _LEAST_EXPOSURE = 0.02
-_FEW_STEP = 3.0  # DN per electron, below which a DN is no small part of an electron
 _PHASE = 0.3  # DN from a whole number to the bias
 
 
@@ -102,11 +102,11 @@ def gain_rival(
         nearest: smallest change of ln g to look at.
         gain: g, e-/DN; matters where a DN is no small part of an electron.
     """
-    few = gain > 1.0 / _FEW_STEP
+    few = gain > 1.0 / FEW_STEP
     lights, laws, dark = _split_off_bias(exposures, shares, read_noise_e, gain if few else 0.0)
     found, top = Ambiguity(float("inf"), 0.0), lights[-1]
     changes = [side * offset for offset in _GAIN_CHANGES for side in (-1.0, 1.0) if offset > nearest - 1e-9]
-    # the same means and variances: H g^-2 and, without bias frames, mu + H/g stay
+    # the same means, and without bias frames the same mean variance: H g^-2
     starts = [(c, 0.0 if dark > 0 else float(np.mean(lights) * (1 - np.exp(c)))) for c in changes]
     if few and gain < 1.0:
         # its peaks lie on the same whole numbers

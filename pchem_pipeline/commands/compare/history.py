@@ -159,11 +159,12 @@ class HotPixels:
         return cls(hot_pixels(exposure, stderr, flagged, sigmas), exposure, stderr)
 
     def new_since(self, first: HotPixels) -> tuple[tuple[int, int], ...]:
-        """Return the places of those that were not hot, and whose H differs by more than its error."""
+        """Return the places of those that were not hot, unless H agrees within its error, if known."""
         if self.hot.shape != first.hot.shape:
             return ()
-        apart = np.abs(self.exposure - first.exposure) > LIMIT * np.hypot(self.stderr, first.stderr)
-        return tuple((int(y), int(x)) for y, x in np.argwhere(self.hot & ~first.hot & apart))
+        error = np.hypot(np.nan_to_num(self.stderr), np.nan_to_num(first.stderr))
+        near = np.abs(self.exposure - first.exposure) <= LIMIT * error
+        return tuple((int(y), int(x)) for y, x in np.argwhere(self.hot & ~first.hot & ~near))
 
 
 def _flags(store: RunStore) -> dict[str, int]:

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
+from pchem_pipeline.base.units import FEW_STEP
 from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.fisher import observed_covariance
 from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_may_matter
 from pchem_pipeline.model.fit import engine, guard_numba, profile, profile_numba, search_numba, tile_numba
-from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, FEW_STEP, Limits
+from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, Limits
 from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
 from pchem_pipeline.model.fit.guard import fit_guarded
 from pchem_pipeline.model.fit.result import FitResult, quantile_of

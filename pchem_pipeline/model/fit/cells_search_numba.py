@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, FEW_STEP, LEAST_STEP, same_place
+from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
+from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, LEAST_STEP, same_place
 from pchem_pipeline.model.fit.satellites_numba import search_satellites
 from pchem_pipeline.model.fit.search_numba import (
     AMPLITUDE,

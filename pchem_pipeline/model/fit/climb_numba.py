@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.algebra_numba import solve_arrow
 from pchem_pipeline.model.law.pixel_numba import (
     AHEAD,
@@ -60,7 +60,6 @@ _GOING, _AT_KNOWN = 4, 5  # within a climb: not there yet; heading for the maxim
 MIN_LOG_VARIANCE = math.log(QUANTISATION_VARIANCE)
 MIN_ELECTRON_NOISE = 0.03  # of the density: below it the polynomials of the E-step overflow
 MAX_ELECTRON_NOISE = 3.0  # above it there is one Gaussian to all intents
-FEW_STEP = 3.0  # DN per electron, below which a DN is no small part of an electron
 ALIASED_STEP = (
     6.0  # DN per electron: whole numbers do not tell 1/a from 1 - 1/a, and MIN_STEP is the alias of 6
 )

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit.climb_numba import (
     CONVERGED,
     DEGENERATE,
-    FEW_STEP,
     Goal,
     Limits,
     same_place,

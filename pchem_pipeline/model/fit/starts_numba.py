@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, counting, fused, simd_load, simd_store
 from pchem_pipeline.model.fit.climb_numba import (
-    FEW_STEP,
     LEAST_STEP,
     MIN_STEP,
     min_log_variance,
