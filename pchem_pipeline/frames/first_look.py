@@ -103,10 +103,13 @@ def _is_time_last(values: NDArray[Any]) -> bool:
     values = values[np.ptp(values, axis=(1, 2)) > 0]  # empty frames are no pattern of pixels
     if min(values.shape) < _FEWEST:
         return False
-    along_last = _common_variance(np.moveaxis(values, 1, 0))
-    along_first = _common_variance(np.moveaxis(values, 1, 0).swapaxes(1, 2))
-    seen = along_first[0] > _ERRORS * along_first[1]
-    return bool(seen and along_first[0] > _CLEARLY * (max(along_last[0], 0.0) + _ERRORS * along_last[1]))
+    rows = np.moveaxis(values, 1, 0)
+    last = _common_variance(rows)
+    first = _common_variance(rows.swapaxes(1, 2))
+    # what whole frames share is no pattern of pixels either
+    single = _common_variance((rows - rows.mean(axis=0)).swapaxes(1, 2))
+    seen = min(first[0] - _ERRORS * first[1], single[0] - _ERRORS * single[1]) > 0.0
+    return bool(seen and first[0] > _CLEARLY * (max(last[0], 0.0) + _ERRORS * last[1]))
 
 
 def _common_variance(values: NDArray[np.float64]) -> tuple[float, float]:
