@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
-from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, LEAST_STEP, same_place
+from pchem_pipeline.model.errors.algebra_numba import invert_arrow
+from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, LEAST_STEP, find_held, same_place
 from pchem_pipeline.model.fit.satellites_numba import search_satellites
 from pchem_pipeline.model.fit.search_numba import (
     AMPLITUDE,
@@ -39,6 +40,7 @@ from pchem_pipeline.model.fit.search_numba import (
 from pchem_pipeline.model.fit.starts_numba import (
     add_line_starts,
     alias_of_step,
+    combs_of_step,
     fill_starts,
     keep_start,
     scan_steps,
@@ -46,6 +48,7 @@ from pchem_pipeline.model.fit.starts_numba import (
 from pchem_pipeline.model.law.pixel_numba import (
     ADDED_EXPOSURE,
     ADDED_WEIGHT,
+    AT_BEST,
     BIAS,
     BOTTOM,
     CUMULATIVE,
@@ -55,6 +58,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     FIRST,
     FIXED,
     HEIGHTS,
+    HELD,
     HERE,
     LOG_VARIANCE,
     N_BINS,
@@ -88,6 +92,7 @@ _UNRESOLVED = 0.45
 _CUT_SHARE = 0.005  # of a sample at a limit, beyond which the starts of the whole sample mislead
 _CUT_EXPOSURES = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.8, 1.2, 1.8, 2.5, 3.3, 4.2, 5.3, 6.8, 9.0)  # e-
 _CUT_NOISE_E, _CUT_RATIO = 0.28, 1.2
+_NEAR_TWO, _CLIMBED = 0.06, 2  # e-/DN from 0.5: combs of whole numbers with aliases; of 2 DN, climbed from
 _STEPS, _AROUND = 3, 3  # biases per electron, and to either side
 
 
@@ -227,6 +232,27 @@ def _climb_known(pixel: Pixel, tools: Tools, near: FloatArray, best: FloatArray)
     return Found(-math.inf, -math.inf, used, np.bool_(False))
 
 
+@kernel
+def _flat_at_two(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -> bool:
+    """Tell whether the log-likelihood falls towards 2 DN per electron by less than half of its parabola.
+
+    Whole numbers do not tell 1/a from 1 - 1/a: it has no slope at 2 DN, and near it no standard error.
+    """
+    scratch, top, covariance = tools.scratch, -math.inf, np.empty((best.size, best.size))
+    at, held, trial = scratch.evaluations[AT_BEST], scratch.flags[HELD], scratch.small[HERE]
+    find_held(best, at, scratch.flags[FIXED], tools.limits, held)
+    if abs(1.0 / best[1 + STEP] - 0.5) > _NEAR_TWO or not invert_arrow(at, best, held, covariance):
+        return False
+    combs_of_step(pixel, tools.evaluate, 2.0, scratch)
+    scratch.flags[FIXED, 1 + STEP] = True
+    for _ in range(_CLIMBED):
+        if next_start(scratch, trial):
+            top = max(top, climb_on(pixel, tools, from_start(), trial, trial)[1])
+    scratch.flags[FIXED, 1 + STEP] = False
+    parabola = 0.5 * (best[1 + STEP] - 2.0) ** 2 / covariance[1 + STEP, 1 + STEP]
+    return bool(loglik - top < CLEAR_GAP and 2.0 * (loglik - top) < parabola)
+
+
 @kernel(inline=True)
 def _start_anew(
     pixel: Pixel,
@@ -254,8 +280,14 @@ def _start_anew(
     if lost or (limits.scan and (astray or few)):
         found = _climb_few(pixel, tools, best, found)
     if limits.scan and n == 1 and best[place] < ALIASED_STEP:
-        used = alias_of_step(pixel, tools.evaluate, best, tools.scratch)
-        found = _climb_kept(pixel, tools, best, plus(found, used))
+        if abs(1.0 / best[place] - 0.5) > _NEAR_TWO:
+            used = alias_of_step(pixel, tools.evaluate, best, tools.scratch)
+            near: Found = _climb_kept(pixel, tools, best, plus(found, used))
+            return near
+        for nearer in (1.0, 3.0):
+            a = 1.0 / (0.5 - (1.0 / best[place] - 0.5) / nearer)
+            used = combs_of_step(pixel, tools.evaluate, a, tools.scratch)
+            found = _climb_kept(pixel, tools, best, plus(found, used))
     return found
 
 
@@ -337,6 +369,7 @@ def search_cells(
     # the density has told whether there is a gain: it knows no other law than one Gaussian does
     above_null = math.inf if known else found.loglik - null
     of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.loglik - bias_gap)
+    of_gain = of_gain or (n == 1 and limits.scan and _flat_at_two(pixel, tools, best, found.loglik))
     of_gain = of_gain or (cut and bias_gap < limits.gap)
     word = judge(pixel, limits, best, above_null, blurred, bias_gap, of_gain)
     return word, found.used, int(out[DEGREES])

@@ -74,7 +74,6 @@ _BLURRED2, _LEAST_SKEWNESS = 0.64, 0.02  # e-^2: read noise without peaks; a ske
 _SAME_GAIN, _SAME_RIVAL = 0.03, 0.1  # relative; nats
 _SURELY_SEEN = 40.0  # nats: where so much is expected of the peaks alone, they are no chance
 _LOCKED_NOISE = 0.15  # DN: below it each electron number has one code, and many combs have these codes
-_IN_STEP = 0.1  # DN by which the peaks within a standard deviation of H drift against the codes
 _FEWEST_CODES = 7.0  # of which the four parameters leave two free shares
 _COARSE_NOISE = 0.6  # DN: below it, or below so many DN per electron, rounding is more than additive noise
 _COARSE_STEP = 2.5
@@ -461,10 +460,7 @@ def judge(
     if not limits.cells and (sigma < _COARSE_NOISE or a < _COARSE_STEP):
         status |= COARSE_STEPS
     if n == 1:
-        # at 2 DN per electron a code is between two peaks, and whole numbers do not tell 1/a from 1 - 1/a
-        in_step = abs(a - 2.0) * math.exp(0.5 * best[0]) < _IN_STEP
-        locked = sigma < _LOCKED_NOISE or pixel.facts[0, OCCUPIED] < _FEWEST_CODES
-        if limits.cells and ((in_step and sigma < _COARSE_NOISE) or locked):
+        if limits.cells and (sigma < _LOCKED_NOISE or pixel.facts[0, OCCUPIED] < _FEWEST_CODES):
             status |= GAIN_AMBIGUOUS
         if limits.cells:
             sigma = math.sqrt(sigma * sigma + QUANTISATION_VARIANCE)

@@ -389,6 +389,30 @@ def alias_of_step(pixel: Pixel, evaluate: Any, best: NDArray[np.float64], scratc
     return used
 
 
+@kernel(borrows=True)
+def combs_of_step(pixel: Pixel, evaluate: Any, a: float, scratch: Scratch) -> int:
+    """Put the likeliest combs of a few DN per electron among the starts of a single sample, of one step.
+
+    Aliases of the lobe at 1/a hide modulus and phase, so read noises and exposures around the one that has
+    the variance right are tried.
+
+    Returns:
+        Evaluations.
+    """
+    histogram, trial, used = histogram_of(pixel, np.int64(0)), scratch.small[HERE], 0
+    _no_starts(scratch.small[HEIGHTS])
+    trial[1 + STEP], trial[1 + SATELLITE] = a, 0.0
+    for noise in _FEW_NOISES:
+        middle = (histogram.variance - QUANTISATION_VARIANCE) / (a * a) - noise * noise
+        trial[1 + LOG_VARIANCE] = max(2.0 * math.log(noise * a), min_log_variance(a, np.bool_(True)))
+        for around in range(-2, 3):
+            exposure = middle + 0.2 * around
+            if exposure > 1e-3:
+                trial[0], trial[1 + BIAS] = math.log(exposure), histogram.mean - exposure * a
+                used += keep_start(pixel, evaluate, np.bool_(True), scratch)
+    return used
+
+
 @kernel(inline=True)
 def _holds_one(histogram: Histogram, theta: NDArray[np.float64]) -> bool:
     """Tell whether the peak of one electron is there: a comb of half the step has nothing where this has it.

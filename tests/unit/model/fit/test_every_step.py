@@ -88,12 +88,17 @@ def test_samples_at_a_limit_are_censored(exposure, bias):
     assert (np.abs(pulls.mean(axis=1)) < 5.0 / np.sqrt(used.sum())).all()
 
 
-def test_two_combs_with_the_same_codes_are_flagged():
+@pytest.mark.parametrize(
+    ("exposure", "step", "noise", "frames", "least"),
+    [(5.0, 1.97, 0.15, 6000, 0.0), (5.0, 2.0, 0.25, 4000, 0.05), (1.6, 2.0, 0.2, 1000, 0.2)],
+)
+def test_two_combs_with_the_same_codes_are_flagged(exposure, step, noise, frames, least):
     """Whole numbers do not tell ``1/a`` from ``1 - 1/a``: near 2 DN per electron both combs fit."""
-    found = fitted(samples(np.random.default_rng(7), 5.0, 1.97, 0.15, 6000, 100.3, 60))
-    pulls = np.abs(found.conversion_gain * 1.97 - 1.0) / (1.97 * np.sqrt(found.covariance[:, 1, 1]))
+    found = fitted(samples(np.random.default_rng(7), exposure, step, noise, frames, 100.3, 60))
+    pulls = np.abs(found.conversion_gain * step - 1.0) / (step * np.sqrt(found.covariance[:, 1, 1]))
     assert (pulls > 5.0).any()  # some are wrong ...
     assert ((pulls > 5.0) & good(found)).sum() <= 1  # ... and say so
+    assert good(found).mean() >= least  # the others need not
 
 
 def test_a_comb_seen_by_chance_is_flagged():
