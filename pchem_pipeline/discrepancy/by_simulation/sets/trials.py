@@ -191,12 +191,18 @@ class Trials:
             return False
         if len(members) > 1 and any(same_kinds(members, others) for others in self.asked):
             return False
-        if self.complete and len({h.tag for h in members}) > len(self.best.tags):
+        settled = self._settled
+        if settled and len({h.tag for h in members}) > len(self.best.tags):
             return False
         alone = len(members) == 1 and bool(self.tried)
-        if not (alone or self.complete):
+        if not (alone or settled):
             return True
         return not (self._beaten(members) or (alone and self._less_likely(members)))
+
+    @property
+    def _settled(self) -> bool:
+        """Whether the best set leaves nothing, and all of its effects have a name."""
+        return self.complete and not any(type(effect).empirical for effect in self.best.effects)
 
     def _beaten(self, members: Sequence[Hypothesis]) -> bool:
         """Tell whether a refit of hypotheses is in vain: far behind the best set, or blind where that is not.
@@ -206,7 +212,7 @@ class Trials:
         nothing, a statistic that stands out and that they hardly move says enough: a refit does not change
         them so much.
         """
-        refitter, complete = self.refitter, self.complete
+        refitter, complete = self.refitter, self._settled
         shift = refitter.target - refitter.null.mean
         noise = refitter.noise(refitter.null.covariance, refitter.null.n_replicates)
         noise = replace(noise, model_error=LOOSE)

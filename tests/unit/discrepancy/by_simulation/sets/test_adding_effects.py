@@ -563,6 +563,21 @@ def test_what_is_measured_competes_with_several_effects_at_its_price(left: float
         assert world.chosen(*guesses[: len(some)], measured=never) == set(some)
 
 
+def test_a_description_that_leaves_nothing_keeps_no_named_effect_from_its_refit() -> None:
+    """Noise in a few rows was not refitted, since a description of two parts had left nothing before."""
+    refitter = World([effect("row_noise", 0.3), effect("frame_noise", 0.05)]).refitter()
+    named = refitter.refined([hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.05)])
+    noise = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))
+    described = replace(named, hypotheses=(Hypothesis(noise, named.parts.sum(axis=0)),))
+    # as near as row noise by its fingerprint, which leaves what frame noise does
+    other = replace(hypothesis("row_noise", 0.3), effect=effect("exposure_drift", 0.3))
+    for first, refits in ((described, 1), (named, 0)):
+        trials = Trials(refitter, HistogramLikelihood(), [first])
+        assert trials.complete
+        trials.refit([other])
+        assert len(trials.tried) == 1 + refits
+
+
 def test_a_signature_is_asked_of_the_same_kind_of_the_others() -> None:
     """Another kind of the one may mimic both: it is no better than the set, or it would stand before it."""
     world = World([effect("row_noise", 0.3)])
