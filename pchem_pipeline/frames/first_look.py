@@ -1,4 +1,4 @@
-"""A look at about 100,000 stored samples for what a format does not say: byte order, justification, axes.
+"""A look at about 100,000 stored samples for what a format does not say: byte order, limits, axes.
 
 The pixels of a sensor differ from one another by the same in every frame, and the samples of one pixel hardly
 do. So the means of two halves of the samples along time vary alike from pixel to pixel. Where they do along
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _FRAMES, _PLACES, _ROWS, _SAMPLES = 48, 4, 16, 100_000  # that are looked at
 _FEWEST, _FEWEST_CODES, _FEWEST_STEPS = 8, 8, 500
+_FEWEST_AT_LIMIT = 20
 _CLEARLY = 4.0  # times the common variance of the one is that of the other
 _ERRORS = 3.0
 _OCTAVES = 1.5  # by which steps shrink on average in the right byte order; in the wrong one they grow
@@ -30,7 +31,7 @@ def first_look(frames: FrameSequence, settings: InputSettings) -> list[str]:
     """Return remarks on left-justified samples, and on a stack whose last axis looks like time.
 
     Args:
-        frames: the stack.
+        frames: the stack; out: the codes at which its samples seem to be cut off.
         settings: the section ``input``; what it states is not looked for.
 
     Raises:
@@ -57,6 +58,8 @@ def first_look(frames: FrameSequence, settings: InputSettings) -> list[str]:
             f"{name.name}: the lowest {unused} bits of the samples are 0 (left-justified samples); set "
             f"input.bit_shift: {unused} (--bit-shift {unused}), else all DN are {1 << unused} times too large"
         )
+    if not frames.bit_shift:
+        frames.seen_limits = limits_seen(values)
     if frames.order_by_habit and not frames.unwritten and _is_time_last(values):
         notes.append(
             f"{name.name}: read as {n} frames of {rows} x {columns} pixels, but the last axis looks like "
@@ -96,6 +99,21 @@ def _unused_bits(values: NDArray[Any]) -> int:
         return 0
     used = int(np.bitwise_or.reduce(values, axis=None))
     return (used & -used).bit_length() - 1
+
+
+def limits_seen(values: NDArray[Any]) -> tuple[int | None, int | None]:
+    """Return the lowest and highest code if samples of several pixels pile up there, else None.
+
+    Args:
+        values: samples (frame, y, x), DN.
+    """
+    found: list[int | None] = []
+    for end, inward in ((int(values.min()), 1), (int(values.max()), -1)):
+        at, next_to = values == end, [values == end + inward * i for i in range(1, _FEWEST_CODES + 1)]
+        beside = [np.count_nonzero(each) for each in next_to]
+        piled = np.count_nonzero(at) > _CLEARLY * max(beside) + _FEWEST_AT_LIMIT and min(beside) > 0
+        found.append(end if piled and np.count_nonzero(at.any(axis=0)) >= _FEWEST else None)
+    return found[0], found[1]
 
 
 def _is_time_last(values: NDArray[Any]) -> bool:

@@ -65,6 +65,7 @@ class FrameSequence(FrameReader):
         self.dtype = readers[0].dtype
         self.rows_per_read = max(reader.rows_per_read for reader in readers)
         self.byte_order = readers[0].byte_order
+        self.seen_limits: tuple[int | None, int | None] = (None, None)
         self.unwritten = any(reader.unwritten for reader in readers)
         self._set_facts(readers, settings, end)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.store.run_store import RunStore
@@ -42,6 +44,7 @@ class SensorInfo:
         nx: columns (for histograms: channels).
         dtype: numpy name of the DN type.
         bit_depth: bits of the ADC, if known; codes at its limits count as clipped.
+        seen_limits: lowest and highest code at which samples pile up; None: they do not.
         integration_time: seconds per frame as the files say, if they do.
         mode: copy (``frames/dn`` holds the frames) or reference (they stay in the camera files).
         identity: names, sizes and content hashes of the files.
@@ -66,11 +69,24 @@ class SensorInfo:
     shown: int = 0
     camera: CameraFacts = field(default_factory=CameraFacts)
     whole: tuple[int, int] | None = None
+    seen_limits: tuple[int | None, int | None] = (None, None)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
         return self.ny, self.nx
+
+    def adc_limits(self, bit_depth: int | None = None) -> tuple[int, int] | None:
+        """Return first and last code of the ADC, or where samples pile up; None: not known.
+
+        Args:
+            bit_depth: as configured; None: that of the files, else of the type of the samples.
+        """
+        depth, kind = bit_depth or self.bit_depth, np.dtype(self.dtype)
+        if depth is None and kind.kind != "u":
+            return None
+        low, high = self.seen_limits
+        return low or 0, high or 2 ** (depth or 8 * kind.itemsize) - 1
 
     def write(self, store: RunStore) -> None:
         """Keep this in the store."""
@@ -92,6 +108,7 @@ class SensorInfo:
             camera = CameraFacts(**content.get("camera", {}))
             whole = content.get("whole")
             given = {"names": tuple(content["names"]), "samples": samples, "camera": camera}
+            given["seen_limits"] = tuple(content.get("seen_limits", (None, None)))
             return cls(**{**content, **given, "whole": None if whole is None else tuple(whole)})
         except (TypeError, KeyError, AttributeError) as error:
             raise StoreError(f"{store.path}: frames is damaged ({error}); {store.cure('frames')}") from error

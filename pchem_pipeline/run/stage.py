@@ -22,8 +22,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-import numpy as np
-
 from pchem_pipeline.base.errors import InputError, StoreError, error_words
 from pchem_pipeline.base.variables import LENGTHS, VARIABLES
 from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor, Stop
@@ -219,12 +217,8 @@ class StageContext:
 
     @property
     def adc_limits(self) -> tuple[int, int] | None:
-        """First and last code of the ADC; of the type of the samples where the bit depth is not known."""
-        depth = self.config.input.bit_depth or self.sensor.bit_depth
-        kind = np.dtype(self.sensor.dtype)
-        if depth is None and kind.kind != "u":
-            return None
-        return 0, 2 ** (depth or 8 * kind.itemsize) - 1
+        """See `SensorInfo.adc_limits`."""
+        return self.sensor.adc_limits(self.config.input.bit_depth)
 
     @property
     def tile(self) -> tuple[int, int]:

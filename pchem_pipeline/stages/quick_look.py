@@ -19,6 +19,7 @@ from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
 
 if TYPE_CHECKING:
     from pchem_pipeline.discrepancy.quick.checks import QuickLook
+    from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.stages.report.stored import StoredRun
     from pchem_pipeline.store.run_store import RunStore
 
@@ -52,7 +53,7 @@ def run_quick_look(store: RunStore, run: StoredRun, sums: StackSums | None) -> Q
     elif maps.usable.sum() < _FEWEST:
         missing["codes"] = f"fewer than {_FEWEST} pixels have a reliable fit"
     else:
-        codes = _codes(store, maps, joint=bool(run.sensor.samples))
+        codes = _codes(store, maps, run.sensor)
     command = f"pchem discrepancy {quoted(Path(run.name))}"
     return quick_look(sums, maps, codes, run.model.effects, missing, command)
 
@@ -144,7 +145,7 @@ def _read(
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _codes(store: RunStore, maps: PixelMaps, *, joint: bool) -> CodeSample | None:
+def _codes(store: RunStore, maps: PixelMaps, sensor: SensorInfo) -> CodeSample | None:
     """Read the histograms of some pixels with a fit, from pieces of whole chunks over the sensor."""
     whole = store.file_shape("histogram/counts")
     ny, nx = maps.usable.shape
@@ -165,4 +166,5 @@ def _codes(store: RunStore, maps: PixelMaps, *, joint: bool) -> CodeSample | Non
         parameters.append(np.stack([each[part].ravel()[inside] for each in values], axis=1))
     if sum(part.size for part in origins) < _FEWEST:
         return None
-    return CodeSample(np.concatenate(counts), np.concatenate(origins), np.concatenate(parameters), joint)
+    joined = np.concatenate(counts), np.concatenate(origins), np.concatenate(parameters)
+    return CodeSample(*joined, bool(sensor.samples), sensor.adc_limits())

@@ -219,6 +219,15 @@ def _sample(settings: InputSettings, i: int, found: OpenSample) -> Sample:
     )
 
 
+def _shared_limits(samples: Sequence[OpenSample]) -> tuple[int | None, int | None]:
+    """Return the outermost codes at which any of the samples pile up."""
+    low, high = zip(*(each.sensor.seen_limits for each in samples), strict=True)
+    return (
+        min((code for code in low if code is not None), default=None),
+        max((code for code in high if code is not None), default=None),
+    )
+
+
 def shown_sample(settings: InputSettings) -> int:
     """Return the place of the sample whose histograms, H and ensemble are shown."""
     if settings.shown_sample is not None:
@@ -238,6 +247,7 @@ def sample_sensor(config: RunConfig, samples: Sequence[OpenSample]) -> SensorInf
         nx=first.nx,
         dtype=first.dtype,
         bit_depth=next((each.bit_depth for each in samples if each.bit_depth is not None), None),
+        seen_limits=_shared_limits(samples),
         integration_time=None,
         mode="reference",
         identity={

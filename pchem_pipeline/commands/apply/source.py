@@ -105,9 +105,9 @@ def _by(shape: tuple[int, ...]) -> str:
 
 
 def top_code(frames: FrameSequence, sensor: SensorInfo) -> int | None:
-    """Return the largest code of the ADC, DN; None where it is not known."""
-    depth = frames.bit_depth or sensor.bit_depth
-    return None if depth is None else 2**depth - 1
+    """Return the largest code of the ADC, DN, or that at which samples pile up; None: not known."""
+    depth, seen = frames.bit_depth or sensor.bit_depth, frames.seen_limits[1] or sensor.seen_limits[1]
+    return seen if depth is None or seen else 2**depth - 1
 
 
 def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:

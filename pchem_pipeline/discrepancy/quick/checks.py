@@ -97,12 +97,14 @@ _WORDS: dict[str, tuple[str, str, str]] = {
     "codes": ("LSB", "unequal code widths (DNL)",
               "the histograms of all pixels deviate from the model at the same DN"),
     "top_code": ("1", "saturation",
-                 "larger signals are cut off there: lower the exposure. If the fit does not know this "
-                 "limit, add the effect clipping with this high to model.effects"),
+                 "larger signals are cut off there: lower the exposure. The fit does not know this limit: "
+                 "set input.bit_depth, or add the effect clipping with this high to model.effects"),
+    "top_limit": ("1", "saturation", "larger signals are cut off there: lower the exposure. The fit treats "
+                  "these samples as this DN or more, so values are right, with larger errors"),
     "bottom_code": ("1", "clipping at the lowest code", "values are cut off there: raise the black level. If "
                     "the camera clips, add the effect clipping with this low to model.effects"),
-    "zero_code": ("1", "clipping at 0 DN", "the black level is too low: raise it. The fit treats them as "
-                  "0 DN or less, so values are right, with larger errors"),
+    "bottom_limit": ("1", "clipping at the lowest code", "the black level is too low: raise it. The fit "
+                     "treats these samples as this DN or less, so values are right, with larger errors"),
 }  # fmt: skip
 
 
@@ -183,7 +185,8 @@ _SIGNS: dict[str, tuple[str, ...]] = {
     "codes": ("code.rough", "code.smooth"),
     "top_code": ("code.top",),
     "bottom_code": ("code.bottom",),
-    "zero_code": ("code.bottom",),
+    "top_limit": ("code.top",),
+    "bottom_limit": ("code.bottom",),
     "wave": ("space.sample.readout.line", "space.sample.readout.spectrum"),
     "odd_frames": ("frame.readout.largest", "frame.readout.quadrants"),
     "empty_frames": (),
@@ -226,7 +229,8 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "codes": (0.1, 0.5),
     "top_code": (1e-4, 1e-2),
     "bottom_code": (1e-4, 1e-2),
-    "zero_code": (1e-4, 1.0),
+    "top_limit": (1e-4, 1.0),
+    "bottom_limit": (1e-4, 1.0),
     "odd_frames": (0.0, 0.01),
     "empty_frames": (0.01, 0.1),
 }

@@ -8,7 +8,7 @@ detected here.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -57,16 +57,20 @@ class CodeSample:
         parameters: H, g, mu, sigma (with quantisation), (n, 4), all finite.
         joint: they come from a joint fit of several exposures, of which the histograms are one: they are
             taken as they are.
+        limits: first and last code of the ADC that the fit knows, DN; None: none.
     """
 
     counts: NDArray[np.unsignedinteger[Any]]
     origin: NDArray[np.integer[Any]]
     parameters: FloatArray
     joint: bool = False
+    limits: tuple[int, int] | None = None
 
     def of(self, some: NDArray[Any] | slice) -> CodeSample:
         """Return some of the pixels."""
-        return CodeSample(self.counts[some], self.origin[some], self.parameters[some], self.joint)
+        return replace(
+            self, counts=self.counts[some], origin=self.origin[some], parameters=self.parameters[some]
+        )
 
 
 def code_checks(sample: CodeSample) -> list[Check]:
@@ -98,7 +102,8 @@ def _sums(sample: CodeSample) -> CodeSums | None:
     sample = sample.of(np.s_[:: max(int(len(sample.counts) * work / _MOST_WORK), 1)])
     counts, origin, found = sample.counts, sample.origin.astype(np.int64), sample.parameters
     if not sample.joint:
-        fit = fit_histograms(counts, origin, settings=FitSettings(likelihood="exact"), start=found)
+        exact = FitSettings(likelihood="exact")
+        fit = fit_histograms(counts, origin, settings=exact, adc_limits=sample.limits, start=found)
         found = np.stack([fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
     usable: NDArray[np.bool_] = np.asarray(np.isfinite(found).all(axis=1))
     for _ in range(2):  # of all pixels, then without those that may be at a wrong maximum
@@ -153,5 +158,6 @@ def _pile_up(codes: CodeSums, sample: CodeSample, code: int, top: bool) -> Check
         z = min(extreme(int(seen[at]), on, float(beyond.sum())), poisson(int(seen[at]), on))
     bins = sample.origin[:, None] + np.arange(sample.counts.shape[1])
     share = float(sample.counts[bins == code].sum() / sample.counts.sum())
-    name = "top_code" if top else "bottom_code" if code else "zero_code"
+    known = sample.limits is not None and code == sample.limits[top]
+    name = f"{'top' if top else 'bottom'}_{'limit' if known else 'code'}"
     return check_of(name, normal_p(z), share, where=f"{code} DN")

@@ -227,7 +227,11 @@ def _weighted_moments(exposure: FloatArray, table: FloatArray, weight: FloatArra
     for k in np.flatnonzero(sums[:, 1] < _FEW_ELECTRONS):  # the ratios of the weights are left
         log_weight = (k * log_exposure if k else 0.0) - exposure
         largest = log_weight[weight > 0.0].max(initial=-np.inf)
-        of_k = np.exp(log_weight - largest) if np.isfinite(largest) else np.full(exposure.size, np.nan)
+        if not np.isfinite(largest):
+            found[k] = np.nan
+            continue
+        # pixels without a weight may lie above
+        of_k = np.exp(np.minimum(log_weight - largest, 0.0))
         found[k] = of_k @ columns[:, 1:] / (of_k @ weight)
     return found
 

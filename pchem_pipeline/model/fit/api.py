@@ -88,8 +88,8 @@ def fit_histograms(
         dark: which samples hold no electrons (H = 0 exactly); none by default.
         law: law of the samples of these pixels, or a list of them, one for each exposure; the PCD if None.
         settings: how to fit; the defaults if None.
-        adc_limits: first and last code of the ADC, DN; pixels that reach them are flagged, and the exact
-            likelihood counts what lies beyond there.
+        adc_limits: first and last code of the ADC, DN, unless samples lie beyond; pixels that reach them are
+            flagged, and the exact likelihood counts what lies beyond there.
         start: a fit of the same histograms with the PCD, from which that under the law starts; or
             (H_1 ... H_J, g, mu, sigma) known to be near the answer, shape (n, J + 3), NaN where nothing is
             known. In the latter case the maximum next to it is taken where it fits well, without a look at
@@ -232,6 +232,8 @@ class _Batch:
         )
         self.n, self.n_samples = counts.shape[0], len(samples)
         self.settings, self.adc_limits = settings, adc_limits
+        if adc_limits is not None and self._reaches_adc(slice(None), beyond=1).any():
+            self.adc_limits = None  # they were seen in some frames only, and are none
         self.outside, self.by_cells = np.zeros(self.n, np.bool_) | (outside > 0), np.zeros(self.n, np.bool_)
 
     # -- the two fits
@@ -567,16 +569,17 @@ class _Batch:
             freedom[few] += 4.0 - np.clip(np.nan_to_num(known, nan=4.0), 0.0, 4.0)
         return freedom
 
-    def _reaches_adc(self, pixels: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Tell which pixels have samples at the limits of the ADC, those left out included."""
+    def _reaches_adc(self, pixels: NDArray[np.intp] | slice, beyond: int = 0) -> NDArray[np.bool_]:
+        """Tell which pixels have samples at the limits of the ADC or ``beyond``, those left out included."""
         assert self.adc_limits is not None
-        found = np.zeros(pixels.size, np.bool_)
+        first, last = self.adc_limits[0] - beyond, self.adc_limits[1] + beyond
+        found = np.zeros(self.n, np.bool_)[pixels]
         for j in range(self.n_samples):
             counts = self.given.counts[pixels, self.given.places[j] : self.given.places[j + 1]] > 0
             seen = counts.any(axis=1)
             low = self.given.origin[pixels, j] + counts.argmax(axis=1)
             high = self.given.origin[pixels, j] + counts.shape[1] - 1 - counts[:, ::-1].argmax(axis=1)
-            found |= seen & ((low <= self.adc_limits[0]) | (high >= self.adc_limits[1]))
+            found |= seen & ((low <= first) | (high >= last))
         return found
 
     def intervals(self, found: FitResult, laws: Sequence[SampleLaw] | None) -> FloatArray:

@@ -108,6 +108,19 @@ LEFT = [
 ]
 
 
+def test_codes_at_which_samples_pile_up_are_limits(tmp_path: Path) -> None:
+    frames = camera(180, 0.3, 30.0)
+    for low, high in ((0, 250), (185, 65535), (185, 250), (0, 65535)):
+        np.save(tmp_path / "a.npy", frames.clip(low, high))
+        assert opened(tmp_path / "a.npy").seen_limits == (low or None, high if high == 250 else None)
+    # pixels that are stuck are no limit, nor is each peak on one code
+    frames[:, :2, :3] = frames.max() + 1
+    np.save(tmp_path / "a.npy", frames)
+    assert opened(tmp_path / "a.npy").seen_limits == (None, None)
+    np.save(tmp_path / "a.npy", camera(180, 0.0, 30.0))
+    assert opened(tmp_path / "a.npy").seen_limits == (None, None)
+
+
 def test_samples_in_the_high_byte_alone_are_one_of_two_things(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", camera(30, 0.3, 5.0) << 8)
     not_opened(r"byte-swapped: .*, or, if they are left-justified, input.bit_shift: 8", tmp_path / "a.npy")

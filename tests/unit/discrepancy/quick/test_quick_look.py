@@ -42,8 +42,11 @@ class OfAnotherPackage(Effect):
         return values
 
 
-def looked(frames: np.ndarray[Any, Any], model: tuple[Effect, ...] = ()) -> QuickLook:
-    return quick_look(sums_of(frames), maps_of(frames.shape[1:]), codes_of(frames), model)
+def looked(
+    frames: np.ndarray[Any, Any], model: tuple[Effect, ...] = (), limits: tuple[int, int] | None = None
+) -> QuickLook:
+    codes = replace(codes_of(frames), limits=limits)
+    return quick_look(sums_of(frames), maps_of(frames.shape[1:]), codes, model)
 
 
 def by_name(look: QuickLook) -> dict[str, Check]:
@@ -345,17 +348,18 @@ def test_widths_of_codes_are_found_with_their_size(size: float) -> None:
 
 def test_clipping_is_found() -> None:
     rng = np.random.default_rng(12)
-    look = looked(stack(rng, SHAPE, lambda dn: np.minimum(dn, 222.0)))
-    assert "top_code" in {check.name for check in look.found}
+    frames = stack(rng, SHAPE, lambda dn: np.minimum(dn, 222.0))
+    unknown, known = (by_name(looked(frames, limits=limits)) for limits in (None, (0, 222)))
+    assert (unknown["top_code"].level, known["top_limit"].level) == ("serious", "caution")
 
 
 def test_samples_cut_off_at_0_are_the_black_level_and_no_widths() -> None:
     frames = stack(np.random.default_rng(12), SHAPE, lambda dn: dn - dn.mean(axis=(0, 1, 2)) + 11.0)
-    found = by_name(looked(frames))
-    assert found["zero_code"].found
-    assert found["zero_code"].size == pytest.approx(np.mean(frames == 0), rel=0.02)
-    assert found["zero_code"].where == "0 DN"
-    assert "black level is too low" in found["zero_code"].advice
+    found = by_name(looked(frames, limits=(0, 65535)))
+    assert found["bottom_limit"].found
+    assert found["bottom_limit"].size == pytest.approx(np.mean(frames == 0), rel=0.02)
+    assert found["bottom_limit"].where == "0 DN"
+    assert "black level is too low" in found["bottom_limit"].advice
     assert "codes" not in found
     assert not found["top_code"].found
 
