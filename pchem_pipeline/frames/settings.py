@@ -123,8 +123,8 @@ class InputSettings(Section):
         default=None,
         ge=1,
         le=32,
-        description="bits of the ADC, after bit_shift; null: from the file, else unknown (saturation cannot "
-        "be detected then)",
+        description="bits of the ADC, after bit_shift; null: from the file, else unknown (saturation is "
+        "then seen where many samples have the highest code)",
     )
     mask: Place | None = Field(
         default=None,
