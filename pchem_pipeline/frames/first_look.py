@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _FRAMES, _PLACES, _ROWS, _SAMPLES = 48, 4, 16, 100_000  # that are looked at
 _FEWEST, _FEWEST_CODES, _FEWEST_STEPS = 8, 8, 500
-_FEWEST_AT_LIMIT = 20
+_FEWEST_AT_LIMIT, _LARGEST_SPAN = 20, 1 << 20  # samples; codes
 _CLEARLY = 4.0  # times the common variance of the one is that of the other
 _ERRORS = 3.0
 _OCTAVES = 1.5  # by which steps shrink on average in the right byte order; in the wrong one they grow
@@ -58,8 +58,10 @@ def first_look(frames: FrameSequence, settings: InputSettings) -> list[str]:
             f"{name.name}: the lowest {unused} bits of the samples are 0 (left-justified samples); set "
             f"input.bit_shift: {unused} (--bit-shift {unused}), else all DN are {1 << unused} times too large"
         )
-    if not frames.bit_shift:
-        frames.seen_limits = limits_seen(values)
+    low, high = int(values.min()), int(values.max())
+    if not frames.bit_shift and high - low < _LARGEST_SPAN:
+        at_low, at_high = (int((values == end).any(axis=0).sum()) for end in (low, high))
+        frames.seen_limits = limits_seen(low, np.bincount((values - low).ravel()), (at_low, at_high))
     if frames.order_by_habit and not frames.unwritten and _is_time_last(values):
         notes.append(
             f"{name.name}: read as {n} frames of {rows} x {columns} pixels, but the last axis looks like "
@@ -101,19 +103,35 @@ def _unused_bits(values: NDArray[Any]) -> int:
     return (used & -used).bit_length() - 1
 
 
-def limits_seen(values: NDArray[Any]) -> tuple[int | None, int | None]:
+def limits_seen(first: int, samples: NDArray[Any], pixels: tuple[int, int]) -> tuple[int | None, int | None]:
     """Return the lowest and highest code if samples of several pixels pile up there, else None.
 
     Args:
-        values: samples (frame, y, x), DN.
+        first: the lowest code, DN.
+        samples: how many there are of each code from the lowest to the highest.
+        pixels: how many have samples of the lowest, and of the highest code.
     """
+    last, few = first + samples.size - 1, _FEWEST_CODES + 1
     found: list[int | None] = []
-    for end, inward in ((int(values.min()), 1), (int(values.max()), -1)):
-        at, next_to = values == end, [values == end + inward * i for i in range(1, _FEWEST_CODES + 1)]
-        beside = [np.count_nonzero(each) for each in next_to]
-        piled = np.count_nonzero(at) > _CLEARLY * max(beside) + _FEWEST_AT_LIMIT and min(beside) > 0
-        found.append(end if piled and np.count_nonzero(at.any(axis=0)) >= _FEWEST else None)
+    for code, n, (at, *beside) in (
+        (first, pixels[0], samples[:few].tolist()),
+        (last, pixels[1], samples[::-1][:few].tolist()),
+    ):
+        several = n >= _FEWEST and len(beside) == _FEWEST_CODES and min(beside) > 0
+        found.append(code if several and at > _CLEARLY * max(beside) + _FEWEST_AT_LIMIT else None)
     return found[0], found[1]
+
+
+def limits_in(counts: NDArray[Any], origin: NDArray[Any]) -> tuple[int | None, int | None]:
+    """Return the same of histograms, shape (..., B), with the DN of their bins 0, shape (...)."""
+    first = int(origin.min())
+    codes = (origin - first)[..., None] + np.arange(counts.shape[-1])
+    samples, pixels = np.bincount(codes.ravel(), counts.ravel()), np.bincount(codes[counts > 0])
+    used = np.flatnonzero(pixels)
+    if not used.size:
+        return None, None
+    low, high = int(used[0]), int(used[-1])
+    return limits_seen(first + low, samples[low : high + 1], (int(pixels[low]), int(pixels[high])))
 
 
 def _is_time_last(values: NDArray[Any]) -> bool:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.frames.first_look import limits_in
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.run.input_identity import keep_ingested, known_identity, shortened
@@ -207,6 +208,7 @@ def _record_histograms(context: StageContext) -> None:
         nx=given.shape[1],
         dtype=dtype,
         bit_depth=context.config.input.bit_depth,
+        seen_limits=limits_in(given.counts, given.origin),
         integration_time=None,
         mode="reference",
         identity=shortened(known_identity(context)),

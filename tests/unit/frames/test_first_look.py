@@ -14,6 +14,7 @@ from helpers.plain_camera import LAYOUTS, PlainCamera
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.first_look import limits_in
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
 
@@ -112,7 +113,11 @@ def test_codes_at_which_samples_pile_up_are_limits(tmp_path: Path) -> None:
     frames = camera(180, 0.3, 30.0)
     for low, high in ((0, 250), (185, 65535), (185, 250), (0, 65535)):
         np.save(tmp_path / "a.npy", frames.clip(low, high))
-        assert opened(tmp_path / "a.npy").seen_limits == (low or None, high if high == 250 else None)
+        expected = (low or None, high if high == 250 else None)
+        assert opened(tmp_path / "a.npy").seen_limits == expected
+        pixels = frames.clip(low, high).reshape(len(frames), -1).T
+        counts = np.stack([np.bincount(each, minlength=600) for each in pixels])
+        assert limits_in(counts[:, 150:], np.full(len(counts), 150)) == expected
     # pixels that are stuck are no limit, nor is each peak on one code
     frames[:, :2, :3] = frames.max() + 1
     np.save(tmp_path / "a.npy", frames)
