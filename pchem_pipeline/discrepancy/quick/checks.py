@@ -100,11 +100,11 @@ _WORDS: dict[str, tuple[str, str, str]] = {
                  "larger signals are cut off there: lower the exposure. The fit does not know this limit: "
                  "set input.bit_depth, or add the effect clipping with this high to model.effects"),
     "top_limit": ("1", "saturation", "larger signals are cut off there: lower the exposure. The fit treats "
-                  "these samples as this DN or more, so values are right, with larger errors"),
+                  "these samples as {} or more, so values are right, with larger errors"),
     "bottom_code": ("1", "clipping at the lowest code", "values are cut off there: raise the black level. If "
                     "the camera clips, add the effect clipping with this low to model.effects"),
     "bottom_limit": ("1", "clipping at the lowest code", "the black level is too low: raise it. The fit "
-                     "treats these samples as this DN or less, so values are right, with larger errors"),
+                     "treats these samples as {} or less, so values are right, with larger errors"),
 }  # fmt: skip
 
 

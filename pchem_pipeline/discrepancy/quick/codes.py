@@ -160,4 +160,4 @@ def _pile_up(codes: CodeSums, sample: CodeSample, code: int, top: bool) -> Check
     share = float(sample.counts[bins == code].sum() / sample.counts.sum())
     known = sample.limits is not None and code == sample.limits[top]
     name = f"{'top' if top else 'bottom'}_{'limit' if known else 'code'}"
-    return check_of(name, normal_p(z), share, where=f"{code} DN")
+    return check_of(name, normal_p(z), share, how=f"{code} DN", where=f"{code} DN")
