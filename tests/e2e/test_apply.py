@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -374,6 +375,10 @@ def test_row_noise_of_the_model_is_taken_from_the_frames(striped, tmp_path, monk
     errors = [(each.electrons.values - electrons)[:, good] for each in (found, kept)]
     scatter = [(each - each.mean(axis=0)).std() for each in errors]
     assert scatter[0] < 0.8 * scatter[1]
+    numbers = re.findall(r"(0\.\d+) \+- (0\.\d+) e-", said)
+    for (noise, error), spread in zip(numbers, scatter[::-1], strict=True):
+        assert abs(float(noise) - spread) < 5.0 * float(error)
+        assert float(error) < 0.1 * spread
     # the error says what is left, in either
     for each, spread in zip((found, kept), scatter, strict=True):
         assert abs(spread / np.sqrt((each.electrons_stderr_read.values[good] ** 2).mean()) - 1) < 0.08

@@ -91,11 +91,27 @@ def _write_noise(
         output.write_array(f"applied/{name}", np.sqrt(np.maximum(variance, 0.0)))
     # what is not of the electrons' own number, whose variance is its mean
     signal = gain * (sums[0] / n - calibration.bias)
-    noise = [float(np.nanmedian(np.sqrt(np.maximum(each - signal, 0.0)))) for each in variances]
+    expected = np.maximum(signal, 0.0) + (gain * calibration.read_noise_dn) ** 2
+    before, after = (_noise_words(each - signal, expected) for each in variances)
     reporter.info(
-        f"apply: subtracted {', '.join(job.removed)}: median noise without shot noise {noise[0]:.3f} e- "
-        f"before, {noise[1]:.3f} e- after"
+        f"apply: subtracted {', '.join(job.removed)}: noise without shot noise {before} before, {after} after"
     )
+
+
+def _noise_words(excess: NDArray[np.float64], expected: NDArray[np.float64]) -> str:
+    """Return the root of the mean excess of the pixels over shot noise, with its error, e-.
+
+    Args:
+        excess: variances less their shot noise, e-^2, shape (y, x); NaN where there is none.
+        expected: whole variances by the calibration, whose squares say how far those scatter.
+    """
+    known = np.isfinite(excess)
+    weight = expected[known] ** -2.0
+    mean = float(np.average(excess[known], weights=weight))
+    if not mean > 0.0:
+        return "not known (the samples scatter less than their mean allows: frames of another sensor?)"
+    error = float(np.sqrt(np.sum((weight * (excess[known] - mean)) ** 2)) / weight.sum())
+    return f"{np.sqrt(mean):.3f} +- {error / (2.0 * np.sqrt(mean)):.3f} e-"
 
 
 def _flags_of_sums(
