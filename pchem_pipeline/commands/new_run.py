@@ -9,6 +9,7 @@ import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quoted
@@ -33,6 +34,7 @@ from pchem_pipeline.store.run_store import RunStore
 _YAML = (".yaml", ".yml")
 #: Settings that differ, as many as a message tells.
 _SHOWN = 4
+_WIDTH = 70  # characters of a setting that differs
 #: A setting as messages name it.
 _SETTING = re.compile(rf"\b(?:{'|'.join(RunConfig.model_fields)})\.[a-z_]+")
 
@@ -147,7 +149,10 @@ def settings_there(path: Path, stated: Mapping[str, Any], command: str) -> RunCo
     differ = settings_that_differ(there, make_config(content, "the command line", path.parent))
     if not differ:
         return there
-    shown = [f"{each.name} {each.one} in the file, {each.other} here" for each in differ[:_SHOWN]]
+    shown = [
+        f"{each.name} {shorten(each.one, _WIDTH)} in the file, {shorten(each.other, _WIDTH)} here"
+        for each in differ[:_SHOWN]
+    ]
     more = [f"{len(differ) - _SHOWN} more"] if len(differ) > _SHOWN else []
     raise ConfigError(
         f"{path} exists with other settings ({'; '.join([*shown, *more])}); continue with these: pchem "
@@ -214,7 +219,6 @@ def _file_list(targets: Sequence[Path], base_dir: Path) -> list[str]:
     folders, suffixes = {path.parent for path in files}, {path.suffix for path in files}
     if len(files) > 8 and len(folders) == 1 and len(suffixes) == 1:
         pattern = f"*{suffixes.pop()}"
-        folder = folders.pop()
-        if len(list((base_dir / folder).glob(pattern))) == len(files):
-            return [str(Path(glob.escape(str(folder))) / pattern)]
+        if len(list(targets[0].parent.glob(pattern))) == len(files):
+            return [str(Path(glob.escape(str(folders.pop()))) / pattern)]
     return [str(path) for path in files]

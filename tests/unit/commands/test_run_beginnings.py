@@ -80,6 +80,26 @@ def test_options_can_be_corrected_until_a_stage_is_finished(tmp_path, file):
         find_or_start([file], place, {"bit_depth": 12})
 
 
+def test_a_folder_of_files_is_one_pattern_wherever_the_store_is(tmp_path, monkeypatch):
+    """The files were listed one by one where the store's folder was not there yet; then the command again
+    was refused."""
+    (tmp_path / "frames 1").mkdir()
+    for i in range(12):
+        (tmp_path / "frames 1" / f"f{i}.tif").touch()
+    monkeypatch.chdir(tmp_path)
+    files = sorted(Path("frames 1").glob("*.tif"))
+    for _ in range(2):
+        target, _ = find_or_start(files, Path("new/run.zarr"), {})
+        assert target.config.input.files == ("../frames 1/*.tif",)
+    (tmp_path / "frames 1" / "f.tif").touch()
+    store = RunStore.create(target.store)
+    store.write_config(dump_config(target.config))
+    store.records.write(StageRecord("ingest", 1, "f", {}, finished=True))
+    with pytest.raises(ConfigError, match=r"input\.files .* in the file, .* here") as refused:
+        find_or_start(files, Path("new/run.zarr"), {})
+    assert len(str(refused.value)) < 400
+
+
 def test_an_edited_yaml_is_never_replaced(tmp_path, file):
     place = tmp_path / "run.zarr"
     target, _ = find_or_start([file], place, {})
