@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
 from pchem_pipeline.discrepancy.quick.codes import CodeSample
@@ -54,8 +52,8 @@ def run_quick_look(store: RunStore, run: StoredRun, sums: StackSums | None) -> Q
         missing["codes"] = f"fewer than {_FEWEST} pixels have a reliable fit"
     else:
         codes = _codes(store, maps, run.sensor)
-    command = f"pchem discrepancy {quoted(Path(run.name))}"
-    return quick_look(sums, maps, codes, run.model.effects, missing, command)
+    # the path of the run is told at the end, as it is seen from where the command was typed
+    return quick_look(sums, maps, codes, run.model.effects, missing, "pchem discrepancy")
 
 
 def _maps(run: StoredRun) -> PixelMaps | None:
