@@ -104,6 +104,16 @@ def overdispersion(v, e):
     return (v.d**2 - v.var).sum() / norm, error / norm
 
 
+def offset(v, e):
+    """Multiple of what an effect adds to the voltage."""
+    return regress(v, np.array([e.voltage(t, np.zeros(SHAPE)) for t in range(FRAMES)]) / v.step, e.strength)
+
+
+def light(v, e):
+    """Multiple of what an effect adds to the exposure."""
+    return regress(v, np.array([e.exposure(t, 0.0) for t in range(FRAMES)]), e.strength)
+
+
 def amplifier(v, e):
     half = SHAPE[1] // 2
     left, right = v.c[:, :, :half], v.c[:, :, half:][:, :, ::-1]
@@ -115,7 +125,7 @@ def amplifier(v, e):
 #: by tag: (estimate of the strength, standard error) from a view of a stack and the effect
 ESTIMATES = {
     "exposure_drift": lambda v, e: regress(v, v.h * times(e), e.strength),
-    "persistence": lambda v, e: regress(v, np.array([e.exposure(t, 0) for t in range(FRAMES)]), e.strength),
+    "persistence": light,
     "exposure_flicker": lambda v, e: excess(v, (1, 2), v.h),
     "overdispersed_counts": overdispersion,
     "branching_counts": lambda v, e: regress(v, v.h / (1 - e.strength)),
@@ -124,24 +134,16 @@ ESTIMATES = {
     "interpixel_capacitance": lambda v, e: neighbours(v, 1),
     "analog_memory": lambda v, e: lagged(v, v.h.sum()),
     "gain_drift": lambda v, e: regress(v, v.h * times(e), e.strength),
-    "bias_drift": lambda v, e: regress(v, times(e) / v.step, e.strength),
-    "bias_jumps": lambda v, e: regress(v, e.course[:, e.part] / v.step, e.strength),
+    "bias_drift": offset,
+    "bias_jumps": offset,
     "frame_noise": lambda v, e: excess(v, (1, 2), 1 / v.step),
     "row_noise": lambda v, e: excess(v, (2,), 1 / v.step),
     "column_noise": lambda v, e: excess(v, (1,), 1 / v.step),
-    "periodic_pickup": lambda v, e: regress(
-        v, np.array([e.voltage(t, np.zeros(SHAPE)) for t in range(FRAMES)]) / v.step, e.strength
-    ),
-    "glow": lambda v, e: regress(v, np.array([e.exposure(t, 0.0) for t in range(FRAMES)]), e.strength),
-    "readout_alternation": lambda v, e: regress(
-        v, np.array([e.voltage(t, np.zeros(SHAPE)) for t in range(FRAMES)]) / v.step, e.strength
-    ),
-    "checkerboard_offset": lambda v, e: regress(
-        v, np.array([e.voltage(t, np.zeros(SHAPE)) for t in range(FRAMES)]) / v.step, e.strength
-    ),
-    "herring_bone": lambda v, e: regress(
-        v, np.array([e.voltage(t, np.zeros(SHAPE)) for t in range(FRAMES)]) / v.step, e.strength
-    ),
+    "periodic_pickup": offset,
+    "glow": light,
+    "readout_alternation": offset,
+    "checkerboard_offset": offset,
+    "herring_bone": offset,
     "output_crosstalk": amplifier,
     "spurious_charge": lambda v, e: regress(v, np.ones(SHAPE)),
 }

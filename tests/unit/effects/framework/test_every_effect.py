@@ -85,6 +85,25 @@ EVERY: list[Effect] = [
     *(make("misplaced_lines", share=0.3, move=move, lines="columns") for move in ("swapped", "line_twice")),
     make("black_clamp", follow=1.0, rows=(0, 2)),
     make("read_order_noise", noise_dn=1.0, taps=2),
+    make(
+        "empirical",
+        share=0.4,
+        moves=[{"towards": (-1, 0, 0), "part": 0.5}, {"towards": (0, 1, 0)}],
+    ),
+    make(
+        "empirical_noise",
+        noise_dn=3.0,
+        modes=[
+            {"of": "sample", "share": 0.5, "lags": [(1, 1, 0), (0, 0, 1)], "correlation": [0.2, 0.2]},
+            {"of": "row", "share": 0.5, "lags": [(0, 2, 0)], "correlation": [-0.4]},
+        ],
+    ),
+    make(
+        "empirical_electrons",
+        chance=0.1,
+        modes=[{"fate": "followed", "place": place} for place in ((1, 0, 0), (0, 1, 0))]
+        + [{"fate": "moved", "place": (0, 1, 0)}],
+    ),
 ]
 # a list of frames stays what it is at any strength
 SCALED = [effect for effect in EVERY if effect.strength and getattr(effect, effect.strength)]

@@ -179,19 +179,6 @@ def test_the_law_has_the_mean_of_electrons_with_those_that_follow(place: tuple[i
     assert abs(mean - 2.0) > 20 * error
 
 
-def test_simulated_frames_do_not_depend_on_how_they_are_cut() -> None:
-    modes = (
-        ElectronMode(fate="followed", place=(1, 0, 0)),
-        ElectronMode(fate="followed", place=(0, 1, 0)),
-        ElectronMode(fate="moved", place=(0, 1, 0)),
-    )
-    effect = EmpiricalElectrons(chance=0.1, modes=modes)
-    whole, part = (
-        simulated_frames(QUIET, effect, n_frames=40, seed=5, frames=some)[0] for some in (None, (10, 20))
-    )
-    np.testing.assert_array_equal(whole[10:20], part)
-
-
 def test_it_competes_with_nothing_and_refuses_what_cannot_be() -> None:
     assert "empirical_electrons" not in candidate_classes(DiscrepancySettings())
     with pytest.raises(ValidationError, match="this frame or a later one"):

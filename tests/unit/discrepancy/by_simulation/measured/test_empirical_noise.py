@@ -190,20 +190,6 @@ def test_the_simulated_noise_has_its_power_and_correlations(mode):
         assert abs(wanted) > 10 * (error if mode.of != "frame" else error / 4)
 
 
-def test_the_same_frames_at_every_division():
-    modes = (
-        NoiseMode(of="sample", share=0.5, lags=((1, 1, 0), (0, 0, 1)), correlation=(0.2, 0.2)),
-        NoiseMode(of="row", share=0.5, lags=((0, 2, 0),), correlation=(-0.4,)),
-    )
-    effect = EmpiricalNoise(noise_dn=3.0, modes=modes)
-    sensor = a_uniform_sensor(SHAPE, 1.0, 0.1, 100.0, 0.2)
-    whole, part = (
-        simulated_frames(sensor, effect, n_frames=20, seed=8, frames=some, rows=rows)[0]
-        for some, rows in ((None, None), ((7, 12), (5, 9)))
-    )
-    np.testing.assert_array_equal(part, whole[7:12, 5:9])
-
-
 def test_the_law_of_a_pixel_has_its_variance():
     effect = EmpiricalNoise.typical()[0].scaled(4.0)
     maps = PixelMaps(*(np.array([v]) for v in (1.2, 1 / STEP, 100.0, 3.0)), np.ones(1, bool))
