@@ -301,24 +301,6 @@ def test_component_widths(arrays: dict[str, np.ndarray], width: float) -> None:
     drawn(draw_chart(LOOK, components_chart(component_table(np.zeros_like(variance), CASES))))
 
 
-@pytest.mark.parametrize("kind", ["svg", "png", "pdf"])
-def test_the_same_figure_gives_the_same_bytes(pixel: PixelFit, kind: str) -> None:
-    tables = cell_tables(pixel.parameters, pixel)
-    first, second = (
-        drawing_bytes(draw_chart(LOOK, cells_chart(tables)), kind, dpi=60, title="a <title>")
-        for _ in range(2)
-    )
-    assert first == second
-
-
-def test_fonts_are_embedded(pixel: PixelFit) -> None:
-    figure = draw_chart(LOOK, cells_chart(cell_tables(pixel.parameters)))
-    svg = drawing_bytes(figure, "svg").decode()
-    assert "<text" not in svg
-    pdf = drawing_bytes(figure, "pdf")
-    assert b"/FontFile2" in pdf
-
-
 def test_drawing_leaves_the_users_settings_alone(pixel: PixelFit) -> None:
     with mpl.rc_context({"font.size": 31.0, "axes.facecolor": "red"}):
         before = dict(mpl.rcParams)

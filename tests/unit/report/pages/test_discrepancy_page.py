@@ -145,32 +145,32 @@ def test_the_legend_over_the_scatter_of_lines_covers_no_point() -> None:
         assert (top - low) / (high - low) < 0.8
 
 
-def test_frames_that_no_part_has_are_told() -> None:
-    seen = {"frames": 1000, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320,
-            "histograms": None}  # fmt: skip
-    words = "; 40 left over."
-    assert frames_text(discrepancy_data("named", examined=seen).found).endswith(words)
-    whole = {**seen, "frames": 960}
-    assert "left over" not in frames_text(discrepancy_data("named", examined=whole).found)
-
-
-def test_where_the_model_was_looked_at_again_is_told() -> None:
-    seen = {"frames": 960, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320,
-            "elsewhere": {"rows": [8, 16], "columns": [0, 8]}}  # fmt: skip
-    found = discrepancy_data("named", examined=seen).found
-    words = "tested again in rows 8 to 15, columns 0 to 7: the model holds"
-    assert frames_text(found).endswith(f" The final model was {words}.")
-    assert words in verdict_text(found)
-
-
-def test_pixels_that_are_not_compared_are_told_with_their_place() -> None:
-    seen = {"frames": 960, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320,
-            "histograms": None, "unfitted": 7}  # fmt: skip
-    words = frames_text(discrepancy_data("named", examined=seen).found)
-    assert words.endswith(" Not compared: 7 pixels without a reliable fit.")
-    spot = {"map": "unfitted", "region": {"columns": [[2, 5]]}, "p": 1e-6}
-    words = frames_text(discrepancy_data("named", examined={**seen, "places": [spot]}).found)
-    assert words.endswith(", clustered in columns 2 to 4.")
+@pytest.mark.parametrize(
+    ("examined", "words"),
+    [
+        ({}, ""),
+        ({"frames": 1000}, "; 40 left over."),
+        (
+            {"elsewhere": {"rows": [8, 16], "columns": [0, 8]}},
+            " The final model was tested again in rows 8 to 15, columns 0 to 7: the model holds.",
+        ),
+        ({"unfitted": 7}, " Not compared: 7 pixels without a reliable fit."),
+        (
+            {
+                "unfitted": 7,
+                "places": [{"map": "unfitted", "region": {"columns": [[2, 5]]}, "p": 1e-6}],
+            },
+            ", clustered in columns 2 to 4.",
+        ),
+    ],
+)
+def test_what_was_looked_at_is_told(examined: dict[str, Any], words: str) -> None:
+    seen = {"frames": 960, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320}
+    found = discrepancy_data("named", examined={**seen, **examined}).found
+    assert frames_text(found).endswith(words)
+    assert ("left over" in frames_text(found)) == ("frames" in examined)
+    again = words.removeprefix(" The final model was ").removesuffix(".")
+    assert "elsewhere" not in examined or again in verdict_text(found)
 
 
 @pytest.mark.usefixtures("undrawn")

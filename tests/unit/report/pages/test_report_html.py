@@ -347,21 +347,6 @@ def test_no_sample_left_out_is_white_and_samples_are_whole_numbers() -> None:
     assert np.isfinite(image.values).sum() == 1
 
 
-@pytest.mark.parametrize(
-    ("change", "level", "words"),
-    [
-        ({"rmse": {"epcd_exact": 5e-4, "noise_floor": 1e-4}}, "serious", "does not describe"),
-        ({"rmse": {"epcd_exact": 2e-4, "noise_floor": 1e-4}}, "caution", "small differences"),
-        ({"rmse": {"epcd_exact": 1.1e-4, "noise_floor": 1e-4}}, "good", "describes the data"),
-    ],
-)
-def test_flags_of_the_ensemble(
-    data: ReportData, change: dict[str, dict[str, float]], level: str, words: str
-) -> None:
-    found = [flag for flag in flags(replace(data, ensemble_facts=change)) if "raw ensemble" in flag.text]
-    assert [(flag.level, words in flag.text) for flag in found] == [(level, True)]
-
-
 def test_how_to_cite_has_the_numbers_and_the_papers(page: Page, data: ReportData) -> None:
     found = citation(data)
     assert found.text in page.text
