@@ -77,10 +77,6 @@ def installed(monkeypatch):
     registry._discover.cache_clear()
 
 
-def test_planes_are_in_the_order_of_the_signal():
-    assert [plane.name for plane in Plane] == ["EXPOSURE", "CHARGE", "ANALOG", "ADC", "READOUT"]
-
-
 def test_our_effects_are_found_in_the_folder_of_their_plane():
     found = registry.effect_classes()
     assert {"exposure_drift", "row_noise", "clipping"} <= found.keys()

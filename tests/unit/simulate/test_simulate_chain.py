@@ -53,16 +53,6 @@ def constant_truth(shape=(6, 7), *, exposure=2.0, gain=0.1, bias=100.0, noise=0.
     )
 
 
-def test_effects_of_no_strength_change_nothing_not_even_the_last_bit():
-    plain, nothing = sensor(), sensor(effects=NOTHING)
-    truth = draw_truth(plain)
-    for a, b in zip(
-        simulate_block(truth, plain, (0, 20)), simulate_block(truth, nothing, (0, 20)), strict=True
-    ):
-        assert a.dtype == b.dtype
-        np.testing.assert_array_equal(a, b)
-
-
 def test_compiled_chain_equals_plain():
     settings = sensor()
     truth = draw_truth(settings)
@@ -120,13 +110,6 @@ def test_electron_numbers_only_as_far_as_wanted():
         assert (len(dn), len(electrons)) == (8, 3)
         assert len(simulate_block(truth, given, (4, 12), electron_frames=0)[1]) == 0
         np.testing.assert_array_equal(electrons, simulate_block(truth, settings, (4, 7))[1])
-
-
-def test_other_seeds_give_other_frames():
-    truth = constant_truth()
-    assert (
-        simulate_block(truth, sensor(), (0, 5))[0] != simulate_block(truth, sensor(seed=12), (0, 5))[0]
-    ).any()
 
 
 def test_a_truth_of_another_shape_is_refused():

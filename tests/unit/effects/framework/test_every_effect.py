@@ -11,7 +11,9 @@ from helpers.charge_material import a_sensor, simulated
 from helpers.sensor_of_modes import make
 from pydantic import ValidationError
 
+from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.simulate import chain
@@ -122,7 +124,10 @@ def test_every_effect_is_described(tag):
     assert kind.power > 0
     assert kind.strength in kind.model_fields or tag == "clipping"
     assert bool(kind.untestable) == (tag in UNTESTABLE)
-    # empirical effects have estimators of their own, and no rivals
+    # empirical effects have estimators of their own, no rivals, and compete with nothing
+    assert (tag in candidate_classes(DiscrepancySettings())) == (
+        tag not in UNTESTABLE and not tag.startswith("empirical")
+    )
     known = tag not in UNTESTABLE and not tag.startswith("empirical")
     assert bool(kind.signature) == bool(kind.separate) == known
     assert set(kind.signature) <= set(STATISTICS)

@@ -13,13 +13,11 @@ from helpers.charge_material import simulated as simulated_frames
 from pydantic import ValidationError
 from scipy import stats
 
-from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.by_simulation.measured.response import measured_response, residual_responses
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import Measurement, PartSamples
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
-from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.size import size_of
 from pchem_pipeline.effects.analog.empirical_response import (
     EmpiricalResponse,
@@ -290,8 +288,7 @@ def test_its_size_in_a_place_is_that_of_the_place() -> None:
     assert size.electrons == pytest.approx(0.1 * (2.1 / 2) ** 0.5, rel=0.1)
 
 
-def test_it_is_no_candidate_and_says_what_follows() -> None:
-    assert "empirical_response" not in candidate_classes(DiscrepancySettings())
+def test_it_says_what_follows() -> None:
     terms = ResponseTerm(place=(0, 0, -16)), ResponseTerm(of="row", weight=-0.5, number=32)
     assert EmpiricalResponse(response=0.004, terms=terms).describe() == (
         "samples depend on the charge of other samples (+0.4 % of the sample 16 columns to the left, "
