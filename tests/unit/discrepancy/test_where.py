@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -29,6 +30,7 @@ PIXELS = SHAPE[1:]
 Array = np.ndarray[Any, Any]
 
 
+@functools.cache
 def seen(moved: Callable[[Array, np.random.Generator], Array] | None = None, seed: int = 1) -> Evidence:
     rng = np.random.default_rng(seed)
     frames = stack(rng, SHAPE, (lambda dn: dn) if moved is None else (lambda dn: moved(dn, rng)))

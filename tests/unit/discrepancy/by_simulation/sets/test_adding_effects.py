@@ -34,7 +34,6 @@ from pchem_pipeline.discrepancy.by_simulation.sets.comparison import (
     _grown,
     chosen,
     compare,
-    own_signature,
 )
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
@@ -445,13 +444,6 @@ def test_a_part_of_a_better_set_is_not_grown_again() -> None:
     assert len(seeds(far, other, both)) == 2
 
 
-def test_a_set_with_more_in_vain_is_not_grown_beside_its_part() -> None:
-    refitter = World([effect("row_noise", 0.3), effect("exposure_drift", 0.3)]).refitter()
-    alone = refitter.refined([hypothesis("row_noise")])
-    more = refitter.refined([hypothesis("row_noise"), hypothesis("frame_noise")])
-    assert seeds(refitter, alone, replace(more, score=alone.score)) == [{"row_noise"}]
-
-
 def test_an_effect_that_its_set_lets_vanish_does_not_take_the_others_with_it() -> None:
     """Of three effects that the fingerprints ask for one is not there, and something is left."""
     true = effect("row_noise", 0.3), effect("frame_noise", 0.3), effect("interpixel_capacitance", 0.1)
@@ -601,15 +593,6 @@ def test_a_simulated_stack_is_known_by_all_that_makes_it_under_a_name_that_a_fil
     ]
     assert len(set(keys)) == len(keys)
     assert not any("/" in key for key in keys)
-
-
-def test_a_signature_is_its_own_where_the_others_leave_it_and_do_not_touch_it() -> None:
-    own, noise = np.eye(M)[1] * 10.0, np.ones(M)
-    left = np.eye(M)[1] * 8.0
-    assert own_signature(own, np.eye(M)[:1] * 40.0, left, noise)
-    assert not own_signature(own, np.eye(M)[:1] * 40.0, -left, noise)
-    assert not own_signature(own, np.eye(M)[:1] * 40.0, 0.3 * left, noise)
-    assert not own_signature(own, np.eye(M)[1:2] * 40.0, left, noise)
 
 
 def test_few_events_of_an_exact_count_are_a_signature_though_they_scatter(
