@@ -20,13 +20,6 @@ def test_defaults_survive_a_round_trip_through_json():
     assert SimulateSettings.model_validate_json(settings.model_dump_json()) == settings
 
 
-def test_effects_survive_a_round_trip_with_their_own_fields():
-    settings = SimulateSettings(effects=[{"tag": "row_noise", "row_noise_dn": 0.2}])
-    again = SimulateSettings.model_validate_json(settings.model_dump_json())
-    assert again == settings
-    assert again.effects[0].row_noise_dn == 0.2
-
-
 def test_giving_the_second_way_replaces_the_first():
     parameters = ParameterSettings(dark_current=CONSTANT, conversion_gain=CONSTANT)
     assert list(parameters.given()) == ["dark_current", "conversion_gain", "bias", "analog_read_noise_e"]

@@ -198,12 +198,6 @@ def test_a_map_of_more_pixels_than_an_image_can_show_has_every_odd_th_of_them() 
     assert draw_chart(Look(dpi=600), chart).axes[1].images[0].get_array().shape == values.shape
 
 
-def test_pixels_without_a_value_are_counted_in_the_map() -> None:
-    values = _map("holes")
-    assert f"no value: {np.isnan(values).sum()} pixels" in texts(bias(values))
-    assert "no value:" not in texts(bias(_map("plain")))
-
-
 def test_the_median_of_the_read_noise_is_marked() -> None:
     values = _map("plain") * 0.15
     figure = read_noise(values)
