@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 from pydantic import ValidationError
 
@@ -99,15 +96,6 @@ def test_strong_but_possible_correlations_are_accepted():
     pairs = [("bias", "quanta_exposure", 0.9), ("bias", "dn_per_electron", 0.9)]
     both = [*pairs, ("quanta_exposure", "dn_per_electron", 0.8)]
     assert len(ParameterSettings.model_validate(correlated(*both)).correlations) == 3
-
-
-def test_the_settings_import_nothing_heavy():
-    code = (
-        "import sys; import pchem_pipeline.simulate.settings; "
-        "print([m for m in ('numpy', 'numba', 'scipy') if m in sys.modules])"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
 
 
 def test_the_commented_yaml_of_a_simulated_run_gives_the_defaults():

@@ -165,15 +165,6 @@ def test_every_division_gives_the_same_frames(effect, monkeypatch):
             np.testing.assert_array_equal(a, b[slice(*t), slice(*y)])
 
 
-@pytest.mark.parametrize("effect", [e for e in STRONG if e.halo() or e.history()], ids=repr)
-def test_without_halo_or_history_the_division_would_show(effect, monkeypatch):
-    whole = frames(effect)[0]
-    monkeypatch.setattr(type(effect), "halo", lambda self: 0)
-    monkeypatch.setattr(type(effect), "history", lambda self: 0)
-    part = frames(effect, frames=(18, 40), rows=(3, 5))[0]
-    assert (part != whole[18:40, 3:5]).any()
-
-
 @pytest.mark.parametrize("effect", [e for e in EVERY if e.plane.value == "analog"], ids=repr)
 def test_nothing_is_overwritten(effect, monkeypatch):
     apply, calls = type(effect).apply, []
