@@ -328,30 +328,6 @@ def test_offsets_follow_the_bit_before():
     assert abs(apart / (effect.side * effect.strength) - 1) < 0.05
 
 
-def test_a_stitch_moves_what_is_above_it_only():
-    kinds = set()
-    for seed in range(6):
-        (effect,) = hide(("gain_stitch",), 20.0, seed, SHAPE, 10).effects
-        dn = np.linspace(80.0, 260.0, 2000)
-        moved = effect.voltage(0, dn) - dn
-        assert not moved[dn <= effect.code].any()
-        slope, start = np.polyfit(dn[dn > effect.code], moved[dn > effect.code], 1)
-        assert slope == pytest.approx(effect.parameters["sign"] * effect.strength)
-        at_level = start + slope * effect.code
-        kinds.add(effect.parameters["agree"])
-        assert (abs(at_level) > 0.1) == (effect.parameters["agree"] == "black")
-    assert kinds == {"there", "black"}
-
-
-def test_the_clamp_takes_off_what_its_pixels_deviate():
-    hiding, plain = hide(("black_clamp",), 40.0, SEED, SHAPE, FRAMES), made().frames.astype(float)
-    (effect,) = hiding.effects
-    moved = (hiding.frames - plain).mean(axis=(1, 2))
-    seen = plain[:, *effect.part].mean(axis=(1, 2)) - effect.usual
-    assert np.polyfit(seen, moved, 1)[0] == pytest.approx(-effect.strength, rel=0.05)
-    assert np.corrcoef(seen, moved)[0, 1] < -0.95
-
-
 def test_repeated_lines_are_those_before_them():
     for seed in (1, 2, 3):
         hiding, plain = hide(("repeated_lines",), 20.0, seed, SHAPE, FRAMES), made(seed=seed).frames

@@ -276,24 +276,6 @@ def test_a_refit_that_meets_the_limit_keeps_the_steps_before_it(paid: int) -> No
     assert found.score < whole.score
 
 
-def test_a_choice_among_sets_that_were_refitted_is_made_at_the_limit_too(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Of three effects all pairs are asked for, to see that each has a signature of its own."""
-    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.comparison._MOST_SETS", 1)
-    tags = ("row_noise", "frame_noise", "exposure_drift")
-    world = World([effect(tag, 0.3) for tag in tags])
-
-    def allow(words: str) -> None:
-        if words.count("+") == 1:
-            raise EffortSpentError(words)
-
-    plain = world.refitter()
-    monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
-    found = world.compare(*(hypothesis(tag, 0.3) for tag in tags))
-    assert found.chosen.tags == set(tags)
-
-
 @pytest.mark.parametrize(("share", "refits"), [(0.0, 0), (0.4, 3)])
 def test_others_are_not_refitted_where_no_strength_of_theirs_makes_what_an_effect_does(
     monkeypatch: pytest.MonkeyPatch, share: float, refits: int
@@ -593,23 +575,6 @@ def test_a_simulated_stack_is_known_by_all_that_makes_it_under_a_name_that_a_fil
     ]
     assert len(set(keys)) == len(keys)
     assert not any("/" in key for key in keys)
-
-
-def test_few_events_of_an_exact_count_are_a_signature_though_they_scatter(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.1)])
-    plain = world.draw
-
-    def draw(effects: tuple[Effect, ...], count: int) -> tuple[Any, np.ndarray]:
-        fit, vectors = plain(effects, count)
-        if "frame_noise" in {e.tag for e in effects}:  # four events: they scatter by half of what they do
-            vectors[:, 1] += 20.0 * np.random.default_rng(3).standard_normal(count)
-        return fit, vectors
-
-    monkeypatch.setattr(world, "draw", draw)
-    found = world.compare(hypothesis("row_noise"), hypothesis("frame_noise"))
-    assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
 @pytest.mark.parametrize("rest", [0.0, 9.0])
