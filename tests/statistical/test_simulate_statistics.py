@@ -16,7 +16,7 @@ from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.streams import make_key, to_words, uniform_pair
-from pchem_pipeline.simulate.truth import Defect, TruthMaps
+from pchem_pipeline.simulate.truth import TruthMaps
 
 FALSE_ALARM = 6e-7
 N = 1 << 20
@@ -177,21 +177,3 @@ def test_maps_have_the_distributions_and_rank_correlations_asked_for():
             # the rank correlation of a normal copula has at most the error of an independent one
             assert abs(found - rank) < 5 / np.sqrt(200 * 200)
             assert rank == 0 or abs(rank) > 20 / np.sqrt(200 * 200)
-
-
-def test_hot_pixels_are_as_many_and_as_hot_as_asked_for():
-    multiplier = {"kind": "lognormal", "median": 5.0, "log_std": 0.3}
-    settings = SimulateSettings(
-        shape=(300, 300),
-        seed=12,
-        parameters={
-            "quanta_exposure": {"kind": "constant", "value": 1.0},
-            "hot_pixels": {"fraction": 0.05, "multiplier": multiplier},
-        },
-    )
-    truth = draw_truth(settings)
-    hot = truth.defect == Defect.HOT
-    assert abs(hot.mean() - 0.05) < 5 * np.sqrt(0.05 * 0.95 / hot.size)
-    assert stats.kstest(truth.quanta_exposure[hot], stats.lognorm(0.3, scale=5).cdf).pvalue > FALSE_ALARM
-    assert stats.kstest(truth.quanta_exposure[hot] * 1.1, stats.lognorm(0.3, scale=5).cdf).pvalue < 1e-20
-    assert (truth.quanta_exposure[~hot] == 1.0).all()
