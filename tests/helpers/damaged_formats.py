@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from helpers.damage import damaged, frames
+from helpers.layouts import LAYOUTS, write
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.config.load import make_config
@@ -38,67 +39,31 @@ INGESTED = 7
 # -- files -------------------------------------------------------------------------------------------------
 
 
-def _npy(path):
-    np.save(path / "a.npy", frames())
-
-
-def _npy_big_endian(path):
-    np.save(path / "a.npy", frames().astype(">u2"))
-
-
-def _npy_second_version(path):
-    with (path / "a.npy").open("wb") as file:
-        np.lib.format.write_array(file, frames(dtype="uint8"), version=(2, 0))
-
-
-def _tiff(path, *, name="a.tif", data=None, pages=True, **options):
+def _tiff(path, *, name="a.tif", data=None, **options):
     import tifffile
 
-    data = frames() if data is None else data
-    kinds = {key: options.pop(key) for key in ("byteorder", "bigtiff", "imagej", "ome") if key in options}
-    options = {"photometric": "minisblack", **options}
-    with tifffile.TiffWriter(path / name, **kinds) as writer:
-        for frame in data if pages else [data]:
-            writer.write(frame, **options)
+    with tifffile.TiffWriter(path / name) as writer:
+        for frame in frames() if data is None else data:
+            writer.write(frame, photometric="minisblack", metadata=None, **options)
 
 
 def _tiff_sequence(path):
     for number, frame in enumerate(frames(n=3)):
-        _tiff(path, name=f"f{number}.tif", data=frame[None], metadata=None)
+        _tiff(path, name=f"f{number}.tif", data=frame[None])
 
 
-def _fits(path, *, compressed=False, extension=False):
-    from astropy.io import fits
-
-    if compressed:
-        fits.CompImageHDU(frames(), compression_type=compressed).writeto(path / "a.fits")
-    elif extension:
-        fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(frames(), name="DATA")]).writeto(path / "a.fits")
-    else:
-        fits.PrimaryHDU(frames()).writeto(path / "a.fits")
-
-
-def _hdf5(path, libver=None, **options):
+def _hdf5(path, **options):
     import h5py
 
-    with h5py.File(path / "a.h5", "w", libver=libver) as file:
+    with h5py.File(path / "a.h5", "w", libver="latest") as file:
         file.create_dataset("entry/data", data=frames(), **options)
         file["entry/count_time"] = 0.5
 
 
-def _hdf5_plugin(path):
-    import hdf5plugin
-
-    _hdf5(path, chunks=(2, 8, 9), **hdf5plugin.Bitshuffle())
-
-
-def _zarr(path, version=3, chunks=(3, 4, 9), **options):
+def _shards(path):
     import zarr
 
-    array = zarr.create_array(
-        path / "a.zarr", shape=(6, 8, 9), chunks=chunks, dtype="uint16", zarr_format=version, **options
-    )
-    array[...] = frames()
+    zarr.create_array(path / "a.zarr", data=frames(), chunks=(3, 4, 9), shards=(6, 8, 9))
 
 
 def _ome_zarr(path):
@@ -118,13 +83,11 @@ def _ser(path, dtype="uint16", times=True):
             file.write((621_355_968_000_000_000 + np.arange(6, dtype="<i8")).tobytes())
 
 
-def _raw(path, text='{"shape": [8, 9], "dtype": "uint16", "bit_depth": 12, "header_bytes": 16}', kind="json"):
-    (path / "a.raw").write_bytes(bytes(16) + frames().tobytes())
-    (path / f"a.raw.{kind}").write_text(text)
-
-
 def _raw_yaml(path):
-    _raw(path, "shape: [6, 8, 9]\ndtype: uint16\nheader_bytes: 16\nintegration_time: 2.5\n", "yaml")
+    (path / "a.raw").write_bytes(bytes(16) + frames().tobytes())
+    (path / "a.raw.yaml").write_text(
+        "shape: [6, 8, 9]\ndtype: uint16\nheader_bytes: 16\nintegration_time: 2.5\n"
+    )
 
 
 def _csv(path, mark=","):
@@ -138,44 +101,17 @@ def _npz(path):
 
 
 #: name -> what writes the undamaged files into a folder
-SEEDS = {
-    "npy": _npy,
-    "npy, big-endian": _npy_big_endian,
-    "npy, version 2": _npy_second_version,
-    "tiff": lambda p: _tiff(p, metadata=None),
-    "tiff, series": lambda p: _tiff(p, pages=False),
-    "tiff, big-endian": lambda p: _tiff(p, byteorder=">", metadata=None),
-    "tiff, 8 bit": lambda p: _tiff(p, data=frames(dtype="uint8"), metadata=None),
-    "bigtiff": lambda p: _tiff(p, bigtiff=True, metadata=None),
-    "tiff, one directory": lambda p: _tiff(p, pages=False, data=frames(), metadata={"truncate": True}),
-    "tiff, zlib in strips": lambda p: _tiff(
-        p, compression="zlib", rowsperstrip=3, predictor=True, metadata=None
-    ),
-    "tiff, lzw": lambda p: _tiff(p, compression="lzw", metadata=None),
-    "tiff, packbits": lambda p: _tiff(p, compression="packbits", metadata=None),
-    "tiff, zstd": lambda p: _tiff(p, compression="zstd", metadata=None),
-    "tiff, jpeg": lambda p: _tiff(p, data=frames(dtype="uint8"), compression="jpeg", metadata=None),
-    "tiff, tiles": lambda p: _tiff(p, tile=(16, 16), compression="zlib", metadata=None),
-    "tiff, imagej": lambda p: _tiff(p, imagej=True, pages=False),
-    "tiff, ome": lambda p: _tiff(p, ome=True, pages=False, metadata={"axes": "TYX"}),
+SEEDS = {layout: lambda p, layout=layout: write(p, layout, frames()) for layout in LAYOUTS} | {
+    "tiff, 8 bit": lambda p: _tiff(p, data=frames(dtype="uint8")),
+    "tiff, zstd": lambda p: _tiff(p, compression="zstd"),
+    "tiff, jpeg": lambda p: _tiff(p, data=frames(dtype="uint8"), compression="jpeg"),
     "tiff, a file a frame": _tiff_sequence,
-    "fits": _fits,
-    "fits, extension": lambda p: _fits(p, extension=True),
-    "fits, Rice": lambda p: _fits(p, compressed="RICE_1"),
-    "fits, gzip": lambda p: _fits(p, compressed="GZIP_2"),
-    "hdf5": _hdf5,
-    "hdf5, newest": lambda p: _hdf5(p, libver="latest"),
-    "hdf5, plain chunks": lambda p: _hdf5(p, chunks=(2, 8, 9)),
-    "hdf5, gzip": lambda p: _hdf5(p, chunks=(2, 4, 9), compression="gzip", shuffle=True),
-    "hdf5, newest, checksums": lambda p: _hdf5(p, libver="latest", chunks=(2, 8, 9), fletcher32=True),
-    "hdf5, bitshuffle": _hdf5_plugin,
-    "zarr": _zarr,
-    "zarr, format 2": lambda p: _zarr(p, 2),
-    "zarr, shards": lambda p: _zarr(p, shards=(6, 8, 9)),
+    "hdf5, newest": _hdf5,
+    "hdf5, newest, checksums": lambda p: _hdf5(p, chunks=(2, 8, 9), fletcher32=True),
+    "zarr, shards": _shards,
     "zarr, ome": _ome_zarr,
     "ser": _ser,
     "ser, 8 bit": lambda p: _ser(p, "uint8", times=False),
-    "raw": _raw,
     "raw, YAML": _raw_yaml,
     "histogram, csv": _csv,
     "histogram, semicolons": lambda p: _csv(p, ";"),
@@ -185,10 +121,10 @@ SEEDS = {
 
 def write_seeds(folder):
     """Write the undamaged files, each layout into a folder of its own."""
-    for number, write in enumerate(SEEDS.values()):
+    for number, written in enumerate(SEEDS.values()):
         place = folder / str(number)
         place.mkdir(parents=True)
-        write(place)
+        written(place)
 
 
 # -- a case ------------------------------------------------------------------------------------------------

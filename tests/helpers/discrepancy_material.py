@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals, Evi
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
 
+FAMILIES = ("shape", "code", "tail", "time", "frame", "space")
 VERDICTS = ("named", "named_in_part", "ambiguous", "unexplained", "consistent")
 UNTESTABLE = {
     "charge_lag": "Poisson electrons that are delayed by chance stay Poisson",
@@ -20,6 +22,7 @@ UNTESTABLE = {
 }
 
 
+@functools.cache
 def evidence(shape: tuple[int, int] = (32, 40), n_frames: int = 1200, seed: int = 5) -> Evidence:
     """Pure chance, with some structure: a drift, stripes, a comb of codes, a few odd pixels."""
     rng = np.random.default_rng(seed)
@@ -144,6 +147,12 @@ def _pulls(extended: bool) -> list[dict[str, Any]]:
     ]
 
 
+def _place(statistic: str, channel: str, z: float, p: float, **where: Any) -> dict[str, Any]:
+    found = {"statistic": statistic, "channel": channel, "direction": "+", "z": z, "p": p}
+    found["sentence"] = STATISTICS[statistic].sentence
+    return found | {"pixels": [], "dn": None, "frames": []} | where
+
+
 def step(effect: str | None, verdict: str, before: float, after: float) -> dict[str, Any]:
     """One round of the workflow; gaps in micro-nats per sample."""
     micro = 1e-6
@@ -161,22 +170,11 @@ def step(effect: str | None, verdict: str, before: float, after: float) -> dict[
         "gap_floor": 0.66 * micro,
         "gap_interval_after": [max(after - 0.5, 0.1) * micro, (after + 0.7) * micro],
         "families": {
-            "before": {
-                "shape": 4 * micro,
-                "code": 12 * micro,
-                "tail": -0.1 * micro,
-                "time": 0.3 * micro,
-                "frame": 60 * micro,
-                "space": (before - 76) * micro,
-            },
-            "after": {
-                "shape": 0.2 * micro,
-                "code": 0.1 * micro,
-                "tail": -0.1 * micro,
-                "time": 0.2 * micro,
-                "frame": 0.7 * micro,
-                "space": 0.7 * micro,
-            },
+            when: dict(zip(FAMILIES, (micro * gap for gap in gaps), strict=True))
+            for when, gaps in (
+                ("before", (4.0, 12.0, -0.1, 0.3, 60.0, before - 76.0)),
+                ("after", (0.2, 0.1, -0.1, 0.2, 0.7, 0.7)),
+            )
         },
         "size": {"electrons": 0.032, "dn": 0.351, "of_read_noise": 0.103, "samples": 1.0},
         "rivals": [
@@ -216,50 +214,10 @@ def result(verdict: str) -> dict[str, Any]:
     after = steps[-1]["gap_after"] if steps else 0.2 * micro
     before = steps[0]["gap_before"] if steps else 0.2 * micro
     where = [
-        {
-            "statistic": "space.row.readout.variance",
-            "channel": "readout",
-            "direction": "+",
-            "z": 84.0,
-            "p": 0.0,
-            "sentence": STATISTICS["space.row.readout.variance"].sentence,
-            "pixels": [],
-            "dn": None,
-            "frames": [],
-        },
-        {
-            "statistic": "code.alternating",
-            "channel": "digital",
-            "direction": "+",
-            "z": 22.5,
-            "p": 1e-4,
-            "sentence": STATISTICS["code.alternating"].sentence,
-            "pixels": [],
-            "dn": [148, 152],
-            "frames": [],
-        },
-        {
-            "statistic": "shape.He4.cnt",
-            "channel": "readout",
-            "direction": "+",
-            "z": 8.0,
-            "p": 2e-3,
-            "sentence": STATISTICS["shape.He4.cnt"].sentence,
-            "pixels": [[3, 4], [10, 20], [30, 39]],
-            "dn": None,
-            "frames": [],
-        },
-        {
-            "statistic": "frame.readout.trend",
-            "channel": "readout",
-            "direction": "+",
-            "z": 31.2,
-            "p": 0.0,
-            "sentence": STATISTICS["frame.readout.trend"].sentence,
-            "pixels": [],
-            "dn": None,
-            "frames": [0, 1, 2],
-        },
+        _place("space.row.readout.variance", "readout", 84.0, 0.0),
+        _place("code.alternating", "digital", 22.5, 1e-4, dn=[148, 152]),
+        _place("shape.He4.cnt", "readout", 8.0, 2e-3, pixels=[[3, 4], [10, 20], [30, 39]]),
+        _place("frame.readout.trend", "readout", 31.2, 0.0, frames=[0, 1, 2]),
     ]
     return {
         "schema_version": 3,

@@ -93,3 +93,13 @@ def codes_of(frames: Array, exposure: float = EXPOSURE, read_noise: float = READ
     sigma = np.hypot(read_noise / GAIN, 12**-0.5)
     start = np.stack([np.full(n, exposure), np.full(n, GAIN), bias, np.full(n, sigma)], axis=1)
     return CodeSample(found.counts.reshape(n, -1), found.origin.ravel(), start)
+
+
+def added(part: Any, values: Any) -> Callable[[Array], Array]:
+    """Return what adds values, DN, to a part (an index) of samples before they are rounded."""
+
+    def moved(dn: Array) -> Array:
+        dn[part] += values
+        return dn
+
+    return moved

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import functools
 
 import numpy as np
 
@@ -130,6 +130,7 @@ CASES = tuple(
 )
 
 
+@functools.cache
 def report_data(shape: tuple[int, int] = (48, 64), *, failed: float = 0.01, seed: int = 1) -> ReportData:
     """A whole report of a sensor of which a share of the pixels failed."""
     rng = np.random.default_rng(seed + 10)
@@ -211,8 +212,3 @@ def report_data(shape: tuple[int, int] = (48, 64), *, failed: float = 0.01, seed
             {"stage": "fit", "state": "complete", "seconds": 45.6, "peak_memory_bytes": 256_000_000},
         ],
     )
-
-
-def without(data: ReportData, **changes: object) -> ReportData:
-    """The same report with fields replaced."""
-    return replace(data, **changes)  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,7 +14,7 @@ class Hidden:
     """Base of all that can be hidden; every hook leaves things as they are.
 
     Attributes:
-        tag: the name that the workflow should find.
+        tag: the name that the workflow should find, of the words of the class.
         s95: strength at level 1 for 64 x 64 pixels and 4000 frames (the strength that is found in 95 % of
             stacks), in the unit of the effect.
         scaling: powers of 64 / rows, 64 / columns and 4000 / frames with which s95 goes.
@@ -28,6 +29,10 @@ class Hidden:
     most: ClassVar[float] = np.inf
     warmup: ClassVar[int] = 0
     order: ClassVar[int] = 0
+
+    def __init_subclass__(cls) -> None:
+        """Name the effect."""
+        cls.tag = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
     def __init__(self, rng: np.random.Generator, sensor: Sensor, level: float):
         """Draw the sub-parameters of the effect for a sensor."""

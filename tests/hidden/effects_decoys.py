@@ -5,8 +5,6 @@ Which of them may be looked at, and which only once, at the end: ``scripts/bench
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from hidden.base import Hidden
@@ -15,9 +13,8 @@ from hidden.base import Hidden
 class TemporalFilter(Hidden):
     """Samples averaged with the delivered one before, where those are alike; strength: their share."""
 
-    tag: ClassVar[str] = "temporal_filter"
-    s95: ClassVar[float] = 5e-3
-    most: ClassVar[float] = 1.0
+    s95 = 5e-3
+    most = 1.0
 
     def draw(self):
         self.before = None
@@ -35,10 +32,9 @@ class TemporalFilter(Hidden):
 class RowDroop(Hidden):
     """The level of a row falls with the charge that the row holds (supply); strength: part of its mean."""
 
-    tag: ClassVar[str] = "row_droop"
-    s95: ClassVar[float] = 0.03
-    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
-    most: ClassVar[float] = 0.9
+    s95 = 0.03
+    scaling = (0.25, 0.25, 0.25)
+    most = 0.9
 
     def signal(self, t, v):
         return v - self.strength * v.mean(axis=1, keepdims=True)
@@ -47,9 +43,8 @@ class RowDroop(Hidden):
 class DistantCrosstalk(Hidden):
     """A sample gets a part of the one read some columns before (a pipeline); strength: that part."""
 
-    tag: ClassVar[str] = "distant_crosstalk"
-    s95: ClassVar[float] = 1e-3
-    most: ClassVar[float] = 0.2
+    s95 = 1e-3
+    most = 0.2
 
     def draw(self):
         self.columns = self.pick("columns", 4, 8)
@@ -63,10 +58,9 @@ class DistantCrosstalk(Hidden):
 class NoisyFrames(Hidden):
     """Read noise that is larger in one frame of thirty, by chance; strength: relative."""
 
-    tag: ClassVar[str] = "noisy_frames"
-    s95: ClassVar[float] = 0.03
-    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.25)
-    most: ClassVar[float] = 1.5
+    s95 = 0.03
+    scaling = (0.5, 0.5, 0.25)
+    most = 1.5
 
     def draw(self):
         self.loud = self.rng.random(self.sensor.n_frames) < 1 / 30
@@ -78,9 +72,8 @@ class NoisyFrames(Hidden):
 class SettlingRows(Hidden):
     """Rows whose first pixels settle from the level of the row before; strength: part of it that is left."""
 
-    tag: ClassVar[str] = "settling_rows"
-    s95: ClassVar[float] = 0.02
-    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
+    s95 = 0.02
+    scaling = (0.25, 0.25, 0.25)
 
     def voltage(self, t, dn):
         last = (dn[:, -1] - self.sensor.bias[:, -1])[:-1, None]
@@ -92,9 +85,8 @@ class SettlingRows(Hidden):
 class TapGain(Hidden):
     """The gain of one readout tap, a quarter of the columns, moves frame by frame; strength: relative."""
 
-    tag: ClassVar[str] = "tap_gain"
-    s95: ClassVar[float] = 0.01
-    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
+    s95 = 0.01
+    scaling = (0.25, 0.25, 0.25)
 
     def signal(self, t, v):
         v = v.copy()
@@ -106,9 +98,8 @@ class TapGain(Hidden):
 class DeadTime(Hidden):
     """Electrons that come soon after another are lost; strength: part lost per electron already there."""
 
-    tag: ClassVar[str] = "dead_time"
-    s95: ClassVar[float] = 2e-3
-    most: ClassVar[float] = 0.1
+    s95 = 2e-3
+    most = 0.1
 
     def electrons(self, t, k):
         return k - self.rng.binomial(k, np.clip(self.strength * np.maximum(k - 1, 0), 0, 0.9))
@@ -117,9 +108,8 @@ class DeadTime(Hidden):
 class Hysteresis(Hidden):
     """A sample is drawn towards the one delivered before, whatever its size; strength: DN."""
 
-    tag: ClassVar[str] = "hysteresis"
-    s95: ClassVar[float] = 0.05
-    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.5)
+    s95 = 0.05
+    scaling = (0.5, 0.5, 0.5)
 
     def draw(self):
         self.before = None
@@ -135,9 +125,8 @@ class Hysteresis(Hidden):
 class BlockMean(Hidden):
     """Blocks of 2 x 2 pixels that come as their mean (lossy compression); strength: their share."""
 
-    tag: ClassVar[str] = "block_mean"
-    s95: ClassVar[float] = 2e-3
-    most: ClassVar[float] = 1.0
+    s95 = 2e-3
+    most = 1.0
 
     def convert(self, t, dn, code):
         ny, nx = (size // 2 for size in code.shape)
@@ -152,9 +141,8 @@ class BlockMean(Hidden):
 class RowGain(Hidden):
     """The gain of each row is drawn anew in every frame; strength: relative, rms."""
 
-    tag: ClassVar[str] = "row_gain"
-    s95: ClassVar[float] = 0.01
-    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.5, 0.25)
+    s95 = 0.01
+    scaling = (0.25, 0.5, 0.25)
 
     def signal(self, t, v):
         return v * (1 + self.strength * self.rng.standard_normal((v.shape[0], 1)))
@@ -163,10 +151,9 @@ class RowGain(Hidden):
 class Afterpulses(Hidden):
     """Each electron brings others into the next frame of its pixel; strength: their mean number."""
 
-    tag: ClassVar[str] = "afterpulses"
-    s95: ClassVar[float] = 2e-3
-    most: ClassVar[float] = 0.5
-    warmup: ClassVar[int] = 20
+    s95 = 2e-3
+    most = 0.5
+    warmup = 20
 
     def draw(self):
         self.before = np.zeros(self.sensor.shape, np.int64)
@@ -179,9 +166,8 @@ class Afterpulses(Hidden):
 class RepelledCharge(Hidden):
     """Electrons that come to others go to the pixel on the right; strength: part per electron there."""
 
-    tag: ClassVar[str] = "repelled_charge"
-    s95: ClassVar[float] = 1.5e-3
-    most: ClassVar[float] = 0.1
+    s95 = 1.5e-3
+    most = 0.1
 
     def electrons(self, t, k):
         gone = self.rng.binomial(k, np.clip(self.strength * np.maximum(k - 1, 0), 0, 0.9))
@@ -193,9 +179,8 @@ class RepelledCharge(Hidden):
 class MainsGain(Hidden):
     """A gain that swings with the mains while rows are read; strength: relative amplitude."""
 
-    tag: ClassVar[str] = "mains_gain"
-    s95: ClassVar[float] = 0.01
-    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.25)
+    s95 = 0.01
+    scaling = (0.5, 0.5, 0.25)
 
     def draw(self):
         rows = np.arange(self.sensor.shape[0])[:, None]
@@ -209,9 +194,8 @@ class MainsGain(Hidden):
 class BlendedFrames(Hidden):
     """Frames that are the mean of themselves and the one before; strength: share of the frames."""
 
-    tag: ClassVar[str] = "blended_frames"
-    s95: ClassVar[float] = 2e-3
-    most: ClassVar[float] = 0.5
+    s95 = 2e-3
+    most = 0.5
 
     def record(self, t, frames):
         if t > 0 and self.rng.random() < self.strength:
@@ -221,9 +205,8 @@ class BlendedFrames(Hidden):
 class BurstingBlock(Hidden):
     """A block of pixels whose offset jumps together in one frame of twenty; strength: DN."""
 
-    tag: ClassVar[str] = "bursting_block"
-    s95: ClassVar[float] = 0.5
-    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
+    s95 = 0.5
+    scaling = (0.25, 0.25, 0.25)
 
     def draw(self):
         (ny, nx), side = self.sensor.shape, max(self.sensor.shape[0] // 6, 2)
@@ -238,9 +221,8 @@ class BurstingBlock(Hidden):
 class RowTilt(Hidden):
     """A slope along each row, drawn anew; strength: DN rms at its ends."""
 
-    tag: ClassVar[str] = "row_tilt"
-    s95: ClassVar[float] = 0.15
-    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.5, 0.25)
+    s95 = 0.15
+    scaling = (0.25, 0.5, 0.25)
 
     def voltage(self, t, dn):
         along = np.linspace(-1, 1, dn.shape[1])
@@ -250,8 +232,7 @@ class RowTilt(Hidden):
 class NoisyTime(Hidden):
     """Read noise that is larger in a fifth of the run; strength: relative."""
 
-    tag: ClassVar[str] = "noisy_time"
-    s95: ClassVar[float] = 0.05
+    s95 = 0.05
 
     def draw(self):
         self.begin = self.between("begin", 0.1, 0.7) * self.sensor.n_frames
@@ -263,9 +244,8 @@ class NoisyTime(Hidden):
 class EmptySamples(Hidden):
     """Samples that are read without their electrons; strength: their share."""
 
-    tag: ClassVar[str] = "empty_samples"
-    s95: ClassVar[float] = 1e-3
-    most: ClassVar[float] = 0.2
+    s95 = 1e-3
+    most = 0.2
 
     def electrons(self, t, k):
         return np.where(self.rng.random(k.shape) < self.strength, 0, k)
@@ -274,9 +254,8 @@ class EmptySamples(Hidden):
 class LoudColumn(Hidden):
     """Columns whose pixels share a deviation from frame to frame, one in twelve; strength: DN rms."""
 
-    tag: ClassVar[str] = "loud_column"
-    s95: ClassVar[float] = 0.25
-    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.25, 0.25)
+    s95 = 0.25
+    scaling = (0.5, 0.25, 0.25)
 
     def draw(self):
         self.loud = self.rng.random(self.sensor.shape[1]) < 1 / 12
@@ -289,9 +268,8 @@ class LoudColumn(Hidden):
 class NegativeGhost(Hidden):
     """Large samples leave the next frame of their pixel lower; strength: DN per electron above four."""
 
-    tag: ClassVar[str] = "negative_ghost"
-    s95: ClassVar[float] = 0.3
-    warmup: ClassVar[int] = 1
+    s95 = 0.3
+    warmup = 1
 
     def draw(self):
         self.before = np.zeros(self.sensor.shape)

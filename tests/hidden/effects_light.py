@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from hidden.base import Course, Hidden, telegraph
@@ -12,8 +10,7 @@ from hidden.base import Course, Hidden, telegraph
 class ExposureDrift(Hidden):
     """The exposure of all pixels drifts; strength: relative, end to end."""
 
-    tag: ClassVar[str] = "exposure_drift"
-    s95: ClassVar[float] = 0.004
+    s95 = 0.004
 
     def draw(self):
         self.course = Course(self)
@@ -29,8 +26,7 @@ class Persistence(Hidden):
     six standard errors.
     """
 
-    tag: ClassVar[str] = "persistence"
-    s95: ClassVar[float] = 0.1
+    s95 = 0.1
 
     def draw(self):
         ny, nx = self.sensor.shape
@@ -61,10 +57,9 @@ class Persistence(Hidden):
 class DarkCurrentRts(Hidden):
     """The dark current of some pixels blinks; strength: fraction of pixels."""
 
-    tag: ClassVar[str] = "dark_current_rts"
-    s95: ClassVar[float] = 0.0027
-    scaling: ClassVar[tuple[float, float, float]] = (0.75, 0.75, 0.5)
-    most: ClassVar[float] = 0.3
+    s95 = 0.0027
+    scaling = (0.75, 0.75, 0.5)
+    most = 0.3
 
     def draw(self):
         self.where = self.some_pixels(self.strength)
@@ -87,10 +82,9 @@ class DarkCurrentRts(Hidden):
 class ExposureFlicker(Hidden):
     """The exposure of all pixels varies from frame to frame; strength: relative, rms."""
 
-    tag: ClassVar[str] = "exposure_flicker"
-    s95: ClassVar[float] = 0.005
-    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.25)
-    most: ClassVar[float] = 0.3
+    s95 = 0.005
+    scaling = (0.5, 0.5, 0.25)
+    most = 0.3
 
     def draw(self):
         law = self.pick("law", "normal", "uniform", "two_level")
@@ -110,8 +104,7 @@ class ExposureFlicker(Hidden):
 class OverdispersedCounts(Hidden):
     """The exposure varies from sample to sample: Var K = H + a H^2; strength: a."""
 
-    tag: ClassVar[str] = "overdispersed_counts"
-    s95: ClassVar[float] = 0.0016
+    s95 = 0.0016
 
     def draw(self):
         self.law = self.pick("law", "gamma", "lognormal", p=(0.6, 0.4))
@@ -126,9 +119,8 @@ class OverdispersedCounts(Hidden):
 class BranchingCounts(Hidden):
     """Each electron sets free Poisson(l) more in the same pixel, and those again; strength: l."""
 
-    tag: ClassVar[str] = "branching_counts"
-    s95: ClassVar[float] = 0.0013
-    most: ClassVar[float] = 0.5
+    s95 = 0.0013
+    most = 0.5
 
     def electrons(self, t, k):
         total, young = k.copy(), k
@@ -141,9 +133,8 @@ class BranchingCounts(Hidden):
 class OpticalCrosstalk(Hidden):
     """Each electron sets one free in one of the four neighbours with probability p; strength: p."""
 
-    tag: ClassVar[str] = "optical_crosstalk"
-    s95: ClassVar[float] = 0.0028
-    most: ClassVar[float] = 0.5
+    s95 = 0.0028
+    most = 0.5
 
     def electrons(self, t, k):
         emitted = self.rng.binomial(k, self.strength)
@@ -161,9 +152,8 @@ class OpticalCrosstalk(Hidden):
 class CosmicRays(Hidden):
     """Particles cross some frames; strength: tracks per frame."""
 
-    tag: ClassVar[str] = "cosmic_rays"
-    s95: ClassVar[float] = 0.003
-    scaling: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 1.0)
+    s95 = 0.003
+    scaling = (0.0, 0.0, 1.0)
 
     def draw(self):
         self.alpha = self.between("alpha_share", 0.0, 0.4)
@@ -199,9 +189,8 @@ class CosmicRays(Hidden):
 class Glow(Hidden):
     """Light from a corner or an edge, in one frame of fifty or growing; strength: e- there."""
 
-    tag: ClassVar[str] = "glow"
-    s95: ClassVar[float] = 0.25
-    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.25)
+    s95 = 0.25
+    scaling = (0.5, 0.5, 0.25)
 
     def draw(self):
         (ny, nx), n = self.sensor.shape, self.sensor.n_frames
@@ -231,10 +220,9 @@ class Trapping(Hidden):
     Of traps in some pixels only, each catches the oftener.
     """
 
-    tag: ClassVar[str] = "trapping"
-    s95: ClassVar[float] = 0.005
-    most: ClassVar[float] = 0.9
-    warmup: ClassVar[int] = 60
+    s95 = 0.005
+    most = 0.9
+    warmup = 60
 
     def draw(self):
         self.release = self.between("release", 0.1, 0.6)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from hidden.base import Course, Hidden, telegraph
@@ -16,10 +14,9 @@ class RtsNoise(Hidden):
     and averaged, or the signal alone, frame after frame (two levels, slow).
     """
 
-    tag: ClassVar[str] = "rts_noise"
-    s95: ClassVar[float] = 0.0035
-    scaling: ClassVar[tuple[float, float, float]] = (0.75, 0.75, 0.5)
-    most: ClassVar[float] = 0.5
+    s95 = 0.0035
+    scaling = (0.75, 0.75, 0.5)
+    most = 0.5
 
     def draw(self):
         self.where = self.some_pixels(self.strength)
@@ -70,9 +67,8 @@ class RtsNoise(Hidden):
 class FlickerNoise(Hidden):
     """A part of each pixel's noise power is correlated in time; strength: that part."""
 
-    tag: ClassVar[str] = "flicker_noise"
-    s95: ClassVar[float] = 0.0009
-    most: ClassVar[float] = 0.9
+    s95 = 0.0009
+    most = 0.9
 
     def draw(self):
         if self.pick("spectrum", "one_time_constant", "one_over_f", p=(0.6, 0.4)) == "one_over_f":
@@ -91,9 +87,8 @@ class FlickerNoise(Hidden):
 class HeavyTailedNoise(Hidden):
     """Some samples of every pixel are noisier; strength: part of the samples at three times the noise."""
 
-    tag: ClassVar[str] = "heavy_tailed_noise"
-    s95: ClassVar[float] = 6e-5
-    most: ClassVar[float] = 0.2
+    s95 = 6e-5
+    most = 0.2
 
     def draw(self):
         self.law = self.pick("law", "mixture", "student", p=(0.7, 0.3))
@@ -113,10 +108,9 @@ class HeavyTailedNoise(Hidden):
 class NoiseSkew(Hidden):
     """A part of the noise is exponential; strength: its time constant over the whole standard deviation."""
 
-    tag: ClassVar[str] = "noise_skew"
-    s95: ClassVar[float] = 0.16
-    scaling: ClassVar[tuple[float, float, float]] = (1 / 6, 1 / 6, 1 / 6)
-    most: ClassVar[float] = 0.95
+    s95 = 0.16
+    scaling = (1 / 6, 1 / 6, 1 / 6)
+    most = 0.95
 
     def draw(self):
         self.side = self.sign()
@@ -129,9 +123,8 @@ class NoiseSkew(Hidden):
 class SignalDependentNoise(Hidden):
     """Noise that grows with the electrons: variance s^2 k, or c k^2; strength: s, e- per root electron."""
 
-    tag: ClassVar[str] = "signal_dependent_noise"
-    s95: ClassVar[float] = 0.015
-    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
+    s95 = 0.015
+    scaling = (0.25, 0.25, 0.25)
 
     def draw(self):
         self.power = 0.5 if self.pick("grows_with", "root", "number", p=(0.7, 0.3)) == "root" else 1.0
@@ -146,9 +139,8 @@ class SignalDependentNoise(Hidden):
 class Nonlinearity(Hidden):
     """The response bends; strength: relative change of the gain over 5 e-."""
 
-    tag: ClassVar[str] = "nonlinearity"
-    s95: ClassVar[float] = 0.0012
-    most: ClassVar[float] = 0.2
+    s95 = 0.0012
+    most = 0.2
 
     def draw(self):
         self.bend = self.sign(negative=0.7) * self.strength
@@ -160,9 +152,8 @@ class Nonlinearity(Hidden):
 class InterpixelCapacitance(Hidden):
     """A part of the signal shows in the neighbours; strength: part per neighbour."""
 
-    tag: ClassVar[str] = "interpixel_capacitance"
-    s95: ClassVar[float] = 0.0004
-    most: ClassVar[float] = 0.1
+    s95 = 0.0004
+    most = 0.1
 
     def draw(self):
         skew = 0.0
@@ -183,10 +174,9 @@ class InterpixelCapacitance(Hidden):
 class AnalogMemory(Hidden):
     """A part of the signal of the frame before remains; strength: that part, the mean over the pixels."""
 
-    tag: ClassVar[str] = "analog_memory"
-    s95: ClassVar[float] = 0.0006
-    most: ClassVar[float] = 0.3
-    warmup: ClassVar[int] = 2
+    s95 = 0.0006
+    most = 0.3
+    warmup = 2
 
     def draw(self):
         self.before = np.zeros(self.sensor.shape)
@@ -203,8 +193,7 @@ class AnalogMemory(Hidden):
 class GainDrift(Hidden):
     """The gain of all pixels drifts; strength: relative, end to end."""
 
-    tag: ClassVar[str] = "gain_drift"
-    s95: ClassVar[float] = 0.0015
+    s95 = 0.0015
 
     def draw(self):
         self.course = Course(self)

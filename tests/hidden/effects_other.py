@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from hidden.base import Hidden
@@ -12,11 +10,10 @@ from hidden.base import Hidden
 class ChargeLag(Hidden):
     """Each electron stays behind for a frame with probability q, and again; strength: q. Invisible."""
 
-    tag: ClassVar[str] = "charge_lag"
-    s95: ClassVar[float] = 0.05
-    scaling: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)
-    most: ClassVar[float] = 0.4
-    warmup: ClassVar[int] = 40
+    s95 = 0.05
+    scaling = (0.0, 0.0, 0.0)
+    most = 0.4
+    warmup = 40
 
     def draw(self):
         self.left = np.zeros(self.sensor.shape, np.int64)
@@ -30,10 +27,9 @@ class ChargeLag(Hidden):
 class ChargeDiffusion(Hidden):
     """Each electron moves to one of the four neighbours with probability q; strength: q. Invisible."""
 
-    tag: ClassVar[str] = "charge_diffusion"
-    s95: ClassVar[float] = 0.05
-    scaling: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)
-    most: ClassVar[float] = 0.6
+    s95 = 0.05
+    scaling = (0.0, 0.0, 0.0)
+    most = 0.6
 
     def electrons(self, t, k):
         stay = k.copy()
@@ -54,9 +50,8 @@ class ChargeDiffusion(Hidden):
 class SpuriousCharge(Hidden):
     """Electrons that no light and no dark current made; strength: e- per sample. Invisible."""
 
-    tag: ClassVar[str] = "spurious_charge"
-    s95: ClassVar[float] = 0.075
-    scaling: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)
+    s95 = 0.075
+    scaling = (0.0, 0.0, 0.0)
 
     def electrons(self, t, k):
         return k + self.rng.poisson(self.strength, k.shape)
@@ -65,9 +60,8 @@ class SpuriousCharge(Hidden):
 class SelfTriggerCut(Hidden):
     """Samples without an electron are partly not taken, but awaited anew; strength: that part."""
 
-    tag: ClassVar[str] = "self_trigger_cut"
-    s95: ClassVar[float] = 0.01
-    most: ClassVar[float] = 0.9
+    s95 = 0.01
+    most = 0.9
 
     def electrons(self, t, k):
         again = (k == 0) & (self.rng.random(k.shape) < self.strength)
@@ -77,9 +71,8 @@ class SelfTriggerCut(Hidden):
 class OutputCrosstalk(Hidden):
     """The right half sees a part of what the left half's output reads at the same time; strength: part."""
 
-    tag: ClassVar[str] = "output_crosstalk"
-    s95: ClassVar[float] = 0.01
-    most: ClassVar[float] = 0.2
+    s95 = 0.01
+    most = 0.2
 
     def draw(self):
         nx = self.sensor.shape[1]
@@ -94,9 +87,8 @@ class OutputCrosstalk(Hidden):
 class CheckerboardOffset(Hidden):
     """Two colours of pixels, like a chessboard, swap the sign of an offset from frame to frame; DN."""
 
-    tag: ClassVar[str] = "checkerboard_offset"
-    s95: ClassVar[float] = 0.15
-    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
+    s95 = 0.15
+    scaling = (0.25, 0.25, 0.25)
 
     def draw(self):
         y, x = np.indices(self.sensor.shape)
@@ -112,8 +104,7 @@ class HerringBone(Hidden):
     Its phase runs on from frame to frame, or is new in each. To be told as periodic pickup.
     """
 
-    tag: ClassVar[str] = "herring_bone"
-    s95: ClassVar[float] = 0.05
+    s95 = 0.05
 
     def draw(self):
         per_column = self.between("cycles_per_column", 0.03, 0.47)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from hidden.base import Course, Hidden, telegraph
@@ -12,8 +10,7 @@ from hidden.base import Course, Hidden, telegraph
 class BiasDrift(Hidden):
     """The bias of all pixels drifts; strength: DN, end to end."""
 
-    tag: ClassVar[str] = "bias_drift"
-    s95: ClassVar[float] = 0.022
+    s95 = 0.022
 
     def draw(self):
         self.course = Course(self)
@@ -25,8 +22,7 @@ class BiasDrift(Hidden):
 class BiasJumps(Hidden):
     """The bias of parts of the sensor jumps, each part at its own times; strength: height, DN."""
 
-    tag: ClassVar[str] = "bias_jumps"
-    s95: ClassVar[float] = 0.021
+    s95 = 0.021
 
     def draw(self):
         (ny, nx), nt = self.sensor.shape, self.sensor.n_frames
@@ -56,9 +52,8 @@ class BiasJumps(Hidden):
 class FrameNoise(Hidden):
     """All pixels of a frame share a deviation; strength: DN rms."""
 
-    tag: ClassVar[str] = "frame_noise"
-    s95: ClassVar[float] = 0.031
-    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.25)
+    s95 = 0.031
+    scaling = (0.5, 0.5, 0.25)
 
     def voltage(self, t, dn):
         return dn + self.strength * self.rng.standard_normal()
@@ -67,9 +62,8 @@ class FrameNoise(Hidden):
 class RowNoise(Hidden):
     """All pixels of a row of a frame share a deviation; strength: DN rms."""
 
-    tag: ClassVar[str] = "row_noise"
-    s95: ClassVar[float] = 0.093
-    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.5, 0.25)
+    s95 = 0.093
+    scaling = (0.25, 0.5, 0.25)
 
     def voltage(self, t, dn):
         return dn + self.strength * self.rng.standard_normal((dn.shape[0], 1))
@@ -78,9 +72,8 @@ class RowNoise(Hidden):
 class ColumnNoise(Hidden):
     """All pixels of a column of a frame share a deviation; strength: DN rms."""
 
-    tag: ClassVar[str] = "column_noise"
-    s95: ClassVar[float] = 0.079
-    scaling: ClassVar[tuple[float, float, float]] = (0.5, 0.25, 0.25)
+    s95 = 0.079
+    scaling = (0.5, 0.25, 0.25)
 
     def voltage(self, t, dn):
         return dn + self.strength * self.rng.standard_normal((1, dn.shape[1]))
@@ -89,8 +82,7 @@ class ColumnNoise(Hidden):
 class PeriodicPickup(Hidden):
     """A sine picked up while rows are read; strength: amplitude, DN."""
 
-    tag: ClassVar[str] = "periodic_pickup"
-    s95: ClassVar[float] = 0.023
+    s95 = 0.023
 
     def draw(self):
         along = self.pick("along", "rows", "columns", "frames", p=(0.7, 0.15, 0.15))
@@ -108,8 +100,7 @@ class PeriodicPickup(Hidden):
 class ReadoutAlternation(Hidden):
     """Even and odd frames differ, as with two banks of converters; strength: half the difference, DN."""
 
-    tag: ClassVar[str] = "readout_alternation"
-    s95: ClassVar[float] = 0.006
+    s95 = 0.006
 
     def draw(self):
         self.half = self.sign() * self.strength
@@ -125,10 +116,9 @@ class AdcDnl(Hidden):
     alternation of all codes.
     """
 
-    tag: ClassVar[str] = "adc_dnl"
-    order: ClassVar[int] = 2
-    s95: ClassVar[float] = 0.0015
-    most: ClassVar[float] = 0.9
+    order = 2
+    s95 = 0.0015
+    most = 0.9
 
     def draw(self):
         kind = self.pick("kind", "bit", "random", "one_code", "missing", p=(0.6, 0.25, 0.075, 0.075))
@@ -162,9 +152,8 @@ class AdcDnl(Hidden):
 class AdcInl(Hidden):
     """The converter's curve bends smoothly; strength: amplitude, LSB."""
 
-    tag: ClassVar[str] = "adc_inl"
-    order: ClassVar[int] = 2
-    s95: ClassVar[float] = 0.016
+    order = 2
+    s95 = 0.016
 
     def draw(self):
         self.low, self.high = self.sensor.code_range
@@ -186,10 +175,9 @@ class AdcInl(Hidden):
 class Clipping(Hidden):
     """Nothing below, or nothing above, one code; strength: part of the samples that it catches."""
 
-    tag: ClassVar[str] = "clipping"
-    s95: ClassVar[float] = 7e-6
-    scaling: ClassVar[tuple[float, float, float]] = (1.0, 1.0, 1.0)
-    most: ClassVar[float] = 0.05
+    s95 = 7e-6
+    scaling = (1.0, 1.0, 1.0)
+    most = 0.05
 
     def draw(self):
         self.side = self.pick("side", "low", "high")
@@ -211,9 +199,8 @@ class Clipping(Hidden):
 class RepeatedFrames(Hidden):
     """Frames, or rows of frames, come twice; strength: number of frames."""
 
-    tag: ClassVar[str] = "repeated_frames"
-    s95: ClassVar[float] = 1.0
-    scaling: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)
+    s95 = 1.0
+    scaling = (0.0, 0.0, 0.0)
 
     def draw(self):
         n = max(1, round(self.strength))
@@ -236,10 +223,9 @@ class PixelCorrection(Hidden):
     Far is so many standard deviations of the samples' own scatter.
     """
 
-    tag: ClassVar[str] = "pixel_correction"
-    order: ClassVar[int] = 5
-    s95: ClassVar[float] = 0.05
-    most: ClassVar[float] = 1.0
+    order = 5
+    s95 = 0.05
+    most = 1.0
 
     def draw(self):
         scatter = np.sqrt(np.median(self.sensor.exposure)) * np.median(self.sensor.step)
@@ -259,10 +245,9 @@ class PixelCorrection(Hidden):
 class BitErrors(Hidden):
     """A bit of the converter reads 0, or its opposite, in some of the samples; strength: their share."""
 
-    tag: ClassVar[str] = "bit_errors"
-    order: ClassVar[int] = 4
-    s95: ClassVar[float] = 1e-3
-    most: ClassVar[float] = 1.0
+    order = 4
+    s95 = 1e-3
+    most = 1.0
 
     def draw(self):
         self.bit = int(self.pick("bit", 2, 3, 4))
@@ -278,10 +263,9 @@ class BitErrors(Hidden):
 class BinaryOffset(Hidden):
     """An offset that follows one bit of the sample read before in the row; strength: DN."""
 
-    tag: ClassVar[str] = "binary_offset"
-    order: ClassVar[int] = 3
-    s95: ClassVar[float] = 0.1
-    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.25, 0.25)
+    order = 3
+    s95 = 0.1
+    scaling = (0.25, 0.25, 0.25)
 
     def draw(self):
         self.bit = int(self.pick("bit", 0, 1, 2, 3))
@@ -299,11 +283,10 @@ class BinaryOffset(Hidden):
 class RepeatedLines(Hidden):
     """Rows or columns that repeat the one before; strength: share of them."""
 
-    tag: ClassVar[str] = "repeated_lines"
-    order: ClassVar[int] = 6
-    s95: ClassVar[float] = 1e-4
-    scaling: ClassVar[tuple[float, float, float]] = (1.0, 0.0, 1.0)
-    most: ClassVar[float] = 0.2
+    order = 6
+    s95 = 1e-4
+    scaling = (1.0, 0.0, 1.0)
+    most = 0.2
 
     def draw(self):
         self.axis = 0 if self.pick("lines", "rows", "columns") == "rows" else 1
@@ -319,10 +302,9 @@ class RepeatedLines(Hidden):
 class MisplacedLines(Hidden):
     """Rows or columns that hold the samples of other pixels; strength: share of them, or of the frames."""
 
-    tag: ClassVar[str] = "misplaced_lines"
-    order: ClassVar[int] = 6
-    s95: ClassVar[float] = 5e-3
-    most: ClassVar[float] = 0.3
+    order = 6
+    s95 = 5e-3
+    most = 0.3
 
     def draw(self):
         self.axis = 0 if self.pick("lines", "rows", "columns") == "rows" else 1
@@ -356,10 +338,9 @@ class GainStitch(Hidden):
     Both gains agree at that code, or at the black level: then there is a step.
     """
 
-    tag: ClassVar[str] = "gain_stitch"
-    order: ClassVar[int] = 2
-    s95: ClassVar[float] = 3e-3
-    most: ClassVar[float] = 0.4
+    order = 2
+    s95 = 3e-3
+    most = 0.4
 
     def draw(self):
         low, high = self.sensor.code_range
@@ -380,11 +361,10 @@ class BlackClamp(Hidden):
     They are the left eighth of the columns, the upper eighth of the rows, or all.
     """
 
-    tag: ClassVar[str] = "black_clamp"
-    order: ClassVar[int] = 1
-    s95: ClassVar[float] = 0.018
-    scaling: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.5)
-    most: ClassVar[float] = 1.0
+    order = 1
+    s95 = 0.018
+    scaling = (0.0, 0.0, 0.5)
+    most = 1.0
 
     def draw(self):
         (ny, nx), s = self.sensor.shape, self.sensor
@@ -403,9 +383,8 @@ class ReadOrderNoise(Hidden):
     Without what changes more slowly than once a frame, which an amplifier's clamp takes away.
     """
 
-    tag: ClassVar[str] = "read_order_noise"
-    s95: ClassVar[float] = 0.07
-    scaling: ClassVar[tuple[float, float, float]] = (0.25, 0.5, 0.25)
+    s95 = 0.07
+    scaling = (0.25, 0.5, 0.25)
 
     def draw(self):
         ny, nx = self.sensor.shape

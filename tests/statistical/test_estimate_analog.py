@@ -192,10 +192,3 @@ def test_very_small_sensors_do_no_harm(shape):
     evidence = seen(taken(drawn_truth(shape), n_frames=400))
     for effect in CLASSES:
         assert len(effect.estimate(evidence)) <= 1
-
-
-@pytest.mark.parametrize("effect", CLASSES, ids=lambda c: c.__name__)
-def test_histograms_without_frames_are_enough_or_give_nothing(effect):
-    for truth in (HeavyTailedNoise(share=1e-3), Nonlinearity(step_change=0.01)):
-        for guess in effect.estimate(replace(evidence_of(truth), time=None)):
-            assert np.isfinite(getattr(guess, guess.strength))

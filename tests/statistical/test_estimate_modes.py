@@ -19,7 +19,7 @@ from pchem_pipeline.effects.analog.frame_noise import FrameNoise
 from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
 from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
 from pchem_pipeline.effects.analog.row_noise import RowNoise
-from pchem_pipeline.effects.estimators.levels.change_points import find_steps, noise_variance
+from pchem_pipeline.effects.estimators.levels.change_points import find_steps
 from pchem_pipeline.effects.estimators.levels.two_levels import between_two_levels
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
@@ -214,33 +214,6 @@ def test_repeats_are_counted():
     assert part.probability == pytest.approx(5 / (N_FRAMES - 1))
 
 
-def test_steps_of_known_series_under_a_common_mode():
-    rng = np.random.default_rng(2)
-    levels = np.zeros((1000, 4))
-    levels[:, 0] = np.repeat([0.0, 1.0, -0.5, 0.5], [300, 200, 30, 470])
-    levels[500:, 2] = 2.0
-    common = 3.0 * np.sin(np.arange(1000) / 70.0)[:, None] + rng.standard_normal((1000, 1))
-    series = levels + common + 0.3 * rng.standard_normal(levels.shape)
-    found = find_steps(series)
-    for q, starts in enumerate(([0, 300, 500, 530], [0], [0, 500], [0])):
-        assert found[q].starts.shape == (len(starts),)
-        assert np.abs(found[q].starts - starts).max() <= 2
-    assert np.abs(np.diff(found[0].levels) - [1, -1.5, 1]).max() < 5 * 0.3 * np.sqrt(1 / 30 + 1 / 200)
-    assert abs(np.diff(found[2].levels)[0] - 2) < 5 * 0.3 * np.sqrt(2 / 500)
-    # the same wave in one of the series alone is cut to pieces
-    alone = 0.3 * rng.standard_normal((1000, 4))
-    alone[:, 1] += 3.0 * np.sin(np.arange(1000) / 70.0)
-    assert find_steps(alone)[1].starts.size > 5
-
-
-def test_series_without_steps_are_left_whole():
-    rng = np.random.default_rng(3)
-    empty = [sum(s.starts.size - 1 for s in find_steps(rng.standard_normal((400, 4)))) for _ in range(100)]
-    assert sum(n > 0 for n in empty) <= 2
-    variances = [noise_variance(rng.standard_normal(400)) for _ in range(100)]
-    assert abs(np.mean(variances) - 1) < 0.05
-
-
 def test_a_change_across_a_gap_is_put_into_the_gap():
     rng = np.random.default_rng(4)
     series = 0.5 * rng.standard_normal((200, 4))
@@ -261,24 +234,6 @@ def test_rare_repeats_are_simulated_in_their_mean_number():
     assert (len(many.frames), share) == (20, pytest.approx(0.02 * 999 / 20))
     listed = RepeatedFrames(frames=(3, 9))
     assert listed.representative(numbers) == (listed, 1.0)
-
-
-@pytest.mark.parametrize("noise_of_all", [0.0, 0.6])
-def test_steps_of_pairs_of_series_are_told_from_opposite_steps_of_the_others(noise_of_all):
-    rng = np.random.default_rng(8)
-    first, second = np.zeros(1200), np.zeros(1200)
-    for place in (150, 420, 700, 1000):
-        first[place:] = 1.0 - first[place]
-    for place in (300, 610):
-        second[place:] = 1.0 - second[place]
-    levels = np.stack([first, second, first, second], axis=1)
-    common = (1e-3 * np.arange(1200) + noise_of_all * rng.standard_normal(1200))[:, None]
-    found = find_steps(levels + common + 0.25 * rng.standard_normal(levels.shape))
-    for q, steps in enumerate(found):
-        profile = np.repeat(steps.levels, np.diff([*steps.starts, 1200]))
-        apart = profile - (levels[:, q] - levels[:, q].mean())
-        # what the contrasts leave open is a constant: half a jump wrong at every cut if it were taken
-        assert np.sqrt(np.mean(apart**2)) < 0.1
 
 
 def _apart(steps, levels):

@@ -34,28 +34,3 @@ def test_exact_is_unbiased_and_the_density_biased_as_predicted(step, exposure):
         signed = predicted * np.array([1, -1, 1, 1])
         np.testing.assert_allclose(shifts, signed, atol=0.1 + 0.15 * np.abs(signed).max())
     assert np.abs(shifts).max() > 5 / np.sqrt(N) + 0.05
-
-
-def test_codes_at_the_limits_are_censored():
-    drawn = draw(np.random.default_rng(9), np.full(400, 1.5), 8.0, 0.3, np.full(400, 100.3))
-    top = 124
-    last = top - int(drawn.origin[0])
-    counts = drawn.counts[:, : last + 1].copy()
-    counts[:, last] += drawn.counts[:, last + 1 :].sum(axis=1, dtype=np.uint32)
-    assert counts[:, last].mean() / counts.sum(axis=1).mean() > 0.03
-    density = FitSettings(likelihood="density")
-    plain = fit_histograms(counts, drawn.origin, settings=density, adc_limits=(0, top))
-    exact = fit_histograms(
-        counts,
-        drawn.origin,
-        settings=FitSettings(likelihood="exact"),
-        adc_limits=(0, top),
-        start=plain,
-    )
-    good = np.isfinite(exact.conversion_gain)
-    assert good.mean() > 0.99
-    for i, name in enumerate(("quanta_exposure", "conversion_gain", "bias")):
-        pulls = ((getattr(exact, name) - drawn.truth[:, i]) / np.sqrt(exact.covariance[:, i, i]))[good]
-        assert abs(pulls.mean()) < 5 / np.sqrt(pulls.size), name
-    h = (plain.quanta_exposure - drawn.truth[:, 0]) / np.sqrt(plain.covariance[:, 0, 0])
-    assert not abs(np.nanmean(h)) < 20 / np.sqrt(400)

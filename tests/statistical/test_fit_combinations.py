@@ -95,16 +95,6 @@ def test_each_pair_has_the_right_pulls_and_covers_the_truth(told: tuple[str, ...
         np.testing.assert_allclose(np.median(found.outlier_share), share, rtol=0.6)
 
 
-def test_without_the_law_the_pulls_would_be_off() -> None:
-    rng = np.random.default_rng(5)
-    at = truth(rng)
-    counts = [draw(rng, LAW, at, factor) for factor in FACTORS]
-    plain = fit_histograms(counts, [np.full(N, FIRST)] * 2)
-    whole = np.stack([at[:, 0], at[:, 0] * FACTORS[1], *at[:, 1:].T], axis=1)
-    pulls = (plain.columns - whole) / np.sqrt(np.diagonal(plain.covariance, axis1=1, axis2=2))
-    assert np.abs(np.median(pulls, axis=0)).max() > 3
-
-
 def minus(law: SampleLaw, samples: list[NDArray[np.uint32]], aside: Array, *at: float) -> float:
     """Minus the log-likelihood of a pixel's samples given that a code is not set aside."""
     value = 0.0

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.small_stacks import small_stack
 
-from pchem_pipeline.discrepancy.observe import laws
-from pchem_pipeline.discrepancy.observe import observe as observe_module
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.observe.vector import FrameView
 
 N_STACKS, SHAPE, N_FRAMES, BLOCK = 60, (24, 24), 600, 50
 LIMIT = 5.0 / np.sqrt(N_STACKS)
@@ -57,31 +52,3 @@ def test_a_statistic_is_standard_normal_without_effects(name: str, vectors: dict
 @pytest.mark.parametrize("name", SILENT)
 def test_impossible_events_do_not_happen(name: str, vectors: dict[str, np.ndarray]) -> None:
     assert np.abs(vectors[name]).max() < 0.01
-
-
-def _means(names: tuple[str, ...], count: int) -> dict[str, np.ndarray]:
-    found = np.array([_vector(1000 + seed) for seed in range(count)])
-    return {name: found[:, list(STATISTICS).index(name)] for name in names}
-
-
-def test_forgetting_that_series_are_centred_would_be_caught(monkeypatch: pytest.MonkeyPatch) -> None:
-    # a billion frames instead of 600: the correction 1 / (n - 1) all but vanishes
-    right = observe_module.pixel_lags
-
-    def wrong(view: FrameView) -> np.ndarray:
-        many = replace(view, numbers=np.broadcast_to(view.numbers[:1], 1_000_000_000))
-        return right(many)
-
-    monkeypatch.setattr(observe_module, "pixel_lags", wrong)
-    name = "time.lag1.charge.mean"
-    z = _means((name,), 12)[name]
-    assert not abs(z.mean()) < LIMIT
-
-
-def test_a_wrong_variance_would_be_caught(vectors: dict[str, np.ndarray]) -> None:
-    # had the rows' common mode not been counted as one degree of freedom of a frame
-    rows = SHAPE[0]
-    shift = laws.chi_square(N_FRAMES * (rows - 1.0), N_FRAMES * rows)
-    name = "space.row.readout.variance"
-    assert _mean_is_zero(name, vectors[name])
-    assert not _mean_is_zero(name, vectors[name] + float(shift))

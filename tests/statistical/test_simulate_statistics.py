@@ -16,7 +16,7 @@ from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.streams import make_key, to_words, uniform_pair
-from pchem_pipeline.simulate.truth import Defect, TruthMaps
+from pchem_pipeline.simulate.truth import TruthMaps
 
 FALSE_ALARM = 6e-7
 N = 1 << 20
@@ -142,55 +142,6 @@ def test_samples_are_independent_in_time_and_space_and_row_noise_is_seen():
     assert abs(correlation_z(means[:, 1:], means[:, :-1])) < 5
 
 
-def test_row_noise_has_the_strength_asked_for():
-    strength, shape, n = 1.5, (48, 64), 300
-    settings = SimulateSettings(
-        shape=shape, n_frames=n, seed=6, effects=[{"tag": "row_noise", "row_noise_dn": strength}]
-    )
-    truth = identical_pixels(shape, 1.0, 0.1, 100.0, 0.3)
-    means = simulate_block(truth, settings, (0, n))[0].mean(axis=2)
-    # a pixel's variance is H / g^2 + (sigma_R / g)^2 + 1/12 DN^2
-    own = (100.0 + 9.0 + 1 / 12) / shape[1]
-    error = (strength**2 + own) * np.sqrt(2 / means.size)
-    assert abs(means.var() - own - strength**2) < 5 * error
-    assert strength**2 > 20 * error
-
-
-def test_exposure_drift_moves_the_exposure_and_keeps_its_mean():
-    drift, n, shape = 0.3, 400, (40, 50)
-    settings = SimulateSettings(
-        shape=shape, n_frames=n, seed=7, effects=[{"tag": "exposure_drift", "drift": drift}]
-    )
-    truth = identical_pixels(shape, 2.0, 0.1, 100.0, 0.3)
-    _, electrons = simulate_block(truth, settings, (0, n))
-    frame_means = electrons.mean(axis=(1, 2))
-    position = np.arange(n) / (n - 1) - 0.5
-    weights = position / (position @ position)
-    slope = weights @ frame_means
-    error = np.sqrt(2.0 / electrons[0].size * (weights @ weights))
-    assert abs(slope - 2.0 * drift) < 5 * error
-    assert 2.0 * drift > 20 * error
-    assert abs(frame_means.mean() - 2.0) < 5 * np.sqrt(2.0 / electrons.size)
-    # variance of a pixel over the run: Poisson, plus that of the drift itself
-    variance = 2.0 + (2.0 * drift) ** 2 / 12
-    spread = np.sqrt((variance * (1 + 3 * variance) - variance**2) / electrons.size)
-    assert abs(electrons.var() - variance) < 5 * spread
-
-
-def test_clipping_piles_the_tails_up_at_its_limits():
-    h, g, mu, sigma, low, high = 1.0, 0.1, 100.0, 0.3, 97, 125
-    settings = SimulateSettings(
-        shape=(40, 50), n_frames=300, seed=9, effects=[{"tag": "clipping", "low": low, "high": high}]
-    )
-    dn, _ = simulate_block(identical_pixels((40, 50), h, g, mu, sigma), settings, (0, 300))
-    mass = exact_mass(np.arange(400), h, g, mu, sigma)
-    assert (dn.min(), dn.max()) == (low, high)
-    for code, p in ((low, mass[: low + 1].sum()), (high, mass[high:].sum())):
-        error = np.sqrt(p * (1 - p) / dn.size)
-        assert abs((dn == code).mean() - p) < 5 * error
-        assert p - mass[code] > 20 * error
-
-
 def test_maps_have_the_distributions_and_rank_correlations_asked_for():
     settings = SimulateSettings(
         shape=(200, 200),
@@ -226,21 +177,3 @@ def test_maps_have_the_distributions_and_rank_correlations_asked_for():
             # the rank correlation of a normal copula has at most the error of an independent one
             assert abs(found - rank) < 5 / np.sqrt(200 * 200)
             assert rank == 0 or abs(rank) > 20 / np.sqrt(200 * 200)
-
-
-def test_hot_pixels_are_as_many_and_as_hot_as_asked_for():
-    multiplier = {"kind": "lognormal", "median": 5.0, "log_std": 0.3}
-    settings = SimulateSettings(
-        shape=(300, 300),
-        seed=12,
-        parameters={
-            "quanta_exposure": {"kind": "constant", "value": 1.0},
-            "hot_pixels": {"fraction": 0.05, "multiplier": multiplier},
-        },
-    )
-    truth = draw_truth(settings)
-    hot = truth.defect == Defect.HOT
-    assert abs(hot.mean() - 0.05) < 5 * np.sqrt(0.05 * 0.95 / hot.size)
-    assert stats.kstest(truth.quanta_exposure[hot], stats.lognorm(0.3, scale=5).cdf).pvalue > FALSE_ALARM
-    assert stats.kstest(truth.quanta_exposure[hot] * 1.1, stats.lognorm(0.3, scale=5).cdf).pvalue < 1e-20
-    assert (truth.quanta_exposure[~hot] == 1.0).all()

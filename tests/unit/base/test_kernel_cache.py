@@ -13,7 +13,6 @@ import pchem_pipeline
 from pchem_pipeline.base import kernel_cache
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.kernel_cache import TIGHT_MEMORY, listening
-from pchem_pipeline.model.electrons import electrons_numba
 
 INNER = """
 from pchem_pipeline.base.kernel import kernel
@@ -146,13 +145,6 @@ def test_garbage_is_collected_meanwhile_where_memory_is_short(tmp_path, monkeypa
 
 def test_where_nothing_can_be_written_kernels_are_compiled_each_time(sample):
     assert end(start(sample, cache="/proc/nowhere")) == "[8, 9, 27] 3"
-
-
-def test_the_state_of_a_source_is_that_of_all_that_it_imports():
-    found = {}
-    kernel_cache._collect(electrons_numba.__name__, {"pchem_pipeline"}, found)
-    assert {"pchem_pipeline.model.law.cells_numba", "pchem_pipeline.base.kernel"} <= found.keys()
-    assert not any(name.startswith(("pchem_pipeline.store", "pchem_pipeline.stages")) for name in found)
 
 
 @kernel

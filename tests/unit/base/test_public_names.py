@@ -36,9 +36,22 @@ def test_the_example_runs():
     assert outcome.failed == 0
 
 
-def test_importing_the_package_imports_nothing_heavy():
-    code = "import sys, pchem_pipeline; print({'numpy', 'numba', 'zarr', 'pydantic'} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "set()\n"
+@pytest.mark.parametrize(
+    ("module", "light"),
+    [
+        ("pchem_pipeline", {"numpy", "numba", "zarr", "pydantic"}),
+        ("pchem_pipeline.simulate.settings", {"numpy", "numba", "scipy"}),
+        (
+            "pchem_pipeline.frames.open, pchem_pipeline.frames.writing, pchem_pipeline.frames.registry as r; "
+            "r.frame_suffixes()",
+            {"numba", "scipy", "zarr", "matplotlib", "tifffile", "astropy", "h5py", "dask", "yaml"},
+        ),
+    ],
+)
+def test_what_is_imported_imports_nothing_heavy(module: str, light: set[str]) -> None:
+    code = f"import sys, {module}; print({light!r} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
 
 
 def test_versions_agree():

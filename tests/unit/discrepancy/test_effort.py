@@ -1,6 +1,7 @@
 """A search has a limit, in work that is counted: it ends well there, and says so."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -79,29 +80,26 @@ def test_however_much_the_candidates_cost_some_is_left_to_fit_them():
         short.check("a candidate was fitted")
 
 
-def test_a_fit_with_a_law_of_many_components_costs_more():
-    plain, mixed = SampleLaw(), SampleLaw().with_noise([0.9, 0.05, 0.05], shift_e=[0.0, -1.0, 1.0])
-    assert (plain.components, mixed.components) == (1, 3)
-    spent = []
-    for law in (plain, mixed):
-        effort = Effort(1.0)
-        effort.refit(10**6, law.components, 8.0, [])
-        spent.append(effort.spent)
-    assert spent[1] > 2.9 * spent[0]
+def spent(work: Callable[[Effort], None], ambiguous: float = 0.0) -> float:
+    effort = Effort(1.0, ambiguous=ambiguous)
+    work(effort)
+    return effort.spent
 
 
-def test_a_fit_that_hardly_arrives_costs_more():
-    usual, lost = Effort(1.0), Effort(1.0)
-    usual.refit(10**6, 1, 8.0, [])
-    lost.refit(10**6, 1, 1000.0, [])
-    assert lost.spent > 10.0 * usual.spent
-
-
-def test_fits_of_pixels_that_are_not_identified_cost_more():
-    plain, poor = Effort(1.0), Effort(1.0, ambiguous=0.9)
-    for effort in (plain, poor):
-        effort.simulate(0, 10**6, 3)
-    assert 4.0 * plain.spent < poor.spent < 6.0 * plain.spent
+def test_work_costs_what_makes_it_long():
+    plain = spent(lambda e: e.refit(10**6, 1, 8.0, []))
+    mixed = SampleLaw().with_noise([0.9, 0.05, 0.05], shift_e=[0.0, -1.0, 1.0])
+    assert (SampleLaw().components, mixed.components) == (1, 3)
+    assert spent(lambda e: e.refit(10**6, mixed.components, 8.0, [])) > 2.9 * plain
+    # that hardly arrives
+    assert spent(lambda e: e.refit(10**6, 1, 1000.0, [])) > 10.0 * plain
+    # levels that every pixel is free to have: the sensor is taken from the maps
+    free = spent(lambda e: e.refit(1000, 15, 20.0, [], learnt=False))
+    assert free < 0.4 * spent(lambda e: e.refit(1000, 15, 20.0, []))
+    # pixels that are not identified
+    usual, poor = (spent(lambda e: e.simulate(0, 10**6, 3), share) for share in (0.0, 0.9))
+    assert 4.0 * usual < poor < 6.0 * usual
+    assert 1.0 < spent(lambda e: e.ask(10**6)) < 5.0
 
 
 def test_a_law_that_differs_by_pixel_costs_no_more_for_that():
@@ -158,17 +156,3 @@ def test_a_law_of_too_many_peaks_is_not_begun_with():
     wave = PeriodicPickup(amplitude_dn=1.0, cycles_per_row=0.36)
     with pytest.raises(NotFittedError, match="would have 80"):
         refit_maps(frames, seen.maps, [NoiseSkew(share=0.83), wave], seen.covariance)
-
-
-def test_a_fit_whose_law_teaches_no_sensor_costs_less():
-    """Levels that every pixel is free to have: the sensor is taken from the maps."""
-    learnt, free = Effort(1.0), Effort(1.0)
-    learnt.refit(1000, 15, 20.0, [])
-    free.refit(1000, 15, 20.0, [], learnt=False)
-    assert free.spent < 0.4 * learnt.spent
-
-
-def test_a_look_for_guesses_is_counted():
-    effort = Effort(1.0)
-    effort.ask(10**6)
-    assert 1.0 < effort.spent < 5.0

@@ -158,14 +158,6 @@ def test_edges_within_cells_are_found(mode: str, axes: tuple[int, ...], place: d
     assert found[0].region.overlap(region, WIDE) == 1.0
 
 
-def test_without_single_lines_the_edges_of_the_cells_would_be_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    region = Region.model_validate({"rows": [7, 23], "columns": [11, 90]})
-    samples = samples_of(noisy(region, (FEW, 1, 1), 0.5))
-    monkeypatch.setattr(Side, "exact", True)
-    found = scan_pairs(samples, most=1)
-    assert 0.8 < found[0].region.overlap(region, WIDE) < 1.0
-
-
 def test_dead_lines_at_an_edge_belong_to_nothing_and_do_not_end_a_place() -> None:
     region = Region.model_validate({"rows": [9, 24]})
     usable = np.ones(WIDE, np.bool_)

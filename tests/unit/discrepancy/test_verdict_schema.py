@@ -107,16 +107,8 @@ def test_a_place_takes_its_words_from_the_catalogue() -> None:
 @pytest.mark.parametrize(
     ("tag", "name", "unit"),
     [
-        ("adc_inl", "period_dn", "DN"),
-        ("gain_stitch", "origin_dn", "DN"),
-        ("persistence", "slow_decay_frames", "frames"),
         ("persistence", "peak_e", "e- per frame"),
-        ("periodic_pickup", "cycles_per_column", "cycles"),
         ("rts_noise", "fraction", ""),
-        ("rts_noise", "amplitude_e", "e-"),
-        ("read_order_noise", "taps", ""),
-        ("exposure_flicker", "correlation_frames", "frames"),
-        ("clipping", "low", "DN"),
         ("cosmic_rays", "tracks_per_frame", "1/frame"),
     ],
 )

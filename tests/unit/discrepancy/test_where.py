@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.quick_stacks import stack
+from helpers.quick_stacks import added, stack
 
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
@@ -29,25 +30,13 @@ PIXELS = SHAPE[1:]
 Array = np.ndarray[Any, Any]
 
 
-def seen(moved: Callable[[Array, np.random.Generator], Array] | None = None, seed: int = 1) -> Evidence:
-    rng = np.random.default_rng(seed)
-    frames = stack(rng, SHAPE, (lambda dn: dn) if moved is None else (lambda dn: moved(dn, rng)))
+NOISE = np.random.default_rng(5).standard_normal
+
+
+@functools.cache
+def seen(moved: Callable[[Array], Array] = lambda dn: dn, seed: int = 1) -> Evidence:
+    frames = stack(np.random.default_rng(seed), SHAPE, moved)
     return observe(frames, np.arange(SHAPE[0]), n_run=SHAPE[0], block_frames=50)
-
-
-def row_noise_of_a_tap(dn: Array, rng: np.random.Generator) -> Array:
-    dn[:, :, 60:] += 1.2 * rng.standard_normal(dn.shape[:2])[:, :, None]
-    return dn
-
-
-def column_noise_of_a_quadrant(dn: Array, rng: np.random.Generator) -> Array:
-    dn[:, :24, 40:] += rng.standard_normal((dn.shape[0], 1, 40))
-    return dn
-
-
-def one_noisy_row(dn: Array, rng: np.random.Generator) -> Array:
-    dn[:, 17] += 1.5 * rng.standard_normal((dn.shape[0], 1))
-    return dn
 
 
 def blob() -> Array:
@@ -55,18 +44,21 @@ def blob() -> Array:
     return np.asarray((y - 20) ** 2 + (x - 50) ** 2 <= 64)
 
 
-def drift_of_a_blob(dn: Array, rng: np.random.Generator) -> Array:
-    dn[:, blob()] += 1.5 * np.linspace(-0.5, 0.5, dn.shape[0])[:, None]
-    return dn
-
-
 @pytest.mark.parametrize(
     ("moved", "name", "region"),
     [
-        (row_noise_of_a_tap, "x.rr", Region(columns=((60, 80),))),
-        (column_noise_of_a_quadrant, "y.rr", Region(rows=((0, 24),), columns=((40, 80),))),
-        (one_noisy_row, "x.rr", Region(rows=((17, 18),))),
-        (drift_of_a_blob, "trend.readout", Region.of_mask(blob())),
+        (added(np.s_[:, :, 60:], 1.2 * NOISE((500, 48, 1))), "x.rr", Region(columns=((60, 80),))),
+        (
+            added(np.s_[:, :24, 40:], NOISE((500, 1, 40))),
+            "y.rr",
+            Region(rows=((0, 24),), columns=((40, 80),)),
+        ),
+        (added(np.s_[:, 17], 1.5 * NOISE((500, 1))), "x.rr", Region(rows=((17, 18),))),
+        (
+            added(np.s_[:, blob()], 1.5 * np.linspace(-0.5, 0.5, 500)[:, None]),
+            "trend.readout",
+            Region.of_mask(blob()),
+        ),
     ],
 )
 def test_the_place_overlaps_the_truth_by_80_per_cent(
@@ -82,27 +74,19 @@ def test_the_place_overlaps_the_truth_by_80_per_cent(
 
 
 def test_row_noise_of_some_frames_is_told_by_its_frames() -> None:
-    def moved(dn: Array, rng: np.random.Generator) -> Array:
-        dn[200:260] += 1.2 * rng.standard_normal((60, dn.shape[1]))[:, :, None]
-        return dn
-
-    found = suspected_frames(seen(moved))
+    found = suspected_frames(seen(added(np.s_[200:260], 1.2 * NOISE((60, 48, 1)))))
     assert found["row.readout"][0].when.numbers() == {"range": [[200, 260]]}
 
 
 def test_frames_that_are_noisier_in_every_sample_by_itself_are_told() -> None:
-    def moved(dn: Array, rng: np.random.Generator) -> Array:
-        dn[200:280] += 0.6 * rng.standard_normal(dn[200:280].shape)
-        return dn
-
-    found = suspected_frames(seen(moved))
+    found = suspected_frames(seen(added(np.s_[200:280], 0.6 * NOISE((80, *PIXELS)))))
     [[first, last]] = found["frame.noise"][0].when.numbers()["range"]
     assert abs(first - 200) + abs(last - 280) <= 8
 
 
 def test_clean_frames_have_no_place_and_no_time() -> None:
     for seed in range(2):
-        evidence = seen(None, seed)
+        evidence = seen(seed=seed)
         assert suspected_regions(evidence) == {}
         assert suspected_frames(evidence) == {}
 

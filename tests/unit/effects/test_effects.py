@@ -7,7 +7,6 @@ import logging
 from importlib.metadata import EntryPoint
 from typing import Any, ClassVar, Literal
 
-import numpy as np
 import pytest
 from pydantic import ValidationError
 
@@ -75,10 +74,6 @@ def installed(monkeypatch):
 
     yield install
     registry._discover.cache_clear()
-
-
-def test_planes_are_in_the_order_of_the_signal():
-    assert [plane.name for plane in Plane] == ["EXPOSURE", "CHARGE", "ANALOG", "ADC", "READOUT"]
 
 
 def test_our_effects_are_found_in_the_folder_of_their_plane():
@@ -155,12 +150,6 @@ def test_effects_are_frozen_and_have_no_reach_by_default():
     assert (shine.halo(), shine.history(), tag_of(Shine)) == (0, 0, "shine")
     with pytest.raises(ValidationError):
         shine.extra = 2.0
-
-
-def test_effects_can_be_given_by_tag_alone_only_if_they_need_nothing():
-    with pytest.raises(ValidationError, match="row_noise_dn"):
-        SimulateSettings(effects=["row_noise"])
-    assert np.size(SimulateSettings().effects) == 0
 
 
 def test_parameters_at_a_limit_are_told_and_defaults_are_not() -> None:

@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -405,34 +404,6 @@ def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path: Path)
     ):
         np.save(tmp_path / "mask.npy", values)
         not_opened(words, tmp_path / "a.npy", mask="mask.npy")
-
-
-@pytest.mark.parametrize("suffix", ["npy", "fits", "zarr", "h5", "tif", "raw"])
-def test_signed_samples_with_an_offset(tmp_path: Path, suffix: str) -> None:
-    stack = np.random.default_rng(4).integers(0, 65536, (9, 6, 8)).astype(np.uint16)
-    stored, path = (stack.astype(np.int32) - 32768).astype(np.int16), tmp_path / f"a.{suffix}"
-    match suffix:
-        case "npy":
-            np.save(path, stored)
-        case "fits":
-            fits.PrimaryHDU(stored).writeto(path)
-        case "zarr":
-            zarr.create_array(path, data=stored)
-        case "h5":
-            with h5py.File(path, "w") as file:
-                file.create_dataset("a", data=stored, chunks=(2, 3, 8), compression="gzip")
-        case "tif":
-            tifffile.imwrite(path, stored, photometric="minisblack", compression="zlib")
-        case "raw":
-            stored.astype("<i2").tofile(path)
-            path.with_suffix(".json").write_text('{"shape": [6, 8], "dtype": "int16"}')
-    not_opened(r"signed samples .*--offset 32768", path)
-    with opened(path, offset=32768) as frames:
-        np.testing.assert_array_equal(frames.read(), stack)
-    frames = opened(path, offset=1000)
-    with pytest.raises(InputError, match=r"negative samples \(down to -\d+ DN, with the offset of 1000\)"):
-        frames.read()
-    not_opened("offset", path, offset=32769)
 
 
 def test_fits_adds_what_its_header_says(tmp_path: Path) -> None:

@@ -159,18 +159,6 @@ def test_missing_library_is_named_with_what_installs_it(
         assert re.search(rf"pip install '{library}>=[\d.]+'", str(caught.value))
 
 
-def test_settings_and_registry_import_nothing_heavy() -> None:
-    code = (
-        "import sys, pchem_pipeline.frames.open, pchem_pipeline.frames.writing\n"
-        "from pchem_pipeline.frames.registry import frame_suffixes\n"
-        "frame_suffixes()\n"
-        "heavy = {'numba', 'scipy', 'zarr', 'matplotlib', 'tifffile', 'astropy', 'h5py', 'dask', 'yaml'}\n"
-        "print(sorted(heavy & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 def test_a_real_package_beside_ours(tmp_path: Path) -> None:
     """Another distribution, found on the path of a fresh process by its metadata alone."""
     info = tmp_path / "site" / "textframes-1.0.dist-info"

@@ -11,11 +11,9 @@ import pytest
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect, Plane
-from pchem_pipeline.simulate import chain_numba
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.streams import make_key, to_words
 from pchem_pipeline.simulate.truth import TruthMaps
 
 NOTHING = [
@@ -51,36 +49,6 @@ def constant_truth(shape=(6, 7), *, exposure=2.0, gain=0.1, bias=100.0, noise=0.
         *(np.full(shape, float(value)) for value in (exposure, gain, bias, noise)),
         defect=np.zeros(shape, np.uint8),
     )
-
-
-def test_effects_of_no_strength_change_nothing_not_even_the_last_bit():
-    plain, nothing = sensor(), sensor(effects=NOTHING)
-    truth = draw_truth(plain)
-    for a, b in zip(
-        simulate_block(truth, plain, (0, 20)), simulate_block(truth, nothing, (0, 20)), strict=True
-    ):
-        assert a.dtype == b.dtype
-        np.testing.assert_array_equal(a, b)
-
-
-def test_compiled_chain_equals_plain():
-    settings = sensor()
-    truth = draw_truth(settings)
-    dn = np.empty((2, 6, 7), np.uint16)
-    electrons = np.empty((1, 6, 7), np.uint32)
-    chain_numba.simulate_rows.py_func(
-        truth.quanta_exposure,
-        truth.conversion_gain,
-        truth.bias,
-        truth.analog_read_noise_e,
-        chain_numba.SampleKeys(*(to_words(np.arange(n)) for n in (2, 6, 7)), make_key(11, "sample")),
-        2.0**14 - 1,
-        dn,
-        electrons,
-    )
-    expected, k = simulate_block(truth, settings, (0, 2))
-    np.testing.assert_array_equal(dn, expected)
-    np.testing.assert_array_equal(electrons, k[:1])
 
 
 def test_long_tables_of_hot_pixels_are_searched_right():
@@ -120,13 +88,6 @@ def test_electron_numbers_only_as_far_as_wanted():
         assert (len(dn), len(electrons)) == (8, 3)
         assert len(simulate_block(truth, given, (4, 12), electron_frames=0)[1]) == 0
         np.testing.assert_array_equal(electrons, simulate_block(truth, settings, (4, 7))[1])
-
-
-def test_other_seeds_give_other_frames():
-    truth = constant_truth()
-    assert (
-        simulate_block(truth, sensor(), (0, 5))[0] != simulate_block(truth, sensor(seed=12), (0, 5))[0]
-    ).any()
 
 
 def test_a_truth_of_another_shape_is_refused():

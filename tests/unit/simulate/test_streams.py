@@ -12,7 +12,6 @@ from pchem_pipeline.simulate.streams import (
     make_key,
     normal_quantile,
     poisson_quantile,
-    to_words,
     uniform_pair,
 )
 
@@ -55,23 +54,6 @@ def test_uniforms_never_reach_zero_or_one():
     assert np.isfinite(normal_quantile(np.array([smallest, largest]))).all()
 
 
-def test_compiled_equals_plain():
-    frames, ys, xs = (to_words(np.arange(n)) for n in (3, 2, 4))
-    key = make_key(1, "x")
-    plain = np.empty((2, 3, 2, 4))
-    for t in range(3):
-        for y in range(2):
-            streams_numba.uniform_row.py_func(frames[t], ys[y], xs, np.uint64(0), *key, *plain[:, t, y])
-    np.testing.assert_array_equal(plain, uniform_pair(key, frames, ys, xs))
-    p = np.concatenate([plain.ravel(), [1e-300, 1e-20, 1e-9, 0.02, 0.5, 0.98, 1 - 1e-12]])
-    out = np.empty(p.size)
-    streams_numba.normal_from_uniform.py_func(p, out)
-    np.testing.assert_array_equal(out, normal_quantile(p))
-    for mean in (0.0, 0.2, 3.0, 250.0):
-        k = [streams_numba.poisson_quantile.py_func(u, mean) for u in plain.ravel()]
-        np.testing.assert_array_equal(k, poisson_quantile(plain.ravel(), np.array(mean)))
-
-
 def test_normal_quantile_agrees_with_scipy():
     p = np.concatenate([np.linspace(1e-4, 1 - 1e-4, 4001), 10.0 ** -np.arange(1, 300, 7)])
     np.testing.assert_allclose(normal_quantile(p), special.ndtri(p), rtol=2e-15, atol=1e-16)
@@ -83,17 +65,6 @@ def test_poisson_quantile_agrees_with_scipy(mean):
     tail = 1e-12 if mean < 1e3 else 1e-8
     u = np.concatenate([np.random.default_rng(4).random(3000), [tail, 1 - tail]])
     np.testing.assert_array_equal(poisson_quantile(u, np.array(mean)), stats.poisson.ppf(u, mean))
-
-
-@pytest.mark.parametrize("mean", [0.0, 0.05, 2.0, 60.0, 4e3])
-def test_poisson_table_holds_the_sums_of_the_quantile(mean):
-    first, _, last = streams_numba.poisson_start(mean)
-    table = np.empty(last - first + 1)
-    start, n = streams_numba.poisson_table(mean, table)
-    assert start == first
-    u = np.random.default_rng(5).random(2000)
-    looked_up = first + np.minimum(np.searchsorted(table[:n], u), n - 1)
-    np.testing.assert_array_equal(looked_up, poisson_quantile(u, np.array(mean)))
 
 
 @pytest.mark.parametrize(

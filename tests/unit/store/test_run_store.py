@@ -9,7 +9,7 @@ import xarray as xr
 
 from pchem_pipeline.base.errors import LockedError, StoreError
 from pchem_pipeline.base.variables import VARIABLES
-from pchem_pipeline.store.files import is_fatal, read_json, storage_error, write_atomic, write_json
+from pchem_pipeline.store.files import is_fatal, read_json, storage_error, write_json
 from pchem_pipeline.store.records import Records, StageRecord, fingerprint_of
 from pchem_pipeline.store.run_store import RunStore
 
@@ -179,12 +179,6 @@ def test_partial_files_of_a_killed_process_are_removed(store):
     orphan.write_bytes(b"half")
     with store.locked():
         assert not orphan.exists()
-
-
-def test_write_atomic_replaces_whole_files_and_leaves_no_litter(tmp_path):
-    write_atomic(tmp_path / "a.txt", b"old")
-    write_atomic(tmp_path / "a.txt", b"new")
-    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("a.txt", b"new")]
 
 
 def test_damaged_json_names_the_file(tmp_path):

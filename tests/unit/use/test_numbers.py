@@ -60,19 +60,6 @@ def test_the_expectation_is_unbiased_and_nearer_than_the_number(night):
     assert ((found.number[:, noisy].astype(int) - electrons[:, noisy]) ** 2).mean() > 1.15 * square
 
 
-def test_photon_number_statistics_are_the_truths(night):
-    """Where the peaks are apart, numbers have the mass of Poisson counts; pixel by pixel they vary as H."""
-    camera, exposure, electrons, _, found = night
-    quiet = camera.read_noise_e < 0.22
-    n = np.bincount(found.number[:, quiet].ravel(), minlength=12)[:12]
-    k = np.bincount(electrons[:, quiet].ravel(), minlength=12)[:12]
-    limit = camera.least_error(exposure)[quiet].mean()
-    # numbers and truth are the same samples: they differ by those that are wrong
-    assert (abs(n - k) <= 5 * np.sqrt(2 * limit * k.sum())).all()
-    fano = found.number[:, quiet].var(axis=0) / found.number[:, quiet].mean(axis=0)
-    assert abs(fano.mean() - 1) < 5 * np.sqrt(2 / len(electrons) / quiet.sum()) + 2 * limit
-
-
 def test_a_wrong_prior_errs_more_often(night):
     camera, exposure, electrons, frames, found = night
     calibration = camera.calibration()

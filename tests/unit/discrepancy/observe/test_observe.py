@@ -11,7 +11,7 @@ from helpers.small_stacks import small_stack
 from scipy import special, stats
 
 from pchem_pipeline.base.errors import InputError, PchEmError
-from pchem_pipeline.discrepancy.observe import law_numba, sums_numba, tables_numba
+from pchem_pipeline.discrepancy.observe import law_numba
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import _without_steps, observe, observe_histograms
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
@@ -255,50 +255,6 @@ def test_gain_of_a_frame_is_the_slope_of_the_residual() -> None:
     top = (r * weight * (k / g + pattern)).sum(axis=1) - (weight * (k * r).mean(axis=0) / g).sum()
     bottom = (weight * (k.var(axis=0) / g**2 + pattern**2)).sum()
     np.testing.assert_allclose(plain.time.frame_gain, top / bottom, atol=2e-4)
-
-
-def test_loops_are_the_same_uncompiled() -> None:
-    frames = small_stack((2, 3), 40, 3)
-    histograms = histogram_frames(frames)
-    counts = histograms.counts.reshape(6, -1)
-    parameters = np.tile([1.5, 11.0, 100.0, 3.0], (6, 1))
-    n_bins, n_codes, first = 20, 320, 60
-    results = []
-    for summarise in (tables_numba.summarise_pixels, tables_numba.summarise_pixels.py_func):
-        sums = [np.zeros((4, n_codes)), np.zeros(16), np.zeros((16, 16)), np.zeros((3, n_bins))]
-        arrays = [
-            np.array([True] * 5 + [False]), np.zeros((6, tables_numba.N_MOMENTS)), np.zeros((6, 3, 8)),
-            np.zeros((6, 3), np.int64), np.zeros((1500, 2), np.float32),
-        ]  # fmt: skip
-        codes = tables_numba.CodeSums(first, 16, *sums, np.zeros((n_bins, n_bins)))
-        fitted = tables_numba.Fitted(
-            counts, histograms.origin.ravel().astype(np.int64), np.zeros((6, 2)), parameters,
-            np.tile([0, 9], (6, 1)), np.tile([75, 230], (6, 1)),
-        )  # fmt: skip
-        summarise(fitted, 1e-2, 1e-3, tables_numba.PixelLaws(*arrays, codes))
-        results.append([*arrays, *codes[2:]])
-    for one, other in zip(*results, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-8)
-    assert results[0][1][:5, tables_numba.CHI2_MEAN].min() > 0
-
-    support = np.array([[[90, 90, 90], [130, 130, 130], [0, 41, 82]]] * 2, np.int32)
-    tables = np.random.default_rng(1).normal(size=(123, 2)).astype(np.float32)
-    modes, weights = (
-        np.array([[[one] * 3] * 2 for one in values], np.float32) for values in ((1.5, 1.0), (0.3, 0.1, 0.7))
-    )
-    results = []
-    for sum_block in (sums_numba.sum_block, sums_numba.sum_block.py_func):
-        charge, readout = np.zeros((2, 7, 2, 3), np.float32)
-        sums = sums_numba.FrameSums(
-            np.zeros((4, 10, 2)), np.zeros((2, 10, 3), np.float32), np.zeros(10), np.zeros((1, 2, 2, 3)),
-            np.zeros((8, 2, 3)), np.zeros((10, 2)), np.zeros((10, 3), np.float32), np.zeros((3, 2, 3)),
-            np.zeros((3, 2, 3)),
-        )  # fmt: skip
-        channels = sums_numba.Channels(support, tables, modes, weights, np.array([9.0, 6.0]))
-        sum_block(frames, (0, 0, 10), channels, charge, readout, sums)
-        results.append([charge, readout, *sums])
-    for one, other in zip(*results, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
 
 
 def _noise_statistics(loud: np.ndarray | float, seed: int) -> dict[str, float]:

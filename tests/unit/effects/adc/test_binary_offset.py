@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
 
-from pchem_pipeline.discrepancy.observe.digital.groups import BITS, previous_bits
+from pchem_pipeline.discrepancy.observe.digital.groups import BITS
 from pchem_pipeline.effects.adc.binary_offset import BinaryOffset
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.mass import sample_mass
@@ -36,25 +36,6 @@ def test_the_law_has_the_variance_of_all_bits():
         mass = sample_mass(one, maps, codes)[0]
         variances.append(mass @ (codes - mass @ codes) ** 2)
     assert variances[1] - variances[0] == pytest.approx(1.6**2 / 4 * np.sum(np.square(bits)), rel=1e-6)
-
-
-def test_the_regression_is_that_of_numpy():
-    frames = np.random.default_rng(2).integers(90, 140, (4, 3, 5)).astype(np.uint16)
-    noise = np.random.default_rng(3).uniform(2.0, 4.0, (3, 5))
-    found = previous_bits(frames, np.array([0, 4]), np.ones((3, 5), bool), noise)
-    codes = frames.astype(float)
-    rows, own = [], []
-    for pair in (0, 2):
-        for y, x in np.ndindex(3, 4):
-            one, two = frames[pair + 1, y, x], frames[pair, y, x]
-            bits = [int(one) - int(two), *((int(one) >> b & 1) - (int(two) >> b & 1) for b in range(BITS))]
-            rows.append(np.array(bits) / noise[y, x + 1])
-            own.append((codes[pair + 1, y, x + 1] - codes[pair, y, x + 1]) / noise[y, x + 1])
-    design, own = np.array(rows), np.array(own)
-    value, bits = design[:, :1], design[:, 1:]
-    left = bits - value @ np.linalg.lstsq(value, bits, rcond=None)[0]
-    np.testing.assert_allclose(found.square, left.T @ left, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(found.product, left.T @ own, rtol=1e-3, atol=1e-3)
 
 
 TRUE = BinaryOffset(offset_dn=-1.0, bits=(-0.3, -0.5, 0.0, 1.0))

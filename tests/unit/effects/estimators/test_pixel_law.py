@@ -97,14 +97,6 @@ def test_typical_pixels_stand_for_all_usable_ones():
     assert typical_pixels(none)[0].size == 0
 
 
-def test_goodness_grows_with_the_change():
-    law = PixelLaw(maps_of(1.5, 0.1, 100.0, 3.0), 0, N_FRAMES)
-    rows = [law.change(Nonlinearity(step_change=c).sample_law(SampleLaw(), law.maps)) for c in (0.05, 0.1)]
-    small, large = (law.goodness(row, 100_000) for row in rows)
-    assert abs(law.goodness(0.0 * rows[0], 100_000)) < 0.5
-    assert 2 < small < large
-
-
 def test_strength_needs_a_direction_and_a_significance():
     small = Nonlinearity(step_change=1e-3)
     assert strength_of(EVIDENCE, small, "He1C2", sigmas=50.0, signed=True) == []

@@ -11,7 +11,9 @@ from helpers.charge_material import a_sensor, simulated
 from helpers.sensor_of_modes import make
 from pydantic import ValidationError
 
+from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.simulate import chain
@@ -85,6 +87,25 @@ EVERY: list[Effect] = [
     *(make("misplaced_lines", share=0.3, move=move, lines="columns") for move in ("swapped", "line_twice")),
     make("black_clamp", follow=1.0, rows=(0, 2)),
     make("read_order_noise", noise_dn=1.0, taps=2),
+    make(
+        "empirical",
+        share=0.4,
+        moves=[{"towards": (-1, 0, 0), "part": 0.5}, {"towards": (0, 1, 0)}],
+    ),
+    make(
+        "empirical_noise",
+        noise_dn=3.0,
+        modes=[
+            {"of": "sample", "share": 0.5, "lags": [(1, 1, 0), (0, 0, 1)], "correlation": [0.2, 0.2]},
+            {"of": "row", "share": 0.5, "lags": [(0, 2, 0)], "correlation": [-0.4]},
+        ],
+    ),
+    make(
+        "empirical_electrons",
+        chance=0.1,
+        modes=[{"fate": "followed", "place": place} for place in ((1, 0, 0), (0, 1, 0))]
+        + [{"fate": "moved", "place": (0, 1, 0)}],
+    ),
 ]
 # a list of frames stays what it is at any strength
 SCALED = [effect for effect in EVERY if effect.strength and getattr(effect, effect.strength)]
@@ -103,7 +124,10 @@ def test_every_effect_is_described(tag):
     assert kind.power > 0
     assert kind.strength in kind.model_fields or tag == "clipping"
     assert bool(kind.untestable) == (tag in UNTESTABLE)
-    # empirical effects have estimators of their own, and no rivals
+    # empirical effects have estimators of their own, no rivals, and compete with nothing
+    assert (tag in candidate_classes(DiscrepancySettings())) == (
+        tag not in UNTESTABLE and not tag.startswith("empirical")
+    )
     known = tag not in UNTESTABLE and not tag.startswith("empirical")
     assert bool(kind.signature) == bool(kind.separate) == known
     assert set(kind.signature) <= set(STATISTICS)
@@ -139,15 +163,6 @@ def test_every_division_gives_the_same_frames(effect, monkeypatch):
     for t, y in itertools.product([(0, 1), (1, 18), (18, 40)], [(0, 3), (3, 4), (4, 8)]):
         for a, b in zip(frames(*effects, frames=t, rows=y), whole, strict=True):
             np.testing.assert_array_equal(a, b[slice(*t), slice(*y)])
-
-
-@pytest.mark.parametrize("effect", [e for e in STRONG if e.halo() or e.history()], ids=repr)
-def test_without_halo_or_history_the_division_would_show(effect, monkeypatch):
-    whole = frames(effect)[0]
-    monkeypatch.setattr(type(effect), "halo", lambda self: 0)
-    monkeypatch.setattr(type(effect), "history", lambda self: 0)
-    part = frames(effect, frames=(18, 40), rows=(3, 5))[0]
-    assert (part != whole[18:40, 3:5]).any()
 
 
 @pytest.mark.parametrize("effect", [e for e in EVERY if e.plane.value == "analog"], ids=repr)

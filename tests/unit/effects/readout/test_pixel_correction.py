@@ -83,29 +83,6 @@ def test_threshold_and_share_are_found(effect, shape, n_frames, seed):
     assert evidence.z["space.predicted.equal"] > 20.0
 
 
-def test_exchanged_predictions_count_the_same_as_a_loop():
-    from pchem_pipeline.discrepancy.observe.digital.groups import predicted_samples
-
-    frames = np.random.default_rng(3).integers(90, 140, (8, 5, 6)).astype(np.uint16)
-    found = predicted_samples(frames, np.array([0, 8]), np.ones((5, 6), bool))["median"]
-    own, others = np.zeros(found.thresholds.size), np.zeros((3, found.thresholds.size))
-    for first in (0, 4):
-        for i, j in np.ndindex(4, 4):
-            for y, x in np.ndindex(3, 4):
-                above = (
-                    int(frames[first + i, y + 1, x + 1])
-                    - predicted_by_hand(frames[first + j], y + 1, x + 1, "median")
-                    > found.thresholds
-                )
-                if i == j:
-                    own += above
-                else:
-                    others[0] += above / 3
-    np.testing.assert_array_equal(found.above, own)
-    np.testing.assert_allclose(found.above_chance[0], others[0])
-    assert (np.diff(found.above_chance, axis=0) <= 1e-9).all()
-
-
 def test_the_rule_says_what_comes_out_in_the_stead_of_a_sample():
     frames = np.random.default_rng(4).integers(90, 140, (5, 7, 6)).astype(np.uint16)
     effect = PixelCorrection(threshold_dn=12)

@@ -109,26 +109,6 @@ def test_raw_with_more_frames_than_stated(tmp_path: Path) -> None:
     assert "has 5 frames; the first 3 are used" in reader.report.message()
 
 
-@pytest.mark.parametrize("dtype", ["u1", "<u2", ">u2", "<u4", ">u4"])
-@pytest.mark.parametrize("version", [(1, 0), (2, 0), (3, 0)])
-def test_npy(tmp_path: Path, dtype: str, version: tuple[int, int]) -> None:
-    stack = np.random.default_rng(2).integers(0, 256 ** np.dtype(dtype).itemsize, STACK.shape).astype(dtype)
-    path = tmp_path / "a.npy"
-    with path.open("wb") as stream:
-        np.lib.format.write_array(stream, stack, version=version)
-    np.testing.assert_array_equal(read(path), stack)
-    reader = opened(tmp_path / "a.npy")
-    assert reader.dtype.isnative
-    np.testing.assert_array_equal(reader.read(1, 4, 2, 9), stack[1:4, 2:9])
-
-
-def test_npy_single_frames_and_cubes_together(tmp_path: Path) -> None:
-    np.save(tmp_path / "f1.npy", STACK[0])
-    np.save(tmp_path / "f2.npy", STACK[1:4])
-    np.save(tmp_path / "f10.npy", STACK[4])
-    np.testing.assert_array_equal(read(tmp_path), STACK)
-
-
 def test_npy_refusals(tmp_path: Path) -> None:
     path = tmp_path / "a.npy"
 
@@ -139,21 +119,15 @@ def test_npy_refusals(tmp_path: Path) -> None:
         assert str(caught.value).startswith(str(path))
 
     refused(np.array([[{"a": 1}, None]] * 2), "object array")
-    refused(STACK.astype(np.float64), "floating-point")
     refused(STACK.astype(np.complex64), "floating-point")
     refused(STACK.astype(bool), "samples of type bool")
     refused(STACK.astype(np.uint64), "samples of type uint64")
-    refused(STACK.astype(np.int16), "signed samples")
     refused(np.zeros(3, np.uint8), r"needed: \(frames")
-    refused(np.zeros((2, 2, 4, 5), np.uint8), "2 axes before rows and columns")
     refused(np.zeros((2, 1, 6, 5, 3), np.uint8), "2 axes before rows and columns")
     refused(np.zeros((1, 6, 5, 3), np.uint8), "looks like colour")
     refused(np.asfortranarray(STACK), "Fortran order")
     refused(STACK, "input.dtype is uint8", dtype="uint8")
     refused(np.zeros((3, 4), np.dtype([("a", "u1"), ("b", "u2")])), "objects instead of numbers")
-    np.save(path, (STACK & 0x7FFF).astype(">i2"))
-    np.testing.assert_array_equal(read(path, dtype="uint16"), STACK & 0x7FFF)
-    refused(-(STACK & 0xFF).astype(np.int16), "negative samples", dtype="uint16")
 
 
 def test_npy_never_opens_a_pickle(tmp_path: Path) -> None:
@@ -168,14 +142,6 @@ def test_npy_never_opens_a_pickle(tmp_path: Path) -> None:
     (tmp_path / "b.npy").write_bytes(pickle.dumps(Trap()))
     refused("not a valid npy file", tmp_path / "b.npy")
     assert not (tmp_path / "sprung").exists()
-
-
-@pytest.mark.parametrize("kept", [3, 9, 60, 128, 129, -1])
-def test_npy_truncated(tmp_path: Path, kept: int) -> None:
-    path = tmp_path / "a.npy"
-    np.save(path, STACK)
-    path.write_bytes(path.read_bytes()[:kept])
-    refused("truncated", path)
 
 
 def ser_bytes(stack: NDArray[Any], depth: int, colour: int = 0, flag: int = 0, times: bool = False) -> bytes:

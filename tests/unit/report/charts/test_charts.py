@@ -188,16 +188,6 @@ def test_a_map_lies_where_its_axes_say() -> None:
     assert axes.images[0].get_extent() == [0.0, 3.0, 5.0, 0.0]
 
 
-def test_of_many_pixels_every_odd_th_is_drawn_and_none_moves() -> None:
-    values = np.arange(90.0 * 1300).reshape(90, 1300)
-    image = Image(values, even_edges(0.0, 1.0), (-0.5, 1299.5), (-0.5, 89.5))
-    some, x, y = image.shown(346.0)
-    np.testing.assert_array_equal(some, values[::3, ::3])
-    assert x == pytest.approx((-0.5, 3 * 434 - 0.5))
-    assert y == pytest.approx((-0.5, 89.5))
-    assert image.shown(1300.0)[0].shape == values.shape
-
-
 def test_the_colours_of_maps_are_those_of_matplotlib() -> None:
     expected = 255.0 * mpl.colormaps[MAP_COLOURS](np.arange(256))[:, :3]
     assert np.abs(shades() - expected).max() < 2.6

@@ -198,12 +198,6 @@ def test_a_map_of_more_pixels_than_an_image_can_show_has_every_odd_th_of_them() 
     assert draw_chart(Look(dpi=600), chart).axes[1].images[0].get_array().shape == values.shape
 
 
-def test_pixels_without_a_value_are_counted_in_the_map() -> None:
-    values = _map("holes")
-    assert f"no value: {np.isnan(values).sum()} pixels" in texts(bias(values))
-    assert "no value:" not in texts(bias(_map("plain")))
-
-
 def test_the_median_of_the_read_noise_is_marked() -> None:
     values = _map("plain") * 0.15
     figure = read_noise(values)
@@ -299,24 +293,6 @@ def test_component_widths(arrays: dict[str, np.ndarray], width: float) -> None:
     drawn(figure)
     drawn(draw_chart(LOOK, components_chart(component_table(variance[:1, :1], CASES[:1]))))
     drawn(draw_chart(LOOK, components_chart(component_table(np.zeros_like(variance), CASES))))
-
-
-@pytest.mark.parametrize("kind", ["svg", "png", "pdf"])
-def test_the_same_figure_gives_the_same_bytes(pixel: PixelFit, kind: str) -> None:
-    tables = cell_tables(pixel.parameters, pixel)
-    first, second = (
-        drawing_bytes(draw_chart(LOOK, cells_chart(tables)), kind, dpi=60, title="a <title>")
-        for _ in range(2)
-    )
-    assert first == second
-
-
-def test_fonts_are_embedded(pixel: PixelFit) -> None:
-    figure = draw_chart(LOOK, cells_chart(cell_tables(pixel.parameters)))
-    svg = drawing_bytes(figure, "svg").decode()
-    assert "<text" not in svg
-    pdf = drawing_bytes(figure, "pdf")
-    assert b"/FontFile2" in pdf
 
 
 def test_drawing_leaves_the_users_settings_alone(pixel: PixelFit) -> None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ from helpers.discrepancy_material import (
     step,
     verdict_of,
 )
+from helpers.html_page import HOSTILE, Page, harmless
 from helpers.report_material import report_data
 
 from pchem_pipeline.base.variables import variables_of
@@ -34,10 +33,8 @@ from pchem_pipeline.report.figures.catalogue import DISCREPANCY_FIGURES, discrep
 from pchem_pipeline.report.figures.discrepancy_gap import largest_pulls
 from pchem_pipeline.report.figures.discrepancy_sensor import largest_maps, regions_of
 from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.pages import report as report_module
 from pchem_pipeline.report.pages.discrepancy import frames_text, key_facts, remarks
 from pchem_pipeline.report.pages.discrepancy_tables import discrepancy_tables, place_text
-from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.report.settings import ReportSettings
@@ -48,31 +45,6 @@ from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 
 DISCREPANCY_NAMES = [name for _, name in DISCREPANCY_FIGURES]
 QUICK = ReportSettings(figure_formats=(), dpi=72)
-HOSTILE = '<script>alert("x")</script>$x^{ \'{{ 7*7 }}'
-
-
-class Page(HTMLParser):
-    """Every tag with its attributes, and the text."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.words: list[str] = []
-        self._style = False
-        self.feed(html)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        self._style = tag == "style"
-
-    def handle_data(self, data: str) -> None:
-        if not self._style:
-            self.words.append(data)
-        self._style = False
-
-    @property
-    def text(self) -> str:
-        return re.sub(r"\s+", " ", " ".join(self.words))
 
 
 @pytest.fixture(scope="module")
@@ -80,33 +52,8 @@ def base() -> ReportData:
     return ReportData(title="my sensor", shape=(8, 8), run={"store": "run.zarr"})
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Texts without pictures: fast."""
-
-    def dots(figures: Sequence[Figure], settings: ReportSettings) -> dict[str, Drawn]:
-        return {figure.name: Drawn("data:image/png;base64,AA==", 10, 10) for figure in figures}
-
-    monkeypatch.setattr(report_module, "draw_here", dots)
-
-
 def rendered(base: ReportData, data: DiscrepancyData | None) -> RenderedReport:
     return render_report(replace(base, discrepancy=data), QUICK)
-
-
-def harmless(html: str) -> Page:
-    page = Page(html)
-    for tag, attributes in page.tags:
-        assert tag not in ("link", "iframe", "object", "embed", "base", "form")
-        assert tag != "script" or set(attributes) <= {"type", "id"}  # its policy: test_report_html.py
-        for name, value in attributes.items():
-            assert not name.startswith("on")
-            if name in ("src", "srcset", "href"):
-                assert str(value).startswith(("data:image/", "#"))
-    ids = [a["id"] for _, a in page.tags if a.get("id")]
-    assert len(ids) == len(set(ids))
-    assert {str(a["href"])[1:] for tag, a in page.tags if tag == "a"} <= set(ids)
-    return page
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -142,7 +89,7 @@ def test_the_verdict_comes_first(base: ReportData, verdict: str) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_named_effect_has_all_its_evidence(base: ReportData) -> None:
-    text = Page(rendered(base, discrepancy_data("named")).pages["discrepancy.html"]).text.replace("\xa0", " ")
+    text = Page(rendered(base, discrepancy_data("named")).pages["discrepancy.html"]).text
     for words in (
         "0.35 DN",
         "10 % of the",
@@ -198,32 +145,32 @@ def test_the_legend_over_the_scatter_of_lines_covers_no_point() -> None:
         assert (top - low) / (high - low) < 0.8
 
 
-def test_frames_that_no_part_has_are_told() -> None:
-    seen = {"frames": 1000, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320,
-            "histograms": None}  # fmt: skip
-    words = "; 40 left over."
-    assert frames_text(discrepancy_data("named", examined=seen).found).endswith(words)
-    whole = {**seen, "frames": 960}
-    assert "left over" not in frames_text(discrepancy_data("named", examined=whole).found)
-
-
-def test_where_the_model_was_looked_at_again_is_told() -> None:
-    seen = {"frames": 960, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320,
-            "elsewhere": {"rows": [8, 16], "columns": [0, 8]}}  # fmt: skip
-    found = discrepancy_data("named", examined=seen).found
-    words = "tested again in rows 8 to 15, columns 0 to 7: the model holds"
-    assert frames_text(found).endswith(f" The final model was {words}.")
-    assert words in verdict_text(found)
-
-
-def test_pixels_that_are_not_compared_are_told_with_their_place() -> None:
-    seen = {"frames": 960, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320,
-            "histograms": None, "unfitted": 7}  # fmt: skip
-    words = frames_text(discrepancy_data("named", examined=seen).found)
-    assert words.endswith(" Not compared: 7 pixels without a reliable fit.")
-    spot = {"map": "unfitted", "region": {"columns": [[2, 5]]}, "p": 1e-6}
-    words = frames_text(discrepancy_data("named", examined={**seen, "places": [spot]}).found)
-    assert words.endswith(", clustered in columns 2 to 4.")
+@pytest.mark.parametrize(
+    ("examined", "words"),
+    [
+        ({}, ""),
+        ({"frames": 1000}, "; 40 left over."),
+        (
+            {"elsewhere": {"rows": [8, 16], "columns": [0, 8]}},
+            " The final model was tested again in rows 8 to 15, columns 0 to 7: the model holds.",
+        ),
+        ({"unfitted": 7}, " Not compared: 7 pixels without a reliable fit."),
+        (
+            {
+                "unfitted": 7,
+                "places": [{"map": "unfitted", "region": {"columns": [[2, 5]]}, "p": 1e-6}],
+            },
+            ", clustered in columns 2 to 4.",
+        ),
+    ],
+)
+def test_what_was_looked_at_is_told(examined: dict[str, Any], words: str) -> None:
+    seen = {"frames": 960, "rows": [0, 8], "columns": [0, 8], "train": 320, "test": 320, "final": 320}
+    found = discrepancy_data("named", examined={**seen, **examined}).found
+    assert frames_text(found).endswith(words)
+    assert ("left over" in frames_text(found)) == ("frames" in examined)
+    again = words.removeprefix(" The final model was ").removesuffix(".")
+    assert "elsewhere" not in examined or again in verdict_text(found)
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -167,11 +167,22 @@ def test_two_taps_are_said_with_the_medians_of_both() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ratio", "p", "level"),
-    [(1.5, 0.2, "good"), (1.2, 1e-9, "good"), (1.5, 1e-9, "caution"), (4.0, 1e-9, "serious")],
+    ("ratio", "p", "level", "words"),
+    [
+        (1.5, 0.2, "good", ""),
+        (1.2, 1e-9, "good", ""),
+        (1.5, 1e-9, "caution", ""),
+        (4.0, 1e-9, "serious", ""),
+        (1.1, None, "good", "describes the data"),
+        (2.0, None, "caution", "small differences"),
+        (5.0, None, "serious", "does not describe"),
+    ],
 )
-def test_a_difference_counts_where_it_is_large_and_no_chance(ratio: float, p: float, level: str) -> None:
-    facts = {"rmse": {"epcd_exact": ratio, "noise_floor": 1.0}, "chi_square": {"p": p}}
+def test_a_difference_counts_where_it_is_large_and_no_chance(
+    ratio: float, p: float | None, level: str, words: str
+) -> None:
+    facts = {"rmse": {"epcd_exact": ratio, "noise_floor": 1.0}}
+    facts |= {} if p is None else {"chi_square": {"p": p}}
     data = replace(report_data((8, 8), failed=0.0), ensemble_facts=facts)
     (found,) = (flag for flag in flags(data) if flag.text.startswith("The RMSE of the predicted raw"))
-    assert found.level == level
+    assert (found.level, words in found.text) == (level, True)

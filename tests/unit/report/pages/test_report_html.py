@@ -5,12 +5,11 @@ import gzip
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from helpers.html_page import HOSTILE, Page, harmless
 from helpers.quick_stacks import stack, sums_of
 from helpers.report_material import pixel_fit, report_data, true_maps
 
@@ -19,15 +18,13 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.charts.chart import Image
 from pchem_pipeline.report.data import MAP_NAMES, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import REPORT_FIGURES, report_figures
-from pchem_pipeline.report.figures.figure import DataTable, Figure, csv_text
+from pchem_pipeline.report.figures.figure import DataTable, csv_text
 from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.figures.trust import left_out_chart
 from pchem_pipeline.report.inspector.inspector import script
-from pchem_pipeline.report.pages import report as report_module
 from pchem_pipeline.report.pages.cite import citation
 from pchem_pipeline.report.pages.glossary import GLOSSARY, explained
 from pchem_pipeline.report.pages.page import chart_script, figure_tables, page_script
-from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.report.pages.summary import flags, key_numbers, sentence
 from pchem_pipeline.report.pages.tables import result_tables
@@ -54,36 +51,6 @@ FIGURES = tuple(name for _, names in REPORT_FIGURES for name in names if name no
 QUICK = ReportSettings(figure_formats=(), dpi=72)
 
 
-class Page(HTMLParser):
-    """Every tag with its attributes, and the text."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.words: list[str] = []
-        self.style = ""
-        self._in_style = False
-        self.feed(html)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        self._in_style = tag == "style"
-
-    def handle_data(self, data: str) -> None:
-        if self._in_style:
-            self.style += data
-            self._in_style = False
-        else:
-            self.words.append(data)
-
-    @property
-    def text(self) -> str:
-        return re.sub(r"\s+", " ", " ".join(self.words))
-
-    def of(self, tag: str) -> Iterator[dict[str, str | None]]:
-        return (attributes for name, attributes in self.tags if name == tag)
-
-
 @pytest.fixture(scope="module")
 def data() -> ReportData:
     frames = stack(np.random.default_rng(2), (300, 24, 32))
@@ -97,19 +64,10 @@ def report(data: ReportData) -> RenderedReport:
 
 @pytest.fixture(scope="module")
 def page(report: RenderedReport) -> Page:
-    return Page(report.html)
+    return harmless(report.html)
 
 
 def test_nothing_is_loaded_from_anywhere(page: Page) -> None:
-    for tag, attributes in page.tags:
-        assert tag not in ("link", "iframe", "object", "embed", "base", "form")
-        for name, value in attributes.items():
-            assert not name.startswith("on")
-            if name in ("src", "srcset", "href", "data", "poster", "action", "background"):
-                assert value is not None
-                assert value.startswith(("data:image/", "#")), (tag, name, value[:60])
-    assert "url(" not in page.style
-    assert "@import" not in page.style
     policy = next(a for a in page.of("meta") if a.get("http-equiv") == "Content-Security-Policy")
     rules = dict(rule.strip().split(" ", 1) for rule in str(policy["content"]).split(";"))
     assert (
@@ -118,7 +76,6 @@ def test_nothing_is_loaded_from_anywhere(page: Page) -> None:
     assert rules["img-src"] == "data:"
     # no script but the one whose hash is in the policy; data blocks are not run
     scripts = [a for a in page.of("script") if a.get("type") not in ("application/json", "text/plain")]
-    assert all(set(a) <= {"type", "id"} for a in page.of("script"))
     digests = [
         f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
         for text in (page_script(), chart_script(), script())
@@ -144,14 +101,6 @@ def test_every_figure_of_the_paper_is_there_and_described(
         assert image["width"]
     median = np.nanmedian(np.where(data.flagged_in("read_noise_e"), np.nan, data.maps["read_noise_e"]))
     assert any(f"read noise: median {median:.4f}" in str(image["alt"]) for image in images)
-
-
-def test_contents_lead_somewhere_and_ids_are_unique(page: Page) -> None:
-    ids = [a["id"] for _, a in page.tags if a.get("id")]
-    assert len(ids) == len(set(ids))
-    targets = [str(a["href"])[1:] for a in page.of("a")]
-    assert len(targets) >= 10
-    assert set(targets) <= set(ids)
 
 
 def test_tables_have_headings_and_scroll_by_keyboard(page: Page) -> None:
@@ -217,22 +166,6 @@ def test_the_tables_are_there(page: Page, words: str) -> None:
     assert words in page.text
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Texts without pictures: fast."""
-
-    def dots(figures: Sequence[Figure], settings: ReportSettings) -> dict[str, Drawn]:
-        return {figure.name: Drawn("data:image/png;base64,AA==", 10, 10) for figure in figures}
-
-    monkeypatch.setattr(report_module, "draw_here", dots)
-
-
-HOSTILE = (
-    '<script>alert("x")</script><img src=http://evil.example/x onerror=alert(1)>"\'{{ 7*7 }} '
-    "$x^{ \u4e2d\U0001f600"
-)
-
-
 def test_hostile_metadata_is_shown_not_run(data: ReportData) -> None:
     small = report_data((8, 8))
     pixel = replace(small.pixels[0], label=HOSTILE, status=HOSTILE)
@@ -249,7 +182,7 @@ def test_hostile_metadata_is_shown_not_run(data: ReportData) -> None:
         ensemble={},
     )
     rendered = render_report(odd, QUICK)
-    shown = Page(rendered.html)
+    shown = harmless(rendered.html)
     test_nothing_is_loaded_from_anywhere(shown)
     assert shown.text.count('<script>alert("x")</script>') >= 6
     assert "{{ 7*7 }}" in shown.text
@@ -412,21 +345,6 @@ def test_no_sample_left_out_is_white_and_samples_are_whole_numbers() -> None:
     (image,) = (mark for mark in right.panels[0].marks if isinstance(mark, Image))
     assert image.none == "paper"
     assert np.isfinite(image.values).sum() == 1
-
-
-@pytest.mark.parametrize(
-    ("change", "level", "words"),
-    [
-        ({"rmse": {"epcd_exact": 5e-4, "noise_floor": 1e-4}}, "serious", "does not describe"),
-        ({"rmse": {"epcd_exact": 2e-4, "noise_floor": 1e-4}}, "caution", "small differences"),
-        ({"rmse": {"epcd_exact": 1.1e-4, "noise_floor": 1e-4}}, "good", "describes the data"),
-    ],
-)
-def test_flags_of_the_ensemble(
-    data: ReportData, change: dict[str, dict[str, float]], level: str, words: str
-) -> None:
-    found = [flag for flag in flags(replace(data, ensemble_facts=change)) if "raw ensemble" in flag.text]
-    assert [(flag.level, words in flag.text) for flag in found] == [(level, True)]
 
 
 def test_how_to_cite_has_the_numbers_and_the_papers(page: Page, data: ReportData) -> None:

@@ -1,5 +1,7 @@
 """Numbers in words."""
 
+from collections.abc import Callable
+
 import pytest
 
 from pchem_pipeline.base.variables import VARIABLES
@@ -18,91 +20,79 @@ from pchem_pipeline.report.style.wording import (
     visible,
 )
 
+NAN, INF = float("nan"), float("inf")
+IN_WORDS = {
+    short: [
+        ((0.0, 3), "0"),
+        ((0.30512, 3), "0.305"),
+        ((-2.5, 2), "−2.5"),
+        ((1.9e-4, 2), "1.9×10⁻⁴"),
+        ((9.996e-5, 3), "1.00×10⁻⁴"),
+        ((0.00123, 2), "0.0012"),
+        ((123456.0, 3), "1.23×10⁵"),
+        ((17750.0, 3), "17750"),
+        ((99.96, 3), "100"),
+        ((NAN, 3), "not known"),
+    ],
+    # two digits of the error
+    measured: [
+        ((2.01344, 0.01234, "e⁻"), "2.013 ± 0.012 e⁻"),
+        ((0.0953671, 0.000024, "e⁻"), "0.095367 ± 0.000024 e⁻"),
+        ((100.04, 12.3, "e⁻"), "100 ± 12 e⁻"),
+        ((-0.5, 0.0996, "e⁻"), "−0.50 ± 0.10 e⁻"),
+        ((2.0, NAN, "e⁻"), "2.000 e⁻"),
+        ((2.0, 0.0, "e⁻"), "2.000 e⁻"),
+        ((NAN, 1.0, "e⁻"), "not known"),
+    ],
+    # a number that was chosen claims no precision
+    fitted_or_chosen: [
+        ((30.0, NAN, "frames"), "30 frames"),
+        ((0.2, NAN), "0.2"),
+        ((100.0, NAN, "DN"), "100 DN"),
+        ((2.0, 0.01, "DN"), "2.000 ± 0.010 DN"),
+    ],
+    # some are never none or all
+    percent: [
+        ((0, 10), "0 %"),
+        ((1, 1_000_000), "< 0.01 %"),
+        ((5, 1000), "0.50 %"),
+        ((1, 3), "33 %"),
+        ((999, 1000), "99.9 %"),
+        ((2.065, 1.0), "206 %"),
+        ((999_999, 1_000_000), "> 99.99 %"),
+        ((7, 7), "100 %"),
+        ((0, 0), "0 %"),
+    ],
+    scientific: [
+        ((0.00115,), "1.1×10⁻³"),
+        ((9.34e-4,), "9.3×10⁻⁴"),
+        ((-2.0,), "−2.0"),
+        ((1234.0,), "1.2×10³"),
+        ((INF,), "not known"),
+    ],
+    signed: [
+        ((1.24,), "+1.2"),
+        ((-0.3,), "−0.3"),
+        ((-0.04,), "0.0"),
+        ((0.0,), "0.0"),
+        ((NAN,), "not known"),
+    ],
+    count: [((1, "pixel"), "1 pixel"), ((17_750, "frame"), "17,750 frames")],
+    unit_text: [(("e-/DN",), "e⁻/DN"), (("1",), ""), (("furlong",), "furlong")],
+}
+
 
 @pytest.mark.parametrize(
-    ("value", "digits", "text"),
-    [
-        (0.0, 3, "0"),
-        (0.30512, 3, "0.305"),
-        (-2.5, 2, "−2.5"),
-        (1.9e-4, 2, "1.9×10⁻⁴"),
-        (9.996e-5, 3, "1.00×10⁻⁴"),
-        (0.00123, 2, "0.0012"),
-        (123456.0, 3, "1.23×10⁵"),
-        (17750.0, 3, "17750"),
-        (99.96, 3, "100"),
-        (float("nan"), 3, "not known"),
-    ],
+    ("words", "given", "text"),
+    [(words, *case) for words, cases in IN_WORDS.items() for case in cases],
 )
-def test_short(value: float, digits: int, text: str) -> None:
-    assert short(value, digits) == text
+def test_numbers_in_words(words: Callable[..., str], given: tuple[object, ...], text: str) -> None:
+    assert words(*given) == text
 
 
 @pytest.mark.parametrize(
-    ("value", "error", "text"),
+    "name",
     [
-        (2.01344, 0.01234, "2.013 ± 0.012 e⁻"),
-        (0.0953671, 0.000024, "0.095367 ± 0.000024 e⁻"),
-        (100.04, 12.3, "100 ± 12 e⁻"),
-        (-0.5, 0.0996, "−0.50 ± 0.10 e⁻"),
-        (2.0, float("nan"), "2.000 e⁻"),
-        (2.0, 0.0, "2.000 e⁻"),
-        (float("nan"), 1.0, "not known"),
-    ],
-)
-def test_measured_rounds_to_two_digits_of_the_error(value: float, error: float, text: str) -> None:
-    assert measured(value, error, "e⁻") == text
-
-
-def test_a_number_that_was_chosen_claims_no_precision() -> None:
-    assert fitted_or_chosen(30.0, float("nan"), "frames") == "30 frames"
-    assert fitted_or_chosen(0.2, float("nan")) == "0.2"
-    assert fitted_or_chosen(100.0, float("nan"), "DN") == "100 DN"
-    assert fitted_or_chosen(2.0, 0.01, "DN") == "2.000 ± 0.010 DN"
-
-
-@pytest.mark.parametrize(
-    ("part", "whole", "text"),
-    [
-        (0, 10, "0 %"),
-        (1, 1_000_000, "< 0.01 %"),
-        (5, 1000, "0.50 %"),
-        (1, 3, "33 %"),
-        (999, 1000, "99.9 %"),
-        (2.065, 1.0, "206 %"),
-        (999_999, 1_000_000, "> 99.99 %"),
-        (7, 7, "100 %"),
-        (0, 0, "0 %"),
-    ],
-)
-def test_percent_never_rounds_some_to_none_or_all(part: int, whole: int, text: str) -> None:
-    assert percent(part, whole) == text
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (0.00115, "1.1×10⁻³"),
-        (9.34e-4, "9.3×10⁻⁴"),
-        (-2.0, "−2.0"),
-        (1234.0, "1.2×10³"),
-        (float("inf"), "not known"),
-    ],
-)
-def test_scientific(value: float, text: str) -> None:
-    assert scientific(value) == text
-
-
-def test_count_and_units() -> None:
-    assert count(1, "pixel") == "1 pixel"
-    assert count(17_750, "frame") == "17,750 frames"
-    assert unit_text("e-/DN") == "e⁻/DN"
-    assert unit_text("1") == ""
-    assert unit_text("furlong") == "furlong"
-
-
-def test_the_units_of_maps_are_those_of_the_store() -> None:
-    for name in (
         "quanta_exposure",
         "conversion_gain",
         "bias",
@@ -110,16 +100,10 @@ def test_the_units_of_maps_are_those_of_the_store() -> None:
         "read_noise_e",
         "charge_rate",
         "dark_current",
-    ):
-        assert symbol(name)[2] == unit_text(VARIABLES[f"maps/{name}"].unit)
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(1.24, "+1.2"), (-0.3, "−0.3"), (-0.04, "0.0"), (0.0, "0.0"), (float("nan"), "not known")],
+    ],
 )
-def test_signed(value: float, text: str) -> None:
-    assert signed(value) == text
+def test_the_units_of_maps_are_those_of_the_store(name: str) -> None:
+    assert symbol(name)[2] == unit_text(VARIABLES[f"maps/{name}"].unit)
 
 
 def test_plain_sentences_get_the_signs_of_a_page() -> None:

@@ -36,27 +36,27 @@ def camera(seed, add, shape=SHAPE, n_frames=FRAMES, noise=0.28):
     return np.rint(np.clip(x + add(rng, charge.shape), 0, 4095)).astype(np.uint16)
 
 
-def rows_of_columns(rng, shape):
-    offsets = np.zeros(shape)
-    offsets[:, :, 24:29] = rng.normal(0.0, 1.2, (*shape[:2], 1))
-    return offsets
+def placed(part, size, *common):
+    """Return what adds normal noise, DN, that samples of a part share along some axes."""
+
+    def add(rng, shape):
+        offsets = np.zeros(shape)
+        lengths = [1 if axis in common else n for axis, n in enumerate(offsets[part].shape)]
+        offsets[part] = rng.normal(0.0, size, lengths)
+        return offsets
+
+    return add
 
 
-def frames_of_quadrant(rng, shape):
-    offsets = np.zeros(shape)
-    offsets[:, 16:, :16] = rng.normal(0.0, 0.6, (shape[0], 1, 1))
-    return offsets
+rows_of_columns = placed(np.s_[:, :, 24:29], 1.2, 2)
+frames_of_quadrant = placed(np.s_[:, 16:, :16], 0.6, 1, 2)
+rows_of_frames = placed(np.s_[600:760], 0.7, 2)
+late_flicker = placed(np.s_[1176:1336], 4.0, 1, 2)
 
 
 def every_eighth(rng, shape):
     offsets = np.zeros(shape)
     offsets[:, :, 3::8] = 0.4 * (1 - 2 * (np.arange(shape[0]) % 2))[:, None, None]
-    return offsets
-
-
-def rows_of_frames(rng, shape):
-    offsets = np.zeros(shape)
-    offsets[600:760] = rng.normal(0.0, 0.7, (160, shape[1], 1))
     return offsets
 
 
@@ -218,12 +218,6 @@ def test_an_effect_in_a_tap_of_a_window_is_named_with_its_place():
     assert step.place == "columns 64 to 68"
 
 
-def late_flicker(rng, shape):
-    offsets = np.zeros(shape)
-    offsets[1176:1336] = 4.0 * rng.standard_normal((160, 1, 1))
-    return offsets
-
-
 def split_of(frames):
     return ObservedFrames.of(stacked(frames)).frames
 
@@ -260,11 +254,7 @@ def test_a_range_of_few_frames_of_poor_pixels_has_statistics():
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("tag", "rows"), [("row_noise", 16), ("frame_noise", 1)])
 def test_estimators_look_at_frames_of_a_period_that_have_no_next_one(tag, rows):
-    def every_tenth(rng, shape):
-        moved = rng.normal(0.0, 1.5, (shape[0], rows, 1))
-        moved[np.arange(shape[0]) % 10 != 7] = 0.0
-        return moved
-
+    every_tenth = placed(np.s_[7::10], 1.5, *((2,) if rows > 1 else (1, 2)))
     frames, numbers = camera(14, every_tenth, (16, 24)), np.arange(FRAMES)
     evidence = observe(frames, numbers, n_run=FRAMES, block_frames=50)
     [part] = suspected_parts(evidence, frames)

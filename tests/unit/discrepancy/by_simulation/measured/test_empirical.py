@@ -12,14 +12,12 @@ from helpers.charge_material import simulated as simulated_frames
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings, _sentence
-from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import (
     _Mixture,
     measured_mixture_shifts,
     without_squares,
 )
 from pchem_pipeline.discrepancy.gap import Gap
-from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.verdict import closed_share
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -226,18 +224,7 @@ def test_what_is_moved_together_comes_from_one_side(together: Any, axes: Any) ->
     assert abs(whole.mean() - 0.3) < 5 * np.sqrt(0.21 / whole.size) + 0.01
 
 
-def test_the_same_frames_at_every_division() -> None:
-    moves = (MixtureShift(towards=(-1, 0, 0), part=0.5), MixtureShift(towards=(0, 1, 0)))
-    effect = Empirical(share=0.4, moves=moves)
-    whole, part = (
-        simulated_frames(SENSOR, effect, n_frames=30, seed=4, frames=some, rows=rows)[0]
-        for some, rows in ((None, None), ((9, 22), (3, 6)))
-    )
-    np.testing.assert_array_equal(part, whole[9:22, 3:6])
-
-
-def test_it_competes_with_nothing_and_refuses_half_a_table() -> None:
-    assert "empirical" not in candidate_classes(DiscrepancySettings())
+def test_half_a_table_is_refused() -> None:
     with pytest.raises(ValidationError, match="earlier"):
         MixtureShift(towards=(1, 0, 0))
     with pytest.raises(ValidationError, match="weight above 0"):

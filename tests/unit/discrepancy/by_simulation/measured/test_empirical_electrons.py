@@ -11,11 +11,9 @@ from helpers.charge_material import a_uniform_sensor
 from helpers.charge_material import simulated as simulated_frames
 from pydantic import ValidationError
 
-from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.by_simulation.measured.electrons import electron_chances, measured_electrons
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import PartSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -179,21 +177,7 @@ def test_the_law_has_the_mean_of_electrons_with_those_that_follow(place: tuple[i
     assert abs(mean - 2.0) > 20 * error
 
 
-def test_simulated_frames_do_not_depend_on_how_they_are_cut() -> None:
-    modes = (
-        ElectronMode(fate="followed", place=(1, 0, 0)),
-        ElectronMode(fate="followed", place=(0, 1, 0)),
-        ElectronMode(fate="moved", place=(0, 1, 0)),
-    )
-    effect = EmpiricalElectrons(chance=0.1, modes=modes)
-    whole, part = (
-        simulated_frames(QUIET, effect, n_frames=40, seed=5, frames=some)[0] for some in (None, (10, 20))
-    )
-    np.testing.assert_array_equal(whole[10:20], part)
-
-
-def test_it_competes_with_nothing_and_refuses_what_cannot_be() -> None:
-    assert "empirical_electrons" not in candidate_classes(DiscrepancySettings())
+def test_what_cannot_be_is_refused() -> None:
     with pytest.raises(ValidationError, match="this frame or a later one"):
         ElectronMode(fate="followed", place=(-1, 0, 0))
     with pytest.raises(ValidationError, match="another sample"):

@@ -215,21 +215,6 @@ def test_the_simulated_wave_has_its_frequencies_and_its_size(wave: tuple[float, 
     assert abs(rms - 0.05) < 5 * np.sqrt(1.05 / (4 * SHAPE[0] * SHAPE[1] * FRAMES))
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"of": "frame"},
-        {"wave": (0.6, 0.0, 0.0)},
-        {"wave": (0.1, 0.2, 0.1)},
-        {"burst": 0.1},
-        {"lags": ((1, 0, 0),), "correlation": (0.1,)},
-    ],
-)
-def test_a_wave_is_below_half_a_cycle_along_its_own_axes_and_nothing_else(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError, match="wave"):
-        NoiseMode(**{"of": "row", "share": 1.0, "changes": "gain", "wave": (0.1, 0.2, 0.0), **wrong})
-
-
 def test_an_offset_that_takes_turns_is_told_as_that() -> None:
     mode = NoiseMode(of="sample", share=1.0, wave=(0.5, 0.5, -0.5))
     assert mode.describe(0.3) == (
@@ -292,13 +277,6 @@ def test_simulated_bursts_are_as_rare_and_where_they_are_told() -> None:
     assert rest.max() < 6 * STEP
 
 
-def test_half_a_mode_is_refused() -> None:
-    with pytest.raises(ValidationError, match="leave lags out"):
-        NoiseMode(of="frame", share=1.0, burst=0.1, lags=((1, 0, 0),), correlation=(0.1,))
-    with pytest.raises(ValidationError, match="equally many"):
-        NoiseMode(of="row", share=1.0, shape=((1.0,),))
-
-
 def test_a_hit_by_a_particle_needs_no_tables_of_its_codes_and_outweighs_no_other_sample() -> None:
     """As many codes as the law reaches; what lies beyond counts as the last of them."""
     stack, maps = frames(1, gain=1.0 + 0.02 * drawn(FRAMES, 1, 1))
@@ -343,11 +321,21 @@ def test_a_shape_that_was_found_in_a_window_is_there_on_the_sensor_and_nowhere_e
         assert "strongest in rows 10 to 25 and columns 20 to 39" in of_sensor.describe()
 
 
-def test_an_effect_without_a_shape_is_the_same_in_every_window() -> None:
-    effect = EmpiricalNoise.typical()[0]
-    assert effect.to_window((3, 9), (2, 8), (20, 20)) == effect == effect.to_sensor((3, 9), (2, 8), (20, 20))
-
-
-def test_an_extent_without_pixels_is_refused() -> None:
-    with pytest.raises(ValidationError, match="extent"):
-        NoiseMode(of="frame", share=1.0, shape=((1.0,),), extent=((4, 4), (0, 2)))
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"of": "frame", "wave": (0.1, 0.2, 0.0)}, "wave"),
+        ({"wave": (0.6, 0.0, 0.0)}, "wave"),
+        ({"wave": (0.1, 0.2, 0.1)}, "wave"),
+        ({"wave": (0.1, 0.2, 0.0), "burst": 0.1}, "wave"),
+        ({"wave": (0.1, 0.2, 0.0), "lags": ((1, 0, 0),), "correlation": (0.1,)}, "wave"),
+        ({"burst": 0.1, "lags": ((1, 0, 0),), "correlation": (0.1,)}, "leave lags out"),
+        ({"shape": ((1.0,),)}, "equally many"),
+        ({"of": "frame", "shape": ((1.0,),), "extent": ((4, 4), (0, 2))}, "extent"),
+        ({"of": "sample", "lags": ((0, 1, 0),)}, "one correlation"),
+        ({"lags": ((0, 0, 1),), "correlation": (0.1,)}, "0 within it"),
+    ],
+)
+def test_a_mode_that_contradicts_itself_is_refused(wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        NoiseMode(**{"of": "row", "share": 1.0, **({"changes": "gain"} if "wave" in wrong else {}), **wrong})

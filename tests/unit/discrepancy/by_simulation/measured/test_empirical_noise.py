@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 from helpers.charge_material import a_uniform_sensor
 from helpers.charge_material import simulated as simulated_frames
-from pydantic import ValidationError
 
-from pchem_pipeline.config.load import parse_config
-from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.by_simulation.measured.noise import (
     Covariance,
@@ -190,20 +187,6 @@ def test_the_simulated_noise_has_its_power_and_correlations(mode):
         assert abs(wanted) > 10 * (error if mode.of != "frame" else error / 4)
 
 
-def test_the_same_frames_at_every_division():
-    modes = (
-        NoiseMode(of="sample", share=0.5, lags=((1, 1, 0), (0, 0, 1)), correlation=(0.2, 0.2)),
-        NoiseMode(of="row", share=0.5, lags=((0, 2, 0),), correlation=(-0.4,)),
-    )
-    effect = EmpiricalNoise(noise_dn=3.0, modes=modes)
-    sensor = a_uniform_sensor(SHAPE, 1.0, 0.1, 100.0, 0.2)
-    whole, part = (
-        simulated_frames(sensor, effect, n_frames=20, seed=8, frames=some, rows=rows)[0]
-        for some, rows in ((None, None), ((7, 12), (5, 9)))
-    )
-    np.testing.assert_array_equal(part, whole[7:12, 5:9])
-
-
 def test_the_law_of_a_pixel_has_its_variance():
     effect = EmpiricalNoise.typical()[0].scaled(4.0)
     maps = PixelMaps(*(np.array([v]) for v in (1.2, 1 / STEP, 100.0, 3.0)), np.ones(1, bool))
@@ -218,30 +201,6 @@ def test_the_spectrum_of_one_distance_is_a_cosine():
     found = spectrum(((0, 1, 0),), (0.5,))
     assert found.shape == (1, 8, 1)
     np.testing.assert_allclose(found[0, :, 0], np.cos(2 * np.pi * np.arange(8) / 8), atol=1e-12)
-
-
-def test_it_competes_with_nothing_and_refuses_what_is_no_correlation():
-    assert "empirical_noise" not in candidate_classes(DiscrepancySettings())
-    with pytest.raises(ValidationError, match="one correlation"):
-        NoiseMode(of="sample", share=1.0, lags=((0, 1, 0),))
-    with pytest.raises(ValidationError, match="0 within it"):
-        NoiseMode(of="row", share=1.0, lags=((0, 0, 1),), correlation=(0.1,))
-
-
-def test_it_is_written_in_a_yaml():
-    text = """
-simulate: {shape: [8, 8], n_frames: 100, output: frames}
-model:
-  effects:
-    - tag: empirical_noise
-      noise_dn: 0.7
-      modes:
-        - {of: row, share: 1.0, lags: [[0, 1, 0]], correlation: [0.48]}
-"""
-    (effect,) = parse_config(text).model.effects
-    assert effect.describe() == (
-        "samples share noise of 0.7 DN (common to each row, correlation +0.48 over 1 row)"
-    )
 
 
 def test_it_is_found_beside_a_named_effect_and_closes_the_gap():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,13 +12,9 @@ from helpers.charge_material import simulated as simulated_frames
 from pydantic import ValidationError
 from scipy import stats
 
-from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.by_simulation.measured.response import measured_response, residual_responses
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import Measurement, PartSamples
-from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
-from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.size import size_of
 from pchem_pipeline.effects.analog.empirical_response import (
     EmpiricalResponse,
@@ -193,35 +188,6 @@ def test_what_a_model_makes_is_not_measured_again() -> None:
     assert measured_response(data, model, evidence[0], EVERYWHERE) is None
 
 
-@pytest.mark.parametrize("axes", [(), (2,), (1,), (2, 1)])
-def test_sums_by_distance_are_those_of_all_pairs(axes: tuple[int, ...]) -> None:
-    frames = drawn(distant, 7)[:24, :5, :6]
-    evidence = observe(drawn(distant, 7)[:, :5, :6], np.arange(FRAMES), n_run=FRAMES, block_frames=100)
-    laws, edges = laws_of_frames(frames, evidence.maps), np.array([0, 24])
-    inside = np.ones((5, 6), bool)
-    inside[1, 2] = False
-    plain = FollowingSamples.of(frames, edges, laws, evidence.maps, inside)
-    found = plain.by_distance([(1,), (2,), (1, 2), (), axes])[-1]
-    prepared = replace(plain, mirrored=axes)
-    residual, charge = (np.concatenate(parts).astype(float) for parts in zip(*prepared.chunks(), strict=True))
-    groups = [u.reshape(-1, 4, 5, 6) for u in (residual, charge)]
-    for step, dy, dx in ((0, 0, 1), (0, -2, 3), (1, 0, 0), (1, 4, -5), (1, -1, 2)):
-        total, number = np.zeros(6), np.zeros(6)
-        for y, x in np.ndindex(5, 6):
-            if 0 <= y + dy < 5 and 0 <= x + dx < 6 and inside[y, x]:
-                pairs = groups[0][:, step:, y, x] * groups[1][:, : 4 - step, y + dy, x + dx]
-                total[x] += pairs.sum()
-                number[x] += pairs.size
-        assert found.products[step, dy + 4, dx + 5] == pytest.approx(total.sum(), abs=1e-3)
-        assert found.pairs[step, dy + 4, dx + 5] == number.sum()
-        products, many = prepared.by_column((-step, dy, dx))
-        np.testing.assert_allclose(products, total, atol=1e-3)
-        np.testing.assert_array_equal(many, number)
-    assert (found.pairs[0, 4, 5] == 0.0) == (not axes)  # no sample follows itself
-    for source in SOURCES:
-        assert found.of(source)[0].sum() == pytest.approx(found.products.sum())
-
-
 def simulated(*terms: ResponseTerm, response: float, region: Any = None) -> np.ndarray:
     """Return signals of a sensor of next to no read noise under the effect, e-."""
     sensor = a_uniform_sensor(SHAPE, 2.0, 1 / STEP, 100.0, 1e-6)
@@ -290,8 +256,7 @@ def test_its_size_in_a_place_is_that_of_the_place() -> None:
     assert size.electrons == pytest.approx(0.1 * (2.1 / 2) ** 0.5, rel=0.1)
 
 
-def test_it_is_no_candidate_and_says_what_follows() -> None:
-    assert "empirical_response" not in candidate_classes(DiscrepancySettings())
+def test_it_says_what_follows() -> None:
     terms = ResponseTerm(place=(0, 0, -16)), ResponseTerm(of="row", weight=-0.5, number=32)
     assert EmpiricalResponse(response=0.004, terms=terms).describe() == (
         "samples depend on the charge of other samples (+0.4 % of the sample 16 columns to the left, "

@@ -20,7 +20,6 @@ from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import Prepared
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise
-from pchem_pipeline.effects.analog.empirical_response import EmpiricalResponse, ResponseTerm
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.readout.empirical import Empirical
@@ -83,19 +82,6 @@ def test_effects_that_leave_a_tenth_of_what_they_closed_get_no_name_where_the_fi
     assert left.too_wide(1.0)
     assert not left.too_wide(1.2)
     assert not Gap(0.3, 0.01, (-0.1, 0.7), {}).too_wide(1.0)
-
-
-def test_what_is_measured_is_fitted_where_it_is_on_the_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
-    frames = SimpleNamespace(on_sensor=lambda effect: effect.to_sensor((8, 16), (4, 12), (32, 32)))
-    unexplained = unexplained_beside(Goodness(), SimpleNamespace(frames=frames))
-    effect = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(0, 0, -1), columns=(0, 2)),))
-    fitted: list[Any] = []
-    refitted = SimpleNamespace(score=0.0)
-    monkeypatch.setattr(unexplained, "_fitted", lambda _, one: fitted.append(one) or refitted)
-    assert unexplained._described((), TAP, lambda *_: Measurement(effect, 9.0)) is refitted
-    [one] = fitted
-    assert one.terms[0].columns == (4, 6)
-    assert one.region == TAP.region
 
 
 def test_the_clearer_of_noise_and_gain_is_told_and_a_wave_first(

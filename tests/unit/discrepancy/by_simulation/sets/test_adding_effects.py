@@ -34,11 +34,10 @@ from pchem_pipeline.discrepancy.by_simulation.sets.comparison import (
     _grown,
     chosen,
     compare,
-    own_signature,
 )
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials, same_kinds
+from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials
 from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import StatisticsGap
@@ -137,12 +136,6 @@ class World:
         found = self.compare(*hypotheses, **how)
         return None if found is None else found.chosen.tags
 
-    def tried(self, *sets: Sequence[Hypothesis]) -> Choice:
-        """Return a choice among given sets, all far better than nothing."""
-        noise = self.refitter().noise(self.null.covariance, 40)
-        shifts = (self.z.train - self.null.mean, self.z.test - self.null.mean)
-        return Choice(tuple(score_set(one, shifts, noise) for one in sets), 100.0)
-
 
 @pytest.mark.parametrize("strength", [0.03, 0.1, 0.4, 1.2])
 def test_a_strength_is_refined_by_refits_until_it_stops_moving(strength: float) -> None:
@@ -221,17 +214,6 @@ def test_the_error_of_a_strong_effect_is_that_of_its_slope(
     assert np.sqrt(np.mean(np.square(off))) < 1.0 + 4.0 / np.sqrt(24.0)
 
 
-def test_a_steep_strong_effect_leaves_a_weak_one_beside_it_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is allowed to the details of an effect goes with what it does, not with its slope."""
-    monkeypatch.setitem(TRUTH, "row_noise", (np.eye(M)[0] * 2000.0, 8.0))
-    truth = [effect("row_noise", 0.1), effect("frame_noise", 0.1)]
-    refitter = World(truth).refitter()
-    found = refitter.refined([Hypothesis(one, statistics([one])) for one in truth])
-    found = refitter.sharpened(found, 24)
-    wanted = np.hypot(np.hypot(np.sqrt(1.0 / 2.0 + 1.0 / 24.0), 0.003 * 2000.0) / 40.0, 0.03)
-    assert found.stderr[1] == pytest.approx(wanted, rel=0.4)
-
-
 def test_a_part_that_stands_out_makes_no_effect_stronger_that_acts_everywhere(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -294,82 +276,6 @@ def test_a_refit_that_meets_the_limit_keeps_the_steps_before_it(paid: int) -> No
     assert found.score < whole.score
 
 
-def test_a_choice_among_sets_that_were_refitted_is_made_at_the_limit_too(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Of three effects all pairs are asked for, to see that each has a signature of its own."""
-    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.comparison._MOST_SETS", 1)
-    tags = ("row_noise", "frame_noise", "exposure_drift")
-    world = World([effect(tag, 0.3) for tag in tags])
-
-    def allow(words: str) -> None:
-        if words.count("+") == 1:
-            raise EffortSpentError(words)
-
-    plain = world.refitter()
-    monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
-    found = world.compare(*(hypothesis(tag, 0.3) for tag in tags))
-    assert found.chosen.tags == set(tags)
-
-
-def test_the_likeliest_set_is_fitted_before_other_effects_and_kept_at_the_limit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(TRUTH, "exposure_drift", (np.eye(M)[0] * 30.0 + np.eye(M)[2] * 20.0, 1.0))
-    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.1)])
-    asked: list[str] = []
-
-    def allow(words: str) -> None:
-        asked.append(words)
-        if "exposure_drift" in words:
-            raise EffortSpentError(words)
-
-    plain = world.refitter()
-    monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
-    for name, value in (("FAR", 1e9), ("_HARDLY", 0.0)):  # nothing is in vain
-        monkeypatch.setattr(f"pchem_pipeline.discrepancy.by_simulation.sets.trials.{name}", value)
-    assert world.chosen(*(hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift"))) == {
-        "row_noise",
-        "frame_noise",
-    }
-    assert "exposure_drift" in asked
-
-
-def asked_by_refits(world: World, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the list that hears which sets are simulated."""
-    asked: list[str] = []
-    plain = world.refitter()
-    monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=asked.append))
-    return asked
-
-
-def test_fewer_effects_are_tried_before_rivals_of_a_set_of_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.1)])
-    asked = asked_by_refits(world, monkeypatch)
-    # nothing is in vain
-    monkeypatch.setattr(Trials, "_beaten", lambda *_: False)
-    row, frame, drift, coupling = (hypothesis(tag) for tag in TRUTH)
-    drift, coupling = (replace(h, fingerprint=0.02 * h.fingerprint) for h in (drift, coupling))
-    choice = world.tried([row, frame, drift], [row, frame, coupling])
-    found = world.best_of([row, frame, drift, coupling], choice)
-    assert found.chosen.tags == {"row_noise", "frame_noise"}
-    sets = list(dict.fromkeys(words for words in asked if "+" in words))
-    assert sets[:2] == ["row_noise + frame_noise + exposure_drift", "row_noise + frame_noise"]
-    assert "row_noise + frame_noise + interpixel_capacitance" not in sets
-
-
-def test_what_does_not_move_a_statistic_that_stands_out_is_no_rival_of_what_leaves_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    world = World([effect("row_noise", 0.3), effect("frame_noise", 0.05)])
-    twin = replace(hypothesis("row_noise", 0.3), effect=effect("exposure_drift", 0.3))
-    asked = asked_by_refits(world, monkeypatch)
-    guesses = [hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.05)]
-    found = world.best_of([*guesses, twin], world.choice(*guesses))
-    assert found.chosen.tags == {"row_noise", "frame_noise"}
-    assert "exposure_drift" not in asked  # as near as row noise by itself, which leaves what frame noise does
-
-
 @pytest.mark.parametrize(("share", "refits"), [(0.0, 0), (0.4, 3)])
 def test_others_are_not_refitted_where_no_strength_of_theirs_makes_what_an_effect_does(
     monkeypatch: pytest.MonkeyPatch, share: float, refits: int
@@ -381,7 +287,9 @@ def test_others_are_not_refitted_where_no_strength_of_theirs_makes_what_an_effec
         monkeypatch.setitem(TRUTH, tag, (form, 1.0))
     world = World([effect(tag, 0.1) for tag in tags])
     one = world.refitter().refined([hypothesis(tag) for tag in tags])
-    asked = asked_by_refits(world, monkeypatch)
+    asked: list[str] = []
+    plain = world.refitter()
+    monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=asked.append))
     assert _all_seen(world.refitter(), one, [])
     assert len({words for words in asked if words.count("+") == 1}) == refits
 
@@ -467,11 +375,6 @@ def test_what_the_histograms_rule_out_is_not_refitted(
     assert ({"frame_noise"} in [one.tags for one in found.tried]) == refitted
 
 
-def test_two_effects_with_signatures_of_their_own_are_found_together() -> None:
-    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.06)])
-    assert world.chosen(hypothesis("row_noise"), hypothesis("frame_noise")) == {"row_noise", "frame_noise"}
-
-
 def test_what_a_strong_effect_hides_is_asked_for_beside_it() -> None:
     """Nothing in the frames leads to the noise of frames: it is guessed of what the rows' leaves."""
     world = World([effect("row_noise", 0.3), effect("frame_noise", 0.04)])
@@ -523,19 +426,14 @@ def test_a_part_of_a_better_set_is_not_grown_again() -> None:
     assert len(seeds(far, other, both)) == 2
 
 
-def test_a_set_with_more_in_vain_is_not_grown_beside_its_part() -> None:
-    refitter = World([effect("row_noise", 0.3), effect("exposure_drift", 0.3)]).refitter()
-    alone = refitter.refined([hypothesis("row_noise")])
-    more = refitter.refined([hypothesis("row_noise"), hypothesis("frame_noise")])
-    assert seeds(refitter, alone, replace(more, score=alone.score)) == [{"row_noise"}]
-
-
 def test_an_effect_that_its_set_lets_vanish_does_not_take_the_others_with_it() -> None:
     """Of three effects that the fingerprints ask for one is not there, and something is left."""
     true = effect("row_noise", 0.3), effect("frame_noise", 0.3), effect("interpixel_capacitance", 0.1)
     world = World(true)
     row, frame, drift = (hypothesis(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift"))
-    choice = world.tried([row, frame, drift])
+    shifts = (world.z.train - world.null.mean, world.z.test - world.null.mean)
+    noise = world.refitter().noise(world.null.covariance, 40)
+    choice = Choice((score_set([row, frame, drift], shifts, noise),), 100.0)
     found = world.best_of([row, frame, drift], choice)
     assert found.chosen.tags == {"row_noise", "frame_noise"}
 
@@ -576,17 +474,6 @@ def test_a_description_that_leaves_nothing_keeps_no_named_effect_from_its_refit(
         assert trials.complete
         trials.refit([other])
         assert len(trials.tried) == 1 + refits
-
-
-def test_a_signature_is_asked_of_the_same_kind_of_the_others() -> None:
-    """Another kind of the one may mimic both: it is no better than the set, or it would stand before it."""
-    world = World([effect("row_noise", 0.3)])
-    guess = hypothesis("row_noise", 0.2)
-    elsewhere = replace(guess, effect=guess.effect.at_place(Region.model_validate({"columns": "0:8"})))
-    one = world.refitter().refined([guess])
-    assert same_kinds(one.hypotheses, [hypothesis("row_noise", 0.9)])
-    assert not same_kinds(one.hypotheses, [elsewhere])
-    assert not same_kinds(one.hypotheses, [hypothesis("row_noise", 0.2), hypothesis("frame_noise")])
 
 
 @pytest.mark.parametrize("second", ["columns=0:8", "columns=16:24"])
@@ -705,32 +592,6 @@ def test_a_simulated_stack_is_known_by_all_that_makes_it_under_a_name_that_a_fil
     assert not any("/" in key for key in keys)
 
 
-def test_a_signature_is_its_own_where_the_others_leave_it_and_do_not_touch_it() -> None:
-    own, noise = np.eye(M)[1] * 10.0, np.ones(M)
-    left = np.eye(M)[1] * 8.0
-    assert own_signature(own, np.eye(M)[:1] * 40.0, left, noise)
-    assert not own_signature(own, np.eye(M)[:1] * 40.0, -left, noise)
-    assert not own_signature(own, np.eye(M)[:1] * 40.0, 0.3 * left, noise)
-    assert not own_signature(own, np.eye(M)[1:2] * 40.0, left, noise)
-
-
-def test_few_events_of_an_exact_count_are_a_signature_though_they_scatter(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.1)])
-    plain = world.draw
-
-    def draw(effects: tuple[Effect, ...], count: int) -> tuple[Any, np.ndarray]:
-        fit, vectors = plain(effects, count)
-        if "frame_noise" in {e.tag for e in effects}:  # four events: they scatter by half of what they do
-            vectors[:, 1] += 20.0 * np.random.default_rng(3).standard_normal(count)
-        return fit, vectors
-
-    monkeypatch.setattr(world, "draw", draw)
-    found = world.compare(hypothesis("row_noise"), hypothesis("frame_noise"))
-    assert found.chosen.tags == {"row_noise", "frame_noise"}
-
-
 @pytest.mark.parametrize("rest", [0.0, 9.0])
 def test_effects_that_move_the_same_statistics_are_seen_where_they_leave_nothing(
     monkeypatch: pytest.MonkeyPatch, rest: float
@@ -753,11 +614,10 @@ def add(
     monkeypatch: pytest.MonkeyPatch,
     *hypotheses: Hypothesis,
     final: Any = None,
-    mapped: Callable[[tuple[Effect, ...]], Any] = lambda _: UNMOVED,
 ) -> Any:
     """Return a search that added what it found, and the null that it came to."""
     z = world.z if final is None else Measured(world.z.train, world.z.test, final)
-    work: Any = SimpleNamespace(mapped=mapped, forget=lambda _: None, effort=Effort(None))
+    work: Any = SimpleNamespace(mapped=lambda _: UNMOVED, forget=lambda _: None, effort=Effort(None))
     unused: Any = None
     settings = DiscrepancySettings()
     judge = Acceptance(world.null, z, StatisticsGap(world.null, 100_000), settings)
@@ -770,28 +630,6 @@ def add(
     shifts = (z.train - world.null.mean, z.test - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
     return search, search.add(Explanation(hypotheses, choice), world.null)
-
-
-def test_what_was_chosen_enters_the_model_though_the_limit_is_reached(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Sharpening the slopes of a strong set was the last work, and lost all that had led there."""
-    world, spent = World([effect("row_noise", 0.5)]), []
-
-    def allow(words: str) -> None:
-        if spent:
-            raise EffortSpentError(words)
-
-    def compared(*given: Any) -> None:
-        compare(*given)
-        spent.append(True)
-
-    plain = world.refitter()
-    monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=allow))
-    monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.explainer.compare", compared)
-    search, _ = add(world, monkeypatch, hypothesis("row_noise"))
-    assert spent
-    assert [e.tag for e in search.model] == ["row_noise"]
 
 
 def test_slopes_beyond_all_that_an_effect_does_do_not_lift_the_floor() -> None:
@@ -1009,39 +847,6 @@ def test_strengths_that_no_pixel_can_be_fitted_with_end_no_search(monkeypatch: p
     assert refitter.sharpened(near, 24).effects == near.effects
     world.unfit = lambda effects: False
     assert refitter.sharpened(near, 24).effects != near.effects
-
-
-def test_a_set_of_which_a_part_cannot_be_fitted_is_not_chosen_and_the_others_are(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    # only a refit of the part says what it leaves
-    monkeypatch.setattr(
-        "pchem_pipeline.discrepancy.by_simulation.sets.comparison._beyond_others", lambda *_: False
-    )
-    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.06)])
-    pair = hypothesis("row_noise"), hypothesis("frame_noise")
-    world.unfit = lambda effects: [e.tag for e in effects] == ["frame_noise"]
-    found = world.compare(*pair)
-    assert found.chosen.tags == {"row_noise"}
-
-
-def test_a_correction_that_no_pixel_can_be_fitted_with_is_not_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World([effect("row_noise", 0.5)])
-    search, _ = add(world, monkeypatch, hypothesis("row_noise"))
-    [corrected] = search.model
-    added = search.extension.compared.chosen
-    added = world.refitter().sharpened(added, DiscrepancySettings().extended_replicates)
-
-    def mapped(model: tuple[Effect, ...]) -> Any:
-        if model == (corrected,):
-            raise NotFittedError("hardly a pixel can be fitted with it")
-        return UNMOVED
-
-    search, extended = add(
-        World([effect("row_noise", 0.5)]), monkeypatch, hypothesis("row_noise"), mapped=mapped
-    )
-    assert search.model == added.effects != (corrected,)
-    assert np.allclose(extended.mean, added.mean)
 
 
 def test_an_effect_is_held_to_what_it_moves_only_where_the_data_disagree_with_the_model(

@@ -1,0 +1,112 @@
+"""What holds in every format and layout: frames come back exactly, damaged or signed samples are refused."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.camera_files import not_opened, opened, read, refused
+from helpers.layouts import LAYOUTS, Stack, write
+
+from pchem_pipeline.base.errors import InputError
+
+SHAPE = (6, 21, 34)
+WINDOWS = [(0, 1, 0, 21), (2, 5, 3, 4), (1, 6, 15, 21), (5, 6, 20, 21), (0, 6, 4, 17), (3, 3, 0, 2)]
+
+
+#: layouts without samples of 32 bits
+AT_MOST_16 = ("tiff, imagej", "tiff, imagej, time", "fits, HCOMPRESS_1")
+
+
+def drawn(top: int, dtype: Any) -> Stack:
+    stack = np.random.default_rng(11).integers(0, top, SHAPE, dtype=dtype, endpoint=True)
+    stack[0, 0, :2] = 0, top
+    return stack
+
+
+@pytest.mark.parametrize(
+    ("layout", "dtype"),
+    [
+        (layout, dtype)
+        for layout in LAYOUTS
+        for dtype in (np.uint8, np.uint16, np.uint32)
+        if not (dtype is np.uint32 and layout in AT_MOST_16)
+    ],
+)
+def test_frames_are_read_exactly(tmp_path: Path, layout: str, dtype: type) -> None:
+    # beyond that HCOMPRESS loses
+    stack = drawn(
+        60_000 if (layout, dtype) == ("fits, HCOMPRESS_1", np.uint16) else np.iinfo(dtype).max, dtype
+    )
+    reader = opened(write(tmp_path, layout, stack))
+    assert (reader.shape, reader.dtype) == (stack.shape, np.dtype(dtype))
+    np.testing.assert_array_equal(reader.read(), stack)
+    for each in (reader, pickle.loads(pickle.dumps(reader))):
+        for t0, t1, y0, y1 in WINDOWS:
+            np.testing.assert_array_equal(each.read(t0, t1, y0, y1), stack[t0:t1, y0:y1])
+
+
+@pytest.mark.parametrize("layout", ["npy", "tiff", "fits", "fits, RICE_1", "hdf5"])
+def test_single_frames_and_stacks_are_joined_in_natural_order(tmp_path: Path, layout: str) -> None:
+    stack = drawn(4095, np.uint16)
+    for name, frames in (("f7", stack[0]), ("f9", stack[1]), ("f10", stack[2:5]), ("f11", stack[5])):
+        write(tmp_path, layout, frames, name)
+    np.testing.assert_array_equal(read(tmp_path), stack)
+
+
+@pytest.mark.parametrize("kept", [9, 60, 100, 129, 2879, 2880, 3380, 0.15, 0.5, 0.9, 0.95])
+@pytest.mark.parametrize(
+    "layout",
+    [
+        "npy", "tiff", "tiff pages", "tiff pages, strips", "tiff pages, tiles", "tiff pages, zlib",
+        "bigtiff pages, big-endian", "fits", "fits, RICE_1", "hdf5",
+    ],
+)  # fmt: skip
+def test_a_file_that_was_cut_is_refused(tmp_path: Path, layout: str, kept: float) -> None:
+    path = write(tmp_path, layout, drawn(4095, np.uint16))
+    data = path.read_bytes()
+    path.write_bytes(data[: kept if kept > 1 else int(len(data) * kept)])
+    refused(rf"{path.name}: .*(truncated|not a valid|no image)", path)
+
+
+@pytest.mark.parametrize(
+    "layout",
+    ["npy", "tiff", "tiff, zlib", "fits", "fits, RICE_1", "hdf5", "hdf5, gzip, shuffle", "zarr", "raw"],
+)
+def test_signed_samples_are_read_with_an_offset_or_where_none_is_negative(
+    tmp_path: Path, layout: str
+) -> None:
+    stack = drawn(65535, np.uint16)
+    path = write(tmp_path, layout, (stack.astype(np.int32) - 32768).astype(np.int16))
+    not_opened(r"signed samples .*--offset 32768", path)
+    with opened(path, offset=32768) as frames:
+        np.testing.assert_array_equal(frames.read(), stack)
+    with (
+        opened(path, offset=1000) as frames,
+        pytest.raises(InputError, match=r"negative samples \(down to -\d+ DN, with the offset of 1000\)"),
+    ):
+        frames.read()
+    not_opened("offset", path, offset=32769)
+    if layout == "raw":
+        return
+    refused("negative samples", path, dtype="uint16")
+    small = (stack // 2).astype(np.int16)
+    path = write(tmp_path / "small", layout, small)
+    refused(r"signed samples \(int16\).*input.dtype: uint16", path)
+    np.testing.assert_array_equal(read(path, dtype="uint16"), small)
+    path = write(tmp_path / "large", layout, small.astype(np.int32))
+    np.testing.assert_array_equal(read(path, dtype="uint32"), small)
+    refused("floating-point samples", write(tmp_path / "float", layout, small.astype(np.float32)))
+
+
+@pytest.mark.parametrize("layout", ["npy", "fits", "hdf5", "zarr, version 2"])
+def test_axes_before_rows_and_columns_are_frames_if_all_but_one_are_of_length_one(
+    tmp_path: Path, layout: str
+) -> None:
+    stack = drawn(65535, np.uint16)
+    for name, index in (("a", np.s_[:, None]), ("b", np.s_[None])):
+        np.testing.assert_array_equal(read(write(tmp_path, layout, stack[index], name)), stack)
+    refused("2 axes before rows and columns", write(tmp_path, layout, np.stack([stack, stack]), "c"))
