@@ -63,24 +63,16 @@ def test_effects_of_no_strength_change_nothing_not_even_the_last_bit():
         np.testing.assert_array_equal(a, b)
 
 
-def test_compiled_chain_equals_plain():
+def test_compiled_draws_equal_plain_python_and_the_frames_are_the_formula():
     settings = sensor()
     truth = draw_truth(settings)
-    dn = np.empty((2, 6, 7), np.uint16)
-    electrons = np.empty((1, 6, 7), np.uint32)
-    chain_numba.simulate_rows.py_func(
-        truth.quanta_exposure,
-        truth.conversion_gain,
-        truth.bias,
-        truth.analog_read_noise_e,
-        chain_numba.SampleKeys(*(to_words(np.arange(n)) for n in (2, 6, 7)), make_key(11, "sample")),
-        2.0**14 - 1,
-        dn,
-        electrons,
-    )
-    expected, k = simulate_block(truth, settings, (0, 2))
-    np.testing.assert_array_equal(dn, expected)
-    np.testing.assert_array_equal(electrons, k[:1])
+    charge, noise = np.empty((2, 6, 7), np.int64), np.empty((2, 6, 7))
+    keys = chain_numba.SampleKeys(*(to_words(np.arange(n)) for n in (2, 6, 7)), make_key(11, "sample"))
+    chain_numba.draw_rows.py_func(truth.quanta_exposure, truth.analog_read_noise_e, keys, charge, noise)
+    dn, electrons = simulate_block(truth, settings, (0, 2))
+    np.testing.assert_array_equal(charge, electrons)
+    volts = (charge + noise) / truth.conversion_gain + truth.bias
+    np.testing.assert_array_equal(dn, np.clip(np.rint(volts), 0, 2**14 - 1))
 
 
 def test_long_tables_of_hot_pixels_are_searched_right():
