@@ -9,17 +9,58 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.methods.moments import SampleMoments, sample_moments
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.model.law.pcd import log_pcd
 
 FloatArray = NDArray[np.float64]
 Needs = Literal["one sample", "a dark and a bright sample", "a series of samples"]
+
+
+class SampleMoments(NamedTuple):
+    """k-statistics of n pixels, shape (n,) each; NaN where the sample is too small.
+
+    Attributes:
+        n_frames: number of samples.
+        mean: DN.
+        variance: DN^2.
+        third: third cumulant, DN^3.
+        fourth: fourth cumulant, DN^4.
+    """
+
+    n_frames: FloatArray
+    mean: FloatArray
+    variance: FloatArray
+    third: FloatArray
+    fourth: FloatArray
+
+
+def sample_moments(counts: NDArray[np.integer], origin: NDArray[np.integer]) -> SampleMoments:
+    """Return the unbiased estimates of the first four cumulants (k-statistics, Fisher 1929).
+
+    Values are centred on the mean first, so that a large bias costs no digits.
+
+    Args:
+        counts: histograms, shape (n, B).
+        origin: DN of bin 0, shape (n,).
+    """
+    weights = np.asarray(counts, np.float64)
+    bins = np.arange(weights.shape[1], dtype=np.float64)
+    n = weights.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        centre = weights @ bins / n
+        residual = bins - centre[:, None]
+        powers = [np.einsum("ij,ij->i", weights, residual**power) for power in (2, 3, 4)]
+        second, third, fourth = powers
+        variance = np.where(n > 1, second / (n - 1), np.nan)
+        skew = np.where(n > 2, n * third / ((n - 1) * (n - 2)), np.nan)
+        top = n * (n + 1) * fourth - 3 * (n - 1) * second**2
+        kurtosis = np.where(n > 3, top / ((n - 1) * (n - 2) * (n - 3)), np.nan)
+    return SampleMoments(n, np.asarray(origin, np.float64) + centre, variance, skew, kurtosis)
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,8 @@ from helpers.drawn_pixels import draw, samples
 from scipy.stats import kstat
 
 from pchem_pipeline.methods import base, plain_em_numba
-from pchem_pipeline.methods.base import Method, PixelSamples, Sample, Settings
+from pchem_pipeline.methods.base import Method, PixelSamples, Sample, Settings, sample_moments
 from pchem_pipeline.methods.compare import compare, errors_of, pixel_bounds, summarise_errors
-from pchem_pipeline.methods.moments import sample_moments
 from pchem_pipeline.methods.peak_valley import comb, read_noise_of_valley
 from pchem_pipeline.methods.registry import methods
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
