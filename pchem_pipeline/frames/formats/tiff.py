@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,17 +77,12 @@ class TiffReader(ContiguousReader):
 
         logging.getLogger("tifffile").addHandler(_QUIET)  # what it would warn of is said in our errors
         reader = cls()
-        reader._guard = threading.Lock()
-        reader._decoders = {}
         with sound(path, "TIFF file"):
             size = path.stat().st_size
             check_chain(path, size)
             with tifffile.TiffFile(path) as file:
                 reader._inspect(path, file, size, settings)
         return reader
-
-    _guard: threading.Lock
-    _decoders: dict[int, Any]
 
     def _inspect(self, path: Path, file: Any, size: int, settings: InputSettings) -> None:
         pages = [page for page in file.pages if not page.is_reduced]
@@ -146,15 +140,19 @@ class TiffReader(ContiguousReader):
 
     def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         """See `ContiguousReader.decode_into`."""
-        with OpenedFile(self.paths[0], self._size) as file:
-            for t in range(t0, t1):
-                self._decode(file, buffer[t - t0], t, y0, y1)
+        import tifffile
 
-    def _decode(self, file: OpenedFile, frame: NDArray[Any], t: int, y0: int, y1: int) -> None:
-        """Decode the segments of page t that touch rows y0..y1 into ``frame``."""
+        table, path = self._segments, self.paths[0]
+        assert table is not None
+        with OpenedFile(path, self._size) as file, tifffile.TiffFile(path) as known:
+            for t in range(t0, t1):
+                page = known.pages[int(table.model[t])]
+                self._decode(file, page, buffer[t - t0], t, y0, y1)
+
+    def _decode(self, file: OpenedFile, page: Any, frame: NDArray[Any], t: int, y0: int, y1: int) -> None:
+        """Decode the segments of page t in rows y0..y1 into ``frame``, by a page that is coded alike."""
         table = self._segments
         assert table is not None
-        page = self._page(int(table.model[t]))
         per_row, rows = int(table.per_row[t]), int(table.height[t])
         for row in range(y0 // rows, (y1 - 1) // rows + 1):
             for number in range(row * per_row, (row + 1) * per_row):
@@ -174,34 +172,6 @@ class TiffReader(ContiguousReader):
                     target[...] = page.nodata
                 else:
                     target[...] = segment[0, low - top : high - top, : target.shape[1], 0]
-
-    def _page(self, index: int) -> Any:
-        """Return the library's page that knows how to decode its kind."""
-        import tifffile
-
-        with self._guard:
-            if index not in self._decoders:
-                try:
-                    with tifffile.TiffFile(self.paths[0]) as file:
-                        page = file.pages[index]
-                        page.decode  # noqa: B018 - built on first use, from tags that may need the open file
-                        page.jpegtables  # noqa: B018
-                except Exception as error:
-                    raise InputError(
-                        f"{self.paths[0]}: the file changed while it was being read ({error}); restore it "
-                        "and start again"
-                    ) from error
-                self._decoders[index] = page
-            return self._decoders[index]
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out the lock and the library's pages: they are made again where the reader is unpickled."""
-        return {key: value for key, value in self.__dict__.items() if key not in ("_guard", "_decoders")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._guard = threading.Lock()
-        self._decoders = {}
 
 
 def _coding(page: Any) -> tuple[Any, ...]:
