@@ -22,6 +22,7 @@ from pchem_pipeline.frames.formats.kinds import (
     choose_dataset,
     chosen_pieces,
     full_window,
+    n_pieces,
 )
 from pchem_pipeline.frames.identity import file_size
 from pchem_pipeline.frames.reader import changed, sound, unwritten_notes
@@ -129,8 +130,7 @@ def _check_chunks(path: Path, folder: Path, array: Any, parts: Sequence[Path]) -
         )
         places = chosen_pieces(chunks, itemgetter(2))
     check_unpacked_size(path, itertools.starmap(_read, places), 4 * size * array.dtype.itemsize, codecs)
-    pairs = zip(array.shape, shards or array.chunks, strict=True)
-    wanted = math.prod(-(-length // piece) for length, piece in pairs)
+    wanted = n_pieces(array.shape, shards or array.chunks)
     return unwritten_notes(path, wanted - len(files), wanted)
 
 
