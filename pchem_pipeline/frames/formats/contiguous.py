@@ -13,14 +13,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
-from pchem_pipeline.frames.reader import FrameReader, changed, check_window
+from pchem_pipeline.frames.reader import FrameReader, changed, check_window, sound
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.files import whole_file
 
@@ -145,8 +145,22 @@ class OpenedFile:
 class ContiguousReader(FrameReader):
     """A reader that needs nothing but a `Layout`; of files without one it decodes by `decode_into`."""
 
+    #: what a file is called that cannot be opened
+    kind: ClassVar[str] = "file"
     _offset: int | None = None
     _full: tuple[int, ...]
+
+    @classmethod
+    def open(cls, path: Path, settings: InputSettings) -> Self:
+        """See `FrameReader.open`."""
+        reader = cls()
+        with sound(path, cls.kind):
+            reader.inspect(path, settings)
+        return reader
+
+    def inspect(self, path: Path, settings: InputSettings) -> None:
+        """Take from a file what `FrameReader.open` promises; any error becomes one line."""
+        raise NotImplementedError
 
     def set_layout(self, path: Path, layout: Layout, size: int) -> None:
         """Take the layout; ``size`` is the size of the file.

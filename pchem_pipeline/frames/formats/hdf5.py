@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ from pchem_pipeline.frames.formats.kinds import (
     full_window,
     n_pieces,
 )
-from pchem_pipeline.frames.reader import changed, sound, unwritten_notes
+from pchem_pipeline.frames.reader import changed, unwritten_notes
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
@@ -65,29 +65,24 @@ class Hdf5Reader(ContiguousReader):
     """One dataset of an HDF5 file."""
 
     format_name = "hdf5"
+    kind = "HDF5 file"
     order_by_habit = True
     suffixes: ClassVar[tuple[str, ...]] = (".h5", ".hdf5", ".hdf", ".nxs", ".nx5")
     magic: ClassVar[tuple[bytes, ...]] = (b"\x89HDF\r\n\x1a\n", b"MATLAB 7.3 MAT-file")
 
-    @classmethod
-    def open(cls, path: Path, settings: InputSettings) -> Self:
-        """See `FrameReader.open`."""
+    def inspect(self, path: Path, settings: InputSettings) -> None:
+        """See `ContiguousReader.inspect`."""
         _require()
-        reader = cls()
-        with sound(path, "HDF5 file"):
-            try:
-                with _LOCK, opened(path) as file:
-                    reader._inspect(path, file, settings)
-            except OSError as error:
-                words = "is open for writing or was not closed; wait for the writing program"
-                if "already open for write" in str(error):
-                    raise InputError(
-                        f"{path}: {words}, or clear the flag: h5clear -s {quoted(path)}"
-                    ) from error
-                if isinstance(error, BlockingIOError):
-                    raise InputError(f"{path}: {words}") from error
-                raise
-        return reader
+        try:
+            with _LOCK, opened(path) as file:
+                self._inspect(path, file, settings)
+        except OSError as error:
+            words = "is open for writing or was not closed; wait for the writing program"
+            if "already open for write" in str(error):
+                raise InputError(f"{path}: {words}, or clear the flag: h5clear -s {quoted(path)}") from error
+            if isinstance(error, BlockingIOError):
+                raise InputError(f"{path}: {words}") from error
+            raise
 
     def _inspect(self, path: Path, file: Any, settings: InputSettings) -> None:
         import h5py

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from pchem_pipeline.frames.formats.kinds import (
     n_pieces,
 )
 from pchem_pipeline.frames.identity import file_size
-from pchem_pipeline.frames.reader import changed, sound, unwritten_notes
+from pchem_pipeline.frames.reader import changed, unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import link_out_of, whole_file
@@ -44,6 +44,7 @@ class ZarrReader(ContiguousReader):
     """A zarr array, the only stack of a zarr group, or the full resolution of an OME-Zarr image."""
 
     format_name = "zarr"
+    kind = "zarr store"
     suffixes: ClassVar[tuple[str, ...]] = (".zarr",)
 
     @classmethod
@@ -51,15 +52,8 @@ class ZarrReader(ContiguousReader):
         """See `FrameReader.recognises`: a zarr store is a folder with metadata."""
         return is_zarr(path)
 
-    @classmethod
-    def open(cls, path: Path, settings: InputSettings) -> Self:
-        """See `FrameReader.open`."""
-        reader = cls()
-        with sound(path, "zarr store"):
-            reader._inspect(path, settings)
-        return reader
-
-    def _inspect(self, path: Path, settings: InputSettings) -> None:
+    def inspect(self, path: Path, settings: InputSettings) -> None:
+        """See `ContiguousReader.inspect`."""
         import zarr
 
         if link := link_out_of(path):

@@ -11,7 +11,7 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ from pchem_pipeline.frames.formats.tiff_facts import (
     stated_channels,
     stated_facts,
 )
-from pchem_pipeline.frames.reader import sound, unwritten_notes
+from pchem_pipeline.frames.reader import unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -45,22 +45,19 @@ class TiffReader(ContiguousReader):
     """Pages of a TIFF file as frames."""
 
     format_name = "tiff"
+    kind = "TIFF file"
     suffixes: ClassVar[tuple[str, ...]] = (".tif", ".tiff", ".btf", ".tf8", ".stk")
     magic: ClassVar[tuple[bytes, ...]] = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
-    @classmethod
-    def open(cls, path: Path, settings: InputSettings) -> Self:
-        """See `FrameReader.open`."""
+    def inspect(self, path: Path, settings: InputSettings) -> None:
+        """See `ContiguousReader.inspect`."""
         import tifffile
 
         logging.getLogger("tifffile").addHandler(_QUIET)  # what it would warn of is said in our errors
-        reader = cls()
-        with sound(path, "TIFF file"):
-            size = path.stat().st_size
-            check_chain(path, size)
-            with tifffile.TiffFile(path) as file:
-                reader._inspect(path, file, size, settings)
-        return reader
+        size = path.stat().st_size
+        check_chain(path, size)
+        with tifffile.TiffFile(path) as file:
+            self._inspect(path, file, size, settings)
 
     def _inspect(self, path: Path, file: Any, size: int, settings: InputSettings) -> None:
         pages = [page for page in file.pages if not page.is_reduced]
