@@ -5,11 +5,9 @@ from __future__ import annotations
 import os
 import pickle
 import shutil
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -265,58 +263,6 @@ def test_gaps_in_the_numbers(tmp_path: Path) -> None:
     assert open_frames(InputSettings(files=(".",)), tmp_path).report.message() == ""
 
 
-def write_any(format: str, path: Path) -> Path:
-    """Write the stack in one of our formats, or coded by the format's library."""
-    if format == "zlib":
-        tifffile.imwrite(path, STACK, photometric="minisblack", compression="zlib")
-    elif format == "rice":
-        fits.CompImageHDU(STACK).writeto(path)
-    else:
-        [path] = write_frames(format, path, iter([STACK]), STACK.shape, "uint16")
-    return path
-
-
-@pytest.mark.parametrize("format", [*WRITERS, "zlib", "rice"])
-def test_file_that_vanishes(tmp_path: Path, format: str) -> None:
-    path = write_any(format, tmp_path / "a")
-    reader = opened(path)
-    path.rename(tmp_path / "gone")
-    with pytest.raises(InputError, match=r"disappeared while it was being read; restore"):
-        reader.read()
-
-
-@pytest.mark.parametrize("format", ["raw", "npy", "tiff", "fits", "ser", "zlib", "rice"])
-def test_file_that_shrinks(tmp_path: Path, format: str) -> None:
-    path = write_any(format, tmp_path / "a")
-    reader = opened(path)
-    os.truncate(path, path.stat().st_size // 2)
-    words = r"(was truncated|size of the file changed) while it was being read; restore"
-    with pytest.raises(InputError, match=words):
-        reader.read()
-
-
-@pytest.mark.parametrize("format", [*WRITERS, "zlib", "rice"])
-def test_many_threads_on_one_reader(tmp_path: Path, format: str) -> None:
-    if format in WRITERS:
-        write_frames(format, tmp_path / "a", iter([STACK]), STACK.shape, "uint16", frames_per_file=5)
-    else:
-        write_any(format, tmp_path / "a.tif")
-    reader = opened(tmp_path / "a[._]*")
-    rng = np.random.default_rng(4)
-    windows = []
-    for _ in range(120):
-        t0, t1 = sorted(rng.choice(13, 2, replace=False).tolist())
-        y0, y1 = sorted(rng.choice(18, 2, replace=False).tolist())
-        windows.append((t0, t1, y0, y1))
-
-    def task(window: tuple[int, int, int, int]) -> bool:
-        t0, t1, y0, y1 = window
-        return bool((reader.read(t0, t1, y0, y1) == STACK[t0:t1, y0:y1]).all())
-
-    with ThreadPoolExecutor(6) as pool:
-        assert all(pool.map(task, windows))
-
-
 def test_read_into_checks_its_arguments(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", STACK)
     reader = opened(tmp_path / "a.npy")
@@ -405,34 +351,6 @@ def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path: Path)
     ):
         np.save(tmp_path / "mask.npy", values)
         not_opened(words, tmp_path / "a.npy", mask="mask.npy")
-
-
-@pytest.mark.parametrize("suffix", ["npy", "fits", "zarr", "h5", "tif", "raw"])
-def test_signed_samples_with_an_offset(tmp_path: Path, suffix: str) -> None:
-    stack = np.random.default_rng(4).integers(0, 65536, (9, 6, 8)).astype(np.uint16)
-    stored, path = (stack.astype(np.int32) - 32768).astype(np.int16), tmp_path / f"a.{suffix}"
-    match suffix:
-        case "npy":
-            np.save(path, stored)
-        case "fits":
-            fits.PrimaryHDU(stored).writeto(path)
-        case "zarr":
-            zarr.create_array(path, data=stored)
-        case "h5":
-            with h5py.File(path, "w") as file:
-                file.create_dataset("a", data=stored, chunks=(2, 3, 8), compression="gzip")
-        case "tif":
-            tifffile.imwrite(path, stored, photometric="minisblack", compression="zlib")
-        case "raw":
-            stored.astype("<i2").tofile(path)
-            path.with_suffix(".json").write_text('{"shape": [6, 8], "dtype": "int16"}')
-    not_opened(r"signed samples .*--offset 32768", path)
-    with opened(path, offset=32768) as frames:
-        np.testing.assert_array_equal(frames.read(), stack)
-    frames = opened(path, offset=1000)
-    with pytest.raises(InputError, match=r"negative samples \(down to -\d+ DN, with the offset of 1000\)"):
-        frames.read()
-    not_opened("offset", path, offset=32769)
 
 
 def test_fits_adds_what_its_header_says(tmp_path: Path) -> None:

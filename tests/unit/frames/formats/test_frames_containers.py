@@ -52,14 +52,6 @@ def test_hdf5_filters(tmp_path: Path, filters: str) -> None:
     check_windows(path, STACK)
 
 
-@pytest.mark.parametrize("dtype", ["u1", "<u2", ">u2", "<u4", ">u4"])
-def test_hdf5_types(tmp_path: Path, dtype: str) -> None:
-    path = tmp_path / "a.hdf5"
-    stack = np.random.default_rng(2).integers(0, 256 ** np.dtype(dtype).itemsize, STACK.shape).astype(dtype)
-    write_hdf5(path, frames=stack)
-    check_windows(path, stack)
-
-
 @pytest.mark.parametrize(
     ("options", "plain"),
     [
@@ -289,12 +281,6 @@ def test_matlab_file(tmp_path: Path) -> None:
     assert "last axis read as frames" in Hdf5Reader.open(path, InputSettings()).notes[0]
 
 
-def test_hdf5_single_frames(tmp_path: Path) -> None:
-    for i, frame in enumerate(STACK):
-        write_hdf5(tmp_path / f"f{i + 7}.h5", image=frame)
-    np.testing.assert_array_equal(read(tmp_path), STACK)
-
-
 def test_hdf5_candidates_are_listed(tmp_path: Path) -> None:
     path = tmp_path / "two.h5"
     write_hdf5(path, **{"dark/frames": STACK}, **{"light/frames": STACK + 1})
@@ -333,18 +319,6 @@ def test_hdf5_damaged_chunk(tmp_path: Path) -> None:
     write_hdf5(path, frames=STACK[:4])
     with pytest.raises(InputError, match="the shape of the dataset changed while it was being read"):
         reader.read(0, 2)
-
-
-def test_hdf5_bad_types(tmp_path: Path) -> None:
-    path = tmp_path / "t.h5"
-    for data, words in [(STACK.astype(float), "floating-point"), (STACK.astype(np.int32), "signed samples")]:
-        write_hdf5(path, frames=data)
-        refused(words, path)
-    np.testing.assert_array_equal(read(path, dtype="uint32"), STACK)
-    write_hdf5(path, frames=-STACK.astype(np.int32))
-    refused("negative samples", path, dtype="uint32")
-    write_hdf5(path, frames=np.zeros((2, 5, 6, 3), np.uint8))
-    refused("axes before rows and columns", path)
 
 
 @pytest.mark.parametrize("version", [2, 3])

@@ -61,20 +61,6 @@ def test_layout_is_read_exactly(tmp_path: Path, layout: str) -> None:
     np.testing.assert_array_equal(again.read(1, 4, 2, 19), STACK[1:4, 2:19])
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
-@pytest.mark.parametrize("byteorder", ["<", ">"])
-@pytest.mark.parametrize("compression", [None, "zlib"])
-def test_sample_types(tmp_path: Path, dtype: type, byteorder: str, compression: str | None) -> None:
-    top = np.iinfo(dtype).max
-    stack = np.random.default_rng(3).integers(0, top, (3, 5, 7), dtype=dtype, endpoint=True)
-    stack[0, 0, :2] = 0, top
-    path = tmp_path / "a.tif"
-    tifffile.imwrite(path, stack, byteorder=byteorder, compression=compression, photometric="minisblack")
-    back = read(path)
-    assert back.dtype == dtype
-    np.testing.assert_array_equal(back, stack)
-
-
 def test_twelve_bits_packed(tmp_path: Path) -> None:
     """Bits packed without gaps, as machine-vision recorders write them: two samples in three bytes."""
     path = tmp_path / "packed.tif"
@@ -164,12 +150,6 @@ def test_previews_are_left_out_and_reported(tmp_path: Path) -> None:
     reader = opened(tmp_path / "preview.tif")
     np.testing.assert_array_equal(reader.read(), STACK)
     assert "1 reduced page" in reader.report.message()
-
-
-def test_sequence_in_natural_order(tmp_path: Path) -> None:
-    for i, frame in enumerate(STACK):
-        tifffile.imwrite(tmp_path / f"frame{2 * i + 1}.tif", frame, photometric="minisblack")
-    np.testing.assert_array_equal(read(tmp_path), STACK)
 
 
 def test_facts_are_taken_from_the_file(tmp_path: Path) -> None:
@@ -293,20 +273,6 @@ def test_pages_of_another_shape_or_type(tmp_path: Path) -> None:
             for frame in (STACK[0], STACK[1], odd):
                 writer.write(frame, photometric="minisblack", metadata=None)
         refused(r"odd\.tif: page 2 is .* page 0 is 21 x 34 uint16", path)
-
-
-def test_signed_and_float(tmp_path: Path) -> None:
-    path = tmp_path / "s.tif"
-    for compression in (None, "zlib"):
-        tifffile.imwrite(path, STACK.astype(np.int16), photometric="minisblack", compression=compression)
-        refused(r"signed samples \(int16\).*input.dtype: uint16", path)
-        np.testing.assert_array_equal(read(path, dtype="uint16"), STACK)
-        negative = STACK.astype(np.int16)
-        negative[3, 4, 5] = -1
-        tifffile.imwrite(path, negative, photometric="minisblack", compression=compression)
-        refused("negative samples", path, dtype="uint16")
-    tifffile.imwrite(path, STACK.astype(np.float32), photometric="minisblack")
-    refused("floating-point samples", path)
 
 
 def test_damaged_strip_is_named(tmp_path: Path) -> None:
