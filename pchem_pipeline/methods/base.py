@@ -1,7 +1,6 @@
 """What a characterisation method is given, what it returns, and where it is registered.
 
-A method is one file of this package: a subclass of :class:`Method` under :func:`register_method`. Adding one
-touches no other file.
+A method is a subclass of :class:`Method` in a file of this package. Adding one touches no other file.
 """
 
 from __future__ import annotations
@@ -169,6 +168,10 @@ def no_estimates(n_pixels: int) -> FloatArray:
     return np.full((n_pixels, 4), np.nan)
 
 
+#: methods by name; the modules of this package are imported by `methods.registry`
+_REGISTERED: dict[str, type[Method]] = {}
+
+
 class Method(ABC):
     """A way to estimate the parameters of pixels.
 
@@ -190,6 +193,18 @@ class Method(ABC):
     order: ClassVar[int]
     sensor_wide: ClassVar[bool] = False
 
+    def __init_subclass__(cls) -> None:
+        """Register the method under its name.
+
+        Raises:
+            ValueError: the name is taken.
+        """
+        other = _REGISTERED.setdefault(cls.name, cls)
+        if other.__module__ != cls.__module__:
+            raise ValueError(
+                f"the method {cls.name!r} is registered twice: {other.__module__}, {cls.__module__}"
+            )
+
     @abstractmethod
     def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
         """Return the estimates of every pixel; no pixel raises."""
@@ -198,24 +213,6 @@ class Method(ABC):
         """Say what the method lacks with so many samples; empty where it can work."""
         least = {"one sample": 1, "a dark and a bright sample": 2, "a series of samples": 3}[self.needs]
         return "" if n_samples >= least else f"needs {self.needs}; this comparison has {n_samples}"
-
-
-_REGISTERED: dict[str, type[Method]] = {}
-
-
-def register_method(method: type[Method]) -> type[Method]:
-    """Register a method under its name.
-
-    Raises:
-        ValueError: the name is taken.
-    """
-    other = _REGISTERED.get(method.name)
-    if other is not None and other.__module__ != method.__module__:
-        raise ValueError(
-            f"the method {method.name!r} is registered twice: {other.__module__}, {method.__module__}"
-        )
-    _REGISTERED[method.name] = method
-    return method
 
 
 def registered() -> dict[str, type[Method]]:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings, register_method
+from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings
 from pchem_pipeline.model.fit.api import fit_histograms
 
 
-@register_method
 class PchEm(Method):
     """Maximum likelihood of one sample: several starts, EM and Newton steps, the neighbours looked at.
 
@@ -29,7 +28,6 @@ class PchEm(Method):
         return Estimates.of_fit(result.columns, result.fit_status)
 
 
-@register_method
 class JointPchEm(Method):
     """Maximum likelihood of all samples together: one g, mu and sigma, an H for each exposure.
 

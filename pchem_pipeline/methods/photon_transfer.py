@@ -6,20 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pchem_pipeline.methods.base import (
-    Estimates,
-    FloatArray,
-    Method,
-    PixelSamples,
-    Settings,
-    no_estimates,
-    register_method,
-)
+from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Settings, no_estimates
 
 _LINEAR_RANGE = 0.7  # of the saturation, EMVA 1288 release 3.1, section on sensitivity
 
 
-@register_method
 class PhotonTransferSeries(Method):
     """Weighted straight line through variance against mean (the photon transfer curve).
 
@@ -41,7 +32,6 @@ class PhotonTransferSeries(Method):
         return _of_line(pixels, range(len(pixels.samples)))
 
 
-@register_method
 class TwoSamplePhotonTransfer(Method):
     """Gain from the difference of two means over the difference of two variances.
 
@@ -63,7 +53,6 @@ class TwoSamplePhotonTransfer(Method):
         return _of_line(pixels, (order[0], order[-1]))
 
 
-@register_method
 class Emva1288(Method):
     """K (DN/e-) as the slope, through the origin, of temporal variance against mean, both above dark.
 
