@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,31 +63,16 @@ class Shared(Suspect):
 
 @dataclass(frozen=True)
 class _Best:
-    """The best place of a family: z, number of places, and a tap, or lines, or cells of lines and across."""
+    """The best place of a family: z, number of places, pixels (None: all), and cells of lines and across."""
 
     family: str
     z: float
     places: float
-    taps: Taps | None = None
-    scattered: tuple[int, ...] = ()
-    lines: tuple[int, int] = (0, 0)
-    across: tuple[int, int] = (0, 0)
-
-    def region(self, pairs: Pairs, shape: tuple[int, int]) -> Region | None:
-        """Return its pixels in the sensor's rows and columns; None for all of it."""
-        if self.taps is not None:
-            return Region(taps=self.taps)
-        if self.scattered:
-            spans = [slice(int(pairs.lines[i]), int(pairs.lines[i + 1])) for i in self.scattered]
-            return _boxes_of(pairs.mode, shape, [(span, slice(None)) for span in spans])
-        lines, across = (
-            slice(int(edges[a]), int(edges[b]))
-            for edges, (a, b) in ((pairs.lines, self.lines), (pairs.across, self.across))
-        )
-        return _boxes_of(pairs.mode, shape, [(lines, across)])
+    region: Region | None = None
+    box: tuple[tuple[int, int], tuple[int, int]] | None = None
 
 
-def _boxes_of(mode: str, shape: tuple[int, int], boxes: Sequence[tuple[slice, slice]]) -> Region | None:
+def _boxes_of(mode: str, shape: tuple[int, ...], boxes: Sequence[tuple[slice, slice]]) -> Region | None:
     """Return the pixels of boxes, of lines and across them; None for all of the sensor."""
     mask = np.zeros(shape, np.bool_)
     turned = mask.T if mode == "column" else mask
@@ -136,7 +121,6 @@ def shared_elsewhere(samples: Samples, place: Shared, *, significance: float = S
 
 def _most_significant(samples: Samples, log_limit: float) -> Shared | None:
     """Return the place of the smallest probability that holds against the scatter of the frames, too."""
-    shape = samples.usable.shape[0], samples.usable.shape[1]
     guesses = sorted(
         (
             (_log_p(best.z, best.places), channel, pairs, best)
@@ -153,10 +137,9 @@ def _most_significant(samples: Samples, log_limit: float) -> Shared | None:
     for log_p, channel, pairs, best in guesses[:_MEASURED]:
         if log_p > log_limit:
             break
-        region = best.region(pairs, shape)
-        if region is None:
+        if best.region is None:
             continue
-        place = _measured(samples, channel, pairs.mode, region, best)
+        place = _measured(samples, channel, pairs.mode, best.region, best)
         if _holds(place, log_limit):
             sharper = _with_ends(samples, channel, pairs, best)
             return sharper if sharper is not None and _holds(sharper, log_limit) else place
@@ -207,8 +190,10 @@ def _measured(samples: Samples, channel: int, mode: str, region: Region, best: _
 
 def _with_ends(samples: Samples, channel: int, pairs: Pairs, best: _Best) -> Shared | None:
     """Return the place of a box with its ends told line by line; None where the scan knows as much."""
-    lines, across = Side.of(pairs.lines, best.lines), Side.of(pairs.across, best.across)
-    if best.taps is not None or best.scattered or (lines.exact and across.exact):
+    if best.box is None:
+        return None
+    lines, across = Side.of(pairs.lines, best.box[0]), Side.of(pairs.across, best.box[1])
+    if lines.exact and across.exact:
         return None
     first, second = (slice(*each) for each in sharpened(samples, channel, pairs.mode, lines, across))
     shape = samples.usable.shape[0], samples.usable.shape[1]
@@ -239,7 +224,13 @@ def _boxes(pairs: Pairs, usable: BoolArray) -> list[_Best]:
             z /= np.sqrt(2.0 * counted * (1.0 - counted / number))
         for family, which in _families(some, a, whole).items():
             best[family] = _better(best[family], np.where(which, z, 0.0), int(which.sum()), a, (c, d))
-    return [each for each in best.values() if each.z > 0]
+    found = []
+    for each in best.values():
+        if each.z > 0 and each.box is not None:
+            sides = zip((pairs.lines, pairs.across), each.box, strict=True)
+            first, second = (slice(int(edges[a]), int(edges[b])) for edges, (a, b) in sides)
+            found.append(replace(each, region=_boxes_of(pairs.mode, usable.shape, [(first, second)])))
+    return found
 
 
 def _families(some: BoolArray, first: int, whole: int) -> dict[str, BoolArray]:
@@ -258,8 +249,8 @@ def _better(best: _Best, z: FloatArray, tried: int, first: int, bands: tuple[Int
     """Return the best box so far of a family, with the number of those tried."""
     last, band = np.unravel_index(int(np.argmax(z)), z.shape)
     if z[last, band] > best.z:
-        across = int(bands[0][band]), int(bands[1][band])
-        best = replace(best, z=float(z[last, band]), lines=(first, first + 1 + int(last)), across=across)
+        box = (first, first + 1 + int(last)), (int(bands[0][band]), int(bands[1][band]))
+        best = replace(best, z=float(z[last, band]), box=box)
     return replace(best, places=best.places + tried)
 
 
@@ -271,7 +262,8 @@ def _areas(usable: BoolArray, lines: IntArray, across: IntArray) -> FloatArray:
 
 def _periods(pairs: Pairs) -> list[_Best]:
     """Return the best set of every n-th column, and of every n-th row where they share the line."""
-    ways = {"row": ("columns",), "column": ("rows",), "frame": ("columns", "rows")}[pairs.mode]
+    ways: tuple[Literal["rows", "columns"], ...] = ("columns", "rows")
+    ways = {"row": ways[:1], "column": ways[1:], "frame": ways}[pairs.mode]
     best, tried = _Best("period", 0.0, 1.0), 0
     for along, sums, counts in zip(ways, pairs.phases, pairs.phase_counts, strict=True):
         total, number = float(sums.sum()), float(counts.sum())
@@ -285,10 +277,8 @@ def _periods(pairs: Pairs) -> list[_Best]:
                     continue
                 z = (inside - counted * total / number) / math.sqrt(2.0 * counted * (1.0 - counted / number))
                 if z > best.z:
-                    taps = Taps(
-                        every=period, which=(phase,), along="columns" if along == "columns" else "rows"
-                    )
-                    best = _Best("period", z, 1.0, taps=taps)
+                    taps = Taps(every=period, which=(phase,), along=along)
+                    best = _Best("period", z, 1.0, Region(taps=taps))
     return [replace(best, places=float(tried))] if best.z > 0 else []
 
 
@@ -317,14 +307,9 @@ def _scattered(pairs: Pairs, usable: BoolArray) -> list[_Best]:
     log_places = (
         special.gammaln(n + 1) - special.gammaln(chosen.size + 1) - special.gammaln(n - chosen.size + 1)
     )
-    return [
-        _Best(
-            "scattered",
-            together,
-            float(np.exp(log_places)),
-            scattered=tuple(chosen.tolist()),
-        )
-    ]
+    spans = [(slice(int(pairs.lines[i]), int(pairs.lines[i + 1])), slice(None)) for i in chosen]
+    region = _boxes_of(pairs.mode, usable.shape, spans)
+    return [_Best("scattered", together, float(np.exp(log_places)), region)]
 
 
 class Side(NamedTuple):

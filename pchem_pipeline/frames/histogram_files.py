@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.identity import content_identity
+from pchem_pipeline.frames.inspect import FileReport, InputReport, mark_repeated_paths
 from pchem_pipeline.frames.resolve import HISTOGRAM_SUFFIXES, resolve_files
 from pchem_pipeline.frames.settings import InputSettings
 
@@ -96,23 +97,17 @@ def read_histograms(settings: InputSettings, base_dir: Path) -> HistogramInput:
     Raises:
         InputError: files that cannot be read, or that are no histograms, all in one message.
     """
-    paths = resolve_files(settings, base_dir)
+    report = InputReport([FileReport(path) for path in resolve_files(settings, base_dir)])
+    mark_repeated_paths(report.files)
     channels: list[_Channel] = []
-    problems: list[str] = []
-    used: list[Path] = []
-    for path in paths:
+    for entry in report.good:
         try:
-            if path in used:
-                raise InputError(f"{path}: is listed twice in input.files")
-            channels += _read(path)
-            used.append(path)
+            channels += _read(entry.path)
         except InputError as error:
-            problems.append(str(error))
-    if problems and (settings.on_bad_file == "error" or not channels):
-        cure = "" if len(paths) == 1 else "; repair or remove them, or set input.on_bad_file: skip"
-        raise InputError("; ".join(problems) + cure)
-    left_out = [f"skipped (input.on_bad_file: skip): {problem}" for problem in problems]
-    return _assemble(channels, used, left_out)
+            entry.problem = str(error).removeprefix(f"{entry.path}: ")
+    report.raise_if_refused(settings.on_bad_file)
+    left_out = [report.message()] if report.bad else []
+    return _assemble(channels, [entry.path for entry in report.good], left_out)
 
 
 def _assemble(channels: Sequence[_Channel], paths: Sequence[Path], notes: Sequence[str]) -> HistogramInput:

@@ -41,11 +41,6 @@ class FileHasher:
         self._begun = False
         self._offset = 0
 
-    def feed(self, data: memoryview) -> None:
-        """Hash the next bytes of a file (no folder), which the caller has read."""
-        self._hasher.update(data)
-        self._count(len(data))
-
     def read_to(self, count: int | None = None) -> None:
         """Read and hash until ``count`` bytes are hashed in all, or everything.
 
@@ -60,9 +55,22 @@ class FileHasher:
                     del self._parts[0]
                     self._begun, self._offset = False, 0
         except OSError as error:
-            raise InputError(
-                f"{self.path}: cannot be read ({error.strerror}); check the path and its permissions"
-            ) from error
+            raise self._unreadable(error) from error
+
+    def take(self, count: int) -> bytes:
+        """Read and hash the next bytes of a file (no folder) and return them, fewer at its end.
+
+        Raises:
+            InputError: the file cannot be read.
+        """
+        try:
+            with self.path.open("rb", buffering=0) as stream:
+                stream.seek(self._offset)
+                data = stream.read(count)
+        except OSError as error:
+            raise self._unreadable(error) from error
+        self._add(data)
+        return data
 
     def hexdigest(self) -> str:
         """Hash what is left, and return the hash of all."""
@@ -82,15 +90,20 @@ class FileHasher:
                 got = stream.readinto(view if count is None else view[: count - self.done])
                 if not got:
                     return True
-                self._hasher.update(view[:got])
-                self._count(got)
+                self._add(view[:got])
         return False
 
-    def _count(self, n_bytes: int) -> None:
-        self.done += n_bytes
-        self._offset += n_bytes
+    def _add(self, data: bytes | memoryview) -> None:
+        self._hasher.update(data)
+        self.done += len(data)
+        self._offset += len(data)
         if self._advance is not None:
-            self._advance(n_bytes)
+            self._advance(len(data))
+
+    def _unreadable(self, error: OSError) -> InputError:
+        return InputError(
+            f"{self.path}: cannot be read ({error.strerror}); check the path and its permissions"
+        )
 
 
 def hash_file(path: Path, advance: Callable[[int], None] | None = None) -> str:

@@ -92,7 +92,7 @@ def survey(
         reader = _open(entry, settings)
         if reader is not None:
             opened.append((entry, reader))
-    _mark_repeated_paths(report.files)
+    mark_repeated_paths(report.files)
     _mark_odd(opened)
     if check_duplicates:
         _mark_duplicates(report.good)
@@ -118,7 +118,8 @@ def _open(entry: FileReport, settings: InputSettings) -> FrameReader | None:
     return reader
 
 
-def _mark_repeated_paths(files: list[FileReport]) -> None:
+def mark_repeated_paths(files: list[FileReport]) -> None:
+    """Mark files that are the same as an earlier one, by whatever name."""
     seen: set[Path] = set()
     for entry in files:
         real = entry.path.resolve()

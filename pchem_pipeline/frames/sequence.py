@@ -246,10 +246,9 @@ def _check_same_camera(readers: Sequence[FrameReader]) -> None:
     """
     serials = {reader.paths[0].name: reader.camera.serial for reader in readers if reader.camera.serial}
     distinct = set(serials.values())
-    if len(distinct) < 2 or 2 < len(readers) == len(distinct):
-        return
-    shown = ", ".join(f"serial number {value} in {file}" for file, value in _first_of_each(serials))
-    raise InputError(f"the files are from different cameras: {shown}; make one run of each")
+    if len(distinct) > 1 and not 2 < len(readers) == len(distinct):
+        shown = _first_of_each(serials, "serial number ")
+        raise InputError(f"the files are from different cameras: {shown}; make one run of each")
 
 
 def _agreed(readers: Sequence[FrameReader], name: str) -> Any:
@@ -257,18 +256,19 @@ def _agreed(readers: Sequence[FrameReader], name: str) -> Any:
     values = {reader.paths[0].name: getattr(reader, name) for reader in readers}
     distinct = set(values.values())
     if len(distinct) > 1 and None not in distinct:
-        shown = ", ".join(f"{value} in {file}" for file, value in _first_of_each(values))
+        shown = _first_of_each(values)
         raise InputError(
             f"the files state different {name}: {shown}; set input.{name}, or make one run of each"
         )
     return distinct.pop() if len(distinct) == 1 else None
 
 
-def _first_of_each(values: Mapping[str, Any]) -> list[tuple[str, Any]]:
+def _first_of_each(values: Mapping[str, Any], what: str = "") -> str:
+    """Return the first values that differ, each with the first file that has it."""
     seen: dict[Any, str] = {}
     for file, value in values.items():
         seen.setdefault(value, file)
-    return [(file, value) for value, file in seen.items()][:4]
+    return ", ".join(f"{what}{value} in {file}" for value, file in [*seen.items()][:4])
 
 
 def _frame_range(settings: InputSettings, total: int, least: int) -> tuple[int, int]:

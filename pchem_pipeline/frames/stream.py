@@ -1,9 +1,9 @@
 """A stack of frames in the order of time, by blocks; the next one is read while one is used.
 
-A `HashedFrameStream` takes the hashes of the files from the same reading. Files in which whole frames lie
-plainly are read from their offsets into the buffers, and hashed there. Of files that have to be decoded, or
-of which only a region is wanted, the bytes are hashed a little ahead of the decoder, which then finds them in
-the memory of the operating system.
+A `HashedFrameStream` takes the hashes of the files from the same reading: frames that lie plainly in a file
+are taken from the bytes that are hashed. Of files that have to be decoded, or of which only a region is
+wanted, the bytes are hashed a little ahead of the decoder, which then finds them in the memory of the
+operating system.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.compute.executor import call_all
-from pchem_pipeline.frames.formats.contiguous import ContiguousReader
+from pchem_pipeline.frames.formats.contiguous import ContiguousReader, unstore
 from pchem_pipeline.frames.identity import FileHasher, file_size, identity_of_hashes
-from pchem_pipeline.frames.reader import FrameReader
+from pchem_pipeline.frames.reader import FrameReader, changed
 from pchem_pipeline.frames.sequence import FrameSequence
 
 #: bytes of decoded frames that a thread holds before they are cut into bands of rows
@@ -184,24 +184,21 @@ class HashedFrameStream(FrameStream):
         return identity_of_hashes({path: hasher.hexdigest() for path, hasher in self._hashers.items()})
 
     def _fill(self, parts: Sequence[NDArray[Any]], t0: int, t1: int) -> None:
-        """Read the next frames, and hash the bytes of their files up to there.
+        """Read the next frames, each once, and hash the bytes of their files up to there.
 
         Raises:
             InputError: a file vanished, changed or cannot be read.
         """
         decode: list[tuple[int, int]] = []
         for reader, first, end, offset in self._stack.pieces(t0, t1):
-            hasher = self._hashers[reader.paths[0]]
+            hasher, n_frames = self._hashers[reader.paths[0]], reader.shape[0]
             if self._is_plain(reader):
-                bands = [part[offset : offset + end - first] for part in parts]
-                assert isinstance(reader, ContiguousReader)
-                reader.scatter(bands, first, end, hasher)
-                for band, (y0, _) in zip(bands, self.bands, strict=True):
-                    self._stack.check_bits(reader, band, y0)
+                self._take(reader, hasher, (first, end), [part[offset:] for part in parts])
             else:
-                hasher.read_to(self._size(reader.paths[0]) * end // reader.shape[0])
+                size = self._sizes.setdefault(hasher.path, file_size(hasher.path))
+                hasher.read_to(size * end // n_frames)
                 decode.append((t0 + offset, t0 + offset + end - first))
-            if end == reader.shape[0]:
+            if end == n_frames:
                 hasher.read_to()
         self._decode(parts, t0, decode)
 
@@ -210,12 +207,30 @@ class HashedFrameStream(FrameStream):
         if not (isinstance(reader, ContiguousReader) and self._stack.whole_frames):
             return False
         layout = reader.layout
-        return layout is not None and layout.in_order
+        return layout is not None and bool((np.diff(layout.offsets) >= layout.frame_bytes).all())
 
-    def _size(self, path: Path) -> int:
-        if path not in self._sizes:
-            self._sizes[path] = file_size(path)
-        return self._sizes[path]
+    def _take(
+        self, reader: Any, hasher: FileHasher, frames: tuple[int, int], parts: Sequence[NDArray[Any]]
+    ) -> None:
+        """Take frames that lie plainly in a file from the bytes that are hashed."""
+        layout, (first, end) = reader.layout, frames
+        step = max(1, _SCRATCH_BYTES // max(layout.frame_bytes, 1))
+        for a in range(first, end, step):
+            offsets = layout.offsets[a : min(a + step, end)]
+            hasher.read_to(int(offsets[0]))
+            wanted = int(offsets[-1] - offsets[0]) + layout.frame_bytes
+            data = hasher.take(wanted)
+            if len(data) < wanted:
+                raise changed(hasher.path, "the file was truncated")
+            for t, start in enumerate((offsets - offsets[0]).tolist(), a - first):
+                frame = np.frombuffer(data, reader.dtype, layout.rows * layout.columns, start)
+                frame = frame.reshape(layout.rows, layout.columns)
+                for part, (y0, y1) in zip(parts, self.bands, strict=True):
+                    part[t] = frame[y0:y1]
+        for part, (y0, _) in zip(parts, self.bands, strict=True):
+            own = part[: end - first]
+            unstore(own, layout.stored, layout.offset, hasher.path)
+            self._stack.check_bits(reader, own, y0)
 
     def _decode(self, parts: Sequence[NDArray[Any]], t0: int, ranges: Sequence[tuple[int, int]]) -> None:
         """Decode ranges of frames, shared among the threads, each frame once."""
@@ -225,9 +240,7 @@ class HashedFrameStream(FrameStream):
 
         def decode(a: int, b: int) -> None:
             frames = self._stack.read(a, b)
-            row = 0
-            for part in parts:
-                part[a - t0 : b - t0] = frames[:, row : row + part.shape[1]]
-                row += part.shape[1]
+            for part, (y0, y1) in zip(parts, self.bands, strict=True):
+                part[a - t0 : b - t0] = frames[:, y0:y1]
 
         call_all([functools.partial(decode, a, b) for a, b in cuts], self._threads)

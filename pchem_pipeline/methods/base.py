@@ -1,7 +1,6 @@
 """What a characterisation method is given, what it returns, and where it is registered.
 
-A method is one file of this package: a subclass of :class:`Method` under :func:`register_method`. Adding one
-touches no other file.
+A method is a subclass of :class:`Method` in a file of this package. Adding one touches no other file.
 """
 
 from __future__ import annotations
@@ -9,17 +8,58 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.methods.moments import SampleMoments, sample_moments
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.model.law.pcd import log_pcd
 
 FloatArray = NDArray[np.float64]
 Needs = Literal["one sample", "a dark and a bright sample", "a series of samples"]
+
+
+class SampleMoments(NamedTuple):
+    """k-statistics of n pixels, shape (n,) each; NaN where the sample is too small.
+
+    Attributes:
+        n_frames: number of samples.
+        mean: DN.
+        variance: DN^2.
+        third: third cumulant, DN^3.
+        fourth: fourth cumulant, DN^4.
+    """
+
+    n_frames: FloatArray
+    mean: FloatArray
+    variance: FloatArray
+    third: FloatArray
+    fourth: FloatArray
+
+
+def sample_moments(counts: NDArray[np.integer], origin: NDArray[np.integer]) -> SampleMoments:
+    """Return the unbiased estimates of the first four cumulants (k-statistics, Fisher 1929).
+
+    Values are centred on the mean first, so that a large bias costs no digits.
+
+    Args:
+        counts: histograms, shape (n, B).
+        origin: DN of bin 0, shape (n,).
+    """
+    weights = np.asarray(counts, np.float64)
+    bins = np.arange(weights.shape[1], dtype=np.float64)
+    n = weights.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        centre = weights @ bins / n
+        residual = bins - centre[:, None]
+        powers = [np.einsum("ij,ij->i", weights, residual**power) for power in (2, 3, 4)]
+        second, third, fourth = powers
+        variance = np.where(n > 1, second / (n - 1), np.nan)
+        skew = np.where(n > 2, n * third / ((n - 1) * (n - 2)), np.nan)
+        top = n * (n + 1) * fourth - 3 * (n - 1) * second**2
+        kurtosis = np.where(n > 3, top / ((n - 1) * (n - 2) * (n - 3)), np.nan)
+    return SampleMoments(n, np.asarray(origin, np.float64) + centre, variance, skew, kurtosis)
 
 
 @dataclass(frozen=True)
@@ -128,6 +168,10 @@ def no_estimates(n_pixels: int) -> FloatArray:
     return np.full((n_pixels, 4), np.nan)
 
 
+#: methods by name; the modules of this package are imported by `methods.registry`
+_REGISTERED: dict[str, type[Method]] = {}
+
+
 class Method(ABC):
     """A way to estimate the parameters of pixels.
 
@@ -149,6 +193,18 @@ class Method(ABC):
     order: ClassVar[int]
     sensor_wide: ClassVar[bool] = False
 
+    def __init_subclass__(cls) -> None:
+        """Register the method under its name.
+
+        Raises:
+            ValueError: the name is taken.
+        """
+        other = _REGISTERED.setdefault(cls.name, cls)
+        if other.__module__ != cls.__module__:
+            raise ValueError(
+                f"the method {cls.name!r} is registered twice: {other.__module__}, {cls.__module__}"
+            )
+
     @abstractmethod
     def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
         """Return the estimates of every pixel; no pixel raises."""
@@ -157,24 +213,6 @@ class Method(ABC):
         """Say what the method lacks with so many samples; empty where it can work."""
         least = {"one sample": 1, "a dark and a bright sample": 2, "a series of samples": 3}[self.needs]
         return "" if n_samples >= least else f"needs {self.needs}; this comparison has {n_samples}"
-
-
-_REGISTERED: dict[str, type[Method]] = {}
-
-
-def register_method(method: type[Method]) -> type[Method]:
-    """Register a method under its name.
-
-    Raises:
-        ValueError: the name is taken.
-    """
-    other = _REGISTERED.get(method.name)
-    if other is not None and other.__module__ != method.__module__:
-        raise ValueError(
-            f"the method {method.name!r} is registered twice: {other.__module__}, {method.__module__}"
-        )
-    _REGISTERED[method.name] = method
-    return method
 
 
 def registered() -> dict[str, type[Method]]:

@@ -4,17 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pchem_pipeline.methods.base import (
-    Estimates,
-    Method,
-    PixelSamples,
-    Settings,
-    no_estimates,
-    register_method,
-)
+from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings, no_estimates
 
 
-@register_method
 class Cumulants(Method):
     """Invert the first four cumulants of the PCD.
 

@@ -4,17 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pchem_pipeline.methods.base import (
-    Estimates,
-    Method,
-    PixelSamples,
-    Settings,
-    register_method,
-)
+from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings
 from pchem_pipeline.methods.plain_em import closed_form_start, run_em
 
 
-@register_method
 class DarkAndBrightMle(Method):
     """Maximise the likelihood of the bright sample over H and g, mu and sigma held at those of the dark one.
 

@@ -7,21 +7,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
-from pchem_pipeline.methods.base import (
-    Estimates,
-    FloatArray,
-    Method,
-    PixelSamples,
-    Settings,
-    no_estimates,
-    register_method,
-)
+from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Settings, no_estimates
 from pchem_pipeline.methods.plain_em import closed_form_start
 
 _SMOOTHING = 0.12  # standard deviation of the smoothing in units of the distance of two peaks
 
 
-@register_method
 class PeakValley(Method):
     """Gain from the distance of the peaks, read noise from the valley-peak modulation (VPM).
 

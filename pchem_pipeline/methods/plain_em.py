@@ -6,20 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.methods import plain_em_numba
-from pchem_pipeline.methods.base import (
-    Estimates,
-    FloatArray,
-    Method,
-    PixelSamples,
-    Sample,
-    Settings,
-    register_method,
-)
+from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Sample, Settings
 from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.inputs import kernel_counts
 
 
-@register_method
 class PlainEm(Method):
     """EM alone, eqs. (update_eqns) to (gamma_nk) of Hendrickson et al. 2023.
 

@@ -4,8 +4,8 @@ Hendrickson et al., eq. PCD_RV_definition: ``X = round((K + R) / g + mu)``, ``K 
 ``R ~ N(0, sigma_R^2)``. Rounding is to the nearest whole DN (halves to even), and what the ADC cannot express
 ends at 0 or at 2**bit_depth - 1: that cut always happens, with or without effects.
 
-Without effects one compiled pass does everything. With effects the same numbers go plane by plane; an
-effect of no strength changes nothing, not even the last bit, and one with a region nothing elsewhere.
+The numbers go plane by plane; an effect of no strength changes nothing, not even the last bit, and one with a
+region nothing elsewhere.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.plane import Plane
-from pchem_pipeline.simulate.chain_numba import SampleKeys, draw_rows, simulate_rows
+from pchem_pipeline.simulate.chain_numba import SampleKeys, draw_rows
 from pchem_pipeline.simulate.streams import (
     KeyedStreams,
     make_key,
@@ -41,6 +41,7 @@ _SAMPLE_PURPOSE = "sample"
 # bytes per sample of a block: digital and electron numbers
 _BYTES_PER_SAMPLE = 8
 _SAMPLES_AT_ONCE = 1 << 19
+_FRAMES_AT_ONCE = 8
 # as long as so many histories are the frames for which one is simulated
 _REPEATED = 8
 _MAPS = ("quanta_exposure", "conversion_gain", "bias", "analog_read_noise_e")
@@ -86,48 +87,13 @@ def simulate_block(
             f"truth has shape {truth.shape}, simulate.shape is {settings.shape}; make them equal"
         )
     rows = rows or (0, settings.shape[0])
-    wanted = frames[1] - frames[0] if electron_frames is None else min(electron_frames, frames[1] - frames[0])
-    if settings.effects:
-        dn, electrons = _simulate_planes(truth, settings, frames, rows)
-        return dn, electrons[:wanted]
-    return _simulate_plain(truth, settings, frames, rows, wanted)
-
-
-def _simulate_plain(
-    truth: TruthMaps, settings: SimulateSettings, frames: tuple[int, int], rows: tuple[int, int], wanted: int
-) -> tuple[NDArray[Any], NDArray[np.uint32]]:
-    band = truth.band(*rows)
-    size = (rows[1] - rows[0], settings.shape[1])
-    dn = np.empty((frames[1] - frames[0], *size), dn_dtype(settings.bit_depth))
-    electrons = np.empty((wanted, *size), np.uint32)
-    simulate_rows(
-        band.quanta_exposure,
-        band.conversion_gain,
-        band.bias,
-        band.analog_read_noise_e,
-        SampleKeys(
-            to_words(np.arange(*frames)),
-            to_words(np.arange(*rows)),
-            to_words(np.arange(settings.shape[1])),
-            make_key(settings.seed, _SAMPLE_PURPOSE),
-        ),
-        float(2**settings.bit_depth - 1),
-        dn,
-        electrons,
-    )
-    return dn, electrons
-
-
-def _simulate_planes(
-    truth: TruthMaps, settings: SimulateSettings, frames: tuple[int, int], rows: tuple[int, int]
-) -> tuple[NDArray[Any], NDArray[np.uint32]]:
     halo = sum(effect.halo() for effect in settings.effects)
     history = sum(effect.history() for effect in settings.effects)
     size = (frames[1] - frames[0], rows[1] - rows[0], settings.shape[1])
     dn, electrons = np.empty(size, dn_dtype(settings.bit_depth)), np.empty(size, np.uint32)
-    # with a long history few rows fit into the cache, and no more are held at once
-    at_once = _SAMPLES_AT_ONCE // ((_REPEATED + 1) * max(history, 1) * settings.shape[1])
-    n_rows = max(at_once, _REPEATED // 2 * halo, 1) if history else size[1]
+    # few rows at once: planes stay in the cache, and what a pixel has of its own serves many frames
+    at_once = _SAMPLES_AT_ONCE // ((_REPEATED + 1) * max(history, _FRAMES_AT_ONCE) * settings.shape[1])
+    n_rows = max(at_once, _REPEATED // 2 * halo, 1)
     for begin in range(rows[0], rows[1], n_rows):
         end = min(begin + n_rows, rows[1])
         first, last = max(0, begin - halo), min(settings.shape[0], end + halo)
@@ -141,7 +107,7 @@ def _simulate_planes(
             part = slice(start - frames[0], start - frames[0] + step), inside
             dn_part, charge = _Block(settings, band, numbers, np.arange(first, last)).run()
             dn[part], electrons[part] = dn_part[keep], charge[keep]
-    return dn, electrons
+    return dn, electrons[:electron_frames]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Compiled forward chain without effects: electrons, read noise, gain, bias and ADC in one pass."""
+"""Compiled draws of electron numbers and read noise of samples."""
 
 from __future__ import annotations
 
@@ -93,32 +93,10 @@ def _draw_row(frame, y, keys, row, k):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def simulate_rows(exposure, gain, bias, noise, keys, top, dn, electrons):  # type: ignore[no-untyped-def]
-    """Fill ``dn`` (frame, y, x), and ``electrons`` as far as it has frames.
-
-    Maps are (y, x) of the band, e-, e-/DN, DN, e-; ``keys`` those of :class:`SampleKeys`; ``top`` the largest
-    DN.
-    """
-    nx = keys.xs.size
-    k = np.empty(nx)
-    for y in range(keys.ys.size):
-        row = _prepared(exposure[y], nx)
-        for t in range(keys.frames.size):
-            _draw_row(keys.frames[t], keys.ys[y], keys, row, k)
-            line = dn[t, y]
-            for x in range(nx):
-                value = np.rint((k[x] + noise[y, x] * row.z[x]) / gain[y, x] + bias[y, x])
-                line[x] = dn.dtype.type(min(max(value, 0.0), top))
-            if t < electrons.shape[0]:
-                for x in range(nx):
-                    electrons[t, y, x] = k[x]
-
-
-@kernel
 def draw_rows(exposure, noise, keys, charge, read_noise):  # type: ignore[no-untyped-def]
-    """Fill ``charge`` and ``read_noise`` (frame, y, x), e-, with the draws of :func:`simulate_rows`.
+    """Fill ``charge`` and ``read_noise`` (frame, y, x), e-, where the exposure is the same in all frames.
 
-    For chains whose exposure is the same in all frames: a table for each pixel is built once.
+    Maps are (y, x) of the band, e-; ``keys`` those of :class:`SampleKeys`. Each pixel's table is built once.
     """
     nx = keys.xs.size
     for y in range(keys.ys.size):

@@ -1,6 +1,6 @@
-"""Distributions of a pixel parameter over the sensor, as they are written in the YAML.
+"""Distributions of a pixel parameter over the sensor and patterns on top, as they are written in the YAML.
 
-Only the settings live here; ``quantiles.py`` turns them into numbers.
+Only the settings live here; ``maps.py`` turns them into numbers.
 """
 
 from __future__ import annotations
@@ -10,7 +10,61 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from pchem_pipeline.base.settings import Section
-from pchem_pipeline.simulate.patterns import Pattern
+
+
+class PatternBase(Section):
+    """What every pattern has."""
+
+    relative: bool = Field(
+        default=False, description="true: multiply the parameter by 1 + pattern; false: add the pattern to it"
+    )
+
+    @model_serializer(mode="wrap")
+    def _kind_first(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        data = handler(self)
+        relative = data.pop("relative")
+        return {**data, "relative": relative}
+
+
+class ColumnPattern(PatternBase):
+    """One normal random offset per column, as left by column amplifiers."""
+
+    kind: Literal["column"] = Field(default="column", description="shape of the pattern")
+    amplitude: float = Field(
+        gt=0, description="standard deviation over columns, the parameter's unit (none if relative)"
+    )
+
+
+class RowPattern(PatternBase):
+    """One normal random offset per row, as left by row drivers."""
+
+    kind: Literal["row"] = Field(default="row", description="shape of the pattern")
+    amplitude: float = Field(
+        gt=0, description="standard deviation over rows, the parameter's unit (none if relative)"
+    )
+
+
+class GradientPattern(PatternBase):
+    """A plane through the centre of the sensor, for example amplifier glow or heat from one side."""
+
+    kind: Literal["gradient"] = Field(default="gradient", description="shape of the pattern")
+    amplitude: float = Field(
+        description="difference from edge to edge, the parameter's unit (none if relative)"
+    )
+    angle: float = Field(default=0.0, description="direction of the rise, degrees from +x towards +y")
+
+
+class RadialPattern(PatternBase):
+    """A paraboloid, zero in the centre, for example vignetting."""
+
+    kind: Literal["radial"] = Field(default="radial", description="shape of the pattern")
+    amplitude: float = Field(description="value in the corners, the parameter's unit (none if relative)")
+
+
+Pattern = Annotated[
+    ColumnPattern | RowPattern | GradientPattern | RadialPattern,
+    Field(discriminator="kind"),
+]
 
 
 class DistributionBase(Section):
@@ -79,10 +133,9 @@ class Gamma(DistributionBase):
     std: float = Field(gt=0, description="standard deviation before truncation, unit of the parameter")
 
 
-class Uniform(DistributionBase):
-    """Uniform distribution."""
+class _Between(DistributionBase):
+    """What has a lower and an upper end."""
 
-    kind: Literal["uniform"] = Field(default="uniform", description="shape of the distribution")
     low: float = Field(description="lower end, unit of the parameter")
     high: float = Field(description="upper end, unit of the parameter")
 
@@ -93,18 +146,18 @@ class Uniform(DistributionBase):
         return self
 
 
-class LogUniform(DistributionBase):
+class Uniform(_Between):
+    """Uniform distribution."""
+
+    kind: Literal["uniform"] = Field(default="uniform", description="shape of the distribution")
+
+
+class LogUniform(_Between):
     """Uniform distribution of the logarithm: equal numbers of pixels per decade."""
 
     kind: Literal["loguniform"] = Field(default="loguniform", description="shape of the distribution")
     low: float = Field(gt=0, description="lower end, unit of the parameter")
     high: float = Field(gt=0, description="upper end, unit of the parameter")
-
-    @model_validator(mode="after")
-    def _ends_in_order(self) -> Self:
-        if not self.low < self.high:
-            raise ValueError(f"low {self.low} is not below high {self.high}; swap them or use kind: constant")
-        return self
 
 
 Distribution = Annotated[

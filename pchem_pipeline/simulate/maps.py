@@ -7,27 +7,32 @@ contains the smaller one (but for gradients, which are stretched), and any band 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import special
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.simulate.patterns import (
+from pchem_pipeline.simulate.distributions import (
     ColumnPattern,
+    Constant,
+    Distribution,
+    Gamma,
     GradientPattern,
+    LogNormal,
+    LogUniform,
+    Normal,
     Pattern,
     RadialPattern,
     RowPattern,
+    Uniform,
 )
-from pchem_pipeline.simulate.quantiles import truncated_quantile
 from pchem_pipeline.simulate.streams import KeyedStreams
 from pchem_pipeline.simulate.truth import Defect, TruthMaps
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from pchem_pipeline.simulate.distributions import Distribution
     from pchem_pipeline.simulate.settings import SimulateSettings
 
 
@@ -151,3 +156,60 @@ def _with_defects(truth: TruthMaps, settings: SimulateSettings, ys: NDArray[np.i
         analog_read_noise_e=np.where(stuck, 0.0, truth.analog_read_noise_e),
         defect=defect.astype(np.uint8),
     )
+
+
+def truncated_quantile(distribution: Distribution, u: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the quantiles of a distribution truncated to its bounds.
+
+    Args:
+        distribution: the settings.
+        u: probabilities in (0, 1), any shape.
+
+    Raises:
+        ConfigError: if the bounds leave practically nothing of the distribution.
+    """
+    if isinstance(distribution, Constant):
+        return np.full(u.shape, distribution.value)
+    low = 0.0 if distribution.minimum is None else _cdf(distribution, distribution.minimum)
+    high = 1.0 if distribution.maximum is None else _cdf(distribution, distribution.maximum)
+    if not high - low > 1e-9:
+        raise ConfigError(
+            f"simulate: bounds {distribution.minimum} .. {distribution.maximum} exclude the whole "
+            f"{distribution.kind} distribution; change them"
+        )
+    values = _quantile(distribution, low + u * (high - low))
+    return np.clip(values, distribution.minimum, distribution.maximum)
+
+
+def _quantile(d: Distribution, u: NDArray[np.float64]) -> NDArray[np.float64]:
+    result: Any
+    match d:
+        case Normal():
+            result = d.mean + d.std * special.ndtri(u)
+        case LogNormal():
+            result = d.median * np.exp(d.log_std * special.ndtri(u))
+        case Gamma():
+            shape = (d.mean / d.std) ** 2
+            result = special.gammaincinv(shape, u) * d.mean / shape
+        case Uniform():
+            result = d.low + u * (d.high - d.low)
+        case LogUniform():
+            result = d.low * np.exp(u * np.log(d.high / d.low))
+    return np.asarray(result, dtype=np.float64)
+
+
+def _cdf(d: Distribution, x: float) -> float:
+    result: Any
+    match d:
+        case Normal():
+            result = special.ndtr((x - d.mean) / d.std)
+        case LogNormal():
+            result = special.ndtr(np.log(x / d.median) / d.log_std) if x > 0 else 0.0
+        case Gamma():
+            shape = (d.mean / d.std) ** 2
+            result = special.gammainc(shape, max(x, 0.0) * shape / d.mean)
+        case Uniform():
+            result = np.clip((x - d.low) / (d.high - d.low), 0.0, 1.0)
+        case LogUniform():
+            result = np.clip(np.log(x / d.low) / np.log(d.high / d.low), 0.0, 1.0) if x > 0 else 0.0
+    return float(result)

@@ -10,8 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.registry import EffectList
-from pchem_pipeline.simulate.distributions import Distribution, LogNormal, Normal
-from pchem_pipeline.simulate.patterns import ColumnPattern
+from pchem_pipeline.simulate.distributions import ColumnPattern, Distribution, LogNormal, Normal
 from pchem_pipeline.store.remote_path import local_path
 
 ParameterName = Literal[

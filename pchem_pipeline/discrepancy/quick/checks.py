@@ -7,6 +7,7 @@ detection limit.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -150,47 +151,28 @@ class QuickLook:
 
 #: Statistics of the catalogue that show the same as a check: an effect with one of them in its signature
 #: explains the check.
-_SIGNS: dict[str, tuple[str, ...]] = {
-    "frame_noise": (
-        "frame.readout.variance", "frame.readout.slow", "frame.readout.trend",
-        "frame.charge.variance", "frame.charge.slow", "frame.charge.trend", "frame.covariance",
-    ),
-    "levels": ("frame.charge.variance", "frame.charge.slow", "frame.charge.trend"),
-    "row_noise": ("space.row.readout.variance",),
-    "column_noise": ("space.column.readout.variance",),
-    "drift": (
-        "frame.readout.slow", "frame.readout.trend", "frame.charge.slow", "frame.charge.trend",
-        "frame.gain.slow", "frame.gain.trend",
-    ),
-    "local_drift": (
-        "frame.readout.trend", "frame.readout.quadrants", "frame.charge.trend", "frame.charge.quadrants",
-    ),
-    "period": (
-        "frame.readout.line", "frame.readout.alternating", "frame.charge.line", "space.row.readout.line",
-    ),
-    "frame_lag": (
-        "frame.readout.lag1", "frame.charge.lag1", "time.lag1.readout.mean", "time.cross.readout_charge",
-    ),
-    "lag": (
-        "time.lag1.readout.mean", "time.lag1.charge.mean", "time.cross.readout_charge", "frame.repeated",
-    ),
-    "neighbours_x": (
-        "space.x.kk", "space.x.rk", "space.x.bits", "space.row.readout.lag1", "tail.high.clusters",
-    ),
-    "neighbours_y": ("space.y.kk", "space.y.rk", "tail.high.clusters"),
-    "wandering_pixels": (
-        "time.block.charge.chi", "time.block.charge.cnt", "time.block.readout.chi", "time.block.readout.cnt",
-    ),
-    "repeated_frames": ("frame.repeated",),
-    "codes": ("code.rough", "code.smooth"),
-    "top_code": ("code.top",),
-    "bottom_code": ("code.bottom",),
-    "top_limit": ("code.top",),
-    "bottom_limit": ("code.bottom",),
-    "wave": ("space.sample.readout.line", "space.sample.readout.spectrum"),
-    "odd_frames": ("frame.readout.largest", "frame.readout.quadrants"),
-    "empty_frames": (),
-}  # fmt: skip
+_SIGNS = {
+    "frame_noise": r"frame\.(readout|charge)\.(variance|slow|trend)|frame\.covariance",
+    "levels": r"frame\.charge\.(variance|slow|trend)",
+    "row_noise": r"space\.row\.readout\.variance",
+    "column_noise": r"space\.column\.readout\.variance",
+    "drift": r"frame\.(readout|charge|gain)\.(slow|trend)",
+    "local_drift": r"frame\.(readout|charge)\.(trend|quadrants)",
+    "period": r"frame\.(readout|charge)\.line|frame\.readout\.alternating|space\.row\.readout\.line",
+    "frame_lag": r"frame\.(readout|charge)\.lag1|time\.lag1\.readout\.mean|time\.cross\.readout_charge",
+    "lag": r"time\.lag1\.(readout|charge)\.mean|time\.cross\.readout_charge|frame\.repeated",
+    "neighbours_x": r"space\.x\.(kk|rk|bits)|space\.row\.readout\.lag1|tail\.high\.clusters",
+    "neighbours_y": r"space\.y\.(kk|rk)|tail\.high\.clusters",
+    "wandering_pixels": r"time\.block\.(charge|readout)\.(chi|cnt)",
+    "repeated_frames": r"frame\.repeated",
+    "codes": r"code\.(rough|smooth)",
+    "top_code": r"code\.top",
+    "bottom_code": r"code\.bottom",
+    "top_limit": r"code\.top",
+    "bottom_limit": r"code\.bottom",
+    "wave": r"space\.sample\.readout\.(line|spectrum)",
+    "odd_frames": r"frame\.readout\.(largest|quadrants)",
+}
 
 
 def graded(checks: list[Check], gain: float, read_noise: float, model: Sequence[Effect]) -> tuple[Check, ...]:
@@ -210,7 +192,7 @@ def graded(checks: list[Check], gain: float, read_noise: float, model: Sequence[
         done = replace(
             check,
             p_global=p_global,
-            in_model=not shown.isdisjoint(_SIGNS[check.name]),
+            in_model=any(re.fullmatch(_SIGNS.get(check.name, ""), name) for name in shown),
             size_e=check.size * gain if in_dn else math.nan,
             share=check.size / read_noise if in_dn else math.nan,
         )

@@ -3,34 +3,29 @@
 Raw files, npy, SER, uncompressed TIFF and uncompressed FITS all come down to a table of byte offsets. Each
 call opens the file, reads by ``preadv`` and closes it: so threads do not disturb each other, a reader can
 be pickled, and thousands of files do not exhaust the file descriptors. The libraries of the formats read into
-arrays of their own, and cannot hash what they read.
+arrays of their own.
 """
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
-from pchem_pipeline.frames.identity import FileHasher
-from pchem_pipeline.frames.reader import FrameReader, changed, check_window
+from pchem_pipeline.frames.reader import FrameReader, changed, check_window, sound
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.files import whole_file
 
 _MOST_BYTES = 1 << 30
 _MOST_FRAMES = 1 << 26
-#: targets of one call of preadv
-_MOST_VECTORS = 1024
 
 
 @dataclass(frozen=True)
@@ -55,11 +50,6 @@ class Layout:
     def frame_bytes(self) -> int:
         """Bytes of one frame."""
         return self.rows * self.columns * self.stored.itemsize
-
-    @functools.cached_property
-    def in_order(self) -> bool:
-        """The frames lie one behind the other."""
-        return bool((np.diff(self.offsets) >= self.frame_bytes).all())
 
     @property
     def end(self) -> int:
@@ -145,28 +135,6 @@ class OpenedFile:
                 raise changed(self._path, "the file was truncated")
             done += count
 
-    def scatter(self, targets: Sequence[memoryview], offset: int) -> None:
-        """Fill the targets (bytes) one after the other with what follows each other from the offset."""
-        for start in range(0, len(targets), _MOST_VECTORS):
-            batch = targets[start : start + _MOST_VECTORS]
-            wanted = sum(map(len, batch))
-            try:
-                count = os.preadv(self._handle, batch, offset) if wanted <= _MOST_BYTES else 0
-            except OSError as error:
-                raise InputError(f"{self._path}: read error ({error.strerror}); check the disk") from error
-            if count < wanted:  # a short read, or too much for one call: go on piece by piece
-                place = offset
-                for target in batch:
-                    self.read_into(target, place)
-                    place += len(target)
-            offset += wanted
-
-    def expect(self, offset: int, count: int) -> None:
-        """Ask the operating system to read the bytes ahead that will be wanted next (a hint)."""
-        if hasattr(os, "posix_fadvise"):
-            with suppress(OSError):
-                os.posix_fadvise(self._handle, offset, count, os.POSIX_FADV_WILLNEED)
-
     def read_bytes(self, offset: int, count: int) -> bytes:
         """Return bytes from the offset."""
         data = bytearray(count)
@@ -177,8 +145,22 @@ class OpenedFile:
 class ContiguousReader(FrameReader):
     """A reader that needs nothing but a `Layout`; of files without one it decodes by `decode_into`."""
 
+    #: what a file is called that cannot be opened
+    kind: ClassVar[str] = "file"
     _offset: int | None = None
     _full: tuple[int, ...]
+
+    @classmethod
+    def open(cls, path: Path, settings: InputSettings) -> Self:
+        """See `FrameReader.open`."""
+        reader = cls()
+        with sound(path, cls.kind):
+            reader.inspect(path, settings)
+        return reader
+
+    def inspect(self, path: Path, settings: InputSettings) -> None:
+        """Take from a file what `FrameReader.open` promises; any error becomes one line."""
+        raise NotImplementedError
 
     def set_layout(self, path: Path, layout: Layout, size: int) -> None:
         """Take the layout; ``size`` is the size of the file.
@@ -223,33 +205,6 @@ class ContiguousReader(FrameReader):
     def layout(self) -> Layout | None:
         """Where the frames lie, or None where they have to be decoded."""
         return getattr(self, "_layout", None)
-
-    def scatter(self, parts: Sequence[NDArray[Any]], t0: int, t1: int, hasher: FileHasher) -> None:
-        """Read whole frames into the bands of rows that make them up, and hash all bytes up to their end.
-
-        Args:
-            parts: C-contiguous, (t1 - t0, rows, columns) each, that cover the frames from top to bottom.
-            t0: first frame.
-            t1: end of the frames.
-            hasher: of this file; it stands before the first of the frames.
-
-        Raises:
-            InputError: the file vanished, changed or cannot be read.
-        """
-        layout = self._layout
-        bytes_of = [part.reshape(t1 - t0, -1).view(np.uint8) for part in parts]
-        with OpenedFile(self.paths[0], self._size) as file:
-            here, end = int(layout.offsets[t0]), int(layout.offsets[t1 - 1]) + layout.frame_bytes
-            file.expect(here, 2 * (end - here))
-            for first, count in _runs(layout.offsets[t0:t1], layout.frame_bytes):
-                start = int(layout.offsets[t0 + first])
-                hasher.read_to(start)
-                targets = [rows[i].data for i in range(first, first + count) for rows in bytes_of]
-                file.scatter(targets, start)
-                for target in targets:
-                    hasher.feed(target)
-        for part in parts:
-            unstore(part, layout.stored, layout.offset, self.paths[0])
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameReader.read_into`."""

@@ -15,7 +15,7 @@ import threading
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ from pchem_pipeline.frames.camera import (
 )
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.formats.kinds import check_coded, check_unpacked_size, chosen_pieces, full_window
-from pchem_pipeline.frames.reader import changed, sound
+from pchem_pipeline.frames.reader import changed
 from pchem_pipeline.frames.registry import check_unpacked, require
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
@@ -56,22 +56,20 @@ class FitsReader(ContiguousReader):
     """The first image of a FITS file that has data, 2-D or 3-D."""
 
     format_name = "fits"
+    kind = "FITS file"
     suffixes: ClassVar[tuple[str, ...]] = (".fits", ".fit", ".fts", ".fz")
     magic: ClassVar[tuple[bytes, ...]] = (b"SIMPLE  =",)
 
     _compressed: int | None = None
 
-    @classmethod
-    def open(cls, path: Path, settings: InputSettings) -> Self:
-        """See `FrameReader.open`."""
+    def inspect(self, path: Path, settings: InputSettings) -> None:
+        """See `ContiguousReader.inspect`."""
         require("astropy.io.fits", "fits", "FITS files")
-        reader = cls()
-        with sound(path, "FITS file"), warnings.catch_warnings():
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # truncation and sloppy headers are reported below
             with path.open("rb") as stream:
                 check_unpacked(path, stream.read(8))
-            reader._inspect(path, path.stat().st_size, settings)
-        return reader
+            self._inspect(path, path.stat().st_size, settings)
 
     def _inspect(self, path: Path, size: int, settings: InputSettings) -> None:
         from astropy.io import fits

@@ -12,9 +12,9 @@ import math
 import threading
 from collections.abc import Iterator
 from importlib.util import find_spec
-from operator import itemgetter
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +38,9 @@ from pchem_pipeline.frames.formats.kinds import (
     choose_dataset,
     chosen_pieces,
     full_window,
+    n_pieces,
 )
-from pchem_pipeline.frames.reader import changed, sound, unwritten_notes
+from pchem_pipeline.frames.reader import changed, unwritten_notes
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
@@ -64,29 +65,24 @@ class Hdf5Reader(ContiguousReader):
     """One dataset of an HDF5 file."""
 
     format_name = "hdf5"
+    kind = "HDF5 file"
     order_by_habit = True
     suffixes: ClassVar[tuple[str, ...]] = (".h5", ".hdf5", ".hdf", ".nxs", ".nx5")
     magic: ClassVar[tuple[bytes, ...]] = (b"\x89HDF\r\n\x1a\n", b"MATLAB 7.3 MAT-file")
 
-    @classmethod
-    def open(cls, path: Path, settings: InputSettings) -> Self:
-        """See `FrameReader.open`."""
+    def inspect(self, path: Path, settings: InputSettings) -> None:
+        """See `ContiguousReader.inspect`."""
         _require()
-        reader = cls()
-        with sound(path, "HDF5 file"):
-            try:
-                with _LOCK, opened(path) as file:
-                    reader._inspect(path, file, settings)
-            except OSError as error:
-                words = "is open for writing or was not closed; wait for the writing program"
-                if "already open for write" in str(error):
-                    raise InputError(
-                        f"{path}: {words}, or clear the flag: h5clear -s {quoted(path)}"
-                    ) from error
-                if isinstance(error, BlockingIOError):
-                    raise InputError(f"{path}: {words}") from error
-                raise
-        return reader
+        try:
+            with _LOCK, opened(path) as file:
+                self._inspect(path, file, settings)
+        except OSError as error:
+            words = "is open for writing or was not closed; wait for the writing program"
+            if "already open for write" in str(error):
+                raise InputError(f"{path}: {words}, or clear the flag: h5clear -s {quoted(path)}") from error
+            if isinstance(error, BlockingIOError):
+                raise InputError(f"{path}: {words}") from error
+            raise
 
     def _inspect(self, path: Path, file: Any, settings: InputSettings) -> None:
         import h5py
@@ -121,8 +117,7 @@ class Hdf5Reader(ContiguousReader):
         self.notes = check_sources(path, dataset) + _reversed_axes(path, dataset)
         if dataset.chunks is not None:
             check_coded(path, self.shape, dataset.chunks, self.dtype.itemsize, size)
-            _check_chunk_sizes(path, dataset)
-            _check_coded_chunks(path, dataset)
+            _check_chunks(path, dataset)
         missing = _missing_chunks(path, dataset)
         self.notes += missing
         self.unwritten = bool(missing)
@@ -148,6 +143,13 @@ class Hdf5Reader(ContiguousReader):
                 buffer[...] = dataset[window].reshape(buffer.shape)
 
 
+def _chunks_of(dataset: Any) -> list[Any]:
+    """Return place, filters that were left out, first byte and bytes of each chunk that was written."""
+    chunks: list[Any] = []
+    dataset.id.chunk_iter(chunks.append)
+    return chunks
+
+
 def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
     """Say how many chunks of a dataset were never written; the library reads them as the fill value.
 
@@ -157,30 +159,14 @@ def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
     if dataset.chunks is None:
         plain = not (dataset.is_virtual or dataset.external) and dataset.id.get_storage_size() == 0
         return unwritten_notes(path, int(plain and dataset.size > 0), 1, "datasets")
-    pairs = zip(dataset.shape, dataset.chunks, strict=True)
-    wanted = math.prod(-(-length // chunk) for length, chunk in pairs)
+    wanted = n_pieces(dataset.shape, dataset.chunks)
     return unwritten_notes(path, wanted - dataset.id.get_num_chunks(), wanted)
 
 
-def _check_chunk_sizes(path: Path, dataset: Any) -> None:
-    """Refuse plain chunks of another size than their shape: the library reads beyond them, and crashes.
+def _check_chunks(path: Path, dataset: Any) -> None:
+    """Refuse chunks that are not what their shape says, or were compressed twice.
 
-    Raises:
-        InputError: there is one.
-    """
-    if dataset.id.get_create_plist().get_nfilters() or not hasattr(dataset.id, "chunk_iter"):
-        return
-    size = math.prod(dataset.chunks) * dataset.dtype.itemsize
-    sizes: set[int] = set()
-    dataset.id.chunk_iter(lambda chunk: sizes.add(chunk.size))
-    if sizes - {size}:
-        raise InputError(
-            f"{path}: damaged: a chunk of {min(sizes - {size})} bytes, {size} needed; copy it again"
-        )
-
-
-def _check_coded_chunks(path: Path, dataset: Any) -> None:
-    """Refuse chunks that were compressed twice, or that hold more than their shape says.
+    Beyond plain chunks that are too short the library reads on, and crashes.
 
     Raises:
         InputError: there is one.
@@ -191,14 +177,18 @@ def _check_coded_chunks(path: Path, dataset: Any) -> None:
     for number, (code, _, values, _) in enumerate(filters):
         if code == _BITSHUFFLE and not any(values[4:5]):
             codecs[number] = ""  # without compression
-    if not any(codecs) or not hasattr(dataset.id, "chunk_iter"):
+    if (filters and not any(codecs)) or not hasattr(dataset.id, "chunk_iter"):
+        return
+    chunks, size = _chunks_of(dataset), math.prod(dataset.chunks) * dataset.dtype.itemsize
+    if not filters:
+        if odd := {chunk.size for chunk in chunks} - {size}:
+            raise InputError(f"{path}: damaged: a chunk of {min(odd)} bytes, {size} needed; copy it again")
         return
     coded = sum(1 << number for number, codec in enumerate(codecs) if codec)
-    chunks: list[tuple[int, tuple[int, ...]]] = []
-    dataset.id.chunk_iter(lambda chunk: chunks.append((chunk.size, chunk.chunk_offset)))
-    read = (dataset.id.read_direct_chunk(place) for _, place in chosen_pieces(chunks, itemgetter(0)))
+    some = chosen_pieces(chunks, attrgetter("size"))
+    read = (dataset.id.read_direct_chunk(chunk.chunk_offset) for chunk in some)
     pieces = (data for left_out, data in read if not left_out & coded)
-    check_unpacked_size(path, pieces, 4 * math.prod(dataset.chunks) * dataset.dtype.itemsize, codecs)
+    check_unpacked_size(path, pieces, 4 * size, codecs)
 
 
 def _plain_offsets(
@@ -221,11 +211,8 @@ def _plain_offsets(
     if filters or not whole or not hasattr(dataset.id, "chunk_iter"):
         return None
     starts = np.full(-(-n_frames // dataset.chunks[0]), -1, np.int64)
-
-    def take(chunk: Any) -> None:
+    for chunk in _chunks_of(dataset):
         starts[chunk.chunk_offset[0] // dataset.chunks[0]] = chunk.byte_offset
-
-    dataset.id.chunk_iter(take)
     frame = np.arange(n_frames, dtype=np.int64)
     number, inside = np.divmod(frame, dataset.chunks[0])
     offsets: NDArray[np.int64] = starts[number] + frame_bytes * inside

@@ -161,6 +161,11 @@ def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int, code
             )
 
 
+def n_pieces(shape: Sequence[int], piece: Sequence[int]) -> int:
+    """Return how many pieces of a shape make up an array."""
+    return math.prod(-(-length // part) for length, part in zip(shape, piece, strict=True))
+
+
 def chosen_pieces(pieces: Iterable[Any], size: Callable[[Any], int]) -> list[Any]:
     """Return the largest and the smallest coded pieces: what hides much in little is among either."""
     some = sorted(pieces, key=size)

@@ -192,15 +192,12 @@ def read_image(path: Path) -> NDArray[np.float64]:
     Raises:
         InputError: there is no such file, or it is no image.
     """
-    kinds = {".npy": _read_npy, ".tif": _read_tiff, ".tiff": _read_tiff}
-    kinds |= dict.fromkeys((".fits", ".fit", ".fts"), _read_fits)
-    kind = kinds.get(path.suffix.lower())
-    if kind is None:
+    if path.suffix.lower() not in (".npy", ".tif", ".tiff", ".fits", ".fit", ".fts"):
         raise InputError(f"{path}: give an image as .npy, .tif or .fits")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: not a regular file")
     try:
-        values = np.squeeze(np.asarray(kind(path), np.float64))
+        values = np.squeeze(np.asarray(_read_any(path), np.float64))
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file") from error
     except (OSError, ValueError, TypeError) as error:
@@ -210,17 +207,13 @@ def read_image(path: Path) -> NDArray[np.float64]:
     return values
 
 
-def _read_npy(path: Path) -> Any:
-    return np.load(path, allow_pickle=False)
+def _read_any(path: Path) -> Any:
+    if path.suffix.lower() == ".npy":
+        return np.load(path, allow_pickle=False)
+    if path.suffix.lower().startswith(".tif"):
+        import tifffile
 
-
-def _read_tiff(path: Path) -> Any:
-    import tifffile
-
-    return tifffile.imread(path)
-
-
-def _read_fits(path: Path) -> Any:
+        return tifffile.imread(path)
     require("astropy.io.fits", "fits", "FITS files")
     from astropy.io import fits
 

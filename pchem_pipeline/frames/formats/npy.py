@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, write_plain
 from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
-from pchem_pipeline.frames.reader import sound
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 
@@ -22,14 +21,14 @@ class NpyReader(ContiguousReader):
     """An array (frames, rows, columns), or one frame (rows, columns), in C order."""
 
     format_name = "npy"
+    kind = "npy file"
     order_by_habit = True
     suffixes: ClassVar[tuple[str, ...]] = (".npy",)
     magic: ClassVar[tuple[bytes, ...]] = (b"\x93NUMPY",)
 
-    @classmethod
-    def open(cls, path: Path, settings: InputSettings) -> Self:
-        """See `FrameReader.open`."""
-        with sound(path, "npy file"), path.open("rb") as stream:
+    def inspect(self, path: Path, settings: InputSettings) -> None:
+        """See `ContiguousReader.inspect`."""
+        with path.open("rb") as stream:
             version = npy_format.read_magic(stream)
             old = version == (1, 0)
             read = npy_format.read_array_header_1_0 if old else npy_format.read_array_header_2_0
@@ -47,12 +46,10 @@ class NpyReader(ContiguousReader):
                 f"{path}: Fortran order; save it with numpy.save(..., numpy.ascontiguousarray(frames))"
             )
         offsets = even_offsets(path, n, rows * columns * dtype.itemsize, size, start=start)
-        reader = cls()
-        reader.set_layout(path, Layout(offsets, rows, columns, dtype, offset), size)
-        behind = size - max(start, reader._layout.end)
+        self.set_layout(path, Layout(offsets, rows, columns, dtype, offset), size)
+        behind = size - max(start, self._layout.end)
         if behind:
-            reader.notes = (f"{path.name}: {behind} bytes after the array are ignored",)
-        return reader
+            self.notes = (f"{path.name}: {behind} bytes after the array are ignored",)
 
 
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:

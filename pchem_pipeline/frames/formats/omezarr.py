@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from itertools import starmap
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,10 @@ from pchem_pipeline.frames.formats.kinds import (
     choose_dataset,
     chosen_pieces,
     full_window,
+    n_pieces,
 )
 from pchem_pipeline.frames.identity import file_size
-from pchem_pipeline.frames.reader import changed, sound, unwritten_notes
+from pchem_pipeline.frames.reader import changed, unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import link_out_of, whole_file
@@ -43,6 +44,7 @@ class ZarrReader(ContiguousReader):
     """A zarr array, the only stack of a zarr group, or the full resolution of an OME-Zarr image."""
 
     format_name = "zarr"
+    kind = "zarr store"
     suffixes: ClassVar[tuple[str, ...]] = (".zarr",)
 
     @classmethod
@@ -50,15 +52,8 @@ class ZarrReader(ContiguousReader):
         """See `FrameReader.recognises`: a zarr store is a folder with metadata."""
         return is_zarr(path)
 
-    @classmethod
-    def open(cls, path: Path, settings: InputSettings) -> Self:
-        """See `FrameReader.open`."""
-        reader = cls()
-        with sound(path, "zarr store"):
-            reader._inspect(path, settings)
-        return reader
-
-    def _inspect(self, path: Path, settings: InputSettings) -> None:
+    def inspect(self, path: Path, settings: InputSettings) -> None:
+        """See `ContiguousReader.inspect`."""
         import zarr
 
         if link := link_out_of(path):
@@ -89,7 +84,6 @@ class ZarrReader(ContiguousReader):
             )
         self.set_stack(path, array.shape, np.dtype(array.dtype), settings, f"array {self._name}".strip())
         self.rows_per_read = min(self.shape[1], int(array.chunks[-2]))
-        self._array = array
         piece = getattr(array, "shards", None) or array.chunks
         check_coded(path, self.shape, piece, self.dtype.itemsize, file_size(path))
         self.take_facts(facts_from_names(attributes))
@@ -99,23 +93,13 @@ class ZarrReader(ContiguousReader):
 
     def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         """See `ContiguousReader.decode_into`."""
-        if not self.paths[0].exists():  # missing chunks would read as the fill value
-            raise changed(self.paths[0], "the store disappeared")
-        buffer[...] = np.asarray(self._array[full_window(self._full, t0, t1, y0, y1)]).reshape(buffer.shape)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out the array, which holds the event loop's locks; it is opened again."""
-        return {key: value for key, value in self.__dict__.items() if key != "_array"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
         import zarr
 
-        self.__dict__.update(state)
-        try:
-            node: Any = zarr.open(self.paths[0], mode="r")
-            self._array = node[self._name] if self._name else node
-        except Exception as error:
-            raise changed(self.paths[0], "the store disappeared or is damaged") from error
+        if not self.paths[0].exists():  # missing chunks would read as the fill value
+            raise changed(self.paths[0], "the store disappeared")
+        node: Any = zarr.open(self.paths[0], mode="r")
+        array = node[self._name] if self._name else node
+        buffer[...] = np.asarray(array[full_window(self._full, t0, t1, y0, y1)]).reshape(buffer.shape)
 
 
 def _check_chunks(path: Path, folder: Path, array: Any, parts: Sequence[Path]) -> tuple[str, ...]:
@@ -139,9 +123,8 @@ def _check_chunks(path: Path, folder: Path, array: Any, parts: Sequence[Path]) -
             place for part, _, _ in places for place in _places(part, sharding, math.prod(shards) // size)
         )
         places = chosen_pieces(chunks, itemgetter(2))
-    check_unpacked_size(path, starmap(_read, places), 4 * size * array.dtype.itemsize, codecs)
-    pairs = zip(array.shape, shards or array.chunks, strict=True)
-    wanted = math.prod(-(-length // piece) for length, piece in pairs)
+    check_unpacked_size(path, itertools.starmap(_read, places), 4 * size * array.dtype.itemsize, codecs)
+    wanted = n_pieces(array.shape, shards or array.chunks)
     return unwritten_notes(path, wanted - len(files), wanted)
 
 
@@ -215,23 +198,6 @@ def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) 
             dimension_names=("frame", "y", "x"),
             attributes={"units": "DN", "long_name": "raw frames", **stack.stated},
         )
-        start = 0
-        for block in _regrouped(blocks, depth):
-            array[start : start + len(block)] = block
-            start += len(block)
-
-
-def _regrouped(blocks: Iterator[NDArray[Any]], depth: int) -> Iterator[NDArray[Any]]:
-    """Cut the stream into blocks of one chunk's frames, so that each chunk is written once."""
-    held: list[NDArray[Any]] = []
-    count = 0
-    for block in blocks:
-        while count + len(block) >= depth:
-            take = depth - count
-            yield np.concatenate([*held, block[:take]])
-            held, count, block = [], 0, block[take:]
-        if len(block):
-            held.append(np.array(block))
-            count += len(block)
-    if held:
-        yield np.concatenate(held)
+        frames = (frame.copy() for block in blocks for frame in block)
+        for start in range(0, n, depth):  # each chunk is written once
+            array[start : start + depth] = np.stack([*itertools.islice(frames, depth)])

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, write_plain
 from pchem_pipeline.frames.formats.kinds import check_samples
-from pchem_pipeline.frames.reader import sound
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -87,11 +86,11 @@ class RawReader(ContiguousReader):
     """Frames as plain bytes: header, then frames of rows, each followed by padding."""
 
     format_name = "raw"
+    kind = "raw file"
     suffixes: ClassVar[tuple[str, ...]] = (".raw", ".bin", ".dat")
 
-    @classmethod
-    def open(cls, path: Path, settings: InputSettings) -> Self:
-        """See `FrameReader.open`."""
+    def inspect(self, path: Path, settings: InputSettings) -> None:
+        """See `ContiguousReader.inspect`."""
         side = _read_sidecar(path)
         facts = {name: getattr(settings, name, None) for name in _Sidecar.model_fields}
         facts = {name: getattr(side, name) if value is None else value for name, value in facts.items()}
@@ -100,12 +99,9 @@ class RawReader(ContiguousReader):
             raise InputError(
                 f"{path}: raw frames need {missing}; set this, or write a sidecar {path.name}.json"
             )
-        reader = cls()
-        reader.bit_shift = facts["bit_shift"] or 0
-        reader.take_facts(facts_from_names({**side.model_dump(), "bit_depth": facts["bit_depth"]}))
-        with sound(path, "raw file"):
-            reader._lay_out(path, facts)
-        return reader
+        self.bit_shift = facts["bit_shift"] or 0
+        self.take_facts(facts_from_names({**side.model_dump(), "bit_depth": facts["bit_depth"]}))
+        self._lay_out(path, facts)
 
     def _lay_out(self, path: Path, facts: dict[str, Any]) -> None:
         shape, header, padding = facts["shape"], facts["header_bytes"] or 0, facts["frame_padding_bytes"] or 0

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import CameraFacts, text_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, write_plain
-from pchem_pipeline.frames.reader import sound
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 
@@ -32,13 +31,13 @@ class SerReader(ContiguousReader):
     """Monochrome SER video, 1 to 16 bits."""
 
     format_name = "ser"
+    kind = "SER file"
     suffixes: ClassVar[tuple[str, ...]] = (".ser",)
     magic: ClassVar[tuple[bytes, ...]] = (_MAGIC,)
 
-    @classmethod
-    def open(cls, path: Path, settings: InputSettings) -> Self:
-        """See `FrameReader.open`."""
-        with sound(path, "SER file"), path.open("rb") as stream:
+    def inspect(self, path: Path, settings: InputSettings) -> None:
+        """See `ContiguousReader.inspect`."""
+        with path.open("rb") as stream:
             head, size = stream.read(_HEADER.size), path.stat().st_size
         if len(head) < _HEADER.size or not head.startswith(_MAGIC):
             raise InputError(f"{path}: truncated, or not SER video; copy the file again")
@@ -55,13 +54,11 @@ class SerReader(ContiguousReader):
         order = settings.byte_order or ("big" if flag else "little")
         stored = np.dtype("u1" if depth <= 8 else "u2").newbyteorder(order)
         offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=_HEADER.size)
-        reader = cls()
-        reader.set_layout(path, Layout(offsets, rows, columns, stored), size)
-        reader.bit_depth, reader.byte_order = depth, order
-        reader._read_times()
-        taken = _seconds(ticks) if reader.timestamps is None else float(reader.timestamps[0])
-        reader.camera = CameraFacts(text_of(instrument), taken=taken)
-        return reader
+        self.set_layout(path, Layout(offsets, rows, columns, stored), size)
+        self.bit_depth, self.byte_order = depth, order
+        self._read_times()
+        taken = _seconds(ticks) if self.timestamps is None else float(self.timestamps[0])
+        self.camera = CameraFacts(text_of(instrument), taken=taken)
 
     def _read_times(self) -> None:
         """Read the trailer of times, if it is there."""

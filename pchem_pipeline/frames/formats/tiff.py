@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +31,7 @@ from pchem_pipeline.frames.formats.tiff_facts import (
     stated_channels,
     stated_facts,
 )
-from pchem_pipeline.frames.reader import sound, unwritten_notes
+from pchem_pipeline.frames.reader import unwritten_notes
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
@@ -43,52 +41,23 @@ _QUIET = logging.NullHandler()
 _LOSSY = ("JPEG", "LERC", "WEBP")
 
 
-@dataclass(frozen=True)
-class _Segments:
-    """Strips or tiles of the pages of one kind, to be decoded by the library.
-
-    Attributes:
-        offsets: byte offset of each segment, (pages of the file, segments); 0 where there is none.
-        counts: bytes of each segment, likewise.
-        model: for each page, the number of a page that is coded alike.
-        per_row: for each page, segments side by side.
-        height: for each page, rows of a segment.
-    """
-
-    offsets: NDArray[np.int64]
-    counts: NDArray[np.int64]
-    model: NDArray[np.int64]
-    per_row: NDArray[np.int64]
-    height: NDArray[np.int64]
-
-
 class TiffReader(ContiguousReader):
     """Pages of a TIFF file as frames."""
 
     format_name = "tiff"
+    kind = "TIFF file"
     suffixes: ClassVar[tuple[str, ...]] = (".tif", ".tiff", ".btf", ".tf8", ".stk")
     magic: ClassVar[tuple[bytes, ...]] = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
-    _segments: _Segments | None = None
-
-    @classmethod
-    def open(cls, path: Path, settings: InputSettings) -> Self:
-        """See `FrameReader.open`."""
+    def inspect(self, path: Path, settings: InputSettings) -> None:
+        """See `ContiguousReader.inspect`."""
         import tifffile
 
         logging.getLogger("tifffile").addHandler(_QUIET)  # what it would warn of is said in our errors
-        reader = cls()
-        reader._guard = threading.Lock()
-        reader._decoders = {}
-        with sound(path, "TIFF file"):
-            size = path.stat().st_size
-            check_chain(path, size)
-            with tifffile.TiffFile(path) as file:
-                reader._inspect(path, file, size, settings)
-        return reader
-
-    _guard: threading.Lock
-    _decoders: dict[int, Any]
+        size = path.stat().st_size
+        check_chain(path, size)
+        with tifffile.TiffFile(path) as file:
+            self._inspect(path, file, size, settings)
 
     def _inspect(self, path: Path, file: Any, size: int, settings: InputSettings) -> None:
         pages = [page for page in file.pages if not page.is_reduced]
@@ -108,113 +77,66 @@ class TiffReader(ContiguousReader):
         if offsets is not None:
             self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
         else:
-            self._set_segments(path, pages, size, offset)
+            self._set_coded(path, pages, size, offset)
         self.take_facts(stated_facts(file, first))
 
-    def _set_segments(self, path: Path, pages: Sequence[Any], size: int, offset: int | None) -> None:
-        """Remember where the coded strips or tiles of each page are."""
-        most = max(len(page.dataoffsets) for page in pages)
-        offsets = np.zeros((len(pages), most), np.int64)
-        counts = np.zeros((len(pages), most), np.int64)
-        model = np.zeros(len(pages), np.int64)
-        alike: dict[Any, int] = {}
-        for i, page in enumerate(pages):
-            offsets[i, : len(page.dataoffsets)] = page.dataoffsets
-            counts[i, : len(page.databytecounts)] = page.databytecounts
-            model[i] = alike.setdefault(_coding(page), page.index)
-        outside = (offsets < 0) | (counts < 0) | (offsets > size) | (counts > size - offsets)
-        broken = np.flatnonzero(outside.any(axis=1))
-        if broken.size:
+    def _set_coded(self, path: Path, pages: Sequence[Any], size: int, offset: int | None) -> None:
+        """Remember where the pages are, after a look at where their strips or tiles are."""
+        broken = [page for page in pages if _reaches_beyond(page, size)]
+        if broken:
             raise InputError(
-                f"{path}: truncated: {broken.size} of {len(pages)} pages extend beyond the end of the file "
+                f"{path}: truncated: {len(broken)} of {len(pages)} pages extend beyond the end of the file "
                 f"({size} bytes); copy the file again"
             )
-        first = pages[0]
-        rows, columns = first.shape
+        rows, columns = pages[0].shape
         piece = max((page.chunks for page in pages), key=math.prod)
-        itemsize = np.dtype(first.dtype).itemsize
-        check_coded(path, (len(pages), rows, columns), piece, itemsize, size)
-        height = np.array([page.chunks[0] for page in pages], np.int64)
-        width = np.array([page.chunks[1] for page in pages], np.int64)
-        self.paths = (path,)
-        self.shape = (len(pages), rows, columns)
-        self.dtype = unsigned_type(np.dtype(first.dtype))
-        self._size = size
-        self._offset = offset
-        self.rows_per_read = min(rows, int(height.max()))
-        self._segments = _Segments(offsets, counts, model, -(-columns // width), height)
+        stored = np.dtype(pages[0].dtype)
+        check_coded(path, (len(pages), rows, columns), piece, stored.itemsize, size)
+        self.paths, self.shape, self.dtype = (path,), (len(pages), rows, columns), unsigned_type(stored)
+        self._size, self._offset = size, offset
+        self.rows_per_read = min(rows, max(page.chunks[0] for page in pages))
+        self._places = np.array([page.offset for page in pages], np.int64)
 
     def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         """See `ContiguousReader.decode_into`."""
-        with OpenedFile(self.paths[0], self._size) as file:
-            for t in range(t0, t1):
-                self._decode(file, buffer[t - t0], t, y0, y1)
-
-    def _decode(self, file: OpenedFile, frame: NDArray[Any], t: int, y0: int, y1: int) -> None:
-        """Decode the segments of page t that touch rows y0..y1 into ``frame``."""
-        table = self._segments
-        assert table is not None
-        page = self._page(int(table.model[t]))
-        per_row, rows = int(table.per_row[t]), int(table.height[t])
-        for row in range(y0 // rows, (y1 - 1) // rows + 1):
-            for number in range(row * per_row, (row + 1) * per_row):
-                count = int(table.counts[t, number])
-                data = file.read_bytes(int(table.offsets[t, number]), count) if count else None
-                try:
-                    segment, (_, _, top, left, _), (_, height, width, _) = page.decode(
-                        data, number, jpegtables=page.jpegtables
-                    )
-                except Exception as error:
-                    raise InputError(
-                        f"{self.paths[0]}: page {t} cannot be decoded ({error}); copy the file again"
-                    ) from error
-                low, high = max(y0, top), min(y1, top + height)
-                target = frame[low - y0 : high - y0, left : left + width]
-                if segment is None:
-                    target[...] = page.nodata
-                else:
-                    target[...] = segment[0, low - top : high - top, : target.shape[1], 0]
-
-    def _page(self, index: int) -> Any:
-        """Return the library's page that knows how to decode its kind."""
         import tifffile
 
-        with self._guard:
-            if index not in self._decoders:
+        path = self.paths[0]
+        with OpenedFile(path, self._size) as file, tifffile.TiffFile(path) as known:
+            for t in range(t0, t1):
+                known.filehandle.seek(int(self._places[t]))
+                page = tifffile.TiffPage(known, t)
                 try:
-                    with tifffile.TiffFile(self.paths[0]) as file:
-                        page = file.pages[index]
-                        page.decode  # noqa: B018 - built on first use, from tags that may need the open file
-                        page.jpegtables  # noqa: B018
+                    _decode(page, file, buffer[t - t0], y0, y1)
+                except InputError:
+                    raise
                 except Exception as error:
                     raise InputError(
-                        f"{self.paths[0]}: the file changed while it was being read ({error}); restore it "
-                        "and start again"
+                        f"{path}: page {t} cannot be decoded ({error}); copy the file again"
                     ) from error
-                self._decoders[index] = page
-            return self._decoders[index]
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out the lock and the library's pages: they are made again where the reader is unpickled."""
-        return {key: value for key, value in self.__dict__.items() if key not in ("_guard", "_decoders")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._guard = threading.Lock()
-        self._decoders = {}
 
 
-def _coding(page: Any) -> tuple[Any, ...]:
-    """Return what two pages must share to be decoded alike."""
-    return (
-        int(page.compression),
-        int(page.predictor),
-        int(page.fillorder),
-        page.chunks,
-        page.bitspersample,
-        page.rowsperstrip,
-        page.jpegtables,
-    )
+def _reaches_beyond(page: Any, size: int) -> bool:
+    """Tell whether a strip or tile of a page is not within the file."""
+    offsets, counts = (np.array(each, np.int64) for each in (page.dataoffsets, page.databytecounts))
+    return bool(((offsets < 0) | (counts < 0) | (counts > size - offsets)).any())
+
+
+def _decode(page: Any, file: OpenedFile, frame: NDArray[Any], y0: int, y1: int) -> None:
+    """Decode the strips or tiles of a page that touch rows y0..y1 into ``frame``."""
+    rows, per_row = page.chunks[0], page.chunked[1]
+    for number in range(y0 // rows * per_row, ((y1 - 1) // rows + 1) * per_row):
+        count = page.databytecounts[number]
+        data = file.read_bytes(page.dataoffsets[number], count) if count else None
+        segment, (_, _, top, left, _), (_, height, _, _) = page.decode(
+            data, number, jpegtables=page.jpegtables
+        )
+        low, high = max(y0, top), min(y1, top + height)
+        target = frame[low - y0 : high - y0, left : left + page.chunks[1]]
+        if segment is None:
+            target[...] = page.nodata
+        else:
+            target[...] = segment[0, low - top : high - top, : target.shape[1], 0]
 
 
 def _channel_notes(path: Path, channels: int, images: int, pages: int) -> list[str]:

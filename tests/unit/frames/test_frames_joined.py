@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pickle
 import shutil
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -262,58 +261,6 @@ def test_gaps_in_the_numbers(tmp_path: Path) -> None:
     for i in (4, 5):
         np.save(tmp_path / f"frame_{i:04d}.npy", STACK[i])
     assert open_frames(InputSettings(files=(".",)), tmp_path).report.message() == ""
-
-
-def write_any(format: str, path: Path) -> Path:
-    """Write the stack in one of our formats, or coded by the format's library."""
-    if format == "zlib":
-        tifffile.imwrite(path, STACK, photometric="minisblack", compression="zlib")
-    elif format == "rice":
-        fits.CompImageHDU(STACK).writeto(path)
-    else:
-        [path] = write_frames(format, path, iter([STACK]), STACK.shape, "uint16")
-    return path
-
-
-@pytest.mark.parametrize("format", [*WRITERS, "zlib", "rice"])
-def test_file_that_vanishes(tmp_path: Path, format: str) -> None:
-    path = write_any(format, tmp_path / "a")
-    reader = opened(path)
-    path.rename(tmp_path / "gone")
-    with pytest.raises(InputError, match=r"disappeared while it was being read; restore"):
-        reader.read()
-
-
-@pytest.mark.parametrize("format", ["raw", "npy", "tiff", "fits", "ser", "zlib", "rice"])
-def test_file_that_shrinks(tmp_path: Path, format: str) -> None:
-    path = write_any(format, tmp_path / "a")
-    reader = opened(path)
-    os.truncate(path, path.stat().st_size // 2)
-    words = r"(was truncated|size of the file changed) while it was being read; restore"
-    with pytest.raises(InputError, match=words):
-        reader.read()
-
-
-@pytest.mark.parametrize("format", [*WRITERS, "zlib", "rice"])
-def test_many_threads_on_one_reader(tmp_path: Path, format: str) -> None:
-    if format in WRITERS:
-        write_frames(format, tmp_path / "a", iter([STACK]), STACK.shape, "uint16", frames_per_file=5)
-    else:
-        write_any(format, tmp_path / "a.tif")
-    reader = opened(tmp_path / "a[._]*")
-    rng = np.random.default_rng(4)
-    windows = []
-    for _ in range(120):
-        t0, t1 = sorted(rng.choice(13, 2, replace=False).tolist())
-        y0, y1 = sorted(rng.choice(18, 2, replace=False).tolist())
-        windows.append((t0, t1, y0, y1))
-
-    def task(window: tuple[int, int, int, int]) -> bool:
-        t0, t1, y0, y1 = window
-        return bool((reader.read(t0, t1, y0, y1) == STACK[t0:t1, y0:y1]).all())
-
-    with ThreadPoolExecutor(6) as pool:
-        assert all(pool.map(task, windows))
 
 
 def test_read_into_checks_its_arguments(tmp_path: Path) -> None:

@@ -7,9 +7,8 @@ from helpers.drawn_pixels import draw, samples
 from scipy.stats import kstat
 
 from pchem_pipeline.methods import base, plain_em_numba
-from pchem_pipeline.methods.base import Method, PixelSamples, Sample, Settings
+from pchem_pipeline.methods.base import Method, PixelSamples, Sample, Settings, sample_moments
 from pchem_pipeline.methods.compare import compare, errors_of, pixel_bounds, summarise_errors
-from pchem_pipeline.methods.moments import sample_moments
 from pchem_pipeline.methods.peak_valley import comb, read_noise_of_valley
 from pchem_pipeline.methods.registry import methods
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
@@ -40,7 +39,7 @@ def test_every_method_says_what_it_is():
         assert method.remark
 
 
-def test_a_method_is_added_by_registering_it(monkeypatch):
+def test_a_method_is_added_by_its_class(monkeypatch):
     monkeypatch.setattr(base, "_REGISTERED", {})
 
     class Guess(Method):
@@ -49,11 +48,9 @@ def test_a_method_is_added_by_registering_it(monkeypatch):
         def estimate(self, pixels, settings):
             return base.Estimates(base.no_estimates(pixels.n_pixels))
 
-    base.register_method(Guess)
     assert base.registered() == {"guess": Guess}
-    other = type("Other", (Guess,), {"__module__": "elsewhere"})
     with pytest.raises(ValueError, match="registered twice"):
-        base.register_method(other)
+        type("Other", (Guess,), {"__module__": "elsewhere"})
 
 
 def test_drawn_histograms_have_the_moments_of_the_pcd():

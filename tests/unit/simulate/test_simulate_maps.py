@@ -8,8 +8,7 @@ from scipy import stats
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.simulate.distributions import Constant, Gamma, LogNormal, LogUniform, Normal, Uniform
-from pchem_pipeline.simulate.maps import draw_truth
-from pchem_pipeline.simulate.quantiles import truncated_quantile
+from pchem_pipeline.simulate.maps import draw_truth, truncated_quantile
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import Defect
 

@@ -28,9 +28,9 @@ def test_every_field_says_what_it_is():
         for name, field in model.model_fields.items():
             assert field.description, f"{model.__name__}.{name}"
 
-    from pchem_pipeline.simulate import distributions, patterns, settings
+    from pchem_pipeline.simulate import distributions, settings
 
-    for module in (distributions, patterns, settings):
+    for module in (distributions, settings):
         for name in dir(module):
             found = getattr(module, name)
             if isinstance(found, type) and hasattr(found, "model_fields"):

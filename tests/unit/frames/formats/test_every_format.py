@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,11 @@ WINDOWS = [(0, 1, 0, 21), (2, 5, 3, 4), (1, 6, 15, 21), (5, 6, 20, 21), (0, 6, 4
 
 #: layouts without samples of 32 bits
 AT_MOST_16 = ("tiff, imagej", "tiff, imagej, time", "fits, HCOMPRESS_1")
+
+
+#: a layout of each way in which samples are stored
+KINDS = ("npy", "tiff", "tiff, zlib", "fits", "fits, RICE_1", "hdf5", "hdf5, gzip, shuffle", "zarr", "raw")
+every_kind = pytest.mark.parametrize("layout", KINDS)
 
 
 def drawn(top: int, dtype: Any) -> Stack:
@@ -57,6 +64,44 @@ def test_single_frames_and_stacks_are_joined_in_natural_order(tmp_path: Path, la
     np.testing.assert_array_equal(read(tmp_path), stack)
 
 
+@every_kind
+def test_many_threads_read_one_stack_of_files(tmp_path: Path, layout: str) -> None:
+    stack = drawn(65535, np.uint16)
+    for name, part in (("a1", stack[:4]), ("a2", stack[4:])):
+        write(tmp_path, layout, part, name)
+    reader, rng = opened(tmp_path), np.random.default_rng(4)
+    windows = [
+        (*np.sort(rng.choice(7, 2, replace=False)), *np.sort(rng.choice(22, 2, replace=False)))
+        for _ in range(120)
+    ]
+
+    def task(window: tuple[int, int, int, int]) -> bool:
+        t0, t1, y0, y1 = map(int, window)
+        return bool((reader.read(t0, t1, y0, y1) == stack[t0:t1, y0:y1]).all())
+
+    with ThreadPoolExecutor(6) as pool:
+        assert all(pool.map(task, windows))
+
+
+@every_kind
+def test_a_file_that_vanishes(tmp_path: Path, layout: str) -> None:
+    path = write(tmp_path, layout, drawn(65535, np.uint16))
+    reader = opened(path)
+    path.rename(tmp_path / "gone")
+    with pytest.raises(InputError, match=r"disappeared while it was being read; restore"):
+        reader.read()
+
+
+@pytest.mark.parametrize("layout", [each for each in KINDS if not each.startswith(("hdf5", "zarr"))])
+def test_a_file_that_shrinks(tmp_path: Path, layout: str) -> None:
+    path = write(tmp_path, layout, drawn(65535, np.uint16))
+    reader = opened(path)
+    os.truncate(path, path.stat().st_size // 2)
+    words = r"(was truncated|size of the file changed) while it was being read; restore"
+    with pytest.raises(InputError, match=words):
+        reader.read()
+
+
 @pytest.mark.parametrize("kept", [9, 60, 100, 129, 2879, 2880, 3380, 0.15, 0.5, 0.9, 0.95])
 @pytest.mark.parametrize(
     "layout",
@@ -72,10 +117,7 @@ def test_a_file_that_was_cut_is_refused(tmp_path: Path, layout: str, kept: float
     refused(rf"{path.name}: .*(truncated|not a valid|no image)", path)
 
 
-@pytest.mark.parametrize(
-    "layout",
-    ["npy", "tiff", "tiff, zlib", "fits", "fits, RICE_1", "hdf5", "hdf5, gzip, shuffle", "zarr", "raw"],
-)
+@every_kind
 def test_signed_samples_are_read_with_an_offset_or_where_none_is_negative(
     tmp_path: Path, layout: str
 ) -> None:
