@@ -18,7 +18,8 @@ from pchem_pipeline.model.errors.fisher import correlations, covariance_from
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import INTERVAL_NAMES, FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.law.pcd import log_pcd
+from pchem_pipeline.model.law import density_scores_numba
+from pchem_pipeline.model.law.pcd import log_pcd, pcd_posterior
 from pchem_pipeline.stages.fit.fit import fit_tile
 
 Array = NDArray[np.float64]
@@ -150,16 +151,10 @@ def test_errors_are_those_of_a_parametric_bootstrap() -> None:
 def test_the_score_of_a_sample_is_the_slope_of_its_density(case: tuple[float, float, float]) -> None:
     h, a, noise = case
     at = np.array([h, 1 / a, 100.3, noise * a])
-    weights = information_numba.log_poisson(h, 60)
-    np.testing.assert_allclose(information_numba.log_poisson.py_func(h, 60), weights)
+    score, means = np.empty(4), np.empty(5)
     for x in (80.0, 100.0, 104.0, 131.0, 170.0):
-        score, plain = np.empty(4), np.empty(4)
-        logged = information_numba.sample_score(x, at, weights, score)
-        assert logged == pytest.approx(float(log_pcd(np.array([x]), *at)[0]), abs=1e-8)
-        assert information_numba.sample_score.py_func(x, at, weights, plain) == pytest.approx(
-            logged, rel=1e-12
-        )
-        np.testing.assert_allclose(plain, score, rtol=1e-9)
+        density_scores_numba.posterior(x, h, a, 100.3, noise * a, means)
+        density_scores_numba.density_scores(means, h, a, noise * a, score)
         for i in range(4):
             up, down = at.copy(), at.copy()
             up[i] *= 1 + 1e-6
@@ -273,12 +268,12 @@ def test_settings_bring_intervals_and_sandwich_errors_into_the_store() -> None:
     fit = fit_histograms(pixels.counts, pixels.origin)
     middle = np.zeros((4, 4, 4))
     for i in range(4):
-        score = np.empty(4)
-        at = estimates(fit)[i]
-        weights = information_numba.log_poisson(at[0], 60)
-        for b in np.flatnonzero(pixels.counts[i]):
-            information_numba.sample_score(float(pixels.origin[i] + b), at, weights, score)
-            middle[i] += pixels.counts[i, b] * np.outer(score, score)
+        h, g, mu, sigma = estimates(fit)[i]
+        codes = np.flatnonzero(pixels.counts[i])
+        given = pcd_posterior(pixels.origin[i] + codes, h, g, mu, sigma)
+        charge, shift = given.k / h - 1, -given.ke / (g * sigma) ** 2
+        score = np.stack([charge, shift, given.e / sigma**2, (given.ee / sigma**2 - 1) / sigma])
+        middle[i] = score * pixels.counts[i, codes] @ score.T
     sandwich = fit.covariance @ middle @ fit.covariance
     np.testing.assert_allclose(full["bias_stderr"][0], np.sqrt(sandwich[:, 2, 2]), rtol=1e-5)
     assert (full["bias_stderr"] != plain["bias_stderr"]).all()
