@@ -75,7 +75,7 @@ def pcd_posterior(
     values, *parameters = (a.ravel() for a in arrays)
     out = np.empty((N_MEANS + 1, values.size))
     fill_posterior(values, np.stack(parameters), out)
-    return PosteriorMeans(*out.reshape(-1, *arrays[0].shape))
+    return PosteriorMeans(*out.reshape(N_MEANS + 1, *arrays[0].shape))
 
 
 def log_pcd(
