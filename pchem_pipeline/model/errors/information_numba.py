@@ -65,8 +65,6 @@ def fill_squared_scores(pixel: Pixel, theta: NDArray[np.float64], at: NDArray[np
                 continue
             posterior(first + i, 0.0 if dark else exposure, step, bias, sigma, means)
             density_scores(means, exposure, step, sigma, score)
-            if dark:
-                score[0] = 0.0
             for row in range(4):
                 for column in range(row + 1):
                     product = score[row] * slope[row] * score[column] * slope[column]

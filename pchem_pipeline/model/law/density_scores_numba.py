@@ -79,9 +79,9 @@ def posterior(x: float, exposure: float, step: float, bias: float, sigma: float,
 
 @kernel(borrows=True)
 def density_scores(means: FloatArray, exposure: float, step: float, sigma: float, score: FloatArray) -> None:
-    """Fill the slopes of a log density in (H, g, mu, sigma) from the posterior means."""
+    """Fill the slopes of a log density in (H, g, mu, sigma) from the posterior means; not in an H of 0."""
     inverse = 1.0 / (sigma * sigma)
-    score[0] = means[K] / exposure - 1.0
+    score[0] = means[K] / exposure - 1.0 if exposure > 0.0 else 0.0
     score[1] = -means[KE] * inverse * step * step
     score[2] = means[E] * inverse
     score[3] = (means[EE] * inverse - 1.0) / sigma
