@@ -96,7 +96,8 @@ def _of_cells(quanta_exposure: float, read_noise_e: float, gain: float) -> NDArr
     # from (log H, 1/g, mu, log sigma_R^2)
     slopes *= np.array([1.0 / exposure, -1.0 / gain, 1.0 / gain, 2.0 * variance / analog])[:, None]
     seen = mass > 1e-14 * mass.max(axis=1, keepdims=True)
-    return np.einsum("nic,njc,nc->nij", slopes, slopes, np.where(seen, 1.0 / np.maximum(mass, 1e-300), 0.0))
+    weight = np.where(seen, 1.0 / np.maximum(mass, 1e-300), 0.0)
+    return np.asarray(np.einsum("nic,njc,nc->nij", slopes, slopes, weight))
 
 
 def shared_information(

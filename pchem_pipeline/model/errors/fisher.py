@@ -1,4 +1,4 @@
-"""Observed information of a histogram under the PCD, and how errors propagate."""
+"""Observed information of a histogram under the PCD, and covariances as correlations."""
 
 from __future__ import annotations
 
@@ -28,19 +28,6 @@ def observed_covariance(counts: ArrayLike, origin: int, parameters: ArrayLike) -
     values = np.asarray(parameters, np.float64)
     information_numba.observed_covariance(weights, int(origin), values, density_likelihood(), covariance)
     return covariance
-
-
-def propagate(covariance: NDArray[np.float64], gradient: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the standard error of a function of (H, g, mu, sigma) by the delta method.
-
-    Args:
-        covariance: shape (..., 4, 4).
-        gradient: of the function, shape (..., 4).
-
-    Returns:
-        ``sqrt(gradient' covariance gradient)``, shape (...).
-    """
-    return np.asarray(np.sqrt(np.einsum("...i,...ij,...j->...", gradient, covariance, gradient)))
 
 
 def correlations(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

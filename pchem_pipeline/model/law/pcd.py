@@ -1,4 +1,4 @@
-"""The photon counting distribution (PCD): density, moments, quantised mass and thresholds.
+"""The photon counting distribution (PCD): density, quantised mass and thresholds.
 
 A pixel reads ``X = round((K + R)/g + mu)`` with ``K`` Poisson of mean ``H`` and ``R`` normal of
 standard deviation ``sigma_R`` (Hendrickson et al. 2023, eq. PCD_RV_definition). The PCD is the density that
@@ -20,15 +20,6 @@ _Array = NDArray[np.float64]
 
 _REACH = 9.0  # standard deviations of a Gaussian beyond which nothing is left of it
 _TERMS = 2**22  # of a sum over electron numbers, at once
-
-
-class PcdMoments(NamedTuple):
-    """Mean (DN) and the second to fourth cumulants (DN^2, DN^3, DN^4) of the PCD."""
-
-    mean: _Array
-    variance: _Array
-    third: _Array
-    fourth: _Array
 
 
 class PosteriorMeans(NamedTuple):
@@ -151,29 +142,6 @@ def pcd_mass(
         return np.asarray((np.where(k < 0, 0.0, weight) * (ndtr(-low) - ndtr(-high))).sum(axis=1))
 
     return _by_parts(summed, around.size, *flat).reshape(at.shape)
-
-
-def pcd_moments(
-    quanta_exposure: ArrayLike, conversion_gain: ArrayLike, bias: ArrayLike, read_noise_dn: ArrayLike
-) -> PcdMoments:
-    """Return the first four cumulants of the PCD: a Poisson variable scaled by 1/g plus normal noise.
-
-    Arguments as in :func:`log_pcd`.
-
-    Example:
-        >>> mean, variance, *_ = pcd_moments(2.0, 0.5, 10.0, 1.0)
-        >>> float(mean), float(variance)
-        (14.0, 9.0)
-    """
-    exposure, gain, offset, sigma = np.broadcast_arrays(
-        *[np.asarray(a, dtype=np.float64) for a in (quanta_exposure, conversion_gain, bias, read_noise_dn)]
-    )
-    return PcdMoments(
-        np.asarray(offset + exposure / gain),
-        np.asarray(sigma**2 + exposure / gain**2),
-        np.asarray(exposure / gain**3),
-        np.asarray(exposure / gain**4),
-    )
 
 
 def thresholds(

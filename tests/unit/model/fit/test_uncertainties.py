@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.drawn_pixels import Drawn, draw, samples
+from helpers.drawn_pixels import Drawn, draw
 from iminuit import Minuit
 from numpy.typing import NDArray
-from scipy.special import gammaln, logsumexp
 
 from pchem_pipeline.base.variables import INTERVALS, interval_names
 from pchem_pipeline.effects.analog.row_noise import RowNoise
@@ -95,48 +94,6 @@ def test_the_interval_of_the_noise_in_electrons_is_a_profile_too() -> None:
     np.testing.assert_allclose(ends - at[1] * at[3], (other.lower, other.upper), rtol=0.02)
     # and it is far from symmetric here: standard errors would not do
     assert (other.upper + other.lower) / (other.upper - other.lower) > 0.02
-
-
-def expectations(x: Array, theta: Array) -> tuple[Array, Array, Array, Array]:
-    """E[k], E[k^2] and membership of raw samples under (log H, a, mu, log s2), in plain numpy."""
-    k = np.arange(40)
-    e = x[:, None] - theta[2] - k * theta[1]
-    logged = k * theta[0] - gammaln(k + 1) - 0.5 * e**2 * np.exp(-theta[3])
-    return np.exp(logged - logsumexp(logged, axis=1, keepdims=True)), k.astype(float), e, x
-
-
-def gradient_q(theta: Array, given: Array, x: Array) -> Array:
-    """Gradient in theta of the expected complete-data log-likelihood, memberships taken at ``given``."""
-    gamma, k, _, _ = expectations(x, given)
-    e = x[:, None] - theta[2] - k * theta[1]
-    inverse = np.exp(-theta[3])
-    return np.array(
-        [
-            (gamma * (k - np.exp(theta[0]))).sum(),
-            (gamma * k * e).sum() * inverse,
-            (gamma * e).sum() * inverse,
-            (gamma * (0.5 * e**2 * inverse - 0.5)).sum(),
-        ]
-    )
-
-
-@pytest.mark.parametrize("case", CASES[:2])
-def test_information_is_that_of_oakes(case: tuple[float, float, float]) -> None:
-    """Oakes (1999): -d2 l = -(d2 Q / d theta2 + d2 Q / d theta d given), both at the maximum."""
-    pixel, at, covariance = fitted(case)
-    x = samples(pixel.counts[0], int(pixel.origin[0]))
-    theta = np.array([np.log(at[0]), 1 / at[1], at[2], 2 * np.log(at[3])])
-    hessian = np.empty((4, 4))
-    for i, step in enumerate((1e-5, 1e-5, 1e-5, 1e-5)):
-        up, down = theta.copy(), theta.copy()
-        up[i] += step
-        down[i] -= step
-        own = gradient_q(up, theta, x) - gradient_q(down, theta, x)
-        mixed = gradient_q(theta, up, x) - gradient_q(theta, down, x)
-        hessian[i] = (own + mixed) / (2 * step)
-    slope = np.array([at[0], -(at[1] ** 2), 1.0, 0.5 * at[3]])
-    oakes = np.linalg.inv(-hessian) * np.outer(slope, slope)
-    np.testing.assert_allclose(oakes, covariance, rtol=1e-4, atol=1e-6 * np.abs(covariance).max())
 
 
 def test_errors_are_those_of_a_parametric_bootstrap() -> None:
