@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.counting_noise import counting_variance
-from scipy.stats import norm, poisson
+from helpers.plain_law import joint_mass
 
 from pchem_pipeline.model.checks.residuals import noise_floor, rmse
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
@@ -43,13 +43,10 @@ def counts_of(frames: np.ndarray) -> np.ndarray:
 
 def probabilities(pixels: UsablePixels, axis: NucedAxis) -> tuple[np.ndarray, np.ndarray]:
     """Exact probability of each DN, and of each NUCed bin, of each pixel; shapes (n, bins)."""
-    k = np.arange(80)
     raw = np.empty((len(pixels), DN.size))
     nuced = np.empty((len(pixels), axis.size))
     for p, (h, g, mu, sigma) in enumerate(zip(*pixels.maps, strict=True)):
-        centres, analog = mu + k[:, None] / g, np.sqrt(sigma**2 - 1 / 12)
-        cells = norm.cdf(DN.dn + 0.5, centres, analog) - norm.cdf(DN.dn - 0.5, centres, analog)
-        raw[p] = poisson.pmf(k, h) @ cells
+        raw[p] = joint_mass(DN.dn, h, g, mu, sigma, 80).sum(axis=0)
         place = np.floor((DN.dn - mu) * g / axis.width + 0.5).astype(int) - axis.start
         inside = (place >= 0) & (place < axis.size)
         nuced[p] = np.bincount(place[inside], weights=raw[p, inside], minlength=axis.size)

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from helpers.plain_camera import PlainCamera
+from helpers.plain_law import joint_mass
 from helpers.small_stacks import small_stack
 from scipy import special, stats
 
@@ -148,12 +149,7 @@ def _tables(frames: np.ndarray, evidence: Evidence) -> tuple[np.ndarray, np.ndar
     electrons = np.arange(60)
     for y, x in np.argwhere(maps.usable):
         h, g, mu = maps.quanta_exposure[y, x], maps.conversion_gain[y, x], maps.bias[y, x]
-        s = np.sqrt(maps.read_noise_dn[y, x] ** 2 - 1 / 12)
-        codes = np.arange(400)[:, None]
-        mean = mu + electrons / g
-        joint = stats.poisson.pmf(electrons, h) * (
-            stats.norm.cdf(codes + 0.5, mean, s) - stats.norm.cdf(codes - 0.5, mean, s)
-        )
+        joint = joint_mass(np.arange(400), h, g, mu, maps.read_noise_dn[y, x], 60).T
         total = joint.sum(axis=1)
         below, above = np.cumsum(total), np.cumsum(total[::-1])[::-1]
         low, high = np.argmax(n * below >= 0.01), 399 - np.argmax((n * above >= 0.01)[::-1])
