@@ -30,6 +30,12 @@ def normal_mass(low: float, high: float) -> float:
     return 0.5 * (math.erf(high * root) - math.erf(low * root))
 
 
+@kernel(borrows=True)
+def reach_of(log_weight: float) -> float:
+    """Return the standard deviations within which a component of a weight is seen."""
+    return math.sqrt(max(REACH * REACH + 2.0 * log_weight, 0.0))
+
+
 @kernel
 def add_mass(out: FloatArray, base: float, weight: float, centre: float, sigma: float) -> None:
     """Add ``weight`` times the mass of N(centre, sigma^2) between ``base + i -+ 1/2`` to ``out[i]``."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.arithmetic.normal_numba import NARROW, REACH, add_mass
+from pchem_pipeline.model.arithmetic.normal_numba import NARROW, REACH, add_mass, reach_of
 from pchem_pipeline.model.arithmetic.simd_math_numba import simd_exp
 from pchem_pipeline.model.arithmetic.simd_numba import (
     SIMD_WIDTH,
@@ -81,12 +81,6 @@ def log_factorials(n: int) -> FloatArray:
     for k in range(1, n):
         found[k] = found[k - 1] + math.log(k)
     return found
-
-
-@kernel(borrows=True)
-def reach_of(log_weight: float) -> float:
-    """Return the standard deviations within which a component of a weight is seen."""
-    return math.sqrt(max(REACH * REACH + 2.0 * log_weight, 0.0))
 
 
 class AxisSums(NamedTuple):

@@ -404,12 +404,12 @@ def _fill_edges(bins: NDArray[np.float64], part: Component, edges: NDArray[np.fl
 
 
 @kernel(inline=True)
-def _cell_of(mean: float, cells: Cells, part: Component) -> int:
-    """Return the cell that holds a mean, if it is one within reach, or one outside."""
-    middle = int(min(max(mean - cells.first, part.low - 1.0), float(part.high)))
-    while middle < part.high and cells.bins[EDGE, middle + 1] <= mean:
+def cell_of(mean: float, cells: Cells, low: int, high: int) -> int:
+    """Return the cell that holds a mean, if it is one of these, the end excluded, or one outside."""
+    middle = int(min(max(mean - cells.first, low - 1.0), float(high)))
+    while middle < high and cells.bins[EDGE, middle + 1] <= mean:
         middle += 1
-    while middle >= part.low and cells.bins[EDGE, middle] > mean:
+    while middle >= low and cells.bins[EDGE, middle] > mean:
         middle -= 1
     return middle
 
@@ -452,7 +452,7 @@ def _add_component(
         if w_satellite != 0.0:
             slope = fused(d0, w_satellite, simd_load(room, SLOPES + _SATELLITE, i))
             simd_store(room, SLOPES + _SATELLITE, i, slope)
-    middle = _cell_of(part.mean, cells, part)
+    middle = cell_of(part.mean, cells, part.low, part.high)
     if part.low <= middle < part.high:  # both tails are those beyond its edges
         room[MASS, middle] += w
         room[SLOPES + _EXPOSURE, middle] += w_exposure
@@ -643,7 +643,7 @@ def _hermite_sums(
         s3 = fused(ratio, z1 * by_z1 - density1 - (z0 * by_z0 - density0), s3)
         s4 = fused(ratio, (z1 * z1 - 3.0) * by_z1 - (z0 * z0 - 3.0) * by_z0, s4)
     whole = float(simd_sum(s0))
-    middle = _cell_of(part.mean, cells, part)
+    middle = cell_of(part.mean, cells, part.low, part.high)
     if part.low <= middle < part.high:
         whole += room[RATIO, middle]
     return whole, float(simd_sum(s1)), float(simd_sum(s2)), float(simd_sum(s3)), float(simd_sum(s4))
