@@ -1,6 +1,6 @@
 """Loops of plain EM, straight from the paper's update equations, on histograms.
 
-Nothing here is shared with the fit of this package, so that the two can be compared.
+Nothing here is shared with the loops of this package's fit, so that the two can be compared.
 """
 
 from __future__ import annotations
@@ -9,33 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-
-_SMALL = 1e-17  # terms below this share of their sum are left out
-
-
-@kernel
-def mean_electrons(x: float, theta: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the posterior mean of k and of k^2 given x, eq. (gamma_nk); theta: (H, 1/g, mu, sigma)."""
-    exposure, step, bias, sigma = theta
-    first = max(0, int(np.rint((x - bias) / step)))
-    along = step / (sigma * sigma)
-    fall = np.exp(-step * along)
-    residual = x - bias - first * step
-    total, one, two = 1.0, float(first), float(first) * first
-    for side in (1, -1):
-        # the ratio of neighbouring terms falls by the same factor at every electron
-        term, ratio, k = 1.0, np.exp((side * residual - 0.5 * step) * along), first
-        while side > 0 or k > 0:
-            grow = ratio * (exposure / (k + 1) if side > 0 else k / exposure)
-            k += side
-            term *= grow
-            ratio *= fall
-            total += term
-            one += term * k
-            two += term * k * k
-            if grow < 1.0 and term < _SMALL * total:
-                break
-    return one / total, two / total
+from pchem_pipeline.model.law.density_scores_numba import KK, N_MEANS, K, posterior
 
 
 @kernel
@@ -58,7 +32,7 @@ def em_pixel(
     Returns:
         Steps taken; negative where the parameters left the allowed range.
     """
-    n, mean = 0.0, 0.0
+    n, mean, means = 0.0, 0.0, np.empty(N_MEANS)
     for i in range(counts.size):
         n += counts[i]
         mean += counts[i] * float(i)
@@ -71,11 +45,11 @@ def em_pixel(
         a = b = c = 0.0
         for i in range(counts.size):
             if counts[i] > 0:
-                one, two = mean_electrons(float(i), theta)
+                posterior(float(i), theta[0], theta[1], theta[2], theta[3], means)  # eq. (gamma_nk)
                 share = counts[i] / n
-                a += share * one
-                b += share * two
-                c += share * one * (i - mean)
+                a += share * means[K]
+                b += share * means[KK]
+                c += share * means[K] * (i - mean)
         bias, sigma = theta[2], theta[3]
         if only_light:
             step = (c + (mean - bias) * a) / b if b > 0 else -1.0

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.law.density_scores_numba import EE, N_MEANS, E, posterior
 
 FloatArray = NDArray[np.float64]
 
@@ -32,35 +33,6 @@ class Pixels(NamedTuple):
 
 
 @kernel
-def _score(difference: float, exposure: float, gain: float, sigma: float, reach: int) -> tuple[float, float]:
-    """Return the slope of the log-likelihood in an offset, 1/DN, and the information, 1/DN^2.
-
-    Args:
-        difference: x - mu - offset, DN.
-        exposure: H, e-.
-        gain: g, e-/DN.
-        sigma: DN.
-        reach: electron numbers on either side of the nearest that are summed.
-    """
-    precision = 1.0 / (sigma * sigma)
-    nearest = max(math.floor(difference * gain + 0.5), 0)
-    low = max(nearest - reach, 0)
-    prior, total, first, second = 1.0, 0.0, 0.0, 0.0
-    base = (difference - nearest / gain) ** 2
-    for k in range(low, nearest + reach + 1):
-        residual = difference - k / gain
-        weight = prior * math.exp(0.5 * precision * (base - residual * residual))
-        total += weight
-        first += weight * residual
-        second += weight * residual * residual
-        prior *= exposure / (k + 1.0)
-    mean = first / total
-    variance = second / total - mean * mean
-    information = precision - variance * precision * precision
-    return mean * precision, max(information, _LEAST_INFORMATION * precision)
-
-
-@kernel
 def from_electrons(frame: NDArray[Any], pixels: Pixels, offset: FloatArray, form: FloatArray) -> None:
     """Fill the quadratic form ``form[0] o - form[1] o^2 / 2`` of a log-likelihood in samples' offsets.
 
@@ -71,13 +43,16 @@ def from_electrons(frame: NDArray[Any], pixels: Pixels, offset: FloatArray, form
         form: out, shape (2, y, x).
     """
     exposure, gain, bias, sigma = pixels
+    means = np.empty(N_MEANS)
     for y in range(frame.shape[0]):
         for x in range(frame.shape[1]):
             form[0, y, x] = form[1, y, x] = 0.0
             if math.isnan(exposure[y, x]):
                 continue
-            reach = 2 + math.ceil(4.0 * sigma[y, x] * gain[y, x])
-            difference = frame[y, x] - bias[y, x] - offset[y, x]
-            score, information = _score(difference, exposure[y, x], gain[y, x], sigma[y, x], reach)
+            own, value = sigma[y, x], frame[y, x] - bias[y, x] - offset[y, x]
+            posterior(value, exposure[y, x], 1.0 / gain[y, x], 0.0, own, means)
+            precision = 1.0 / (own * own)
+            score, variance = means[E] * precision, means[EE] - means[E] * means[E]
+            information = max(precision - variance * precision * precision, _LEAST_INFORMATION * precision)
             # the form is that of the offset itself, not of its change
             form[0, y, x], form[1, y, x] = score + information * offset[y, x], information

@@ -12,23 +12,25 @@ are CPU times of this process.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import gammaln, logsumexp
 
-from pchem_pipeline.model.errors.fisher import cramer_rao
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 Array = NDArray[np.float64]
 NAMES = ("H", "g", "mu", "sigma")
 
@@ -236,6 +238,8 @@ def bench_maxima(rng: np.random.Generator, n: int, n_frames: int) -> None:
 
 def bench_efficiency(rng: np.random.Generator, n: int, n_pulls: int, n_frames: int) -> None:
     """Print the RMSE over the Cramer-Rao bound, and mean and variance of the pulls, on a grid."""
+    from helpers.bounds import cramer_rao
+
     print(f"\nEfficiency: {n} pixels a point, 1/g = 11 DN, N = {n_frames}")
     print(f"RMSE / Cramer-Rao bound (s.e. {1 / np.sqrt(2 * n):.4f}); pulls (estimate - truth) / stderr of")
     print(f"{n_pulls}: mean (s.e. {1 / np.sqrt(n_pulls):.4f}) and variance (s.e. {np.sqrt(2 / n_pulls):.4f})")

@@ -21,10 +21,11 @@ from typing import NamedTuple
 from pchem_pipeline.compute.environment import prepare_environment
 
 prepare_environment()
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 import numpy as np  # noqa: E402
+from helpers.bounds import cramer_rao  # noqa: E402
 
-from pchem_pipeline.model.errors.fisher import cramer_rao, joint_cramer_rao  # noqa: E402
 from pchem_pipeline.model.fit.api import fit_histograms  # noqa: E402
 from pchem_pipeline.model.law.pcd import pcd_mass  # noqa: E402
 from pchem_pipeline.report.style.style import Look, drawing_bytes, styled  # noqa: E402
@@ -66,7 +67,7 @@ def row(noise, n_pixels, n_frames):
     counts, origins = zip(*drawn, strict=True)
     found = fit_histograms(counts, origins, dark=[exposure == 0 for exposure in exposures])
     j = len(exposures)
-    bound = np.sqrt(np.diagonal(joint_cramer_rao(exposures, 1 / STEP, noise * STEP, n_frames)))
+    bound = np.sqrt(np.diagonal(cramer_rao(exposures, 1 / STEP, noise * STEP, n_frames)))
     errors = {
         j: found.conversion_gain - 1 / STEP,
         j + 1: found.bias - BIAS,

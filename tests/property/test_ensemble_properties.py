@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+from helpers.plain_law import joint_mass
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import norm, poisson
 
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, nuced_axis
@@ -70,15 +70,11 @@ def test_numbers_have_the_largest_joint_mass(
     exposure: float, gain: float, bias: float, noise: float, data: st.DataObject
 ) -> None:
     dn = np.array(data.draw(st.lists(st.integers(0, 6000), min_size=1, max_size=30)), dtype=np.uint16)
-    analog = noise / gain
-    sigma = np.sqrt(analog**2 + 1 / 12)
+    sigma = np.sqrt((noise / gain) ** 2 + 1 / 12)
     pixels = KnownPixels([np.full(1, v) for v in (exposure, gain, bias, sigma)], SampleLaw())
     ends = (np.atleast_1d(each) for each in (dn.min(), dn.max()))
     found = number_tables(*ends, pixels.exposure, pixels).convert(dn[:, None]).number.ravel()
-    k = np.arange(2500)[:, None]
-    low, high = ((dn + side - bias - k / gain) / analog for side in (-0.5, 0.5))
-    inside = np.where(low > 0, norm.sf(low) - norm.sf(high), norm.cdf(high) - norm.cdf(low))
-    joint = poisson.pmf(k, exposure) * inside
+    joint = joint_mass(dn, exposure, gain, bias, sigma, 2500)
     most = joint.max(axis=0)
     # a code where two numbers are as good as alike may have either; one that is never seen may have any
     known = (most > 1e-16) & ((joint > (1 - 1e-6) * most).sum(axis=0) == 1)

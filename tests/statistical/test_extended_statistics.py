@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.masses import log_likelihood
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
-from pchem_pipeline.model.law.mass import log_likelihood
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 PIXELS, FRAMES = 120, 4000

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from helpers.bounds import cramer_rao
 from helpers.joint_material import draw_series
 
-from pchem_pipeline.model.errors.fisher import cramer_rao, joint_cramer_rao
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 
@@ -18,7 +18,7 @@ def test_the_joint_fit_is_efficient(noise, dark):
     series = draw_series(np.random.default_rng(int(100 * noise)), exposures, noise, N_PIXELS)
     found = fit_histograms(series.counts, series.origins, dark=series.dark)
     size = len(exposures)
-    bound = joint_cramer_rao(exposures, 0.1, noise * 10.0, 4000)
+    bound = cramer_rao(exposures, 0.1, noise * 10.0, 4000)
     truth = {size: 0.1, size + 1: 100.3, size + 2: 10.0 * noise} | dict(enumerate(exposures))
     columns = {size: found.conversion_gain, size + 1: found.bias, size + 2: found.read_noise_dn}
     columns |= {j: found.quanta_exposure[:, j] for j in range(size)}
@@ -41,8 +41,8 @@ def test_the_joint_fit_is_efficient(noise, dark):
 
 
 def test_a_bias_stack_tells_more_than_another_exposure():
-    with_bias = joint_cramer_rao([1.0, 4.0, 0.0], 0.1, 8.0, 1000)
-    without = joint_cramer_rao([1.0, 4.0, 2.0], 0.1, 8.0, 1000)
+    with_bias = cramer_rao([1.0, 4.0, 0.0], 0.1, 8.0, 1000)
+    without = cramer_rao([1.0, 4.0, 2.0], 0.1, 8.0, 1000)
     assert with_bias[4, 4] < 0.5 * without[4, 4]
 
 

@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.observe.law_numba import (
-    N_COLUMNS,
-    N_NUISANCE,
     NOTHING,
-    fill_law,
     pixel_scores,
     whiten,
     within,
 )
+from pchem_pipeline.model.law.cell_scores_numba import N_COLUMNS, N_NUISANCE, fill_law
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -345,7 +343,7 @@ def summarise_pixels(fitted: Fitted, allowed: float, allowed_far: float, laws: P
         )  # fmt: skip
         exposure, step, bias, width = fitted.parameters[p]
         full = np.empty((window[1] - window[0] + 1, N_COLUMNS))
-        fill_law(exposure, step, bias - window[0], width, electrons[0], electrons[1], full)
+        fill_law(exposure, step, bias - window[0], width, electrons[0], electrons[1], False, full)
         n = outside[0] + outside[1] + _total(counts)
         low, high, below, above = within(full, n, allowed)
         law, first = full[low : high + 1], window[0] + low

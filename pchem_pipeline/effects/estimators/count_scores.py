@@ -14,6 +14,7 @@ import numpy as np
 
 from pchem_pipeline.effects.estimators.regression import CUT, CUT_ROUNDS
 from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray
+from pchem_pipeline.model.law.pcd import pcd_posterior
 
 # the information is smooth in both: nodes of its table, e-
 _EXPOSURES = np.geomspace(0.02, 60.0, 25)
@@ -80,24 +81,14 @@ def _table() -> FloatArray:
 def _information(exposure: float, noise: float) -> float:
     """Return I of one pixel: sums over x of the densities of the PCD, eq. PCD of Hendrickson et al. 2023."""
     spread = 6.0 * np.sqrt(exposure)
-    k = np.arange(max(0, int(exposure - spread)), int(exposure + spread + 8.0))
-    x = np.arange(k[0] - 6.0 * noise, k[-1] + 6.0 * noise, noise / _POINTS_PER_SIGMA)
-    log_mass = k * np.log(exposure) - exposure - np.cumsum(np.log(np.maximum(np.arange(k[-1] + 1), 1)))[k]
-    residual = (x[:, None] - k) / noise
-    joint = np.exp(log_mass - 0.5 * residual**2)
-    density = joint.sum(axis=1)
-    keep = density > 1e-30
-    share = joint[keep] / density[keep, None]
-    weight = density[keep] / density[keep].sum()
-    k, residual = np.broadcast_to(k, residual.shape)[keep], residual[keep]
-
-    def expected(score: FloatArray) -> FloatArray:
-        values: FloatArray = np.sqrt(weight) * (share * score).sum(axis=1)
-        return values
-
+    first, last = max(0, int(exposure - spread)), int(exposure + spread + 8.0) - 1
+    x = np.arange(first - 6.0 * noise, last + 6.0 * noise, noise / _POINTS_PER_SIGMA)
+    given = pcd_posterior(x, exposure, 1.0, 0.0, noise)
+    density = np.exp(given.log_density)
+    root = np.sqrt(density / density.sum())
     # the four parameters: exposure, bias, gain, read noise
-    tangent = [expected(s) for s in (k - exposure, residual, residual * k, residual**2 - 1.0)]
-    score = expected(0.5 * ((k - exposure) ** 2 - k))
-    basis = np.linalg.qr(np.stack(tangent, axis=1))[0]
+    tangent = [given.k - exposure, given.e / noise, given.ke / noise, given.ee / noise**2 - 1.0]
+    score = root * 0.5 * (given.kk - (2.0 * exposure + 1.0) * given.k + exposure**2)
+    basis = np.linalg.qr(np.stack(tangent, axis=1) * root[:, None])[0]
     left = score - basis @ (basis.T @ score)
     return max(float(left @ left), 1e-30)

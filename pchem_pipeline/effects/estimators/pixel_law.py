@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.effects.framework.evidence import SCORES
 from pchem_pipeline.effects.types import FloatArray, PixelMaps, SampleLaw
 from pchem_pipeline.model.arithmetic.robust import chi_square
 
-#: polynomials (a, b) that the four parameters of the PCD take up: bias, exposure, gain, read noise
-_PARAMETERS = ((1, 0), (0, 1), (1, 1), (2, 0))
+_N_PARAMETERS = 4  # of the PCD
 _SMALLEST_MASS = 1e-100
 _SMALLEST_WIDTH = 0.1  # DN
 # samples expected beyond the codes of a pixel, on either side
@@ -69,28 +69,28 @@ class PixelLaw:
 
     def __init__(self, maps: PixelMaps, where: int, n_frames: int):
         """Tabulate the PCD of one pixel of the maps, by its flat index, for that many samples."""
+        from pchem_pipeline.model.law import cell_scores_numba
+
         self.maps = select_pixels(maps, np.array([where]))
         exposure, gain, bias, sigma = (
             float(getattr(self.maps, name)[0])
             for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
         )
         analog = float(np.sqrt(max(sigma**2 - QUANTISATION_VARIANCE, _SMALLEST_WIDTH**2)))
-        counts = _counts(exposure)
-        levels = bias + counts / gain
-        self._wide = _wide_codes(levels, analog, gain)
-        parts = [_hermite_cells(a, self._wide, levels, analog) for a in range(5)]
-        weights = [_poisson(counts, exposure) * _charlier(b, counts, exposure) for b in range(4)]
-        mass = weights[0] @ parts[0]
+        first, last = _counts(exposure)
+        self._wide = _wide_codes(bias + first / gain, bias + last / gain, analog, gain)
+        law = np.empty((self._wide.size, cell_scores_numba.N_COLUMNS))
+        cell_scores_numba.fill_law(exposure, 1.0 / gain, bias - self._wide[0], analog, first, last, True, law)
+        mass = law[:, 0]
         below, above = np.cumsum(mass), np.cumsum(mass[::-1])[::-1]
         inside = (below * n_frames >= _ALLOWED) & (above * n_frames >= _ALLOWED)
         self.codes = self._wide[inside]
         # between narrow peaks there may be nothing
         within = np.maximum(mass[inside], _SMALLEST_MASS)
         self.mass = np.maximum(self.on_codes(self._wide, mass), _SMALLEST_MASS)
-        self._scores = {(a, b): (weights[b] @ parts[a])[inside] / within for a in range(5) for b in range(4)}
-        self.charge = ((weights[0] * counts) @ parts[0])[inside] / within
+        self._scores = (law[inside] / within[:, None]).T
+        self.charge = exposure + np.sqrt(exposure) * self._scores[1]
         self.readout = self.codes - bias - self.charge / gain
-        self._nuisance = np.stack([np.ones(self.codes.size), *(self._scores[order] for order in _PARAMETERS)])
 
     def on_codes(self, codes: FloatArray, mass: FloatArray) -> FloatArray:
         """Return a mass over other codes as one over those of this law, whose sum is 1, shape (n,)."""
@@ -117,10 +117,10 @@ class PixelLaw:
             name: the score, such as "He2C1".
             change: of the mass, shape (n,).
         """
-        wanted = self._scores[_orders(name)]
-        weighted = self._nuisance * self.mass
-        slopes = np.linalg.lstsq(weighted @ self._nuisance.T, weighted @ wanted, rcond=1e-9)[0]
-        efficient = wanted - slopes @ self._nuisance
+        nuisance, tests = self._scores[: -len(SCORES)], self._scores[-len(SCORES) :]
+        wanted, weighted = tests[SCORES.index(name)], nuisance * self.mass
+        slopes = np.linalg.lstsq(weighted @ nuisance.T, weighted @ wanted, rcond=1e-9)[0]
+        efficient = wanted - slopes @ nuisance
         deviation = np.sqrt(max(float((efficient**2) @ self.mass), _SMALLEST_MASS))
         return float(efficient @ change) / float(deviation)
 
@@ -132,7 +132,7 @@ class PixelLaw:
         first = np.arange(0, self.mass.size, max(round(float(self.maps.read_noise_dn[0])), 1))
         mass, moved = (np.add.reduceat(values, first) for values in (self.mass, change))
         grouped = mass * n_frames >= _FEWEST
-        degrees = max(int(grouped.sum()) - len(_PARAMETERS), 1)
+        degrees = max(int(grouped.sum()) - _N_PARAMETERS, 1)
         excess = n_frames * float((moved[grouped] ** 2 / mass[grouped]).sum())
         return float(chi_square(degrees + excess, degrees))
 
@@ -174,56 +174,12 @@ def refitted(
     return [PixelLaw(maps, i, n_frames) if good[i] else laws[i] for i in range(len(laws))]
 
 
-def _orders(name: str) -> tuple[int, int]:
-    """Return (2, 1) of "He2C1"."""
-    hermite, _, charlier = name.partition("C")
-    return int(hermite.removeprefix("He") or 0), int(charlier or 0)
-
-
-def _counts(exposure: float) -> FloatArray:
+def _counts(exposure: float) -> tuple[int, int]:
+    """Return the smallest and the largest electron number that count."""
     spread = 10.0 * np.sqrt(exposure + 1.0)
-    return np.arange(max(0.0, np.floor(exposure - spread)), np.ceil(exposure + spread) + 1.0)
+    return max(0, int(np.floor(exposure - spread))), int(np.ceil(exposure + spread))
 
 
-def _wide_codes(levels: FloatArray, sigma: float, gain: float) -> FloatArray:
+def _wide_codes(low: float, high: float, sigma: float, gain: float) -> FloatArray:
     reach = max(_REACH * sigma, _REACH_E / gain + 4.0 * sigma)
-    return np.arange(np.floor(levels[0] - reach), np.ceil(levels[-1] + reach) + 1)
-
-
-def _poisson(counts: FloatArray, mean: float) -> FloatArray:
-    from scipy.special import gammaln, xlogy
-
-    found: FloatArray = np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0))
-    return found
-
-
-def _charlier(b: int, counts: FloatArray, mean: float) -> FloatArray:
-    """Return the monic Charlier polynomial of order b."""
-    before, now = np.zeros_like(counts), np.ones_like(counts)
-    for n in range(b):
-        before, now = now, (counts - n - mean) * now - n * mean * before
-    return now
-
-
-def _hermite_cells(a: int, codes: FloatArray, levels: FloatArray, sigma: float) -> FloatArray:
-    """Return the integral of He_a times the normal density over the cell of each code, (level, code)."""
-    if a == 0:
-        return _cells(codes, levels, np.full(levels.size, sigma))
-    edges = (np.append(codes - 0.5, codes[-1] + 0.5) - levels[:, None]) / sigma
-    before, now = np.zeros_like(edges), np.ones_like(edges)
-    for n in range(a - 1):
-        before, now = now, edges * now - n * before
-    # He_a phi is minus the derivative of He_{a-1} phi
-    found: FloatArray = -np.diff(now * np.exp(-0.5 * edges**2) / np.sqrt(2 * np.pi), axis=1)
-    return found
-
-
-def _cells(codes: FloatArray, levels: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Return the normal mass in the cell of each code, (level, code)."""
-    from scipy.special import ndtr
-
-    edges = (np.append(codes - 0.5, codes[-1] + 0.5) - levels[:, None]) / sigma[:, None]
-    # above the level the difference is taken of the upper tails, which keep their digits
-    above = -np.diff(ndtr(-edges), axis=1)
-    found: FloatArray = np.where(edges[:, :-1] > 0, above, np.diff(ndtr(edges), axis=1))
-    return found
+    return np.arange(np.floor(low - reach), np.ceil(high + reach) + 1)

@@ -1,4 +1,4 @@
-"""The normal law in cells of 1 DN: its mass between two values, and Gaussians added to codes."""
+"""The normal law in cells of 1 DN: its mass between two values, and its mass added to codes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 
 FloatArray = NDArray[np.float64]
 
@@ -31,29 +30,10 @@ def normal_mass(low: float, high: float) -> float:
     return 0.5 * (math.erf(high * root) - math.erf(low * root))
 
 
-@kernel
-def add_density(out: FloatArray, base: float, weight: float, centre: float, sigma: float) -> None:
-    """Add ``weight * phi(base + i; centre, sigma^2)`` to ``out[i]``, by two multiplications a point."""
-    first = max(0, math.ceil(centre - REACH * sigma - base))
-    last = min(out.size - 1, math.floor(centre + REACH * sigma - base))
-    if first > last:
-        return
-    nearest = min(max(math.floor(centre - base + 0.5), first), last)
-    precision = 1.0 / (sigma * sigma)
-    distance = base + nearest - centre
-    peak = weight * 0.3989422804014327 / sigma * math.exp(-0.5 * distance * distance * precision)
-    out[nearest] += peak
-    shrink = math.exp(-precision)
-    value, ratio = peak, math.exp(-(distance + 0.5) * precision)
-    for i in range(nearest + 1, last + 1):
-        value *= ratio
-        ratio *= shrink
-        out[i] += value
-    value, ratio = peak, math.exp((distance - 0.5) * precision)
-    for i in range(nearest - 1, first - 1, -1):
-        value *= ratio
-        ratio *= shrink
-        out[i] += value
+@kernel(borrows=True)
+def reach_of(log_weight: float) -> float:
+    """Return the standard deviations within which a component of a weight is seen."""
+    return math.sqrt(max(REACH * REACH + 2.0 * log_weight, 0.0))
 
 
 @kernel
@@ -67,12 +47,3 @@ def add_mass(out: FloatArray, base: float, weight: float, centre: float, sigma: 
         above = math.erf((base + i + 0.5 - centre) * scale)
         out[i] += 0.5 * weight * (above - below)
         below = above
-
-
-@kernel
-def add_component(out: FloatArray, base: float, weight: float, centre: float, sigma: float) -> None:
-    """Add a component of the PCD at the integers ``base + i``: its density, or its mass if narrow."""
-    if sigma >= NARROW:
-        add_density(out, base, weight, centre, sigma)
-    else:  # sigma holds the 1/12 DN^2 of rounding, which the integration over the cell puts back
-        add_mass(out, base, weight, centre, math.sqrt(max(sigma * sigma - QUANTISATION_VARIANCE, 1e-12)))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.arithmetic.normal_numba import NARROW, REACH, normal_mass
+from pchem_pipeline.model.arithmetic.normal_numba import NARROW, normal_mass, reach_of
 from pchem_pipeline.model.arithmetic.simd_math_numba import simd_tail
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, simd_load, simd_store
 from pchem_pipeline.model.ensemble.ensemble_numba import (
@@ -18,7 +18,6 @@ from pchem_pipeline.model.ensemble.ensemble_numba import (
     log_factorials,
     occupied,
     poisson_weights,
-    reach_of,
 )
 
 FloatArray = NDArray[np.float64]
@@ -73,7 +72,11 @@ def sum_by_thresholds(
         errors[p] = 1.0 - right
         # farther from all levels than any sample of the law: the nearest
         ends = bias + low * step, bias + high * step
-        farthest = max(_reach(weights[low]) * sd, step), max(_reach(weights[high]) * sd, step)
+        likely = max(weights[low], _LEAST_LIKELY), max(weights[high], _LEAST_LIKELY)
+        farthest = (
+            max(reach_of(math.log(likely[0])) * sd, step),
+            max(reach_of(math.log(likely[1])) * sd, step),
+        )
         bottom, top = ends[0] - farthest[0] - 0.5, ends[1] + farthest[1] + 0.5
         begin, end = occupied(counts, p)
         if exposure > 0.0:
@@ -178,12 +181,6 @@ def _add_nearest(samples: int, dn: int, bias: float, step: float, largest: int, 
     k = max(math.floor((dn - bias) / step + 0.5), 0)
     beyond: int = _add(np.int64(samples), k, largest, observed)
     return beyond
-
-
-@kernel
-def _reach(likely: float) -> float:
-    """Return the standard deviations within which an electron number of this probability is seen."""
-    return math.sqrt(max(REACH * REACH + 2.0 * math.log(max(likely, _LEAST_LIKELY)), 0.0))
 
 
 @kernel(borrows=True)

@@ -165,21 +165,6 @@ def moment_errors(pixels: UsablePixels, n_frames: int | NDArray[np.integer[Any]]
     return MomentErrors(*errors)
 
 
-def sample_moments(counts: NDArray[np.integer[Any]], dn: NDArray[np.integer[Any]]) -> tuple[float, float]:
-    """Mean and variance of a histogram of integers, without cancellation.
-
-    Args:
-        counts: samples at each DN, shape (n_dn,), not all zero.
-        dn: the DN, shape (n_dn,).
-
-    Returns:
-        Mean (DN) and variance (DN^2, divided by the number of samples).
-    """
-    total = int(counts.sum())
-    mean = float(dn[0]) + float(np.dot(counts, dn - dn[0])) / total
-    return mean, float(np.dot(counts, (dn - mean) ** 2)) / total
-
-
 def component_widths(pixels: UsablePixels, n_k: int, weight: FloatArray | None = None) -> Components:
     """Mean and variance of the components of the EPCD, in the sixteen cases of Appendix B.
 

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.arithmetic.normal_numba import NARROW, REACH, add_component, add_mass
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.arithmetic.normal_numba import NARROW, REACH, add_mass, reach_of
 from pchem_pipeline.model.arithmetic.simd_math_numba import simd_exp
 from pchem_pipeline.model.arithmetic.simd_numba import (
     SIMD_WIDTH,
@@ -82,12 +83,6 @@ def log_factorials(n: int) -> FloatArray:
     return found
 
 
-@kernel(borrows=True)
-def reach_of(log_weight: float) -> float:
-    """Return the standard deviations within which a component of a weight is seen."""
-    return math.sqrt(max(REACH * REACH + 2.0 * log_weight, 0.0))
-
-
 class AxisSums(NamedTuple):
     """What is added up along an axis, of DN or of NUCed values.
 
@@ -150,7 +145,7 @@ def sum_pcd_pixels(
                 within = reach_of(k * log_exposure - exposure[p] - log_factorial[k]) * sigma[p]
                 _add_bell(row, centre - dn_start, sigma[p], weights[k], within, decay, total.size)
             else:
-                add_component(part, base, weights[k], centre, sigma[p])
+                _add_needle(part, base, weights[k], centre, sigma[p])
         for i in range(part.size):
             total[first + i] += part[i]
             total_square[first + i] += part[i] * part[i]
@@ -179,6 +174,13 @@ def _add_bell(
             simd_store(row, 0, i, value + simd_load(row, 0, i))
             value = value * ratio
             ratio = ratio * decay
+
+
+@kernel(borrows=True)
+def _add_needle(out: FloatArray, base: float, weight: float, centre: float, sigma: float) -> None:
+    """Add a component so narrow that its density at the integers ``base + i`` is not its mass."""
+    # sigma holds the 1/12 DN^2 of rounding, which the integration over the cell puts back
+    add_mass(out, base, weight, centre, math.sqrt(max(sigma * sigma - QUANTISATION_VARIANCE, 1e-12)))
 
 
 @kernel(borrows=True)
@@ -356,11 +358,18 @@ def sum_pcd_cells(
     out: FloatArray,
 ) -> None:
     """Add ``share`` times the PCD of each cell of a 4-D histogram at the integers."""
-    weights = np.zeros(capacity(exposure))
+    weights, row = np.zeros(capacity(exposure)), np.zeros((1, out.size + _ROOM))
     for c in range(exposure.size):
         low, high = poisson_weights(exposure[c], weights)
+        decay = math.exp(-((SIMD_WIDTH / sigma[c]) ** 2))
         for k in range(low, high + 1):
-            add_component(out, float(dn_start), share[c] * weights[k], bias[c] + k / gain[c], sigma[c])
+            weight, centre = share[c] * weights[k], bias[c] + k / gain[c]
+            if sigma[c] >= NARROW:
+                _add_bell(row, centre - dn_start, sigma[c], weight, REACH * sigma[c], decay, out.size)
+            else:
+                _add_needle(out, float(dn_start), weight, centre, sigma[c])
+    for i in range(out.size):
+        out[i] += row[0, i]
 
 
 @kernel

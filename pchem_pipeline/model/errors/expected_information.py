@@ -17,9 +17,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaln, ndtr
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.law.mass import sample_slopes
+from pchem_pipeline.model.law.pcd import pcd_posterior
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 #: The coordinates in which the information depends on H and the read noise in electrons only.
 COORDINATES = ("quanta_exposure", "log_gain", "bias_e", "log_read_noise_dn")
@@ -49,74 +51,53 @@ def expected_information(
     """
     if not (np.isfinite([quanta_exposure, read_noise_e]).all() and min(quanta_exposure, read_noise_e) > 0):
         raise ValueError("quanta exposure and read noise must be positive")
-    width = 12.0 * np.sqrt(quanta_exposure) + 12.0
-    least = max(0, int(quanta_exposure - width))
-    k = np.arange(least, int(quanta_exposure + width) + 1, dtype=np.float64)
-    log_mass = k * np.log(quanta_exposure) - quanta_exposure - gammaln(k + 1)
     if read_noise_e < _COARSE * conversion_gain:
-        parts = _of_cells(k, np.exp(log_mass), k / quanta_exposure - 1.0, read_noise_e, conversion_gain)
+        parts = _of_cells(quanta_exposure, read_noise_e, conversion_gain)
         bounds = np.stack([inverse_information(part) for part in parts])
         known = np.isfinite(bounds[:, 0, 0])
         return inverse_information(bounds[known].mean(axis=0)) if known.any() else np.full((4, 4), np.nan)
-    step = read_noise_e / _NODES_PER_SIGMA
-    nodes = np.arange(k[0] - _REACH * read_noise_e, k[-1] + _REACH * read_noise_e, step)
-    residual = nodes[:, None] - k
-    with np.errstate(under="ignore"):
-        joint = log_mass - 0.5 * (residual / read_noise_e) ** 2
-        top = joint.max(axis=1)
-        posterior = np.exp(joint - top[:, None])
-        total = posterior.sum(axis=1)
-        weight = np.exp(top) * total * (step / (np.sqrt(2 * np.pi) * read_noise_e))
-        posterior /= total[:, None]
-        scaled = residual / read_noise_e**2
-        score = np.stack(
-            [
-                posterior @ k / quanta_exposure - 1.0,
-                -np.einsum("ij,ij,j->i", posterior, scaled, k),
-                np.einsum("ij,ij->i", posterior, scaled),
-                np.einsum("ij,ij,ij->i", posterior, scaled, residual) - 1.0,
-            ]
-        )
-        return np.asarray((score * weight) @ score.T)
+    step, (low, high) = read_noise_e / _NODES_PER_SIGMA, _range(quanta_exposure, read_noise_e)
+    given = pcd_posterior(np.arange(low, high, step), quanta_exposure, 1.0, 0.0, read_noise_e)
+    variance = read_noise_e**2
+    score = (
+        given.k / quanta_exposure - 1.0,
+        -given.ke / variance,
+        given.e / variance,
+        given.ee / variance - 1.0,
+    )
+    return np.asarray((score * (step * np.exp(given.log_density))) @ np.transpose(score))
 
 
-def _of_cells(
-    k: NDArray[np.float64],
-    mass: NDArray[np.float64],
-    score: NDArray[np.float64],
-    read_noise_e: float,
-    gain: float,
-) -> list[NDArray[np.float64]]:
+def _range(quanta_exposure: float, noise_e: float) -> tuple[float, float]:
+    """Return the smallest and the largest charge that samples show, e-."""
+    width, reach = 12.0 * np.sqrt(quanta_exposure) + 12.0, _REACH * noise_e
+    return max(0.0, np.floor(quanta_exposure - width)) - reach, quanta_exposure + width + reach
+
+
+def _of_cells(quanta_exposure: float, read_noise_e: float, gain: float) -> NDArray[np.float64]:
     """Return the information of one rounded frame for each of some places of the bias between two DN.
 
     Args:
-        k: electron numbers.
-        mass: their probabilities.
-        score: of H, at each.
+        quanta_exposure: H, e-; 0: of one Gaussian.
         read_noise_e: s_e, quantisation included, e-.
         gain: g, e-/DN.
+
+    Returns:
+        Shape (8, 4, 4).
     """
-    square = (read_noise_e / gain) ** 2
-    analog = np.sqrt(max(square - QUANTISATION_VARIANCE, 1e-6 * square))
-    codes = np.arange(np.floor(k[0] / gain - _REACH * analog) - 1, k[-1] / gain + _REACH * analog + 2)
-    found = []
-    for offset in np.arange(8) / 8:
-        edges = (codes[:, None] + np.array([0.5, -0.5])[:, None, None] - offset - k / gain) / analog
-        share = ndtr(edges[0]) - ndtr(edges[1])
-        normal = np.exp(-0.5 * edges**2) / np.sqrt(2.0 * np.pi)
-        moved, widened = normal[0] - normal[1], edges[0] * normal[0] - edges[1] * normal[1]
-        slopes = np.stack(
-            [
-                share @ (mass * score),
-                moved @ (mass * k) / (gain * analog),
-                -moved @ mass / (gain * analog),
-                -widened @ mass * square / analog**2,
-            ]
-        )
-        whole = share @ mass
-        seen = whole > 1e-14 * whole.max()
-        found.append((slopes[:, seen] / whole[seen]) @ slopes[:, seen].T)
-    return found
+    variance = (read_noise_e / gain) ** 2
+    analog = max(variance - QUANTISATION_VARIANCE, 1e-6 * variance)
+    low, high = _range(quanta_exposure, read_noise_e)
+    bias, n_codes = np.arange(8) / 8, int((high - low) / gain) + 3
+    exposure, sigma = max(quanta_exposure, _LEAST_EXPOSURE), np.sqrt(analog + QUANTISATION_VARIANCE)
+    maps = [np.broadcast_to(each, bias.shape) for each in (exposure, gain, bias, sigma)]
+    first = np.full(bias.size, np.floor(low / gain) - 1, np.int64)
+    mass, slopes = sample_slopes(SampleLaw(), maps, first, n_codes)
+    # from (log H, 1/g, mu, log sigma_R^2)
+    slopes *= np.array([1.0 / exposure, -1.0 / gain, 1.0 / gain, 2.0 * variance / analog])[:, None]
+    seen = mass > 1e-14 * mass.max(axis=1, keepdims=True)
+    weight = np.where(seen, 1.0 / np.maximum(mass, 1e-300), 0.0)
+    return np.asarray(np.einsum("nic,njc,nc->nij", slopes, slopes, weight))
 
 
 def shared_information(
@@ -140,9 +121,7 @@ def shared_information(
     """
     if 0 <= quanta_exposure < _LEAST_EXPOSURE and read_noise_e > 0:
         if read_noise_e < _COARSE * conversion_gain:
-            zero, one = np.zeros(1), np.ones(1)
-            parts = _of_cells(zero, one, zero, read_noise_e, conversion_gain)
-            return np.asarray(np.mean(parts, axis=0)[1:, 1:])
+            return np.asarray(_of_cells(0.0, read_noise_e, conversion_gain).mean(axis=0)[1:, 1:])
         return np.diag([0.0, 1.0 / read_noise_e**2, 2.0])
     full = expected_information(quanta_exposure, read_noise_e, conversion_gain)
     return np.asarray(full[1:, 1:] - np.outer(full[0, 1:], full[0, 1:]) / full[0, 0])

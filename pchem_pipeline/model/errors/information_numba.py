@@ -1,8 +1,4 @@
-"""The score of single samples: what sandwich errors and the calibration of chi-square are made of.
-
-The score of a sample x is the posterior mean of the complete-data score (Louis 1982): it is ``E[k] - H``,
-``E[k e]/s2``, ``E[e]/s2`` and ``-1/2 + E[e^2]/(2 s2)`` in (log H, 1/g, mu, log s2), ``e = x - mu - k/g``.
-"""
+"""Sums of the scores of single samples: sandwich errors and the calibration of chi-square."""
 
 from __future__ import annotations
 
@@ -14,6 +10,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.errors.algebra_numba import invert_arrow, to_natural
+from pchem_pipeline.model.law.density_scores_numba import N_MEANS, density_scores, posterior
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
     BIAS,
@@ -38,76 +35,8 @@ from pchem_pipeline.model.law.pixel_numba import (
     make_scratch,
 )
 
-_REACH = 8.0  # standard deviations around a sample in which components count
 _FAR = 700.0  # exponents below minus this are 0
 _SMALLEST_EXPECTATION = 5.0
-
-
-@kernel
-def log_poisson(exposure: float, size: int) -> NDArray[np.float64]:
-    """Return log P(K = k) of k = 0 .. size - 1."""
-    out = np.empty(size)
-    out[0] = -exposure
-    step = math.log(exposure)
-    for k in range(1, size):
-        out[k] = out[k - 1] + step - math.log(k)
-    return out
-
-
-@kernel
-def sample_score(
-    x: float,
-    parameters: NDArray[np.float64],
-    log_weights: NDArray[np.float64],
-    score: NDArray[np.float64],
-) -> float:
-    """Fill the score of one sample with respect to (H, g, mu, sigma) and return its log-density.
-
-    Args:
-        x: DN.
-        parameters: (H, g, mu, sigma).
-        log_weights: log P(K = k), at least as far as x reaches.
-        score: out, shape (4,).
-
-    Returns:
-        ``log f_X(x)``; -inf and a score of 0 where the density vanishes.
-    """
-    exposure, gain, bias, sigma = parameters[0], parameters[1], parameters[2], parameters[3]
-    step, inverse = 1.0 / gain, 1.0 / (sigma * sigma)
-    nearest = max(0, math.floor((x - bias) * gain + 0.5))
-    noise = sigma * gain
-    half = math.ceil(_REACH * noise) + 2
-    if noise > 0.4:  # the Poisson factor moves the largest term away from the nearest component
-        half += math.ceil(noise * noise * abs(math.log(exposure / (nearest + 1.0))))
-    low, high = max(0, nearest - half), min(log_weights.size - 1, nearest + half)
-    low = min(low, high)
-    top = -math.inf
-    for k in range(low, high + 1):
-        e = x - bias - k * step
-        top = max(top, log_weights[k] - 0.5 * e * e * inverse)
-    s0 = s1 = s2 = s3 = s4 = 0.0
-    for k in range(low, high + 1):
-        e = x - bias - k * step
-        exponent = log_weights[k] - 0.5 * e * e * inverse - top
-        if exponent < -40.0:
-            continue
-        term = math.exp(exponent)
-        s0 += term
-        s1 += k * term
-        s2 += k * e * term
-        s3 += e * term
-        s4 += e * e * term
-    score[0] = s1 / s0 / exposure - 1.0
-    score[1] = -s2 / s0 * inverse * step * step
-    score[2] = s3 / s0 * inverse
-    score[3] = (s4 / s0 * inverse - 1.0) / sigma
-    return top + math.log(s0) - math.log(sigma) - 0.9189385332046727
-
-
-@kernel(inline=True)
-def _size(exposure: float, gain: float, reach: float) -> int:
-    """Return how many electron numbers matter for values up to ``reach`` DN above the bias."""
-    return int(max(exposure + 12.0 * math.sqrt(exposure), max(reach, 0.0) * gain) + 40.0)
 
 
 @kernel(inline=True)
@@ -120,29 +49,22 @@ def fill_squared_scores(pixel: Pixel, theta: NDArray[np.float64], at: NDArray[np
         at: out, an evaluation, in the place of its damping matrix; lower triangles.
     """
     n = pixel.facts.shape[0]
-    parameters, score = np.empty(4), np.empty(4)
-    parameters[1], parameters[3] = 1.0 / theta[n + STEP], math.exp(0.5 * theta[n + LOG_VARIANCE])
+    means, score = np.empty(N_MEANS), np.empty(4)
+    step, sigma = theta[n + STEP], math.exp(0.5 * theta[n + LOG_VARIANCE])
     slope = np.empty(4)
-    slope[1], slope[2], slope[3] = -parameters[1] * parameters[1], 1.0, 0.5 * parameters[3]
+    slope[1], slope[2], slope[3] = -1.0 / (step * step), 1.0, 0.5 * sigma
     for j in range(n):
         facts, first, n_bins = pixel.facts[j], pixel.facts[j, FIRST], int(pixel.facts[j, N_BINS])
         at[j, DAMPING:SUMS] = 0.0
         dark = facts[DARK] > 0.0
-        parameters[0], parameters[2] = math.exp(theta[j]), theta[n + BIAS] - facts[CENTRE]
-        slope[0] = parameters[0]
-        size = _size(parameters[0], parameters[1], first + n_bins - parameters[2])
-        weights = log_poisson(parameters[0], size)
+        exposure, bias = math.exp(theta[j]), theta[n + BIAS] - facts[CENTRE]
+        slope[0] = exposure
         for i in range(n_bins):
             c = pixel.bins[j, WEIGHT, i]
             if c == 0.0:
                 continue
-            if dark:
-                e = first + i - parameters[2]
-                score[0] = score[1] = 0.0
-                score[2] = e / parameters[3] ** 2
-                score[3] = (e * e / parameters[3] ** 2 - 1.0) / parameters[3]
-            else:
-                sample_score(first + i, parameters, weights, score)
+            posterior(first + i, 0.0 if dark else exposure, step, bias, sigma, means)
+            density_scores(means, exposure, step, sigma, score)
             for row in range(4):
                 for column in range(row + 1):
                     product = score[row] * slope[row] * score[column] * slope[column]
@@ -172,18 +94,23 @@ def grouped_trace(
         covariance: of the estimates, shape (n, 4, 4); NaN for what a bound holds.
         out: out, shape (n,); NaN without parameters.
     """
-    score, held, rest = np.empty(4), np.empty(4), np.empty(4)
+    means, score, held, rest = np.empty(N_MEANS), np.empty(4), np.empty(4), np.empty(4)
     for p in range(first.size):
         out[p] = math.nan
         if not math.isfinite(parameters[p].sum()):
             continue
-        reach = float(last[p]) - parameters[p, 2]
-        weights = log_poisson(parameters[p, 0], _size(parameters[p, 0], parameters[p, 1], reach))
+        exposure, step, bias, sigma = (
+            parameters[p, 0],
+            1.0 / parameters[p, 1],
+            parameters[p, 2],
+            parameters[p, 3],
+        )
         expected, remaining, trace = 0.0, frames[p], 0.0
         held[:] = 0.0
         rest[:] = 0.0
         for x in range(first[p], last[p] + 1):
-            logged = sample_score(float(x), parameters[p], weights, score)
+            logged = posterior(float(x), exposure, step, bias, sigma, means)
+            density_scores(means, exposure, step, sigma, score)
             mass = frames[p] * math.exp(max(logged, -_FAR))
             expected += mass
             for i in range(4):

@@ -14,20 +14,14 @@ from pchem_pipeline.model.arithmetic.normal_numba import add_mass
 from pchem_pipeline.model.errors.algebra_numba import invert_arrow, solve_arrow
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
-    CUMULATIVE,
     DERIVATIVES,
-    FIRST,
     HELD,
     HERE,
-    MEAN,
-    N_BINS,
-    N_FRAMES,
     N_SHARED,
     SATELLITE,
     SCORE,
     STEPS,
-    VARIANCE,
-    WEIGHT,
+    load,
     make_pixel,
     make_scratch,
 )
@@ -61,26 +55,16 @@ def _shift(parameters: NDArray[np.float64], n: float, evaluate: Any, shift: NDAr
     offset = bias - math.floor(bias)
     pixel = make_pixel(np.zeros(1, np.bool_), n_bins, 0, 0)
     scratch = make_scratch(1, n_bins, np.bool_(False))
-    weights, cumulative, facts = pixel.bins[0, WEIGHT, :n_bins], pixel.bins[0, CUMULATIVE], pixel.facts[0]
+    weights = np.zeros(n_bins)
     electrons, holding = 0.0, n
-    weights[:] = 0.0
     while electrons < exposure or holding > _NO_FRAMES:
         holding = n * math.exp(electrons * math.log(exposure) - exposure - math.lgamma(electrons + 1.0))
         if holding > _NO_FRAMES:
             add_mass(weights, float(first), holding, offset + electrons * a, math.sqrt(analog2))
         electrons += 1.0
-    total = mean = variance = 0.0
-    for i in range(n_bins):
-        cumulative[i + 1] = cumulative[i] + weights[i]
-        total += weights[i]
-        mean += weights[i] * (first + i)
-    mean /= total
-    for i in range(n_bins):
-        variance += weights[i] * (first + i - mean) ** 2 / total
-    facts[N_BINS], facts[FIRST], facts[N_FRAMES], facts[MEAN] = float(n_bins), float(first), total, mean
-    facts[VARIANCE] = variance
+    centre = first + load(weights, np.zeros(n_bins, np.uint8), pixel.bins[0], pixel.facts[0])
     theta, at, held = scratch.small[HERE], scratch.evaluations[AT], scratch.flags[HELD]
-    theta[0], theta[1], theta[2], theta[3] = math.log(exposure), a, offset, 2.0 * math.log(sigma)
+    theta[0], theta[1], theta[2], theta[3] = math.log(exposure), a, offset - centre, 2.0 * math.log(sigma)
     evaluate(pixel, theta, DERIVATIVES, scratch, at)
     held[1 + SATELLITE] = True
     step = scratch.small[STEPS]

@@ -104,7 +104,7 @@ _CUT = (1e-17, 1e-50, 1e-305)
 _OUTLIER = (1e-9, 1e-40, 0.0)
 #: Stages of :func:`fill_masses`: as far out as most samples lie, down to 1e-50, to the ends of the tails.
 CORE, NEAR, EXACT = range(3)
-LEAST_MASS = 1e-300
+_LEAST_MASS = 1e-300
 _TO_ONE = 1e306  # makes 1 of a mass that counts
 _LEAST_VARIANCE = 1e-6  # DN^2
 _NO_ELECTRONS = -60.0  # log H of a sample without electrons
@@ -404,12 +404,12 @@ def _fill_edges(bins: NDArray[np.float64], part: Component, edges: NDArray[np.fl
 
 
 @kernel(inline=True)
-def _cell_of(mean: float, cells: Cells, part: Component) -> int:
-    """Return the cell that holds a mean, if it is one within reach, or one outside."""
-    middle = int(min(max(mean - cells.first, part.low - 1.0), float(part.high)))
-    while middle < part.high and cells.bins[EDGE, middle + 1] <= mean:
+def cell_of(mean: float, cells: Cells, low: int, high: int) -> int:
+    """Return the cell that holds a mean, if it is one of these, the end excluded, or one outside."""
+    middle = int(min(max(mean - cells.first, low - 1.0), float(high)))
+    while middle < high and cells.bins[EDGE, middle + 1] <= mean:
         middle += 1
-    while middle >= part.low and cells.bins[EDGE, middle] > mean:
+    while middle >= low and cells.bins[EDGE, middle] > mean:
         middle -= 1
     return middle
 
@@ -452,7 +452,7 @@ def _add_component(
         if w_satellite != 0.0:
             slope = fused(d0, w_satellite, simd_load(room, SLOPES + _SATELLITE, i))
             simd_store(room, SLOPES + _SATELLITE, i, slope)
-    middle = _cell_of(part.mean, cells, part)
+    middle = cell_of(part.mean, cells, part.low, part.high)
     if part.low <= middle < part.high:  # both tails are those beyond its edges
         room[MASS, middle] += w
         room[SLOPES + _EXPOSURE, middle] += w_exposure
@@ -534,13 +534,13 @@ def _log_mass(cells: Cells, room: NDArray[np.float64]) -> float:
     """Return the log-likelihood of the masses in the room."""
     total, inside = counting() * 0.0, 1.0
     for i in range(0, cells.n_bins, SIMD_WIDTH):
-        weight, own = simd_load(cells.bins, WEIGHT, i), most(simd_load(room, MASS, i), LEAST_MASS)
+        weight, own = simd_load(cells.bins, WEIGHT, i), most(simd_load(room, MASS, i), _LEAST_MASS)
         total = fused(weight, simd_log(own), total)
     if cells.conditional:
         inside = 0.0
         for i in range(cells.n_bins):
             inside += cells.bins[KEPT, i] * room[MASS, i]
-    return float(simd_sum(total)) - cells.frames * math.log(max(inside, LEAST_MASS))
+    return float(simd_sum(total)) - cells.frames * math.log(max(inside, _LEAST_MASS))
 
 
 @kernel(inline=True)
@@ -553,10 +553,10 @@ def _sum_up(
     """
     total = counting() * 0.0
     for i in range(0, cells.n_bins, SIMD_WIDTH):
-        weight, own = simd_load(cells.bins, WEIGHT, i), most(simd_load(room, MASS, i), LEAST_MASS)
+        weight, own = simd_load(cells.bins, WEIGHT, i), most(simd_load(room, MASS, i), _LEAST_MASS)
         total = fused(weight, simd_log(own), total)
         # a mass that is hardly one has no slope
-        per_mass = least((own - LEAST_MASS) * _TO_ONE, 1.0) / own
+        per_mass = least((own - _LEAST_MASS) * _TO_ONE, 1.0) / own
         simd_store(room, PER_MASS, i, per_mass)
         simd_store(room, RATIO, i, weight * per_mass)
     simd_store(room, RATIO, cells.n_bins, 0.0)
@@ -605,7 +605,7 @@ def _condition(
         inside += cells.bins[KEPT, cell] * mass[cell]
         for i in range(N_BLOCK):
             change[i] += cells.bins[KEPT, cell] * slopes[i, cell]
-    inside = max(inside, LEAST_MASS)
+    inside = max(inside, _LEAST_MASS)
     for i in range(N_BLOCK):
         change[i] /= inside
     for i in range(N_BLOCK):
@@ -643,7 +643,7 @@ def _hermite_sums(
         s3 = fused(ratio, z1 * by_z1 - density1 - (z0 * by_z0 - density0), s3)
         s4 = fused(ratio, (z1 * z1 - 3.0) * by_z1 - (z0 * z0 - 3.0) * by_z0, s4)
     whole = float(simd_sum(s0))
-    middle = _cell_of(part.mean, cells, part)
+    middle = cell_of(part.mean, cells, part.low, part.high)
     if part.low <= middle < part.high:
         whole += room[RATIO, middle]
     return whole, float(simd_sum(s1)), float(simd_sum(s2)), float(simd_sum(s3)), float(simd_sum(s4))

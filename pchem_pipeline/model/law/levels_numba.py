@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.arithmetic.normal_numba import FARTHEST, REACH, normal_mass
+from pchem_pipeline.model.arithmetic.normal_numba import FARTHEST, REACH, normal_mass, reach_of
 from pchem_pipeline.model.arithmetic.simd_math_numba import simd_tail
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, fused, simd_load, simd_store
-from pchem_pipeline.model.law.cells_numba import Cells, Component, Law, cells_of, component, resolve
+from pchem_pipeline.model.law.cells_numba import Cells, Component, Law, cell_of, cells_of, component, resolve
 from pchem_pipeline.model.law.electron_laws_numba import electron_number
 from pchem_pipeline.model.law.pixel_numba import (
     ADDED_EXPOSURE,
@@ -166,10 +166,9 @@ def _add_whole(cells: Cells, part: Component, weight: float, low: int, high: int
     for i in range(0, high - low, SIMD_WIDTH):
         inside = simd_load(share, 1, i + 1) - simd_load(share, 1, i)
         simd_store(share, 0, i, fused(inside, weight, simd_load(share, 0, i)))
-    for i in range(low, high):
-        if cells.bins[EDGE, i] <= mean < cells.bins[EDGE, i + 1]:  # both tails are those beyond its edges
-            share[0, i - low] += weight
-            break
+    middle = cell_of(mean, cells, low, high)
+    if low <= middle < high:  # both tails are those beyond its edges
+        share[0, middle - low] += weight
 
 
 @kernel(borrows=True)
@@ -207,8 +206,7 @@ def fill_level(
         share: out, the first row from the first of these codes on; the second one is worked in; see
             :func:`share_scratch`.
     """
-    reach = math.sqrt(max(REACH * REACH + 2.0 * math.log(likely), 0.0))
-    low, high, _ = _span(k, theta, cells, codes, reach)
+    low, high, _ = _span(k, theta, cells, codes, reach_of(math.log(likely)))
     for i in range(high - low):
         share[0, i] = 0.0
     for peak in range(cells.n_peaks if low < high else 0):

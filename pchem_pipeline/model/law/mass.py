@@ -1,4 +1,4 @@
-"""The mass of codes under any law of a pixel's samples, and the likelihood of histograms."""
+"""The mass of codes under any law of a pixel's samples, its slopes, and the parabola of a likelihood."""
 
 from __future__ import annotations
 
@@ -15,39 +15,6 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 FloatArray = NDArray[np.float64]
 
 
-def log_likelihood(
-    counts: NDArray[np.integer],
-    origin: NDArray[np.integer],
-    parameters: Parameters,
-    model: SampleLaw,
-    *,
-    satellites: tuple[ArrayLike, ArrayLike] | None = None,
-) -> FloatArray:
-    """Return ``sum_i c_i log P(x_i)`` of every pixel, nats, shape (n,); NaN without parameters.
-
-    Comparable between models, the neutral one included, and between frames that were and were not fitted.
-
-    Args:
-        counts: histograms, shape (n, B), any unsigned type.
-        origin: DN of bin 0, shape (n,).
-        parameters: (H, g, mu, sigma) of the pixels, each (n,).
-        model: the law.
-        satellites: ``satellite_amplitude_e`` and ``satellite_weight`` of the pixels; by default those of
-            ``parameters`` where it has any, else none.
-    """
-    counts = kernel_counts(counts)
-    out = np.full(counts.shape[0], np.nan)
-    mass_numba.score_tile(
-        counts,
-        np.ascontiguousarray(origin, np.int64),
-        columns_of(parameters),
-        satellites_of(parameters, satellites, out.size),
-        pack([model], out.size),
-        out,
-    )
-    return out
-
-
 def sample_mass(
     model: SampleLaw,
     maps: Parameters,
@@ -62,7 +29,8 @@ def sample_mass(
         model: the law.
         maps: (H, g, mu, sigma) of n pixels (flattened where they are maps).
         codes: successive whole DN, shape (n_codes,) for all pixels alike or (n, n_codes).
-        satellites: as in :func:`log_likelihood`.
+        satellites: ``satellite_amplitude_e`` and ``satellite_weight`` of the pixels; by default those of
+            ``maps`` where it has any, else none.
         far_tails: also what is below 1e-50, which takes several times as long.
 
     Returns:

@@ -11,11 +11,9 @@ from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.cells_numba import (
     CORE,
-    LEAST_MASS,
     NEAR,
     Law,
     cells_of,
-    fill_far_enough,
     fill_masses,
     resolve,
 )
@@ -31,7 +29,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     WEIGHT,
     Pixel,
     Scratch,
-    load,
     make_pixel,
     make_scratch,
 )
@@ -72,44 +69,6 @@ def known_theta(parameters: FloatArray, centre: int, weight: float, theta: Float
     theta[3] = math.log(max(parameters[3] * parameters[3] - QUANTISATION_VARIANCE, _LEAST_VARIANCE))
     theta[4] = weight
     return True
-
-
-@kernel
-def score_tile(
-    counts: NDArray[np.generic],
-    origin: NDArray[np.int64],
-    parameters: FloatArray,
-    satellites: FloatArray,
-    law: Law,
-    out: FloatArray,
-) -> None:
-    """Fill the log-likelihood of every row of ``counts`` whose parameters are finite.
-
-    Args:
-        counts: shape (n, B).
-        origin: DN of bin 0, shape (n,).
-        parameters: (H, g, mu, sigma), shape (n, 4).
-        satellites: amplitude (e-) and weight of each pixel's free satellite peaks, shape (n, 2).
-        law: of the samples.
-        out: out, nats, shape (n,); comes as NaN.
-    """
-    room, scratch = pixel_scratch(counts.shape[1], law)
-    mask, theta = np.zeros(counts.shape[1], np.uint8), scratch.small[OWN]
-    for index in range(counts.shape[0]):
-        centre = origin[index] + load(counts[index], mask, room.bins[0], room.facts[0])
-        if not known_theta(parameters[index], centre, satellites[index, 1], theta):
-            continue
-        pixel = _at(room, centre)
-        resolve(law, index, satellites[index, 0], pixel)
-        cells = cells_of(pixel, np.int64(0))
-        fill_far_enough(
-            theta, cells, np.int64(LOGLIK_ALONE), scratch.numbers, scratch.edges, scratch.cells[0]
-        )
-        total = 0.0
-        for i in range(cells.n_bins):
-            if room.bins[0, WEIGHT, i] > 0.0:
-                total += room.bins[0, WEIGHT, i] * math.log(max(scratch.cells[0, MASS, i], LEAST_MASS))
-        out[index] = total
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""The photon counting distribution (PCD): density, moments, quantised mass and thresholds.
+"""The photon counting distribution (PCD): density, quantised mass and thresholds.
 
 A pixel reads ``X = round((K + R)/g + mu)`` with ``K`` Poisson of mean ``H`` and ``R`` normal of
 standard deviation ``sigma_R`` (Hendrickson et al. 2023, eq. PCD_RV_definition). The PCD is the density that
@@ -9,28 +9,34 @@ All arguments broadcast. Units: H and sigma_R in e-, g in e-/DN, mu, sigma and x
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaln, logsumexp, ndtr, wrightomega, xlogy
+from scipy.special import gammaln, ndtr, xlogy
 
 _Array = NDArray[np.float64]
 
-_NEGLIGIBLE = 41.0  # nats: exp(-41) is below the resolution of a double
 _REACH = 9.0  # standard deviations of a Gaussian beyond which nothing is left of it
 _TERMS = 2**22  # of a sum over electron numbers, at once
 
 
-class PcdMoments(NamedTuple):
-    """Mean (DN) and the second to fourth cumulants (DN^2, DN^3, DN^4) of the PCD."""
+class PosteriorMeans(NamedTuple):
+    """Means given a value x, with the residual ``e = x - mu - k/g``, and the density at it.
 
-    mean: _Array
-    variance: _Array
-    third: _Array
-    fourth: _Array
+    Attributes:
+        k, kk: E[k], E[k^2].
+        e, ke, ee: E[e], E[k e], E[e^2], DN and DN^2.
+        log_density: log f_X(x), nats of 1/DN.
+    """
+
+    k: _Array
+    kk: _Array
+    e: _Array
+    ke: _Array
+    ee: _Array
+    log_density: _Array
 
 
 def _by_parts(terms: Callable[..., _Array], width: int, *arguments: _Array) -> _Array:
@@ -38,6 +44,29 @@ def _by_parts(terms: Callable[..., _Array], width: int, *arguments: _Array) -> _
     n_parts = arguments[0].size * width // _TERMS + 1
     parts = (np.array_split(a, n_parts) for a in arguments)
     return np.concatenate([terms(*some) for some in zip(*parts, strict=True)])
+
+
+def pcd_posterior(
+    x: ArrayLike,
+    quanta_exposure: ArrayLike,
+    conversion_gain: ArrayLike,
+    bias: ArrayLike,
+    read_noise_dn: ArrayLike,
+) -> PosteriorMeans:
+    """Return the log density of the PCD, and what a value says of its electron number and its noise.
+
+    Exact to rounding everywhere, also deep in the tails. Arguments as in :func:`log_pcd`; all answers are NaN
+    where a parameter is NaN or not valid.
+    """
+    from pchem_pipeline.model.law.density_scores_numba import N_MEANS, fill_posterior  # a compiled loop
+
+    arrays = np.broadcast_arrays(
+        *[np.asarray(a, np.float64) for a in (x, quanta_exposure, conversion_gain, bias, read_noise_dn)]
+    )
+    values, *parameters = (a.ravel() for a in arrays)
+    out = np.empty((N_MEANS + 1, values.size))
+    fill_posterior(values, np.stack(parameters), out)
+    return PosteriorMeans(*out.reshape(N_MEANS + 1, *arrays[0].shape))
 
 
 def log_pcd(
@@ -49,8 +78,6 @@ def log_pcd(
 ) -> _Array:
     """Return the log density of the PCD, eq. (X_density), with as many components as matter.
 
-    Exact to rounding everywhere, also deep in the tails, since the terms are summed around the largest.
-
     Args:
         x: values, DN, any shape.
         quanta_exposure: H >= 0, e-.
@@ -61,30 +88,7 @@ def log_pcd(
     Returns:
         log f_X(x), nats of 1/DN, of the broadcast shape; NaN where a parameter is NaN or not valid.
     """
-    at, exposure, gain, offset, sigma = np.broadcast_arrays(
-        *[np.asarray(a, np.float64) for a in (x, quanta_exposure, conversion_gain, bias, read_noise_dn)]
-    )
-    values, answer = gain * (at - offset), np.full(at.shape, np.nan)
-    valid = (exposure >= 0) & (gain > 0) & (sigma > 0) & np.isfinite(values + exposure + sigma)
-    y, h, s = values[valid], exposure[valid], (gain * sigma)[valid]
-    if y.size == 0:
-        return answer
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # the largest term has d/dk = 0: log(H / (k + 1/2)) + (y - k) / s^2 = 0
-        mode = np.where(h > 0, s**2 * wrightomega(np.log(h / s**2) + (y + 0.5) / s**2).real, 0.0)
-    # from there a term falls as the Gaussian does, and as the Poisson weights do
-    reach = np.minimum(math.sqrt(2 * _NEGLIGIBLE) * s, np.sqrt(2 * _NEGLIGIBLE * mode) + _NEGLIGIBLE)
-    around = np.arange(-int(reach.max()) - 2, int(reach.max()) + 3)
-
-    def summed(y: _Array, h: _Array, s: _Array, mode: _Array) -> _Array:
-        k = np.floor(mode)[:, None] + around
-        y, h, s = y[:, None], h[:, None], s[:, None]
-        terms = xlogy(k, h) - gammaln(np.maximum(k, 0) + 1.0) - 0.5 * ((y - k) / s) ** 2
-        return np.asarray(logsumexp(np.where(k < 0, -np.inf, terms), axis=1))
-
-    constant = -h - np.log(sigma[valid]) - 0.5 * math.log(2 * math.pi)
-    answer[valid] = constant + _by_parts(summed, around.size, y, h, s, mode)
-    return answer
+    return pcd_posterior(x, quanta_exposure, conversion_gain, bias, read_noise_dn).log_density
 
 
 def pcd(
@@ -138,29 +142,6 @@ def pcd_mass(
         return np.asarray((np.where(k < 0, 0.0, weight) * (ndtr(-low) - ndtr(-high))).sum(axis=1))
 
     return _by_parts(summed, around.size, *flat).reshape(at.shape)
-
-
-def pcd_moments(
-    quanta_exposure: ArrayLike, conversion_gain: ArrayLike, bias: ArrayLike, read_noise_dn: ArrayLike
-) -> PcdMoments:
-    """Return the first four cumulants of the PCD: a Poisson variable scaled by 1/g plus normal noise.
-
-    Arguments as in :func:`log_pcd`.
-
-    Example:
-        >>> mean, variance, *_ = pcd_moments(2.0, 0.5, 10.0, 1.0)
-        >>> float(mean), float(variance)
-        (14.0, 9.0)
-    """
-    exposure, gain, offset, sigma = np.broadcast_arrays(
-        *[np.asarray(a, dtype=np.float64) for a in (quanta_exposure, conversion_gain, bias, read_noise_dn)]
-    )
-    return PcdMoments(
-        np.asarray(offset + exposure / gain),
-        np.asarray(sigma**2 + exposure / gain**2),
-        np.asarray(exposure / gain**3),
-        np.asarray(exposure / gain**4),
-    )
 
 
 def thresholds(

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.plain_law import joint_mass
 from scipy import stats
 
 from pchem_pipeline.base.errors import InputError
@@ -343,13 +344,10 @@ def test_expected_codes_are_those_of_the_mixture_of_every_usable_pixel() -> None
     h, g, mu, sigma = np.array([[1.0, 2.5], [0.1, 0.08], [100.0, 104.5], [3.1, 4.2]]).reshape(4, 1, 2)
     maps = PixelMaps(h, g, mu, sigma, np.array([[True, True]]))
     codes = np.arange(70, 260)
-    k = np.arange(40)[:, None]
     by_hand = np.zeros(codes.size)
     for pixel in range(2):
-        analog = np.sqrt(sigma[0, pixel] ** 2 - 1 / 12)  # without quantisation
-        edges = (np.append(codes, 260) - 0.5 - mu[0, pixel] - k / g[0, pixel]) / analog
-        cells = np.diff(stats.norm.cdf(edges), axis=1)
-        by_hand += 300 * (stats.poisson.pmf(k, h[0, pixel]) * cells).sum(axis=0)
+        theta = (each[0, pixel] for each in (h, g, mu, sigma))
+        by_hand += 300 * joint_mass(codes, *theta, 40).sum(axis=0)
     found = expected_codes(maps, [], codes, np.arange(300))
     assert found is not None
     np.testing.assert_allclose(found, by_hand, rtol=1e-8, atol=1e-9)

@@ -34,6 +34,7 @@ from pchem_pipeline.effects.analog.empirical_noise import (
 )
 from pchem_pipeline.effects.estimators.lines import Line, coherent_line
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.law.pcd import pcd_posterior
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -166,13 +167,9 @@ def codes_within_reach(maps: PixelMaps, pixels: IntArray, first: IntArray, last:
         last: their highest codes, shape (n,).
     """
     exposure, gain, bias, sigma = (values.ravel()[pixels] for values in maps.maps)
-    reach = bias + _most_electrons(exposure) / gain + _REACH * sigma
+    most = np.ceil(exposure.max() + 8.0 * np.sqrt(exposure.max()) + 4.0)
+    reach = bias + most / gain + _REACH * sigma
     return max(int(np.ceil((np.minimum(last, reach) - first).max())), 0) + 1
-
-
-def _most_electrons(exposure: FloatArray) -> int:
-    """Return the largest number of electrons that samples of such exposures hold."""
-    return int(np.ceil(exposure.max() + 8.0 * np.sqrt(exposure.max()) + 4.0))
 
 
 def score_tables(maps: PixelMaps, pixels: IntArray, first: IntArray, length: int) -> FloatArray:
@@ -182,20 +179,11 @@ def score_tables(maps: PixelMaps, pixels: IntArray, first: IntArray, length: int
     ``H + a H^2`` of electrons.
     """
     exposure, gain, bias, sigma = (values.ravel()[pixels][:, None] for values in maps.maps)
-    most = _most_electrons(exposure)
-    signal = first[:, None] + np.arange(length) - bias
-    total, sums = np.zeros(signal.shape), np.zeros((5, *signal.shape))
-    chance = np.exp(-exposure)
-    for k in range(most + 1):
-        chance = chance * exposure / k if k else chance
-        rest = (signal - k / gain) / sigma**2
-        weight = chance * np.exp(-0.5 * np.minimum((signal - k / gain) ** 2 / sigma**2, 200.0))
-        total += weight
-        noise = rest**2 * sigma**2 - 1.0
-        scores = rest, rest * k / gain, k - exposure, noise, 0.5 * ((k - exposure) ** 2 - k)
-        for one, score in zip(sums, scores, strict=True):
-            one += weight * score
-    return np.asarray(sums / np.maximum(total, np.finfo(np.float64).tiny))
+    given = pcd_posterior(first[:, None] + np.arange(length), exposure, gain, bias, sigma)
+    variance = sigma**2
+    excess = given.kk - (2.0 * exposure + 1.0) * given.k + exposure**2
+    offset, scale = given.e / variance, given.ke / gain / variance
+    return np.stack([offset, scale, given.k - exposure, given.ee / variance - 1.0, 0.5 * excess])
 
 
 def measured_mode(

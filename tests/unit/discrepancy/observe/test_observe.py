@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from helpers.plain_camera import PlainCamera
+from helpers.plain_law import joint_mass
 from helpers.small_stacks import small_stack
 from scipy import special, stats
 
@@ -18,15 +19,16 @@ from pchem_pipeline.discrepancy.observe.sums import blocks_of
 from pchem_pipeline.effects.framework.evidence import SCORES, Evidence
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.histogram.count import histogram_frames
+from pchem_pipeline.model.law import cell_scores_numba
 from pchem_pipeline.model.law.pcd import pcd_mass
 
 H, STEP, BIAS, WIDTH = 1.7, 9.0, 40.3, 2.4
 
 
 def _law(width: float = WIDTH) -> np.ndarray:
-    first, last = law_numba.electron_range(H, np.log(1e-12))
-    law = np.empty((int(BIAS + last * STEP + 8 * width) + 1, law_numba.N_COLUMNS))
-    law_numba.fill_law(H, STEP, BIAS, width, first, last, law)
+    first, last = cell_scores_numba.electron_range(H, np.log(1e-12))
+    law = np.empty((int(BIAS + last * STEP + 8 * width) + 1, cell_scores_numba.N_COLUMNS))
+    cell_scores_numba.fill_law(H, STEP, BIAS, width, first, last, False, law)
     return law
 
 
@@ -51,7 +53,7 @@ def test_law_holds_the_polynomials_integrated_over_cells(width: float) -> None:
     for code in (35, 40, 45, 53, 60, 75):
         z = (code + 0.5 * node[:, None] - BIAS - k * STEP) / width
         density = stats.norm.pdf(z) * 0.5 * size[:, None] / width
-        for column, (a, b) in enumerate(law_numba.COLUMNS):
+        for column, (a, b) in enumerate(cell_scores_numba.COLUMNS):
             expected = np.sum(weight * charlier[b] * density * special.eval_hermitenorm(a, z))
             assert law[code, column] == pytest.approx(expected, rel=1e-6, abs=1e-6 * law[code, 0])
     np.testing.assert_allclose(
@@ -64,10 +66,10 @@ def test_scores_are_orthogonal_to_the_parameters_and_know_their_variance() -> No
     law = _law()[26:120].copy()
     mass = law[:, 0].copy()
     raw = law.copy()
-    gram = np.empty((law_numba.N_NUISANCE, law_numba.N_COLUMNS))
+    gram = np.empty((cell_scores_numba.N_NUISANCE, cell_scores_numba.N_COLUMNS))
     assert law_numba.whiten(law, 1 / mass, gram)
     products = law.T @ (law / mass[:, None])
-    n = law_numba.N_NUISANCE
+    n = cell_scores_numba.N_NUISANCE
     np.testing.assert_allclose(products[:n, :n], np.eye(n), atol=1e-9)
     np.testing.assert_allclose(products[:n, n:], 0.0, atol=1e-9)
     np.testing.assert_allclose(raw[:, :n], law[:, :n] @ gram[:, :n], atol=1e-12)
@@ -85,13 +87,13 @@ def test_scores_are_orthogonal_to_the_parameters_and_know_their_variance() -> No
 
 def test_a_parameter_without_a_trace_in_the_law_takes_nothing_from_the_scores() -> None:
     # each electron number has the same two codes, half of its samples in each, whatever the read noise
-    first, last = law_numba.electron_range(H, np.log(1e-12))
-    law = np.zeros((160, law_numba.N_COLUMNS))
-    law_numba.fill_law(H, 4.0, 40.5, 0.1, first, last, law)
+    first, last = cell_scores_numba.electron_range(H, np.log(1e-12))
+    law = np.zeros((160, cell_scores_numba.N_COLUMNS))
+    cell_scores_numba.fill_law(H, 4.0, 40.5, 0.1, first, last, False, law)
     inverse = np.divide(1.0, law[:, 0], out=np.zeros(160), where=law[:, 0] > 1e-14)
-    raw, gram = law.copy(), np.empty((law_numba.N_NUISANCE, law_numba.N_COLUMNS))
+    raw, gram = law.copy(), np.empty((cell_scores_numba.N_NUISANCE, cell_scores_numba.N_COLUMNS))
     assert law_numba.whiten(law, inverse, gram)
-    n = law_numba.N_NUISANCE
+    n = cell_scores_numba.N_NUISANCE
     products = (law * inverse[:, None]).T @ law
     lost = np.diagonal(products)[:n] < 0.5
     assert lost[4]
@@ -107,14 +109,14 @@ def test_a_parameter_without_a_trace_in_the_law_takes_nothing_from_the_scores() 
 
 def test_bias_of_the_scores_is_that_of_fitted_samples() -> None:
     # the second-order expectation against its definition by finite differences of the law
-    gram = np.empty((law_numba.N_NUISANCE, law_numba.N_COLUMNS))
+    gram = np.empty((cell_scores_numba.N_NUISANCE, cell_scores_numba.N_COLUMNS))
     law = _law()[:150].copy()
     mass = law[:, 0].copy()
     keep = mass > 1e-12
     law, mass = law[keep], mass[keep]
     codes = np.arange(150)[keep]
     assert law_numba.whiten(law, 1 / mass, gram)
-    n = law_numba.N_NUISANCE
+    n = cell_scores_numba.N_NUISANCE
     theta = np.array([H, STEP, BIAS, WIDTH])
 
     def mass_at(shift: np.ndarray) -> np.ndarray:
@@ -147,12 +149,7 @@ def _tables(frames: np.ndarray, evidence: Evidence) -> tuple[np.ndarray, np.ndar
     electrons = np.arange(60)
     for y, x in np.argwhere(maps.usable):
         h, g, mu = maps.quanta_exposure[y, x], maps.conversion_gain[y, x], maps.bias[y, x]
-        s = np.sqrt(maps.read_noise_dn[y, x] ** 2 - 1 / 12)
-        codes = np.arange(400)[:, None]
-        mean = mu + electrons / g
-        joint = stats.poisson.pmf(electrons, h) * (
-            stats.norm.cdf(codes + 0.5, mean, s) - stats.norm.cdf(codes - 0.5, mean, s)
-        )
+        joint = joint_mass(np.arange(400), h, g, mu, maps.read_noise_dn[y, x], 60).T
         total = joint.sum(axis=1)
         below, above = np.cumsum(total), np.cumsum(total[::-1])[::-1]
         low, high = np.argmax(n * below >= 0.01), 399 - np.argmax((n * above >= 0.01)[::-1])

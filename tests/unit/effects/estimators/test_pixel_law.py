@@ -1,4 +1,4 @@
-"""The exact law of single pixels: the same numbers as the tables of the evidence, by other code."""
+"""The exact law of single pixels: its scores are those of the evidence, its mass that of the extended law."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.plain_law import joint_mass
 from scipy.stats import norm, poisson
 
 from pchem_pipeline.model.electrons.electrons import (
@@ -32,14 +33,6 @@ def membership_argmax(x: np.ndarray, h: float, g: float, mu: float, sigma: float
     k = np.arange(400)
     log_weight = poisson.logpmf(k, h) + norm.logpdf(x[:, None], mu + k / g, sigma)
     return np.asarray(log_weight.argmax(axis=1))
-
-
-def joint_masses(x: np.ndarray, h: float, g: float, mu: float, sigma: float, n_k: int = 400) -> np.ndarray:
-    """P(k, x) of whole codes, shape (k, code), by differences of the nearer tail."""
-    k, analog = np.arange(n_k)[:, None], np.sqrt(sigma**2 - 1 / 12)
-    low, high = ((x + side - mu - k / g) / analog for side in (-0.5, 0.5))
-    inside = np.where(low > 0, norm.sf(low) - norm.sf(high), norm.cdf(high) - norm.cdf(low))
-    return np.asarray(poisson.pmf(k, h) * inside)
 
 
 def known(*columns: np.ndarray) -> KnownPixels:
@@ -71,7 +64,7 @@ def test_the_paper_s_example_is_not_centred() -> None:
 @pytest.mark.parametrize("case", CASES)
 def test_codes_have_the_number_of_largest_joint_mass(case: tuple[float, ...]) -> None:
     x = np.arange(int(case[2]) - 30, int(case[2]) + 300)
-    joint = joint_masses(x, *case)
+    joint = joint_mass(x, *case)
     found = converted(x[:, None, None].astype(np.uint16), known(*(np.full((1, 1), v) for v in case))).ravel()
     seen = joint.max(axis=0) > 1e-15  # the others are never seen: any number will do
     np.testing.assert_array_equal(found[seen], joint.argmax(axis=0)[seen])
@@ -139,8 +132,8 @@ def test_errors_are_those_of_all_integers() -> None:
         errors = []
         for true, guess in zip(truth.T, used.T, strict=True):
             x = np.arange(int(true[2]) - 150, int(true[2]) + 1500)
-            joint = joint_masses(x, *true, n_k=200)
-            number = joint_masses(x, *guess, n_k=200).argmax(axis=0)
+            joint = joint_mass(x, *true, n_k=200)
+            number = joint_mass(x, *guess, n_k=200).argmax(axis=0)
             errors.append(1.0 - joint[number, np.arange(x.size)].sum())
         found = errors_by_thresholds(UsablePixels(*used), UsablePixels(*truth))
         np.testing.assert_allclose(found, errors, atol=1e-11)
@@ -149,7 +142,7 @@ def test_errors_are_those_of_all_integers() -> None:
 def test_tables_expect_what_all_integers_show() -> None:
     data, total, errors = known(*np.array(CASES).T), np.zeros(60), []
     for case in CASES:
-        joint = joint_masses(np.arange(int(case[2]) - 150, int(case[2]) + 1500), *case, n_k=200)
+        joint = joint_mass(np.arange(int(case[2]) - 150, int(case[2]) + 1500), *case, n_k=200)
         number = joint.argmax(axis=0)
         total += np.bincount(number, weights=joint.sum(axis=0), minlength=60)[:60]
         errors.append(1.0 - joint.max(axis=0).sum())
@@ -200,7 +193,7 @@ def test_numbers_are_decided_with_the_effects_of_the_law() -> None:
     law = law.with_added_exposure([[0.0, 1.5]], [[0.5, 0.5]])
     x = np.arange(92, 300)
     joint = sum(
-        0.25 * joint_masses(x - 5 * side, lam, g, mu, sigma, 40) for side in (0, 1) for lam in (h, h + 1.5)
+        0.25 * joint_mass(x - 5 * side, lam, g, mu, sigma, 40) for side in (0, 1) for lam in (h, h + 1.5)
     )
     columns = [np.array([v]) for v in (h, g, mu, sigma)]
     pixels = KnownPixels(columns, law)

@@ -12,7 +12,6 @@ from pchem_pipeline.model.ensemble.components import (
     component_widths,
     moment_errors,
     predicted_moments,
-    sample_moments,
 )
 from pchem_pipeline.model.law.parameters import UsablePixels
 
@@ -135,13 +134,6 @@ def test_pixels_whose_bias_may_be_an_electron_off_do_not_count() -> None:
     assert bias.var() > 15.0
     np.testing.assert_allclose(bias_weight(np.array([0.0, np.log(3.0), np.nan])), [0.0, 0.5, 1.0])
     np.testing.assert_array_equal(bias_weight(np.zeros(3)), 1.0)  # nothing else to go by
-
-
-def test_sample_moments_at_a_large_bias() -> None:
-    samples = np.random.default_rng(1).integers(60_000, 60_050, size=5000)
-    mean, variance = sample_moments(np.bincount(samples - 59_990), 59_990 + np.arange(60))
-    assert mean == pytest.approx(samples.mean(), rel=1e-14)
-    assert variance == pytest.approx(samples.var(), rel=1e-12)
 
 
 def test_moment_errors_of_equal_poisson_pixels() -> None:

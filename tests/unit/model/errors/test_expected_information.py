@@ -13,8 +13,8 @@ from pchem_pipeline.model.errors.expected_information import (
     inverse_information,
     shared_information,
 )
-from pchem_pipeline.model.errors.fisher import cramer_rao
-from pchem_pipeline.model.law.pcd import pcd_mass
+from pchem_pipeline.model.errors.fisher import observed_covariance
+from pchem_pipeline.model.law.pcd import pcd, pcd_mass
 
 POINTS = [(2.0, 0.2), (0.1, 0.305), (2.0, 0.305), (10.0, 0.45), (2.0, 0.6), (1.0, 1.0)]
 
@@ -28,10 +28,11 @@ def density(y, theta):
 
 @pytest.mark.parametrize(("exposure", "noise"), POINTS)
 def test_bound_agrees_with_louis_formula(exposure, noise):
-    gain = 0.1
+    gain = noise / 4.0  # a read noise of 4 DN: sums over whole DN are integrals
     ours = inverse_information(expected_information(exposure, noise))
-    louis = cramer_rao(exposure, gain, noise / gain, 1.0)
-    scale = np.array([1.0, 1 / gain, gain, gain / noise])
+    x = np.arange(-40, int((exposure + 12.0 * np.sqrt(exposure) + 12.0) / gain) + 40)
+    louis = observed_covariance(pcd(x, exposure, gain, 0.0, 4.0), -40, (exposure, gain, 0.0, 4.0))
+    scale = np.array([1.0, 1 / gain, gain, 0.25])
     np.testing.assert_allclose(ours, louis * np.outer(scale, scale), rtol=2e-5, atol=2e-5 * ours.max())
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import norm, poisson
+from helpers.plain_law import joint_mass
 
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus
@@ -29,10 +29,9 @@ def good(found):
 def log_likelihood(dn, exposure, step, bias, noise_dn):
     """Return the log-likelihood of one pixel's whole DN: a Poisson comb of Gaussians over cells."""
     codes, counts = np.unique(dn, return_counts=True)
-    k = np.arange(int(exposure + 10 * np.sqrt(exposure) + 14))
-    ends = (codes[:, None] + np.array([-0.5, 0.5])[:, None, None] - bias - k * step) / noise_dn
-    cells = np.where(ends[0] > 0, norm.sf(ends[0]) - norm.sf(ends[1]), norm.cdf(ends[1]) - norm.cdf(ends[0]))
-    return counts @ np.log(np.maximum(cells @ poisson.pmf(k, exposure), 1e-300))
+    n_k = int(exposure + 10 * np.sqrt(exposure) + 14)
+    joint = joint_mass(codes, exposure, 1 / step, bias, np.hypot(noise_dn, 12**-0.5), n_k)
+    return counts @ np.log(np.maximum(joint.sum(axis=0), 1e-300))
 
 
 @pytest.mark.parametrize(

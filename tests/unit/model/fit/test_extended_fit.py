@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from helpers.extended_reference import LAWS
+from helpers.masses import log_likelihood
 from numpy.typing import NDArray
 from scipy.optimize import root
 
@@ -15,7 +16,7 @@ from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.model.law.mass import log_likelihood, sample_mass
+from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.drawn_pixels import Drawn, draw, samples
+from helpers.drawn_pixels import Drawn, draw
 from iminuit import Minuit
 from numpy.typing import NDArray
-from scipy.special import gammaln, logsumexp
 
 from pchem_pipeline.base.variables import INTERVALS, interval_names
 from pchem_pipeline.effects.analog.row_noise import RowNoise
@@ -18,7 +17,8 @@ from pchem_pipeline.model.errors.fisher import correlations, covariance_from
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import INTERVAL_NAMES, FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.law.pcd import log_pcd
+from pchem_pipeline.model.law import density_scores_numba
+from pchem_pipeline.model.law.pcd import log_pcd, pcd_posterior
 from pchem_pipeline.stages.fit.fit import fit_tile
 
 Array = NDArray[np.float64]
@@ -96,48 +96,6 @@ def test_the_interval_of_the_noise_in_electrons_is_a_profile_too() -> None:
     assert (other.upper + other.lower) / (other.upper - other.lower) > 0.02
 
 
-def expectations(x: Array, theta: Array) -> tuple[Array, Array, Array, Array]:
-    """E[k], E[k^2] and membership of raw samples under (log H, a, mu, log s2), in plain numpy."""
-    k = np.arange(40)
-    e = x[:, None] - theta[2] - k * theta[1]
-    logged = k * theta[0] - gammaln(k + 1) - 0.5 * e**2 * np.exp(-theta[3])
-    return np.exp(logged - logsumexp(logged, axis=1, keepdims=True)), k.astype(float), e, x
-
-
-def gradient_q(theta: Array, given: Array, x: Array) -> Array:
-    """Gradient in theta of the expected complete-data log-likelihood, memberships taken at ``given``."""
-    gamma, k, _, _ = expectations(x, given)
-    e = x[:, None] - theta[2] - k * theta[1]
-    inverse = np.exp(-theta[3])
-    return np.array(
-        [
-            (gamma * (k - np.exp(theta[0]))).sum(),
-            (gamma * k * e).sum() * inverse,
-            (gamma * e).sum() * inverse,
-            (gamma * (0.5 * e**2 * inverse - 0.5)).sum(),
-        ]
-    )
-
-
-@pytest.mark.parametrize("case", CASES[:2])
-def test_information_is_that_of_oakes(case: tuple[float, float, float]) -> None:
-    """Oakes (1999): -d2 l = -(d2 Q / d theta2 + d2 Q / d theta d given), both at the maximum."""
-    pixel, at, covariance = fitted(case)
-    x = samples(pixel.counts[0], int(pixel.origin[0]))
-    theta = np.array([np.log(at[0]), 1 / at[1], at[2], 2 * np.log(at[3])])
-    hessian = np.empty((4, 4))
-    for i, step in enumerate((1e-5, 1e-5, 1e-5, 1e-5)):
-        up, down = theta.copy(), theta.copy()
-        up[i] += step
-        down[i] -= step
-        own = gradient_q(up, theta, x) - gradient_q(down, theta, x)
-        mixed = gradient_q(theta, up, x) - gradient_q(theta, down, x)
-        hessian[i] = (own + mixed) / (2 * step)
-    slope = np.array([at[0], -(at[1] ** 2), 1.0, 0.5 * at[3]])
-    oakes = np.linalg.inv(-hessian) * np.outer(slope, slope)
-    np.testing.assert_allclose(oakes, covariance, rtol=1e-4, atol=1e-6 * np.abs(covariance).max())
-
-
 def test_errors_are_those_of_a_parametric_bootstrap() -> None:
     _, at, covariance = fitted(CASES[0])
     again = draw(np.random.default_rng(8), np.full(500, at[0]), 1 / at[1], at[1] * at[3], at[2], n_frames=N)
@@ -150,16 +108,10 @@ def test_errors_are_those_of_a_parametric_bootstrap() -> None:
 def test_the_score_of_a_sample_is_the_slope_of_its_density(case: tuple[float, float, float]) -> None:
     h, a, noise = case
     at = np.array([h, 1 / a, 100.3, noise * a])
-    weights = information_numba.log_poisson(h, 60)
-    np.testing.assert_allclose(information_numba.log_poisson.py_func(h, 60), weights)
+    score, means = np.empty(4), np.empty(5)
     for x in (80.0, 100.0, 104.0, 131.0, 170.0):
-        score, plain = np.empty(4), np.empty(4)
-        logged = information_numba.sample_score(x, at, weights, score)
-        assert logged == pytest.approx(float(log_pcd(np.array([x]), *at)[0]), abs=1e-8)
-        assert information_numba.sample_score.py_func(x, at, weights, plain) == pytest.approx(
-            logged, rel=1e-12
-        )
-        np.testing.assert_allclose(plain, score, rtol=1e-9)
+        density_scores_numba.posterior(x, h, a, 100.3, noise * a, means)
+        density_scores_numba.density_scores(means, h, a, noise * a, score)
         for i in range(4):
             up, down = at.copy(), at.copy()
             up[i] *= 1 + 1e-6
@@ -273,12 +225,12 @@ def test_settings_bring_intervals_and_sandwich_errors_into_the_store() -> None:
     fit = fit_histograms(pixels.counts, pixels.origin)
     middle = np.zeros((4, 4, 4))
     for i in range(4):
-        score = np.empty(4)
-        at = estimates(fit)[i]
-        weights = information_numba.log_poisson(at[0], 60)
-        for b in np.flatnonzero(pixels.counts[i]):
-            information_numba.sample_score(float(pixels.origin[i] + b), at, weights, score)
-            middle[i] += pixels.counts[i, b] * np.outer(score, score)
+        h, g, mu, sigma = estimates(fit)[i]
+        codes = np.flatnonzero(pixels.counts[i])
+        given = pcd_posterior(pixels.origin[i] + codes, h, g, mu, sigma)
+        charge, shift = given.k / h - 1, -given.ke / (g * sigma) ** 2
+        score = np.stack([charge, shift, given.e / sigma**2, (given.ee / sigma**2 - 1) / sigma])
+        middle[i] = score * pixels.counts[i, codes] @ score.T
     sandwich = fit.covariance @ middle @ fit.covariance
     np.testing.assert_allclose(full["bias_stderr"][0], np.sqrt(sandwich[:, 2, 2]), rtol=1e-5)
     assert (full["bias_stderr"] != plain["bias_stderr"]).all()

@@ -13,7 +13,7 @@ from pchem_pipeline.model.law import cells_numba, pixel_numba
 from pchem_pipeline.model.law.electron_laws_numba import LOST, _one_law, electron_number
 from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood
-from pchem_pipeline.model.law.mass import log_likelihood, sample_mass, sample_parabolas, sample_slopes
+from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas, sample_slopes
 from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -180,24 +180,6 @@ def test_what_is_lost_of_electrons_is_what_chance_takes() -> None:
         compiled, plain = (f(LOST, chance, float(k), exposure) for f in (_one_law, _one_law.py_func))
         np.testing.assert_allclose(plain, compiled, rtol=1e-13)
     assert _one_law(LOST, 0.0, 3.0, exposure) == _one_law(0, 0.0, 3.0, exposure)
-
-
-def test_log_likelihood_is_that_of_the_masses() -> None:
-    columns = list(np.transpose(PIXELS))
-    counts = np.zeros((3, 150), np.uint16)
-    counts[:, 25:80] = 3
-    counts[0, 149] = 1  # far out: every tail counts
-    got = log_likelihood(counts, np.full(3, 70), columns, EVERYTHING)
-    with np.errstate(divide="ignore"):
-        log_mass = np.log(sample_mass(EVERYTHING, columns, list(CODES)))
-    expected = [float(row[c > 0] @ log[c > 0]) for row, log, c in zip(counts, log_mass, counts, strict=True)]
-    np.testing.assert_allclose(got, expected, rtol=1e-12)
-    columns[1] = np.array([np.nan, 0.1, 0.2])
-    assert np.isnan(log_likelihood(counts, np.full(3, 70), columns, EVERYTHING)).tolist() == [
-        True,
-        False,
-        False,
-    ]
 
 
 def test_threshold_of_free_satellites_grows_with_the_number_of_trials() -> None:
