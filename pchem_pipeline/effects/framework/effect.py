@@ -255,8 +255,17 @@ class Effect(Section):
     def times(self, name: str, factor: float) -> Self:
         """Return a copy with ``factor`` times a number of it, kept within the limits of its field."""
         values = self.model_dump()
-        values[name] = _within(type(self), name, values[name] * factor)
+        values[name] = self.limited(name, values[name] * factor)
         return type(self).model_validate(values)
+
+    @classmethod
+    def limited(cls, name: str, value: float) -> float:
+        """Return a value cut to the limits that its field states."""
+        for limit in cls.model_fields[name].metadata:
+            low, high = getattr(limit, "ge", None), getattr(limit, "le", None)
+            value = max(value, low) if low is not None else value
+            value = min(value, high) if high is not None else value
+        return value
 
     def stuck_words(self) -> str:
         """State which parameters are at a limit; empty if none."""
@@ -363,15 +372,6 @@ class Effect(Section):
     def history(self) -> int:
         """Return how many frames before it a frame depends on: :attr:`reach_frames`."""
         return self.reach_frames
-
-
-def _within(effect: type[Effect], name: str, value: float) -> float:
-    """Return the value cut to the limits that the field states."""
-    for limit in effect.model_fields[name].metadata:
-        low, high = getattr(limit, "ge", None), getattr(limit, "le", None)
-        value = max(value, low) if low is not None else value
-        value = min(value, high) if high is not None else value
-    return value
 
 
 EffectClass = TypeVar("EffectClass", bound=type[Effect])
