@@ -53,17 +53,17 @@ class BiasJumps(OffsetEffect):
     """
 
     tag: Literal["bias_jumps"] = Field(default="bias_jumps", description="name of the effect")
-    title: ClassVar[str] = "bias jumps (popcorn mesa noise)"
-    source: ClassVar[str] = "WFPC2 Data Handbook (STScI), bias jumps; Rauscher 2015, PASP 127, 1144"
-    signature: ClassVar[tuple[str, ...]] = (
+    title = "bias jumps (popcorn mesa noise)"
+    source = "WFPC2 Data Handbook (STScI), bias jumps; Rauscher 2015, PASP 127, 1144"
+    signature = (
         "frame.readout.quadrants",
         "frame.readout.slow",
         "frame.readout.lag1",
         "time.lag1.readout.mean",
     )
-    random_realisation: ClassVar[bool] = True
-    strength: ClassVar[str] = "amplitude_dn"
-    power: ClassVar[float] = 2.0
+    random_realisation = True
+    strength = "amplitude_dn"
+    power = 2.0
     separate: ClassVar[Mapping[str, str]] = {
         "bias_drift": "means of the quadrants, frame by frame: a drift is slow and common to all",
         "flicker_noise": "means of the quadrants: 1/f noise of single pixels averages out",

@@ -26,7 +26,7 @@ class OffsetEffect(Effect):
     frames, and the values that they take in the run; by these a pixel's own histogram is smeared.
     """
 
-    plane: ClassVar[Plane] = Plane.ANALOG
+    plane = Plane.ANALOG
 
     @abstractmethod
     def offsets(self, context: EffectContext) -> FloatArray:
@@ -68,7 +68,7 @@ class SharedNoise(OffsetEffect):
         shared_by: what has one offset.
     """
 
-    power: ClassVar[float] = 2.0
+    power = 2.0
     shared_by: ClassVar[Literal["frame", "row", "column"]]
 
     def offsets(self, context: EffectContext) -> FloatArray:
