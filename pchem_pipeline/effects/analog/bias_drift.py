@@ -18,8 +18,7 @@ from pchem_pipeline.effects.estimators.common_modes import responsivity, run_pos
 from pchem_pipeline.effects.estimators.time_profiles import likely_profiles, time_profiles
 from pchem_pipeline.effects.families.drifts import Drift
 from pchem_pipeline.effects.families.offsets import OffsetEffect, quantile_means
-from pchem_pipeline.effects.framework.effect import Dn, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.framework.effect import Dn, SharedOffset, register_effect
 from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
 

@@ -19,8 +19,7 @@ from pchem_pipeline.effects.estimators.levels.change_points import noise_varianc
 from pchem_pipeline.effects.estimators.levels.two_levels import likeliest_parts
 from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.families.offsets import OffsetEffect, quantile_means
-from pchem_pipeline.effects.framework.effect import Count, Dn, PerFrame, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.framework.effect import Count, Dn, PerFrame, SharedOffset, register_effect
 from pchem_pipeline.effects.types import (
     BoolArray,
     EffectContext,

@@ -17,11 +17,11 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
+from pchem_pipeline.effects.families.offsets import add_offset
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.context import DIMS, Dim
 from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.region import Span
-from pchem_pipeline.effects.framework.shared_offset import add_offset
 from pchem_pipeline.effects.types import (
     AnyArray,
     EffectContext,

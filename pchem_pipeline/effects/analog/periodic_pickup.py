@@ -20,10 +20,9 @@ from pchem_pipeline.effects.estimators.common_modes import (
 )
 from pchem_pipeline.effects.estimators.lines import coherent_line, incoherent_line
 from pchem_pipeline.effects.families.offsets import OffsetEffect, sine_values
-from pchem_pipeline.effects.framework.effect import Dn, Radians, Turns, register_effect
+from pchem_pipeline.effects.framework.effect import Dn, Radians, SharedOffset, Turns, register_effect
 from pchem_pipeline.effects.framework.evidence import Wave
 from pchem_pipeline.effects.framework.region import Span
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
 
 Pickup = TypeVar("Pickup", bound="PeriodicPickup")

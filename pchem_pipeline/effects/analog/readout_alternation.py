@@ -19,8 +19,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
     responsivity,
 )
 from pchem_pipeline.effects.families.offsets import OffsetEffect
-from pchem_pipeline.effects.framework.effect import Dn, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.framework.effect import Dn, SharedOffset, register_effect
 from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
 
 

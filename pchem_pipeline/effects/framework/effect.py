@@ -51,8 +51,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.added_exposure import AddedExposure
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.effects.framework.replacement import Replacement
-    from pchem_pipeline.effects.framework.shared_offset import SharedOffset
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
 _registered: dict[str, type[Effect]] = {}
@@ -79,6 +77,38 @@ PerFrame = Annotated[float, Unit("1/frame")]
 Turns = Annotated[float, Unit("cycles")]
 Radians = Annotated[float, Unit("rad")]
 Micrometres = Annotated[float, Unit("um")]
+
+
+class SharedOffset(NamedTuple):
+    """An offset of all pixels of a frame, of a row, of a column, or along a wave across the sensor.
+
+    Attributes:
+        of: what has one offset; a wave has a sine and a cosine of its own in each frame.
+        variance: of the offset, of a wave's sine and of its cosine, in any frame of the camera, DN^2; None:
+            other frames have another one.
+        cycles_per_row, cycles_per_column: of a wave, from row to row and from column to column.
+    """
+
+    of: Literal["frame", "row", "column", "wave"]
+    variance: float | None
+    cycles_per_row: float = 0.0
+    cycles_per_column: float = 0.0
+
+
+class Replacement(NamedTuple):
+    """A rule: of the samples that exceed a number by more than so much, that number comes out.
+
+    Attributes:
+        value: the number, DN, shape (frame, y, x).
+        inside: pixels for which the rule holds, shape (y, x).
+        excess: by how much, DN.
+        share: of those samples that is replaced, no unit.
+    """
+
+    value: NDArray[np.integer[Any]]
+    inside: NDArray[np.bool_]
+    excess: int
+    share: float
 
 
 class Effect(Section):

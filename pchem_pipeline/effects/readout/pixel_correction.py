@@ -15,9 +15,8 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.prediction import PREDICTORS, Predictor, predicted
-from pchem_pipeline.effects.framework.effect import Code, Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.framework.effect import Code, Effect, Plane, Ratio, Replacement, register_effect
 from pchem_pipeline.effects.framework.evidence import PredictedSamples
-from pchem_pipeline.effects.framework.replacement import Replacement
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray
 
 # standard deviations by which samples must equal their prediction too often, and exceed it too seldom
