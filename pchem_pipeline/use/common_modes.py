@@ -18,8 +18,7 @@ from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.use.calibration import Calibration
 
 if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+    from pchem_pipeline.effects.framework.effect import Effect, SharedOffset
 
 _AXES = ("frame", "row", "column")
 _LEAST_SCENE = 0.02  # e-

@@ -105,8 +105,8 @@ def test_a_path_of_the_gain_is_found():
     assert found[0].shape == "path"
     position = np.linspace(0, 1, 50)
     seen_profile, true_profile = (
-        found[0].drift * found[0]._profile(position),
-        0.06 * effect._profile(position),
+        found[0].drift * found[0].profile(position),
+        0.06 * effect.profile(position),
     )
     assert np.abs(seen_profile - true_profile).max() < 0.02
 
@@ -117,9 +117,9 @@ def test_a_gain_that_settles_is_found_as_such(sign):
     [first] = [e for e in GainDrift.estimate(evidence_of(effect)) if e.shape == "settling"]
     assert 0.05 <= first.settling_fraction <= 0.2
     position = np.linspace(0, 1, 50)
-    apart = first.drift * first._profile(position) - effect.drift * effect._profile(position)
+    apart = first.drift * first.profile(position) - effect.drift * effect.profile(position)
     assert np.abs(apart).max() < 0.02
-    line = effect.drift * (position - 0.5) - effect.drift * effect._profile(position)
+    line = effect.drift * (position - 0.5) - effect.drift * effect.profile(position)
     assert np.abs(line).max() > 0.02  # what the limit would catch
 
 

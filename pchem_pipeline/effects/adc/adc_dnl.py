@@ -50,13 +50,11 @@ class AdcDnl(Effect):
     """
 
     tag: Literal["adc_dnl"] = Field(default="adc_dnl", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ADC
-    along: ClassVar[int] = 2
-    title: ClassVar[str] = "differential nonlinearity of the ADC (DNL), bit weight error, missing codes"
-    source: ClassVar[str] = (
-        "IEEE Std 1241; Harpsoe et al. 2012, A&A 542, A23; Boone et al. 2018, PASP 130, 064504"
-    )
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.ADC
+    along = 2
+    title = "differential nonlinearity of the ADC (DNL), bit weight error, missing codes"
+    source = "IEEE Std 1241; Harpsoe et al. 2012, A&A 542, A23; Boone et al. 2018, PASP 130, 064504"
+    signature = (
         "code.rough",
         "code.alternating",
         "code.period2",
@@ -65,9 +63,9 @@ class AdcDnl(Effect):
         "code.period16",
         "shape.goodness.mean",
     )
-    strength: ClassVar[str] = "dnl_lsb"
-    power: ClassVar[float] = 2.0
-    may_be_at_bound: ClassVar[tuple[str, ...]] = ("dnl_lsb",)
+    strength = "dnl_lsb"
+    power = 2.0
+    may_be_at_bound = ("dnl_lsb",)
     separate: ClassVar[Mapping[str, str]] = {
         "gain_stitch": "a ramp over many codes: a stitch shifts all codes above it, DNL single codes",
         "clipping": "a shifted bias: DNL affects all codes, clipping the extreme one",
@@ -91,6 +89,12 @@ class AdcDnl(Effect):
         default=(),
         max_length=1 << 16,
         description="edges pattern: shift of the lower edge of each code, in units of dnl_lsb",
+    )
+
+    #: at 0.006 LSB: random by code, and wrong weights of bits, as visible in fewer codes
+    typical_values = (
+        {"dnl_lsb": 0.006},
+        *({"dnl_lsb": round(0.006 * 2 ** (bit / 2), 4), "pattern": "bit", "bit": bit} for bit in range(4)),
     )
 
     @model_validator(mode="after")
@@ -151,12 +155,6 @@ class AdcDnl(Effect):
             shift = np.where(inside, np.array(self.edges)[place.clip(0, len(self.edges) - 1)], 0.0)
         edges = codes + np.clip(self.dnl_lsb * shift, -_FARTHEST, _FARTHEST)
         return np.asarray((np.maximum.accumulate(edges) - codes)[1:], np.float64)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.006 LSB: random by code, and wrong weights of bits, as visible in fewer codes."""
-        bits = [cls(dnl_lsb=round(0.006 * 2 ** (bit / 2), 4), pattern="bit", bit=bit) for bit in range(4)]
-        return cls(dnl_lsb=0.006), *bits
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

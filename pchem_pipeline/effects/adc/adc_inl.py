@@ -8,6 +8,7 @@ form. It is fixed in DN, whatever the bias and the gain of a pixel.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -35,18 +36,18 @@ class AdcInl(Effect):
     """
 
     tag: Literal["adc_inl"] = Field(default="adc_inl", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ADC
-    along: ClassVar[int] = 1
-    title: ClassVar[str] = "integral nonlinearity of the ADC (INL)"
-    source: ClassVar[str] = "IEEE Std 1241 (terminology and test methods for analog-to-digital converters)"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.ADC
+    along = 1
+    title = "integral nonlinearity of the ADC (INL)"
+    source = "IEEE Std 1241 (terminology and test methods for analog-to-digital converters)"
+    signature = (
         "code.smooth",
         "shape.goodness.mean",
         "shape.He1C2.mean",
         "shape.He1C2.chi",
         "shape.He3.mean",
     )
-    strength: ClassVar[str] = "inl_lsb"
+    strength = "inl_lsb"
     separate: ClassVar[Mapping[str, str]] = {
         "gain_stitch": "a ramp of light over all codes: INL is curved everywhere, a stitch is one kink",
         "nonlinearity": "a shifted bias (pedestal): INL is fixed in DN, nonlinearity in charge",
@@ -72,6 +73,12 @@ class AdcInl(Effect):
         max_length=1 << 10,
         description="curve: deviations in units of inl_lsb, through which a natural cubic spline goes; "
         "beyond the ends as at the ends",
+    )
+
+    #: at 0.065 LSB with periods of 60 and 150 DN, at two phases each
+    typical_values = tuple(
+        {"inl_lsb": 0.065, "period_dn": period, "phase": phase}
+        for period, phase in itertools.product((60.0, 150.0), (0.0, 1.57))
     )
 
     @model_validator(mode="after")
@@ -124,15 +131,6 @@ class AdcInl(Effect):
     def _fine(self) -> float:
         """Distance of the places of the table, DN."""
         return self.spacing_dn / _FINER
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it at 0.065 LSB with periods of 60 and 150 DN, at two phases each."""
-        return tuple(
-            cls(inl_lsb=0.065, period_dn=period, phase=phase)
-            for period in (60.0, 150.0)
-            for phase in (0.0, 1.57)
-        )
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -31,12 +31,12 @@ class BinaryOffset(Effect):
     """
 
     tag: Literal["binary_offset"] = Field(default="binary_offset", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ADC
-    along: ClassVar[int] = 2
-    title: ClassVar[str] = "binary offset (bit-dependent ADC memory)"
-    source: ClassVar[str] = "Boone et al. 2018, PASP 130, 064504"
-    signature: ClassVar[tuple[str, ...]] = ("space.x.bits", "space.x.rk", "space.x.rr")
-    strength: ClassVar[str] = "offset_dn"
+    plane = Plane.ADC
+    along = 2
+    title = "binary offset (bit-dependent ADC memory)"
+    source = "Boone et al. 2018, PASP 130, 064504"
+    signature = ("space.x.bits", "space.x.rk", "space.x.rr")
+    strength = "offset_dn"
     separate: ClassVar[Mapping[str, str]] = {
         "interpixel_capacitance": "pixels above and below: ADC memory acts along the row only",
         "optical_crosstalk": "a bright spot: crosstalk depends on nearby charge, a binary offset on the code",

@@ -29,18 +29,18 @@ class BlackClamp(Effect):
     """
 
     tag: Literal["black_clamp"] = Field(default="black_clamp", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ADC
-    title: ClassVar[str] = "frame-dependent black-level clamp"
-    source: ClassVar[str] = "Andor iXon manual (baseline clamp); Janesick 2001 (optically black pixels)"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.ADC
+    title = "frame-dependent black-level clamp"
+    source = "Andor iXon manual (baseline clamp); Janesick 2001 (optically black pixels)"
+    signature = (
         "frame.covariance",
         "frame.readout.variance",
         "frame.charge.variance",
         "space.x.rk",
     )
-    strength: ClassVar[str] = "follow"
+    strength = "follow"
     reach_rows = ALL_ROWS  # the clamp may be anywhere
-    may_be_at_bound: ClassVar[tuple[str, ...]] = ("follow",)
+    may_be_at_bound = ("follow",)
     separate: ClassVar[Mapping[str, str]] = {
         "frame_noise": "clamp switched off: frame noise stays and is independent of charge",
         "exposure_flicker": "clamp switched off, or covered pixels: flicker is proportional to the light",

@@ -32,11 +32,11 @@ class Clipping(Effect):
     """
 
     tag: Literal["clipping"] = Field(default="clipping", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ADC
-    along: ClassVar[int] = 3
-    title: ClassVar[str] = "clipping (black-level clamping, saturation)"
-    source: ClassVar[str] = "Tobin 1958, Econometrica 26, 24 (censored observations); EMVA 1288 (saturation)"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.ADC
+    along = 3
+    title = "clipping (black-level clamping, saturation)"
+    source = "Tobin 1958, Econometrica 26, 24 (censored observations); EMVA 1288 (saturation)"
+    signature = (
         "code.top",
         "code.bottom",
         "code.largest",

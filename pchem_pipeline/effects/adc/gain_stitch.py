@@ -33,17 +33,17 @@ class GainStitch(Effect):
     """
 
     tag: Literal["gain_stitch"] = Field(default="gain_stitch", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ADC
-    along: ClassVar[int] = 1
-    title: ClassVar[str] = "stitch point of two gains"
-    source: ClassVar[str] = "arXiv:2412.10109 (pCam6060); arXiv:2510.14484 (Marana 4.2)"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.ADC
+    along = 1
+    title = "stitch point of two gains"
+    source = "arXiv:2412.10109 (pCam6060); arXiv:2510.14484 (Marana 4.2)"
+    signature = (
         "code.smooth",
         "shape.goodness.mean",
         "shape.He1C2.mean",
         "shape.C3.mean",
     )
-    strength: ClassVar[str] = "gain_change"
+    strength = "gain_change"
     separate: ClassVar[Mapping[str, str]] = {
         "adc_inl": "a ramp of light over all codes: a stitch is one kink, INL is curved everywhere",
         "nonlinearity": "a shifted bias (pedestal): a stitch is fixed in DN, nonlinearity in charge",

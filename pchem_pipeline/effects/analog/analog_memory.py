@@ -38,16 +38,15 @@ class AnalogMemory(Effect):
     """
 
     tag: Literal["analog_memory"] = Field(default="analog_memory", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "analog memory (incomplete reset)"
-    source: ClassVar[str] = "Janesick 2001 (incomplete reset); Boone et al. 2018 (memory of readout chains)"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.ANALOG
+    title = "analog memory (incomplete reset)"
+    source = "Janesick 2001 (incomplete reset); Boone et al. 2018 (memory of readout chains)"
+    signature = (
         "time.cross.readout_charge", "time.lag1.readout.mean", "time.lag1.charge.mean",
         "time.cross.readout_charge.chi",
     )  # fmt: skip
-    strength: ClassVar[str] = "memory"
+    strength = "memory"
     reach_frames = 1
-    power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {
         "flicker_noise": "frames without exposure: 1/f noise remains, memory vanishes",
         "dark_current_rts": "dark frames after a bright one: memory fades within a frame, blinking stays",

@@ -19,8 +19,7 @@ from pchem_pipeline.effects.estimators.levels.change_points import noise_varianc
 from pchem_pipeline.effects.estimators.levels.two_levels import likeliest_parts
 from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.families.offsets import OffsetEffect, quantile_means
-from pchem_pipeline.effects.framework.effect import Count, Dn, PerFrame, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.framework.effect import Count, Dn, PerFrame, SharedOffset, register_effect
 from pchem_pipeline.effects.types import (
     BoolArray,
     EffectContext,
@@ -53,17 +52,17 @@ class BiasJumps(OffsetEffect):
     """
 
     tag: Literal["bias_jumps"] = Field(default="bias_jumps", description="name of the effect")
-    title: ClassVar[str] = "bias jumps (popcorn mesa noise)"
-    source: ClassVar[str] = "WFPC2 Data Handbook (STScI), bias jumps; Rauscher 2015, PASP 127, 1144"
-    signature: ClassVar[tuple[str, ...]] = (
+    title = "bias jumps (popcorn mesa noise)"
+    source = "WFPC2 Data Handbook (STScI), bias jumps; Rauscher 2015, PASP 127, 1144"
+    signature = (
         "frame.readout.quadrants",
         "frame.readout.slow",
         "frame.readout.lag1",
         "time.lag1.readout.mean",
     )
-    random_realisation: ClassVar[bool] = True
-    strength: ClassVar[str] = "amplitude_dn"
-    power: ClassVar[float] = 2.0
+    random_realisation = True
+    strength = "amplitude_dn"
+    power = 2.0
     separate: ClassVar[Mapping[str, str]] = {
         "bias_drift": "means of the quadrants, frame by frame: a drift is slow and common to all",
         "flicker_noise": "means of the quadrants: 1/f noise of single pixels averages out",

@@ -26,11 +26,11 @@ class ColumnNoise(SharedNoise):
     """
 
     tag: Literal["column_noise"] = Field(default="column_noise", description="name of the effect")
-    title: ClassVar[str] = "column noise (column temporal noise)"
-    source: ClassVar[str] = "Gow et al. 2007, IEEE Trans. Electron Devices 54, 1321"
-    signature: ClassVar[tuple[str, ...]] = ("space.column.readout.variance", "space.y.rr")
-    strength: ClassVar[str] = "column_noise_dn"
-    shared_by: ClassVar[Literal["frame", "row", "column"]] = "column"
+    title = "column noise (column temporal noise)"
+    source = "Gow et al. 2007, IEEE Trans. Electron Devices 54, 1321"
+    signature = ("space.column.readout.variance", "space.y.rr")
+    strength = "column_noise_dn"
+    shared_by = "column"
     separate: ClassVar[Mapping[str, str]] = {
         "interpixel_capacitance": "distant pixels of a column: column noise correlates them like neighbours",
         "frame_noise": "column means within a frame: frame noise is common to all",

@@ -10,18 +10,18 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
+from pchem_pipeline.effects.families.offsets import add_offset
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.context import DIMS, Dim
 from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.region import Span
-from pchem_pipeline.effects.framework.shared_offset import add_offset
 from pchem_pipeline.effects.types import (
     AnyArray,
     EffectContext,
@@ -278,12 +278,12 @@ class EmpiricalNoise(Effect):
     """
 
     tag: Literal["empirical_noise"] = Field(default="empirical_noise", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "empirical correlated noise"
-    source: ClassVar[str] = "Wold 1938, Priestley 1981 (a stationary process by its spectrum)"
-    strength: ClassVar[str] = "noise_dn"
-    power: ClassVar[float] = 2.0
-    empirical: ClassVar[bool] = True
+    plane = Plane.ANALOG
+    title = "empirical correlated noise"
+    source = "Wold 1938, Priestley 1981 (a stationary process by its spectrum)"
+    strength = "noise_dn"
+    power = 2.0
+    empirical = True
     noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of all of it, DN")
     modes: tuple[NoiseMode, ...] = Field(
         min_length=1,

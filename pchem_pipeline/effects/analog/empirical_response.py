@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -138,12 +138,12 @@ class EmpiricalResponse(Effect):
     """
 
     tag: Literal["empirical_response"] = Field(default="empirical_response", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "empirical response to the charge of other samples"
-    source: ClassVar[str] = "Volterra 1930, Priestley 1981 (linear responses)"
-    strength: ClassVar[str] = "response"
-    empirical: ClassVar[bool] = True
-    far_reaching: ClassVar[bool] = True
+    plane = Plane.ANALOG
+    title = "empirical response to the charge of other samples"
+    source = "Volterra 1930, Priestley 1981 (linear responses)"
+    strength = "response"
+    empirical = True
+    far_reaching = True
     response: Ratio = Field(
         ge=0,
         le=1,

@@ -45,15 +45,14 @@ class FlickerNoise(Effect):
     """
 
     tag: Literal["flicker_noise"] = Field(default="flicker_noise", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "flicker (1/f) noise of the pixels"
-    source: ClassVar[str] = "van Vliet 1976; Kansy 1980 (double sampling of 1/f noise); McWhorter 1957"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.ANALOG
+    title = "flicker (1/f) noise of the pixels"
+    source = "van Vliet 1976; Kansy 1980 (double sampling of 1/f noise); McWhorter 1957"
+    signature = (
         "time.block.readout.chi", "time.lag1.readout.mean", "time.lag2.readout.mean",
         "time.lag3.readout.mean",
     )  # fmt: skip
-    strength: ClassVar[str] = "share"
-    power: ClassVar[float] = 1.0
+    strength = "share"
     separate: ClassVar[Mapping[str, str]] = {
         "analog_memory": "frames without exposure: 1/f noise remains, memory vanishes",
         "dark_current_rts": "a sweep of the exposure time: blinking grows with it, 1/f noise does not",
@@ -74,6 +73,12 @@ class FlickerNoise(Effect):
         description="lorentzian: one correlation time; one_over_f: it, an eighth and a 64th, of equal power",
     )
 
+    #: from some frames to hundreds of frames long, and 1/f
+    typical_values = (
+        *({"share": 0.0036, "correlation_frames": tau} for tau in (3.0, 30.0, 300.0)),
+        {"share": 0.0036, "correlation_frames": 300.0, "spectrum": "one_over_f"},
+    )
+
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with a part of the noise exchanged for a correlated one."""
         times = self._times()
@@ -90,12 +95,6 @@ class FlickerNoise(Effect):
         """Return the correlation times, frames."""
         factors = (1.0,) if self.spectrum == "lorentzian" else _SPACING
         return tuple(self.correlation_frames * factor for factor in factors)
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return it from some frames to hundreds of frames long, and 1/f."""
-        lorentzian = [cls(share=0.0036, correlation_frames=tau) for tau in (3.0, 30.0, 300.0)]
-        return *lorentzian, cls(share=0.0036, correlation_frames=300.0, spectrum="one_over_f")
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

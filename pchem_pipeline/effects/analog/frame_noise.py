@@ -36,16 +36,16 @@ class FrameNoise(SharedNoise):
     """
 
     tag: Literal["frame_noise"] = Field(default="frame_noise", description="name of the effect")
-    title: ClassVar[str] = "frame noise (frame-to-frame offset noise)"
-    source: ClassVar[str] = "Janesick 2001, Scientific Charge-Coupled Devices; Rauscher 2015, PASP 127, 1144"
-    signature: ClassVar[tuple[str, ...]] = (
+    title = "frame noise (frame-to-frame offset noise)"
+    source = "Janesick 2001, Scientific Charge-Coupled Devices; Rauscher 2015, PASP 127, 1144"
+    signature = (
         "frame.readout.variance",
         "frame.readout.largest",
         "space.x.rr",
         "space.y.rr",
     )
-    strength: ClassVar[str] = "frame_noise_dn"
-    shared_by: ClassVar[Literal["frame", "row", "column"]] = "frame"
+    strength = "frame_noise_dn"
+    shared_by = "frame"
     separate: ClassVar[Mapping[str, str]] = {
         "black_clamp": "clamp switched off: frame noise stays, offsets of the clamp vanish",
         "exposure_flicker": "frames without light, or at short exposure: flicker vanishes",

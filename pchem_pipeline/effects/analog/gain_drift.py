@@ -16,18 +16,9 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.common_modes import run_position
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
-from pchem_pipeline.effects.estimators.time_profiles import (
-    NODES,
-    check_path,
-    fitted,
-    fitted_profile,
-    hats,
-    profile_at,
-    settling,
-    settling_time,
-)
-from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.estimators.time_profiles import likely_profiles
+from pchem_pipeline.effects.families.drifts import Drift
+from pchem_pipeline.effects.framework.effect import Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
     EffectContext,
@@ -43,7 +34,7 @@ _SMALL = 1e-4  # relative change of the gain
 
 
 @register_effect
-class GainDrift(Effect):
+class GainDrift(Drift):
     """Slow change of 1/g of all pixels, zero on average over the run.
 
     Signature: block means of the readout residual move in proportion to the exposure of the pixel, and the
@@ -52,15 +43,14 @@ class GainDrift(Effect):
     """
 
     tag: Literal["gain_drift"] = Field(default="gain_drift", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "conversion gain drift"
-    source: ClassVar[str] = "EMVA 1288 (stability of the gain); Janesick 2007"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.ANALOG
+    title = "conversion gain drift"
+    source = "EMVA 1288 (stability of the gain); Janesick 2007"
+    signature = (
         "frame.gain.trend", "frame.gain.slow", "frame.readout.trend", "frame.readout.slow",
         "frame.charge.trend", "frame.charge.slow",
     )  # fmt: skip
-    strength: ClassVar[str] = "drift"
-    power: ClassVar[float] = 1.0
+    strength = "drift"
     separate: ClassVar[Mapping[str, str]] = {
         "bias_drift": "frames without exposure: a bias drift remains, a gain drift vanishes",
         "exposure_drift": "peak spacing over time: constant if the exposure drifts; or a logged light level",
@@ -73,18 +63,6 @@ class GainDrift(Effect):
         description="linear: relative change of the gain (DN/e-) from the first frame to the last, no unit; "
         "path: its scale",
     )
-    shape: Literal["linear", "settling", "path"] = Field(
-        default="linear",
-        description="linear; settling: exponential approach to the end; path: as listed in `path`",
-    )
-    settling_fraction: Ratio = Field(
-        default=0.2, gt=0, le=10, description="settling: time constant in lengths of the run"
-    )
-    path: tuple[float, ...] = Field(
-        default=(),
-        max_length=4096,
-        description="gain at equally spaced frames from the first to the last of the run, in units of drift",
-    )
 
     #: a gain that rises, falls, and does both
     typical_values = (
@@ -94,73 +72,29 @@ class GainDrift(Effect):
     )
 
     @model_validator(mode="after")
-    def _path_where_it_belongs(self) -> Self:
-        check_path(self.tag, self.shape, self.path)
-        if abs(self.drift) * float(np.abs(self._profile(np.linspace(0.0, 1.0, 4097))).max()) >= 1:
+    def _gain_stays_positive(self) -> Self:
+        if np.abs(self.values()).max() >= 1:
             raise ValueError("gain_drift: drift times path takes the gain to zero; make one of them smaller")
         return self
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
-        """Return the signal (frame, y, x), e-, scaled by the time profile of the gain; draws nothing."""
-        profile = self._profile(run_position(context.frames, context.n_frames))
-        result: AnyArray = values * (1.0 + self.drift * profile)[:, None, None]
+        """Return the signal (frame, y, x), e-, scaled by the time profile of the gain."""
+        result: AnyArray = values * (1.0 + self.drift * self.in_frames(context))[:, None, None]
         return result
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the regression of the blocks' gain on time: a line, and time profiles that explain more.
-
-        Those are an exponential approach and a path with as many nodes as the Bayesian information criterion
-        asks for; the likeliest comes first.
-        """
+        """Return the time profiles that the blocks' gain follows."""
         if evidence.time is None or evidence.time.block_start.size < 3:
             return ()
         gain, error, position = _block_gains(evidence, evidence.time)
-        if gain.size < 3:
-            return ()
-        flat = fitted(gain, np.ones((gain.size, 1)), error)
-        fraction = settling_time(lambda f: fitted_profile(gain, settling(position, f), error).chi2)
-        curve = fitted_profile(gain, settling(position, fraction), error)
-        line = fitted_profile(gain, position - 0.5, error)
-        # three nodes can always be told; more of them where three blocks come on each
-        paths = [fitted(gain, hats(position, n), error) for n in NODES[:-1] if n == 3 or 3 * n <= gain.size]
-        path = min(paths, key=lambda fit: fit.chi2 + fit.price(gain.size))
-        straight = line.chi2 + line.price(gain.size)
-        found: list[tuple[float, Self]] = []
-        if flat.chi2 - line.chi2 > SIGNIFICANT**2:
-            found.append((straight, cls(drift=_limited(line.values[1]))))
-        # the time constant is a number more
-        left = curve.chi2 + curve.price(gain.size) + float(np.log(gain.size))
-        if flat.chi2 - curve.chi2 > _improvement(3) and left < straight:
-            size = _limited(curve.values[1])
-            found.append((left, cls(drift=size, shape="settling", settling_fraction=fraction)))
-        left = path.chi2 + path.price(gain.size)
-        if flat.chi2 - path.chi2 > _improvement(path.values.size) and left < straight:
-            spread = float(np.ptp(path.values))
-            nodes = tuple(np.round(path.values / spread, 4).tolist())
-            found.append((left, cls(drift=min(spread, 0.4), shape="path", path=nodes)))
-        return [effect for _, effect in sorted(found, key=lambda pair: pair[0])]
+        return (
+            [cls.of(profile) for profile in likely_profiles(gain, position, error)] if gain.size >= 3 else ()
+        )
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the variance of the gain: that of the peaks grows as k^2."""
-        profile = self.drift * self._profile(np.linspace(0.0, 1.0, 1001))
-        return model.with_variance(per_electron2=float(profile.var()))
-
-    def _profile(self, position: FloatArray) -> FloatArray:
-        """Return the shape at positions 0..1 in the run, in units of ``drift``, zero on average."""
-        fraction = self.settling_fraction if self.shape == "settling" else None
-        return profile_at(position, fraction, self.path)
-
-
-def _limited(drift: float) -> float:
-    """Return a drift within the limits of its field."""
-    return float(np.clip(drift, -0.5, 0.5))
-
-
-def _improvement(nodes: int) -> float:
-    """Return by how much chi squared falls by chance, plus three standard deviations of that."""
-    free = nodes - 1
-    return free + 3.0 * float(np.sqrt(2.0 * free))
+        return model.with_variance(per_electron2=float(self.values().var()))
 
 
 def _block_gains(evidence: Evidence, time: TimeSeries) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -36,17 +36,16 @@ class HeavyTailedNoise(Effect):
     """
 
     tag: Literal["heavy_tailed_noise"] = Field(default="heavy_tailed_noise", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "non-Gaussian (heavy-tailed) read noise"
-    source: ClassVar[str] = (
+    plane = Plane.ANALOG
+    title = "non-Gaussian (heavy-tailed) read noise"
+    source = (
         "Tukey 1960 (contaminated normal); Wang, Rao, Mierop and Theuwissen 2006, Leyris et al. 2006 (tails "
         "of CMOS read noise)"
     )
-    signature: ClassVar[tuple[str, ...]] = (
+    signature = (
         "tail.low.count", "shape.He4.mean", "tail.low.pixels", "shape.He3.mean", "shape.He3C1.mean",
     )  # fmt: skip
-    strength: ClassVar[str] = "share"
-    power: ClassVar[float] = 1.0
+    strength = "share"
     separate: ClassVar[Mapping[str, str]] = {
         "rts_noise": "longer runs: RTS noise stays in the same few pixels; or another number of "
         "correlated samples: it changes the levels of RTS noise",
@@ -61,6 +60,13 @@ class HeavyTailedNoise(Effect):
         description="noise of such a sample relative to others, no unit",
     )
 
+    #: few noisy samples, and more but less noisy ones; the last is near a Student law of many degrees of
+    #: freedom: kurtosis almost without tails
+    typical_values = tuple(
+        {"share": share, "factor": factor}
+        for share, factor in ((2.4e-4, 3.0), (3e-3, 2.0), (6e-5, 5.0), (5e-2, 1.25))
+    )
+
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the noise of some samples enlarged."""
         noisy = context.random.uniform(("frame", "y", "x")) < self.share
@@ -68,15 +74,6 @@ class HeavyTailedNoise(Effect):
         if context.read_noise is not None:
             result[noisy] += (self.factor - 1.0) * context.read_noise[noisy]
         return result
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return mixtures of a few noisy samples and of more but less noisy ones.
-
-        The least noisy is near a Student law of many degrees of freedom: kurtosis almost without tails.
-        """
-        pairs = (2.4e-4, 3.0), (3e-3, 2.0), (6e-5, 5.0), (5e-2, 1.25)
-        return [cls(share=share, factor=factor) for share, factor in pairs]
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

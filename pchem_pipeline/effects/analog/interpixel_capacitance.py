@@ -38,15 +38,14 @@ class InterpixelCapacitance(Effect):
     tag: Literal["interpixel_capacitance"] = Field(
         default="interpixel_capacitance", description="name of the effect"
     )
-    plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "interpixel capacitance (IPC)"
-    source: ClassVar[str] = "Moore, Ninkov and Forrest 2004; Donlon, Ninkov and Baum 2018"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.ANALOG
+    title = "interpixel capacitance (IPC)"
+    source = "Moore, Ninkov and Forrest 2004; Donlon, Ninkov and Baum 2018"
+    signature = (
         "space.x.rk", "space.y.rk", "space.x.rr", "space.y.rr", "space.x.kk", "space.y.kk",
     )  # fmt: skip
-    strength: ClassVar[str] = "coupling"
+    strength = "coupling"
     reach_rows = 1
-    power: ClassVar[float] = 1.0
     separate: ClassVar[Mapping[str, str]] = {
         "optical_crosstalk": "single hot pixels: crosstalk adds whole electrons to neighbours, "
         "capacitance shifts their peaks by a fraction of an electron",

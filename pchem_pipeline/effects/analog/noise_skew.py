@@ -32,14 +32,14 @@ class NoiseSkew(Effect):
     """
 
     tag: Literal["noise_skew"] = Field(default="noise_skew", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "skewed read noise (exponentially modified Gaussian)"
-    source: ClassVar[str] = "Grushka 1972 (exponentially modified Gaussian)"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.ANALOG
+    title = "skewed read noise (exponentially modified Gaussian)"
+    source = "Grushka 1972 (exponentially modified Gaussian)"
+    signature = (
         "shape.He3.mean", "shape.He2C1.mean", "shape.He3C1.mean", "shape.He4.mean", "code.smooth",
     )  # fmt: skip
-    strength: ClassVar[str] = "share"
-    power: ClassVar[float] = 3.0
+    strength = "share"
+    power = 3.0
     separate: ClassVar[Mapping[str, str]] = {
         "heavy_tailed_noise": "frames without exposure: skewed noise has one tail, heavy-tailed noise two",
         "signal_dependent_noise": "frames without exposure: the skewness remains",

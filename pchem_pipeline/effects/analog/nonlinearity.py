@@ -33,14 +33,13 @@ class Nonlinearity(Effect):
     """
 
     tag: Literal["nonlinearity"] = Field(default="nonlinearity", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "nonlinearity of the pixel's response"
-    source: ClassVar[str] = "Janesick 2007 (V/V and V/e- nonlinearity)"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.ANALOG
+    title = "nonlinearity of the pixel's response"
+    source = "Janesick 2007 (V/V and V/e- nonlinearity)"
+    signature = (
         "shape.He1C2.mean", "code.smooth", "shape.He3C1.mean", "shape.He1C2.slope", "shape.C3.mean",
     )  # fmt: skip
-    strength: ClassVar[str] = "step_change"
-    power: ClassVar[float] = 1.0
+    strength = "step_change"
     separate: ClassVar[Mapping[str, str]] = {
         "adc_inl": "a sweep of the bias: INL is fixed in DN, pixel nonlinearity in electrons",
         "signal_dependent_noise": "a series of exposures: nonlinearity bends the means, noise the variances",

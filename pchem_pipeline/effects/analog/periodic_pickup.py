@@ -20,10 +20,9 @@ from pchem_pipeline.effects.estimators.common_modes import (
 )
 from pchem_pipeline.effects.estimators.lines import coherent_line, incoherent_line
 from pchem_pipeline.effects.families.offsets import OffsetEffect, sine_values
-from pchem_pipeline.effects.framework.effect import Dn, Radians, Turns, register_effect
+from pchem_pipeline.effects.framework.effect import Dn, Radians, SharedOffset, Turns, register_effect
 from pchem_pipeline.effects.framework.evidence import Wave
 from pchem_pipeline.effects.framework.region import Span
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset
 from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
 
 Pickup = TypeVar("Pickup", bound="PeriodicPickup")
@@ -40,11 +39,9 @@ class PeriodicPickup(OffsetEffect):
     """
 
     tag: Literal["periodic_pickup"] = Field(default="periodic_pickup", description="name of the effect")
-    title: ClassVar[str] = "periodic pickup (pattern noise, EMI)"
-    source: ClassVar[str] = (
-        "Jansen et al. 2003, HST Calibration Workshop (herring-bone noise of the STIS CCD)"
-    )
-    signature: ClassVar[tuple[str, ...]] = (
+    title = "periodic pickup (pattern noise, EMI)"
+    source = "Jansen et al. 2003, HST Calibration Workshop (herring-bone noise of the STIS CCD)"
+    signature = (
         "space.row.readout.line",
         "frame.readout.line",
         "space.column.readout.line",
@@ -52,9 +49,9 @@ class PeriodicPickup(OffsetEffect):
         "space.sample.readout.spectrum",
         "space.row.readout.variance",
     )
-    strength: ClassVar[str] = "amplitude_dn"
-    power: ClassVar[float] = 2.0
-    may_be_at_bound: ClassVar[tuple[str, ...]] = ("cycles_per_row", "cycles_per_frame", "cycles_per_column")
+    strength = "amplitude_dn"
+    power = 2.0
+    may_be_at_bound = ("cycles_per_row", "cycles_per_frame", "cycles_per_column")
     separate: ClassVar[Mapping[str, str]] = {
         "row_noise": "spectrum of the row means within a frame: pickup is a line, row noise is flat",
         "frame_noise": "spectrum of the frame means: pickup is a line, frame noise is flat",

@@ -30,17 +30,17 @@ class ReadOrderNoise(OffsetEffect):
     """
 
     tag: Literal["read_order_noise"] = Field(default="read_order_noise", description="name of the effect")
-    title: ClassVar[str] = "1/f noise along the readout"
-    source: ClassVar[str] = "Rauscher 2015, PASP 127, 1144 (correlated pink noise)"
-    signature: ClassVar[tuple[str, ...]] = (
+    title = "1/f noise along the readout"
+    source = "Rauscher 2015, PASP 127, 1144 (correlated pink noise)"
+    signature = (
         "space.row.readout.lag1",
         "space.row.readout.variance",
         "space.x.rr",
         "space.y.rr",
         "frame.readout.quadrants",
     )
-    strength: ClassVar[str] = "noise_dn"
-    power: ClassVar[float] = 2.0
+    strength = "noise_dn"
+    power = 2.0
     separate: ClassVar[Mapping[str, str]] = {
         "row_noise": "distant pixels of a row: 1/f noise correlates them less than neighbours",
         "frame_noise": "distant rows of a frame: 1/f noise does not correlate them",

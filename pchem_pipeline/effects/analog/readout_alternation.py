@@ -19,8 +19,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
     responsivity,
 )
 from pchem_pipeline.effects.families.offsets import OffsetEffect
-from pchem_pipeline.effects.framework.effect import Dn, register_effect
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.framework.effect import Dn, SharedOffset, register_effect
 from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
 
 
@@ -36,10 +35,10 @@ class ReadoutAlternation(OffsetEffect):
     tag: Literal["readout_alternation"] = Field(
         default="readout_alternation", description="name of the effect"
     )
-    title: ClassVar[str] = "even-odd readout alternation (ping-pong offset)"
-    source: ClassVar[str] = "Black and Hodges 1980, IEEE J. Solid-State Circuits 15, 1022 (interleaved ADCs)"
-    signature: ClassVar[tuple[str, ...]] = ("frame.readout.alternating", "frame.readout.lag1")
-    strength: ClassVar[str] = "alternation_dn"
+    title = "even-odd readout alternation (ping-pong offset)"
+    source = "Black and Hodges 1980, IEEE J. Solid-State Circuits 15, 1022 (interleaved ADCs)"
+    signature = ("frame.readout.alternating", "frame.readout.lag1")
+    strength = "alternation_dn"
     separate: ClassVar[Mapping[str, str]] = {
         "periodic_pickup": "another frame rate: pickup leaves half the frame rate",
         "frame_noise": "spectrum of the frame means: alternation is a line at half the frame rate",

@@ -26,11 +26,11 @@ class RowNoise(SharedNoise):
     """
 
     tag: Literal["row_noise"] = Field(default="row_noise", description="name of the effect")
-    title: ClassVar[str] = "row noise (row temporal noise)"
-    source: ClassVar[str] = "Gow et al. 2007, IEEE Trans. Electron Devices 54, 1321"
-    signature: ClassVar[tuple[str, ...]] = ("space.row.readout.variance", "space.x.rr")
-    strength: ClassVar[str] = "row_noise_dn"
-    shared_by: ClassVar[Literal["frame", "row", "column"]] = "row"
+    title = "row noise (row temporal noise)"
+    source = "Gow et al. 2007, IEEE Trans. Electron Devices 54, 1321"
+    signature = ("space.row.readout.variance", "space.x.rr")
+    strength = "row_noise_dn"
+    shared_by = "row"
     separate: ClassVar[Mapping[str, str]] = {
         "read_order_noise": "distant pixels of a row: 1/f noise correlates them less than neighbours",
         "periodic_pickup": "spectrum of the row means within a frame: pickup is a line, row noise is flat",

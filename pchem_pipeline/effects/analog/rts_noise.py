@@ -78,18 +78,17 @@ class RtsNoise(Effect):
     """
 
     tag: Literal["rts_noise"] = Field(default="rts_noise", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "random telegraph noise (RTS noise, burst noise) of the source follower"
-    source: ClassVar[str] = (
+    plane = Plane.ANALOG
+    title = "random telegraph noise (RTS noise, burst noise) of the source follower"
+    source = (
         "Kandiah and Whiting 1978; Wang, Rao, Mierop and Theuwissen 2006; Leyris et al. 2006 (three levels "
         "behind correlated double sampling)"
     )
-    signature: ClassVar[tuple[str, ...]] = (
+    signature = (
         "shape.peaks.cnt", "shape.He4.chi", "shape.He3.chi", "shape.C2.cnt", "tail.low.count",
         "time.block.readout.cnt",
     )  # fmt: skip
-    strength: ClassVar[str] = "fraction"
-    power: ClassVar[float] = 1.0
+    strength = "fraction"
     separate: ClassVar[Mapping[str, str]] = {
         "heavy_tailed_noise": "longer runs: RTS noise stays in the same few pixels; or another number of "
         "correlated samples: it changes the levels of RTS noise",

@@ -29,14 +29,14 @@ class SignalDependentNoise(Effect):
     tag: Literal["signal_dependent_noise"] = Field(
         default="signal_dependent_noise", description="name of the effect"
     )
-    plane: ClassVar[Plane] = Plane.ANALOG
-    title: ClassVar[str] = "signal-dependent noise (gain or excess noise)"
-    source: ClassVar[str] = "McIntyre 1966 (multiplication noise); Eckert et al. 2010 (peaks of SiPM spectra)"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.ANALOG
+    title = "signal-dependent noise (gain or excess noise)"
+    source = "McIntyre 1966 (multiplication noise); Eckert et al. 2010 (peaks of SiPM spectra)"
+    signature = (
         "shape.He2C1.mean", "shape.He3.mean", "shape.He2C1.slope", "shape.He4.mean", "shape.He2C2.mean",
     )  # fmt: skip
-    strength: ClassVar[str] = "noise_e"
-    power: ClassVar[float] = 2.0
+    strength = "noise_e"
+    power = 2.0
     separate: ClassVar[Mapping[str, str]] = {
         "nonlinearity": "a series of exposures: nonlinearity bends the means, noise the variances",
         "noise_skew": "frames without exposure: skewness remains, signal-dependent noise vanishes",

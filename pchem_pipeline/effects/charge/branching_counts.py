@@ -43,13 +43,11 @@ class BranchingCounts(Effect):
     """
 
     tag: Literal["branching_counts"] = Field(default="branching_counts", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.CHARGE
-    title: ClassVar[str] = "branching (generalised Poisson) counts"
-    source: ClassVar[str] = (
-        "Consul and Jain 1973, Technometrics 15, 791; Vinogradov 2012, Nucl. Instrum. Methods A 695, 247"
-    )
-    signature: ClassVar[tuple[str, ...]] = ("shape.C2.mean", "shape.C3.mean", "code.smooth")
-    strength: ClassVar[str] = "branching"
+    plane = Plane.CHARGE
+    title = "branching (generalised Poisson) counts"
+    source = "Consul and Jain 1973, Technometrics 15, 791; Vinogradov 2012, Nucl. Instrum. Methods A 695, 247"
+    signature = ("shape.C2.mean", "shape.C3.mean", "code.smooth")
+    strength = "branching"
     separate: ClassVar[Mapping[str, str]] = {
         "overdispersed_counts": "several exposures: excess variance grows as H, by over-dispersion as H^2",
         "optical_crosstalk": "electron numbers of neighbours: correlated by crosstalk only",

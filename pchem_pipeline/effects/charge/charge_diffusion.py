@@ -9,7 +9,7 @@ and part of H.
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -29,12 +29,12 @@ class ChargeDiffusion(Effect):
     """
 
     tag: Literal["charge_diffusion"] = Field(default="charge_diffusion", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.CHARGE
-    title: ClassVar[str] = "charge diffusion"
-    source: ClassVar[str] = "Janesick 2001, Scientific Charge-Coupled Devices, ch. 4"
-    strength: ClassVar[str] = "fraction"
+    plane = Plane.CHARGE
+    title = "charge diffusion"
+    source = "Janesick 2001, Scientific Charge-Coupled Devices, ch. 4"
+    strength = "fraction"
     reach_rows = 1
-    untestable: ClassVar[str] = (
+    untestable = (
         "randomly moved Poisson electrons remain independent and Poisson, only the map of H changes; an "
         "edge, a spot or single X-rays would show it"
     )

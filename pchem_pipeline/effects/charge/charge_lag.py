@@ -8,7 +8,7 @@ Hondongwa 2014, "A Review of the Pinned Photodiode"; 0.1 e- and less in the pump
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -26,12 +26,12 @@ class ChargeLag(Effect):
     """
 
     tag: Literal["charge_lag"] = Field(default="charge_lag", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.CHARGE
-    title: ClassVar[str] = "charge transfer lag"
-    source: ClassVar[str] = "Fossum and Hondongwa 2014, IEEE J. Electron Devices Soc. 2, 33; Mirasol 1963"
-    strength: ClassVar[str] = "fraction"
+    plane = Plane.CHARGE
+    title = "charge transfer lag"
+    source = "Fossum and Hondongwa 2014, IEEE J. Electron Devices Soc. 2, 33; Mirasol 1963"
+    strength = "fraction"
     reach_frames = 1
-    untestable: ClassVar[str] = (
+    untestable = (
         "randomly delayed Poisson electrons remain independent and Poisson; a bright frame followed by dark "
         "ones would show it"
     )

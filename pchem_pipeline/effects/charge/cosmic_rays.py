@@ -77,11 +77,11 @@ class CosmicRays(Effect):
     """
 
     tag: Literal["cosmic_rays"] = Field(default="cosmic_rays", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.CHARGE
-    title: ClassVar[str] = "cosmic rays and radioactivity"
-    source: ClassVar[str] = "Groom 2002, Exp. Astron. 14, 45"
-    signature: ClassVar[tuple[str, ...]] = ("tail.high.count", "tail.high.clusters", "tail.high.pixels")
-    strength: ClassVar[str] = "tracks_per_frame"
+    plane = Plane.CHARGE
+    title = "cosmic rays and radioactivity"
+    source = "Groom 2002, Exp. Astron. 14, 45"
+    signature = ("tail.high.count", "tail.high.clusters", "tail.high.pixels")
+    strength = "tracks_per_frame"
     separate: ClassVar[Mapping[str, str]] = {
         "heavy_tailed_noise": "samples far below the bias: none by tracks",
         "rts_noise": "a longer run: RTS noise stays in the same pixels, tracks hit all",

@@ -8,7 +8,7 @@ samples; nothing is said about why.
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -82,11 +82,11 @@ class EmpiricalElectrons(Effect):
     tag: Literal["empirical_electrons"] = Field(
         default="empirical_electrons", description="name of the effect"
     )
-    plane: ClassVar[Plane] = Plane.CHARGE
-    title: ClassVar[str] = "empirical electron-number correlations"
-    source: ClassVar[str] = "Cox and Isham 1980, Point processes (factorial cumulants)"
-    strength: ClassVar[str] = "chance"
-    empirical: ClassVar[bool] = True
+    plane = Plane.CHARGE
+    title = "empirical electron-number correlations"
+    source = "Cox and Isham 1980, Point processes (factorial cumulants)"
+    strength = "chance"
+    empirical = True
     chance: Ratio = Field(ge=0, le=0.5, description="largest probability or mean number (weight 1), no unit")
     modes: tuple[ElectronMode, ...] = Field(
         min_length=1, max_length=8, description="what happens: its `fate`, `place` and relative `weight`"

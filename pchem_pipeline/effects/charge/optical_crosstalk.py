@@ -33,13 +33,11 @@ class OpticalCrosstalk(Effect):
     """
 
     tag: Literal["optical_crosstalk"] = Field(default="optical_crosstalk", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.CHARGE
-    title: ClassVar[str] = "optical crosstalk (luminescence)"
-    source: ClassVar[str] = (
-        "Rech et al. 2008, Opt. Express 16, 8381; Otte et al. 2009, Nucl. Instrum. Methods A 610, 105"
-    )
-    signature: ClassVar[tuple[str, ...]] = ("space.x.kk", "space.y.kk")
-    strength: ClassVar[str] = "probability"
+    plane = Plane.CHARGE
+    title = "optical crosstalk (luminescence)"
+    source = "Rech et al. 2008, Opt. Express 16, 8381; Otte et al. 2009, Nucl. Instrum. Methods A 610, 105"
+    signature = ("space.x.kk", "space.y.kk")
+    strength = "probability"
     reach_rows = 1
     separate: ClassVar[Mapping[str, str]] = {
         "interpixel_capacitance": "residuals and neighbour's electrons: correlated by capacitance only",

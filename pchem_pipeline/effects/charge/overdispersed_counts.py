@@ -46,11 +46,11 @@ class OverdispersedCounts(Effect):
     tag: Literal["overdispersed_counts"] = Field(
         default="overdispersed_counts", description="name of the effect"
     )
-    plane: ClassVar[Plane] = Plane.CHARGE
-    title: ClassVar[str] = "over-dispersed counts"
-    source: ClassVar[str] = "Mandel 1959, Proc. Phys. Soc. 74, 233; Goodman 1985, Statistical Optics, ch. 9"
-    signature: ClassVar[tuple[str, ...]] = ("shape.C2.mean", "shape.C2.slope", "code.smooth", "shape.C3.mean")
-    strength: ClassVar[str] = "relative_variance"
+    plane = Plane.CHARGE
+    title = "over-dispersed counts"
+    source = "Mandel 1959, Proc. Phys. Soc. 74, 233; Goodman 1985, Statistical Optics, ch. 9"
+    signature = ("shape.C2.mean", "shape.C2.slope", "code.smooth", "shape.C3.mean")
+    strength = "relative_variance"
     separate: ClassVar[Mapping[str, str]] = {
         "branching_counts": "several exposures: excess variance grows as H^2, by branching as H",
         "exposure_flicker": "pixels of one frame: correlated by flicker only",

@@ -7,7 +7,7 @@ Poisson electrons is Poisson: at one exposure time they are part of H.
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -24,14 +24,14 @@ class SpuriousCharge(Effect):
     """
 
     tag: Literal["spurious_charge"] = Field(default="spurious_charge", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.CHARGE
-    title: ClassVar[str] = "spurious (clock-induced) charge"
-    source: ClassVar[str] = (
+    plane = Plane.CHARGE
+    title = "spurious (clock-induced) charge"
+    source = (
         "Janesick 2001, Scientific Charge-Coupled Devices, ch. 7; "
         "Barak et al. 2022, Phys. Rev. Applied 17, 014022"
     )
-    strength: ClassVar[str] = "mean_e"
-    untestable: ClassVar[str] = (
+    strength = "mean_e"
+    untestable = (
         "sums of Poisson electrons are Poisson, so that it is part of H; a series of integration times would "
         "show it (the part of H independent of time)"
     )

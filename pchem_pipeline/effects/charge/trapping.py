@@ -65,15 +65,15 @@ class Trapping(Effect):
     """
 
     tag: Literal["trapping"] = Field(default="trapping", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.CHARGE
-    title: ClassVar[str] = "charge trapping"
-    source: ClassVar[str] = (
+    plane = Plane.CHARGE
+    title = "charge trapping"
+    source = (
         "Shockley and Read 1952, Phys. Rev. 87, 835; Massey et al. 2010, Mon. Not. R. Astron. Soc. 401, 371"
     )
-    signature: ClassVar[tuple[str, ...]] = (
+    signature = (
         "time.lag1.charge.mean", "shape.C2.mean", "shape.C3.mean", "time.lag2.charge.mean",
     )  # fmt: skip
-    strength: ClassVar[str] = "capture"
+    strength = "capture"
     separate: ClassVar[Mapping[str, str]] = {
         "overdispersed_counts": "longer runs: trapping anticorrelates electron numbers of successive frames, "
         "over-dispersion does not",

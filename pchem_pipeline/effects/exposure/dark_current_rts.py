@@ -48,19 +48,19 @@ class DarkCurrentRts(Effect):
     """
 
     tag: Literal["dark_current_rts"] = Field(default="dark_current_rts", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.EXPOSURE
-    title: ClassVar[str] = "random telegraph signal of the dark current"
-    source: ClassVar[str] = (
+    plane = Plane.EXPOSURE
+    title = "random telegraph signal of the dark current"
+    source = (
         "Hopkins and Hopkinson 1993, IEEE Trans. Nucl. Sci. 40, 1567; Goiffon et al. 2009, ibid. 56, 2132"
     )
-    signature: ClassVar[tuple[str, ...]] = (
+    signature = (
         "time.block.charge.cnt",
         "time.lag1.charge.cnt",
         "time.block.charge.chi",
         "shape.C2.cnt",
     )
-    strength: ClassVar[str] = "fraction"
-    resample_pixels: ClassVar[bool] = True
+    strength = "fraction"
+    resample_pixels = True
     separate: ClassVar[Mapping[str, str]] = {
         "rts_noise": "several exposure times: jumps of the dark current grow with it",
         "flicker_noise": "dark current jumps in the electron numbers, 1/f noise in the readout residuals",

@@ -19,7 +19,7 @@ from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, expos
 from pchem_pipeline.effects.estimators.common_modes import successive
 from pchem_pipeline.effects.estimators.levels.level_mixtures import Levels, few_levels
 from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
-from pchem_pipeline.effects.estimators.time_profiles import fitted, hats
+from pchem_pipeline.effects.estimators.time_profiles import hats
 from pchem_pipeline.effects.framework.effect import Effect, Frames, Plane, Ratio, Turns, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
@@ -40,20 +40,18 @@ class ExposureFlicker(Effect):
     """
 
     tag: Literal["exposure_flicker"] = Field(default="exposure_flicker", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.EXPOSURE
-    title: ClassVar[str] = "illumination flicker (intensity noise)"
-    source: ClassVar[str] = (
-        "EMVA Standard 1288, release 4.0 (2021), sec. 6; Petermann 1988, Laser Diode Modulation"
-    )
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.EXPOSURE
+    title = "illumination flicker (intensity noise)"
+    source = "EMVA Standard 1288, release 4.0 (2021), sec. 6; Petermann 1988, Laser Diode Modulation"
+    signature = (
         "frame.charge.variance",
         "frame.charge.line",
         "frame.charge.largest",
         "frame.charge.lag1",
     )
-    strength: ClassVar[str] = "rms"
-    power: ClassVar[float] = 2.0
-    may_be_at_bound: ClassVar[tuple[str, ...]] = ("phase_cycles",)
+    strength = "rms"
+    power = 2.0
+    may_be_at_bound = ("phase_cycles",)
     separate: ClassVar[Mapping[str, str]] = {
         "glow": "a map of the bright frames: flicker is proportional to H, a glow local",
         "exposure_drift": "a longer run: flicker has no trend",
@@ -238,7 +236,7 @@ def _sine(cls: type[_T], profile: ExposureProfile) -> list[_T]:
 def _slow(position: FloatArray, deviation: FloatArray) -> FloatArray:
     """Return the least squares broken line of ``_SLOWEST`` pieces: the gaps between blocks would alias it."""
     basis = hats(position, _SLOWEST + 1)
-    return np.asarray(basis @ fitted(deviation, basis).values)
+    return np.asarray(basis @ np.linalg.lstsq(basis, deviation, rcond=1e-6)[0])
 
 
 def _refined(series: FloatArray, frequency: float) -> float:

@@ -40,10 +40,10 @@ class Glow(Effect):
     """
 
     tag: Literal["glow"] = Field(default="glow", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.EXPOSURE
-    title: ClassVar[str] = "local glow or light leak"
-    source: ClassVar[str] = "Janesick 2001, Scientific Charge-Coupled Devices (amplifier luminescence)"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.EXPOSURE
+    title = "local glow or light leak"
+    source = "Janesick 2001, Scientific Charge-Coupled Devices (amplifier luminescence)"
+    signature = (
         "space.row.charge.lag1",
         "space.column.charge.lag1",
         "space.row.charge.variance",
@@ -52,8 +52,8 @@ class Glow(Effect):
         "space.x.kk",
         "time.block.charge.chi",
     )
-    strength: ClassVar[str] = "peak_e"
-    may_be_at_bound: ClassVar[tuple[str, ...]] = ("centre_y", "centre_x")
+    strength = "peak_e"
+    may_be_at_bound = ("centre_y", "centre_x")
     separate: ClassVar[Mapping[str, str]] = {
         "exposure_flicker": "a map of the bright frames: flicker is proportional to H, a glow local",
         "exposure_drift": "a map of the change along the run: a drift is proportional to H, a glow local",

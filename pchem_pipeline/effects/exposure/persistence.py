@@ -52,17 +52,17 @@ class Persistence(Effect):
     """
 
     tag: Literal["persistence"] = Field(default="persistence", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.EXPOSURE
-    title: ClassVar[str] = "image persistence"
-    source: ClassVar[str] = "Smith et al. 2008, Proc. SPIE 7021, 70210J"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.EXPOSURE
+    title = "image persistence"
+    source = "Smith et al. 2008, Proc. SPIE 7021, 70210J"
+    signature = (
         "frame.charge.quadrants",
         "frame.charge.trend",
         "time.block.charge.chi",
         "frame.charge.slow",
     )
-    strength: ClassVar[str] = "peak_e"
-    may_be_at_bound: ClassVar[tuple[str, ...]] = ("slow_share", "centre_y", "centre_x")
+    strength = "peak_e"
+    may_be_at_bound = ("slow_share", "centre_y", "centre_x")
     separate: ClassVar[Mapping[str, str]] = {
         "glow": "a run after a longer time in the dark: persistence is gone, a glow is not",
         "exposure_drift": "a run after a longer time in the dark: persistence is gone, a drift is not",

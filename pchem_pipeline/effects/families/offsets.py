@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pchem_pipeline.effects.estimators.common_modes import line_noise
 from pchem_pipeline.effects.framework.context import DIMS
-from pchem_pipeline.effects.framework.effect import Effect, Plane
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset, add_offset
+from pchem_pipeline.effects.framework.effect import Effect, Plane, SharedOffset
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
 # below this ratio of the spread of an offset to the read noise its shape is lost: the fourth cumulant that
@@ -26,7 +26,7 @@ class OffsetEffect(Effect):
     frames, and the values that they take in the run; by these a pixel's own histogram is smeared.
     """
 
-    plane: ClassVar[Plane] = Plane.ANALOG
+    plane = Plane.ANALOG
 
     @abstractmethod
     def offsets(self, context: EffectContext) -> FloatArray:
@@ -68,7 +68,7 @@ class SharedNoise(OffsetEffect):
         shared_by: what has one offset.
     """
 
-    power: ClassVar[float] = 2.0
+    power = 2.0
     shared_by: ClassVar[Literal["frame", "row", "column"]]
 
     def offsets(self, context: EffectContext) -> FloatArray:
@@ -84,6 +84,12 @@ class SharedNoise(OffsetEffect):
     def shared_offset(self) -> SharedOffset:
         """Return its offset."""
         return SharedOffset(self.shared_by, getattr(self, self.strength) ** 2)
+
+
+def add_offset(values: AnyArray, offset_dn: ArrayLike, context: EffectContext) -> AnyArray:
+    """Return the analog signal (frame, y, x), e-, with offsets in DN referred to the input."""
+    result: AnyArray = values + np.asarray(offset_dn) * context.truth["conversion_gain"]
+    return result
 
 
 def sine_values(count: int) -> FloatArray:

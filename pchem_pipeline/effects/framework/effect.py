@@ -51,8 +51,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.added_exposure import AddedExposure
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-    from pchem_pipeline.effects.framework.replacement import Replacement
-    from pchem_pipeline.effects.framework.shared_offset import SharedOffset
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
 _registered: dict[str, type[Effect]] = {}
@@ -79,6 +77,38 @@ PerFrame = Annotated[float, Unit("1/frame")]
 Turns = Annotated[float, Unit("cycles")]
 Radians = Annotated[float, Unit("rad")]
 Micrometres = Annotated[float, Unit("um")]
+
+
+class SharedOffset(NamedTuple):
+    """An offset of all pixels of a frame, of a row, of a column, or along a wave across the sensor.
+
+    Attributes:
+        of: what has one offset; a wave has a sine and a cosine of its own in each frame.
+        variance: of the offset, of a wave's sine and of its cosine, in any frame of the camera, DN^2; None:
+            other frames have another one.
+        cycles_per_row, cycles_per_column: of a wave, from row to row and from column to column.
+    """
+
+    of: Literal["frame", "row", "column", "wave"]
+    variance: float | None
+    cycles_per_row: float = 0.0
+    cycles_per_column: float = 0.0
+
+
+class Replacement(NamedTuple):
+    """A rule: of the samples that exceed a number by more than so much, that number comes out.
+
+    Attributes:
+        value: the number, DN, shape (frame, y, x).
+        inside: pixels for which the rule holds, shape (y, x).
+        excess: by how much, DN.
+        share: of those samples that is replaced, no unit.
+    """
+
+    value: NDArray[np.integer[Any]]
+    inside: NDArray[np.bool_]
+    excess: int
+    share: float
 
 
 class Effect(Section):
@@ -255,8 +285,17 @@ class Effect(Section):
     def times(self, name: str, factor: float) -> Self:
         """Return a copy with ``factor`` times a number of it, kept within the limits of its field."""
         values = self.model_dump()
-        values[name] = _within(type(self), name, values[name] * factor)
+        values[name] = self.limited(name, values[name] * factor)
         return type(self).model_validate(values)
+
+    @classmethod
+    def limited(cls, name: str, value: float) -> float:
+        """Return a value cut to the limits that its field states."""
+        for limit in cls.model_fields[name].metadata:
+            low, high = getattr(limit, "ge", None), getattr(limit, "le", None)
+            value = max(value, low) if low is not None else value
+            value = min(value, high) if high is not None else value
+        return value
 
     def stuck_words(self) -> str:
         """State which parameters are at a limit; empty if none."""
@@ -363,15 +402,6 @@ class Effect(Section):
     def history(self) -> int:
         """Return how many frames before it a frame depends on: :attr:`reach_frames`."""
         return self.reach_frames
-
-
-def _within(effect: type[Effect], name: str, value: float) -> float:
-    """Return the value cut to the limits that the field states."""
-    for limit in effect.model_fields[name].metadata:
-        low, high = getattr(limit, "ge", None), getattr(limit, "le", None)
-        value = max(value, low) if low is not None else value
-        value = min(value, high) if high is not None else value
-    return value
 
 
 EffectClass = TypeVar("EffectClass", bound=type[Effect])

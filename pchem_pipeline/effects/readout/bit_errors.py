@@ -44,10 +44,10 @@ class BitErrors(Effect):
     """
 
     tag: Literal["bit_errors"] = Field(default="bit_errors", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.READOUT
-    title: ClassVar[str] = "stuck, missing or flipping bit"
-    source: ClassVar[str] = "Eldred 1959, J. ACM 6, 33 (stuck-at faults); Boone et al. 2018, PASP 130, 064504"
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.READOUT
+    title = "stuck, missing or flipping bit"
+    source = "Eldred 1959, J. ACM 6, 33 (stuck-at faults); Boone et al. 2018, PASP 130, 064504"
+    signature = (
         "code.smooth",
         "tail.low.count",
         "code.period16",
@@ -55,8 +55,8 @@ class BitErrors(Effect):
         "code.period4",
         "shape.goodness.mean",
     )
-    strength: ClassVar[str] = "share"
-    rough_law: ClassVar[bool] = True
+    strength = "share"
+    rough_law = True
     separate: ClassVar[Mapping[str, str]] = {
         "adc_dnl": "a ramp of light: bit errors put samples far from the ramp, DNL does not",
         "heavy_tailed_noise": "a shifted bias: bit errors are fixed in DN, heavy tails shift with the peaks",
@@ -66,6 +66,12 @@ class BitErrors(Effect):
     share: Ratio = Field(ge=0, le=1, description="share of the samples with an error, no unit")
     bit: Count = Field(ge=0, lt=_MOST_BITS, description="the bit, 0 is the least significant")
     fault: Fault = Field(default="zero", description="value in error: zero, one, or flip (the opposite)")
+
+    #: bits of 4, 8 and 16 DN that are lost in one of a thousand samples, and one that flips
+    typical_values = (
+        *({"share": 1e-3, "bit": bit} for bit in (2, 3, 4)),
+        {"share": 1e-3, "bit": 3, "fault": "flip"},
+    )
 
     def faulty(self, codes: AnyArray) -> AnyArray:
         """Return what comes out instead of codes, DN."""
@@ -80,11 +86,6 @@ class BitErrors(Effect):
             return values.copy()
         wrong = context.random.uniform(("frame", "y", "x")) < self.share
         return np.asarray(np.where(wrong, self.faulty(values), values))
-
-    @classmethod
-    def typical(cls) -> Sequence[Self]:
-        """Return bits of 4, 8 and 16 DN that are lost in one of a thousand samples, and one that flips."""
-        return *(cls(share=1e-3, bit=bit) for bit in (2, 3, 4)), cls(share=1e-3, bit=3, fault="flip")
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -9,7 +9,7 @@ about why.
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -97,12 +97,12 @@ class Empirical(Effect):
     """
 
     tag: Literal["empirical"] = Field(default="empirical", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.READOUT
-    along: ClassVar[int] = 3
-    title: ClassVar[str] = "empirical shifts of samples"
-    source: ClassVar[str] = "Laird 1978, Lindsay 1983 (mixing laws); Raftery 1985 (mixture transitions)"
-    strength: ClassVar[str] = "share"
-    empirical: ClassVar[bool] = True
+    plane = Plane.READOUT
+    along = 3
+    title = "empirical shifts of samples"
+    source = "Laird 1978, Lindsay 1983 (mixing laws); Raftery 1985 (mixture transitions)"
+    strength = "share"
+    empirical = True
     share: Ratio = Field(ge=0, le=1, description="share of shifted samples, no unit")
     moves: tuple[MixtureShift, ...] = Field(min_length=1, max_length=16, description="how; one of them each")
     together: Together = Field(

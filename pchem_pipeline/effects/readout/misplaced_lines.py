@@ -41,12 +41,12 @@ class MisplacedLines(Effect):
     """
 
     tag: Literal["misplaced_lines"] = Field(default="misplaced_lines", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.READOUT
-    along: ClassVar[int] = 2
-    title: ClassVar[str] = "misplaced rows or columns"
-    source: ClassVar[str] = "GenICam / GigE Vision (packet resend); likelihood ratio of lines at other places"
-    signature: ClassVar[tuple[str, ...]] = ("space.misplaced.rows", "space.misplaced.columns")
-    strength: ClassVar[str] = "share"
+    plane = Plane.READOUT
+    along = 2
+    title = "misplaced rows or columns"
+    source = "GenICam / GigE Vision (packet resend); likelihood ratio of lines at other places"
+    signature = ("space.misplaced.rows", "space.misplaced.columns")
+    strength = "share"
     reach_rows = 2  # whether a row changes places with the next depends on the two before
     separate: ClassVar[Mapping[str, str]] = {
         "repeated_lines": "neighbouring lines: repeated lines are equal, misplaced ones are not",

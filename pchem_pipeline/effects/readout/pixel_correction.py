@@ -15,9 +15,8 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.prediction import PREDICTORS, Predictor, predicted
-from pchem_pipeline.effects.framework.effect import Code, Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.framework.effect import Code, Effect, Plane, Ratio, Replacement, register_effect
 from pchem_pipeline.effects.framework.evidence import PredictedSamples
-from pchem_pipeline.effects.framework.replacement import Replacement
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray
 
 # standard deviations by which samples must equal their prediction too often, and exceed it too seldom
@@ -38,12 +37,12 @@ class PixelCorrection(Effect):
     """
 
     tag: Literal["pixel_correction"] = Field(default="pixel_correction", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.READOUT
-    along: ClassVar[int] = 1
-    title: ClassVar[str] = "in-camera pixel correction (hot pixels, spurious noise)"
-    source: ClassVar[str] = "Hamamatsu DCAM-API (HOTPIXELCORRECT_LEVEL); Andor SDK3 (SpuriousNoiseFilter)"
-    signature: ClassVar[tuple[str, ...]] = ("space.predicted.equal", "space.predicted.above", "shape.C3.mean")
-    strength: ClassVar[str] = "share"
+    plane = Plane.READOUT
+    along = 1
+    title = "in-camera pixel correction (hot pixels, spurious noise)"
+    source = "Hamamatsu DCAM-API (HOTPIXELCORRECT_LEVEL); Andor SDK3 (SpuriousNoiseFilter)"
+    signature = ("space.predicted.equal", "space.predicted.above", "shape.C3.mean")
+    strength = "share"
     reach_rows = 1
     separate: ClassVar[Mapping[str, str]] = {
         "row_noise": "camera corrections switched off: row noise stays",

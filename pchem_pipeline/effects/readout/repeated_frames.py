@@ -36,19 +36,17 @@ class RepeatedFrames(Effect):
     """
 
     tag: Literal["repeated_frames"] = Field(default="repeated_frames", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.READOUT
-    along: ClassVar[int] = 2
-    title: ClassVar[str] = "repeated (duplicated) frames"
-    source: ClassVar[str] = (
-        "GenICam / GigE Vision frame identifiers; exact-equality test of successive frames"
-    )
-    signature: ClassVar[tuple[str, ...]] = (
+    plane = Plane.READOUT
+    along = 2
+    title = "repeated (duplicated) frames"
+    source = "GenICam / GigE Vision frame identifiers; exact-equality test of successive frames"
+    signature = (
         "frame.repeated",
         "frame.repeated_rows",
         "time.lag1.charge.mean",
         "time.lag1.readout.mean",
     )
-    strength: ClassVar[str] = "probability"
+    strength = "probability"
     separate: ClassVar[Mapping[str, str]] = {
         "analog_memory": "successive frames: repeated ones are exactly equal, memory leaves differences",
         "flicker_noise": "successive frames: repeated ones are exactly equal, 1/f noise leaves differences",

@@ -30,12 +30,12 @@ class RepeatedLines(Effect):
     """
 
     tag: Literal["repeated_lines"] = Field(default="repeated_lines", description="name of the effect")
-    plane: ClassVar[Plane] = Plane.READOUT
-    along: ClassVar[int] = 2
-    title: ClassVar[str] = "repeated rows or columns"
-    source: ClassVar[str] = "exact-equality test of neighbouring lines; GenICam / GigE Vision (packet resend)"
-    signature: ClassVar[tuple[str, ...]] = ("space.repeated.rows", "space.repeated.columns")
-    strength: ClassVar[str] = "share"
+    plane = Plane.READOUT
+    along = 2
+    title = "repeated rows or columns"
+    source = "exact-equality test of neighbouring lines; GenICam / GigE Vision (packet resend)"
+    signature = ("space.repeated.rows", "space.repeated.columns")
+    strength = "share"
     separate: ClassVar[Mapping[str, str]] = {
         "interpixel_capacitance": "neighbouring lines: repeated ones are exactly equal, coupled ones not",
         "repeated_frames": "neighbouring lines of a frame, not successive frames, are equal",

@@ -13,7 +13,7 @@ from pchem_pipeline.effects.analog.frame_noise import FrameNoise
 from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
 from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
 from pchem_pipeline.effects.analog.row_noise import RowNoise
-from pchem_pipeline.effects.framework.shared_offset import SharedOffset
+from pchem_pipeline.effects.framework.effect import SharedOffset
 from pchem_pipeline.use.common_modes import CommonModes, estimate_offsets, scene_of
 from pchem_pipeline.use.electrons import electrons
 
