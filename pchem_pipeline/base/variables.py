@@ -61,6 +61,10 @@ class Variable:
         """Name of the array inside its group."""
         return self.path.split("/", 1)[1]
 
+    def index(self, region: tuple[slice, slice]) -> tuple[slice, ...]:
+        """Return the index of a region (y, x) of the sensor in the array, whole along other dimensions."""
+        return (*(slice(None),) * self.dims.index("y"), *region)
+
 
 _MAP = ("y", "x")
 

@@ -256,27 +256,40 @@ class StageContext:
 
     def create(
         self,
-        name: str,
-        shape: tuple[int, ...],
-        *,
-        chunks: tuple[int, ...],
+        *names: str,
+        lengths: Mapping[str, int] | None = None,
+        chunks: Mapping[str, int] | None = None,
         shards: tuple[int, ...] | None = None,
         dtype: Any = None,
         **attributes: Any,
     ) -> None:
-        """Make an array of this stage, unless the stage resumes and has it."""
-        self.begin()
-        self.created[name] = self.stage
-        if self.fresh or not self.store.has(name):
-            self.store.create_array(
-                name, shape, chunks=chunks, shards=shards, dtype=dtype, attributes=attributes
-            )
+        """Make arrays of this stage with their declared dimensions, unless the stage resumes and has them.
 
-    def create_maps(self, names: Sequence[str], **attributes: Any) -> None:
-        """Make arrays whose first dimensions are (y, x), one tile per chunk; further ones are whole."""
+        Args:
+            names: of the arrays, with their groups.
+            lengths: of dimensions; of y and x the sensor's, chunks a tile, where these are not given.
+            chunks: length of a chunk along dimensions; the whole where none is given.
+            shards: see :meth:`RunStore.create_array`.
+            dtype: only for variables whose type the data decide.
+            attributes: further attributes.
+        """
+        self.begin()
+        sizes, parts = {**LENGTHS, **(lengths or {})}, dict(chunks or {})
+        if "y" not in sizes:
+            sizes |= zip(("y", "x"), self.sensor.shape, strict=True)
+            parts = {**dict(zip(("y", "x"), self.tile, strict=True)), **parts}
         for name in names:
-            rest = tuple(LENGTHS[dim] for dim in VARIABLES[name].dims[2:])
-            self.create(name, (*self.sensor.shape, *rest), chunks=(*self.tile, *rest), **attributes)
+            self.created[name] = self.stage
+            if self.fresh or not self.store.has(name):
+                dims = VARIABLES[name].dims
+                self.store.create_array(
+                    name,
+                    tuple(sizes[dim] for dim in dims),
+                    chunks=tuple(parts.get(dim, sizes[dim]) for dim in dims),
+                    shards=shards,
+                    dtype=dtype,
+                    attributes=attributes,
+                )
 
     def selected(self, units: Sequence[AnyUnit]) -> list[AnyUnit]:
         """Return the units that ``--tiles`` and ``--roi`` choose (all of them without these options)."""

@@ -16,6 +16,13 @@ from pchem_pipeline.store.run_store import RunStore
 _LARGEST_POOL = 2**19  # pixels: every so many-th of a larger sensor
 _LARGEST_KEPT = 2**22  # pixels, 24 bytes each
 _GAIN, _SIGMA = 1, 3  # places in ``variables.PARAMETERS``
+_READ = (
+    "conversion_gain",
+    "read_noise_dn",
+    "conversion_gain_stderr",
+    "read_noise_dn_stderr",
+    "likelihood_gap",
+)
 _PAIR = CORRELATION_PAIRS.index((_GAIN, _SIGMA))
 
 _Region = tuple[slice, slice]
@@ -73,12 +80,7 @@ def _exposure(store: RunStore, band: _Region) -> NDArray[np.float64]:
 
 def _judged(store: RunStore, band: _Region) -> Judged:
     """Return the pixels of a band, in order; NaN where they are not fitted."""
-    gain, sigma, of_gain, of_sigma, gap = (
-        store.read(f"fit/{name}", band).ravel()
-        for name in (
-            "conversion_gain", "read_noise_dn", "conversion_gain_stderr", "read_noise_dn_stderr",
-            "likelihood_gap",
-        )
-    )  # fmt: skip
+    fit = store.read_arrays("fit", _READ, band)
+    gain, sigma, of_gain, of_sigma, gap = (values.ravel() for values in fit.values())
     together = store.read("fit/correlation", (*band, slice(_PAIR, _PAIR + 1))).ravel()
     return Judged(*noise_of(gain, sigma, of_gain, of_sigma, together), gap)

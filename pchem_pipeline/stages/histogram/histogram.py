@@ -205,15 +205,13 @@ def _copy_shown_sample(context: StageContext) -> None:
 def _copied(context: StageContext, counts: Any, missing: str, task: Callable[[Tile], Any]) -> None:
     """Make the arrays, as wide as ``counts``, and do all tiles; summaries are ``missing`` for that reason."""
     create_counts(context, counts.shape[2], counts.dtype)
-    context.create_maps([f"histogram/{name}" for name in MAPS])
     context.store.set_attributes("summary", {"missing": missing})
     context.run_units(context.tiles(), task)
 
 
 def _copy_sample_tile(tile: Tile, *, store: Path, sample: Path) -> None:
-    source, target = RunStore.open(sample), open_store(store)
-    for name in ("counts", *MAPS):
-        target.write(f"histogram/{name}", tile.region, source.read(f"histogram/{name}", tile.region))
+    arrays = RunStore.open(sample).read_arrays("histogram", ("counts", *MAPS), tile.region)
+    open_store(store).write_arrays("histogram", arrays, tile.region)
 
 
 def _copy_tile(tile: Tile, *, store: Path, given: HistogramInput) -> None:
@@ -228,5 +226,4 @@ def _copy_tile(tile: Tile, *, store: Path, given: HistogramInput) -> None:
         minimum=(origin + occupied.argmax(axis=2)).astype(np.int32),
         maximum=(origin + last - occupied[:, :, ::-1].argmax(axis=2)).astype(np.int32),
     )
-    for name, part in vars(values).items():
-        open_store(store).write(f"histogram/{name}", tile.region, part)
+    open_store(store).write_arrays("histogram", vars(values), tile.region)

@@ -114,12 +114,10 @@ def run(context: StageContext) -> None:
     settings = methods_settings(context)
     others = open_other_runs(context.store, context.base_dir, settings.with_runs)
     n_pixels = min(settings.pixels, context.sensor.ny * context.sensor.nx)
-    for name in ("pixel_y", "pixel_x"):
-        context.create(f"methods/{name}", (n_pixels,), chunks=(n_pixels,))
     names = list(methods())
-    for name in PARAMETERS:
-        shape = (len(names), n_pixels)
-        context.create(f"methods/{name}", shape, chunks=shape, methods=names)
+    lengths = {"method": len(names), "pixel": n_pixels}
+    context.create("methods/pixel_y", "methods/pixel_x", lengths=lengths)
+    context.create(*(f"methods/{name}" for name in PARAMETERS), lengths=lengths, methods=names)
     units = [_Unit("run"), *_study_units(context, settings)]
     task = _Task(context.store.path, tuple(o.path for o in others), settings, context.adc_limits)
     found = context.run_units(units, task, unit_name="part", by_tiles=False)

@@ -42,13 +42,13 @@ def double_tile(path, tile):
 
 
 def fit_run(context):
-    context.create_maps(["fit/bias"])
+    context.create("fit/bias")
     value = context.config.fit.gap_threshold
     context.run_units(context.tiles(), functools.partial(number_tile, context.store.path, value))
 
 
 def maps_run(context):
-    context.create_maps(["maps/bias"])
+    context.create("maps/bias")
     context.run_units(context.tiles(), functools.partial(double_tile, context.store.path), needs="fit")
 
 
