@@ -38,11 +38,7 @@ from pchem_pipeline.stages.bands import tile_bands
 from pchem_pipeline.stages.electrons.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
 from pchem_pipeline.stages.fit.code_sums import on_axis
-from pchem_pipeline.stages.fit.fitted_model import (
-    fitted_effects,
-    fitted_law,
-    fitted_satellites,
-)
+from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_effects, fitted_satellites
 from pchem_pipeline.store.files import without_nan
 
 if TYPE_CHECKING:
@@ -337,7 +333,7 @@ def _law(
     """Return the law of the samples, with effects and limits of the codes; None: the PCD."""
     if not job.axes.extended:
         return None
-    law = fitted_law(store, maps, place)
+    law = FittedModel.read(store, place).law(maps)
     low, high = job.limits or (None, None)
     return replace(
         law,

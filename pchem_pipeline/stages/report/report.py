@@ -194,7 +194,7 @@ def _of_pixels(store: RunStore, run: StoredRun, config: RunConfig) -> _Pixels:
     places, bins = [(y, x) for _, y, x in shown], store.array("histogram/counts").shape[2]
     full = choose_inspected(run.maps, run.fit, places, _suspects(run), bins=bins)
     index = np.concatenate([pixel_index(shown, run.sensor.shape), full.index])
-    histograms = read_histograms(store, index, run.sensor.shape, run.model)
+    histograms = read_histograms(store, index, run.sensor.shape)
     drawn, held, some = slice(0, len(shown)), slice(len(shown), None), slice(0, len(shown) + _SOME_MASSES)
     masses = bin_masses(_parameters(run, index[some]), histograms.of(some), run.model.at(index[some]))
     channel = run.sensor.kind == "histograms"
