@@ -7,15 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.compute.executor import Outcome
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.paper import FORMATS, PaperFigure, draw_paper_figure, read_style_sheet
 from pchem_pipeline.run.progress import ProgressMode, Reporter
-from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.stages.report.drawing import drawing_executor, drawing_workers
 from pchem_pipeline.stages.report.report import gather
@@ -70,11 +69,8 @@ def gather_run(target: Target) -> ReportData:
     Raises:
         StoreError: the run lacks maps or histograms.
     """
-    store = target.stored()
-    if not store.has("maps/conversion_gain"):
-        raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
-    time = target.config.input.integration_time or SensorInfo.read(store).integration_time
-    return gather(store, target.config, time, [])
+    store = with_maps(target.stored())
+    return gather(store, target.config, target.sensor(store).integration_time, [])
 
 
 def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
 
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.store.run_store import RunStore
+
+if TYPE_CHECKING:
+    from pchem_pipeline.frames.settings import InputSettings
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,14 @@ class SensorInfo:
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
         return self.ny, self.nx
+
+    def with_settings(self, given: InputSettings) -> SensorInfo:
+        """Return it with the bit depth and integration time that a configuration sets in place of the files."""
+        return replace(
+            self,
+            bit_depth=given.bit_depth or self.bit_depth,
+            integration_time=given.integration_time or self.integration_time,
+        )
 
     def write(self, store: RunStore) -> None:
         """Keep this in the store."""

@@ -20,7 +20,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -42,6 +42,9 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
 
 
+T = TypeVar("T", covariant=True)
+
+
 class Unit(Protocol):
     """A piece of a stage's work."""
 
@@ -57,13 +60,20 @@ class Unit(Protocol):
 
 
 @dataclass(frozen=True)
-class _Whole:
-    key: str = "all"
-    keys: tuple[str, ...] = ("all",)
+class Named(Generic[T]):
+    """A unit that is not a part of the sensor: its name, which is its only marker, and what is done."""
+
+    key: str
+    content: T
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Its only marker."""
+        return (self.key,)
 
 
 #: The only unit of a stage that is not divided.
-WHOLE = _Whole()
+WHOLE = Named("all", None)
 
 AnyUnit = TypeVar("AnyUnit", bound=Unit)
 
@@ -215,13 +225,17 @@ class StageContext:
     @property
     def integration_time(self) -> float | None:
         """Seconds per frame: from the configuration, else from the files."""
-        return self.config.input.integration_time or self.sensor.integration_time
+        return self.sensor.with_settings(self.config.input).integration_time
+
+    @property
+    def bit_depth(self) -> int | None:
+        """Bits of the ADC: from the configuration, else from the files."""
+        return self.sensor.with_settings(self.config.input).bit_depth
 
     @property
     def adc_limits(self) -> tuple[int, int] | None:
         """First and last code of the ADC; of the type of the samples where the bit depth is not known."""
-        depth = self.config.input.bit_depth or self.sensor.bit_depth
-        kind = np.dtype(self.sensor.dtype)
+        depth, kind = self.bit_depth, np.dtype(self.sensor.dtype)
         if depth is None and kind.kind != "u":
             return None
         return 0, 2 ** (depth or 8 * kind.itemsize) - 1

@@ -103,7 +103,11 @@ def cut_rows(ny: int, step: int, workers: int) -> list[tuple[int, int]]:
     Returns:
         First row and end of each band, from top to bottom.
     """
-    height = step * max(1, -(-ny // step) // (_BANDS_PER_WORKER * workers))
+    return equal_rows(ny, step * max(1, -(-ny // step) // (_BANDS_PER_WORKER * workers)))
+
+
+def equal_rows(ny: int, height: int) -> list[tuple[int, int]]:
+    """Return first row and end of bands of ``ny`` rows, from top to bottom; the last may be lower."""
     return [(y, min(y + height, ny)) for y in range(0, ny, height)]
 
 

@@ -44,6 +44,7 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import stop_on_signals
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.session import Command, with_overrides
+from pchem_pipeline.stages.bands import equal_rows
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.remote_path import local_path, place_of
 from pchem_pipeline.store.run_store import RunStore
@@ -364,10 +365,6 @@ def _rows_of_band(context: StageContext, job: Job, bytes_of_pixel: int) -> int:
     return rows * min(fitting, shared)
 
 
-def _bands(ny: int, step: int) -> list[tuple[int, int]]:
-    return [(y, min(y + step, ny)) for y in range(0, ny, step)]
-
-
 def _with_moments(context: StageContext, job: Job, made: _Made) -> tuple[Job, _Made]:
     """Find the errors of the calibration where the curvature of its likelihood does not tell them."""
     run = RunStore.open(job.run)
@@ -379,7 +376,7 @@ def _with_moments(context: StageContext, job: Job, made: _Made) -> tuple[Job, _M
     _create(context, job, "applied_parts/covariance", "applied_parts/rivals", lengths=lengths)
     ends = None if job.top is None else (0, job.top)
     task = functools.partial(moments_piece, job=job, settings=context.config.fit, adc_limits=ends)
-    pieces = [Piece("errors", *band, 0, 1) for band in _bands(ny, rows)]
+    pieces = [Piece("errors", *band, 0, 1) for band in equal_rows(ny, rows)]
     context.run_units(pieces, task, unit_name="band", by_tiles=False)
     if context.failed:
         return job, made
@@ -435,7 +432,7 @@ def _counted(context: StageContext, job: Job, made: _Made) -> Job:
     bytes_of_pixel = 10 * job.bins + 2 * job.window * made.frames.dtype.itemsize + 200
     step = _rows_of_band(context, job, bytes_of_pixel)
     context.run_units(
-        [Piece("count", *band, 0, n) for band in _bands(ny, step)],
+        [Piece("count", *band, 0, n) for band in equal_rows(ny, step)],
         functools.partial(count_piece, job=job),
         unit_name="band",
         by_tiles=False,
@@ -464,7 +461,10 @@ def _bins(context: StageContext, frames: FrameSequence, parts: int) -> int:
     head = min(frames.shape[0], 64)
     wide = settings.max_bins // parts
     pixels = sum(
-        (pixels_by_range(frames.read(0, head, *band), wide) for band in _bands(frames.shape[1], _CHUNK_ROWS)),
+        (
+            pixels_by_range(frames.read(0, head, *band), wide)
+            for band in equal_rows(frames.shape[1], _CHUNK_ROWS)
+        ),
         start=np.zeros(wide + 2, np.int64),
     )
     return min(settings.max_bins, parts * choose_bins(pixels, wide))
@@ -487,7 +487,7 @@ def _converted(context: StageContext, job: Job) -> None:
     pieces = [
         Piece("write", *band, t0, min(t0 + length, n), number)
         for number, t0 in enumerate(starts)
-        for band in _bands(ny, step)
+        for band in equal_rows(ny, step)
     ]
     context.run_units(
         pieces,

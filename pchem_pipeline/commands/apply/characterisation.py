@@ -38,11 +38,7 @@ def check_run(store: RunStore) -> str:
         StoreError: the run is not finished as far as its fit.
     """
     record = store.records.read("fit")
-    if (
-        record is None
-        or not record.finished
-        or len(store.records.done("fit", record.fingerprint)) < record.keys
-    ):
+    if record is None or not (record.finished and store.records.has_all(record)):
         raise StoreError(f"{store.path} has no complete fit; run: pchem run {quoted(store.path)}")
     return record.fingerprint
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError, quoted
+from pchem_pipeline.base.errors import ChangedError, ConfigError
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.commands.compare.arrays import compare_arrays
 from pchem_pipeline.commands.compare.history import (
@@ -33,7 +33,7 @@ from pchem_pipeline.report.pages.compare import (
 from pchem_pipeline.report.style.wording import count, measured, short, signed, symbol
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_workers
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.run_store import RunStore
@@ -112,10 +112,8 @@ def comparison_of(
     if not 0 <= tolerance < 1:
         raise ConfigError(f"--tolerance {tolerance:g}: give a relative difference from 0 to below 1")
     targets = [find_run(path) for path in paths]
-    stores = [target.stored() for target in targets]
+    stores = [with_maps(target.stored()) for target in targets]
     for target, store in zip(targets, stores, strict=True):
-        if not store.has("maps/conversion_gain"):
-            raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
         warn_if_old(target, ("fit", "maps", "ensemble"), f"{store.path} is compared in its present state")
     names = _told_apart([store.path for store in stores])
     runs = [

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +9,7 @@ from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
 from pchem_pipeline.model.errors.fisher import CORRELATION_PAIRS
 from pchem_pipeline.model.fit.status import FitStatus, moves_gain
 from pchem_pipeline.run.stage import StageContext
+from pchem_pipeline.stages.bands import equal_rows
 from pchem_pipeline.store.run_store import RunStore
 
 _LARGEST_POOL = 2**19  # pixels: every so many-th of a larger sensor
@@ -39,7 +38,7 @@ def judge_sensor(context: StageContext) -> int:
         StoreError: the store refuses.
     """
     store, shape = context.store, context.sensor.shape
-    bands = list(_bands(shape, context.tile[0]))
+    bands = [(slice(*rows), slice(0, shape[1])) for rows in equal_rows(shape[0], context.tile[0])]
     every = -(-shape[0] * shape[1] // _LARGEST_POOL)
     kept: dict[int, Judged] = {}  # of a sensor that is not large: nothing is read twice
     chosen = []
@@ -66,12 +65,6 @@ def judge_sensor(context: StageContext) -> int:
         if not np.array_equal(new, words):
             store.write("fit/fit_status", band, new)
     return found
-
-
-def _bands(shape: tuple[int, int], rows: int) -> Iterator[_Region]:
-    """Return the rows of the sensor, as high as a tile: whole chunks."""
-    for first in range(0, shape[0], rows):
-        yield slice(first, min(first + rows, shape[0])), slice(0, shape[1])
 
 
 def _exposure(store: RunStore, band: _Region) -> NDArray[np.float64]:

@@ -24,7 +24,7 @@ from pchem_pipeline.methods.registry import methods
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.methods.study import StudyPoint, study_point
 from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
-from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.run.stage import Named, StageContext, open_store
 from pchem_pipeline.stages.methods.chosen import methods_settings
 from pchem_pipeline.stages.methods.other_runs import open_other_runs
 from pchem_pipeline.stages.methods.result import METHODS_FILE
@@ -38,17 +38,8 @@ _BAND_BYTES = 64 << 20
 _DARK_LIMIT = 0.01  # e-: more electrons in the dark sample are remarked
 
 
-@dataclass(frozen=True)
-class _Unit:
-    """The run's pixels, or one read noise of the simulation."""
-
-    key: str
-    point: StudyPoint | None = None
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Its marker."""
-        return (self.key,)
+#: The run's pixels (None), or one read noise of the simulation.
+_Unit = Named[StudyPoint | None]
 
 
 @dataclass(frozen=True)
@@ -63,8 +54,8 @@ class _Task:
     def __call__(self, unit: _Unit) -> dict[str, Any]:
         """Compare the methods and return the numbers as plain data."""
         numbers = Settings(self.settings.em_iterations, self.settings.em_tolerance)
-        if unit.point is not None:
-            return study_point(unit.point, numbers)
+        if unit.content is not None:
+            return study_point(unit.content, numbers)
         return _compare_run(self, numbers)
 
 
@@ -118,7 +109,7 @@ def run(context: StageContext) -> None:
     lengths = {"method": len(names), "pixel": n_pixels}
     context.create("methods/pixel_y", "methods/pixel_x", lengths=lengths)
     context.create(*(f"methods/{name}" for name in PARAMETERS), lengths=lengths, methods=names)
-    units = [_Unit("run"), *_study_units(context, settings)]
+    units = [_Unit("run", None), *_study_units(context, settings)]
     task = _Task(context.store.path, tuple(o.path for o in others), settings, context.adc_limits)
     found = context.run_units(units, task, unit_name="part", by_tiles=False)
     if not {unit.key for unit in units} <= found.keys():
@@ -136,9 +127,8 @@ def run(context: StageContext) -> None:
 
 
 def _conditions(units: Sequence[_Unit]) -> dict[str, Any] | None:
-    if not units or units[0].point is None:
+    if not units or (point := units[0].content) is None:
         return None
-    point = units[0].point
     names = ("quanta_exposure", "conversion_gain", "n_frames", "n_pixels")
     return {name: getattr(point, name) for name in names}
 
