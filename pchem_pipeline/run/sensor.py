@@ -76,7 +76,7 @@ class SensorInfo:
         return self.ny, self.nx
 
     def with_settings(self, given: InputSettings) -> SensorInfo:
-        """Return it with the bit depth and integration time that a configuration sets in place of the files."""
+        """Return it with the bit depth and integration time of a configuration, where it sets them."""
         return replace(
             self,
             bit_depth=given.bit_depth or self.bit_depth,
