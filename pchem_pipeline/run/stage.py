@@ -181,9 +181,9 @@ class StageContext:
     config: RunConfig
     base_dir: Path
     store: RunStore
-    executor: Executor
-    reporter: Reporter
-    stop: StopRequest
+    executor: Executor = field(default_factory=SerialExecutor)
+    reporter: Reporter = field(default_factory=lambda: Reporter("off", quiet=True))
+    stop: StopRequest = field(default_factory=StopRequest)
     options: Options = field(default_factory=Options)
     stage: str = ""
     fingerprint: str = ""

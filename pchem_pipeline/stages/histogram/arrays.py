@@ -33,18 +33,13 @@ def row_frames(ny: int) -> int:
 
 def create_counts(context: StageContext, bins: int, dtype: Any) -> None:
     """Make the arrays of the histograms; counts are a file for each tile, of pieces that are read alone."""
-    (y, x, _), shards = counts_layout(context, bins)
-    lengths, chunks = {"bin": bins}, {"y": y, "x": x}
-    context.create("histogram/counts", lengths=lengths, chunks=chunks, shards=shards, dtype=dtype)
-    context.create(*(f"histogram/{name}" for name in MAPS))
-
-
-def counts_layout(context: StageContext, bins: int) -> tuple[tuple[int, int, int], tuple[int, ...] | None]:
-    """Return the chunks of the histograms, and the shards; None where a chunk is a tile."""
     tile = tuple(min(size, length) for size, length in zip(context.tile, context.sensor.shape, strict=True))
-    if math.prod(tile) <= _FEW_PIXELS:
-        return (tile[0], tile[1], bins), None
-    return (_part(tile[0], _READ_ROWS), _part(tile[1], _READ_COLUMNS), bins), (*tile, bins)
+    chunks, shards = {}, None
+    if math.prod(tile) > _FEW_PIXELS:
+        chunks = {"y": _part(tile[0], _READ_ROWS), "x": _part(tile[1], _READ_COLUMNS)}
+        shards = (*tile, bins)
+    context.create("histogram/counts", lengths={"bin": bins}, chunks=chunks, shards=shards, dtype=dtype)
+    context.create(*(f"histogram/{name}" for name in MAPS))
 
 
 def _part(side: int, most: int) -> int:
@@ -89,10 +84,8 @@ def extend_arrays(context: StageContext, shape: tuple[int, int, int], bins: int)
     length = with_block_length(context.config.histogram, store).block_length(n_frames)
     open_store.cache_clear()
     if store.array("histogram/counts").dtype != counts_dtype(n_frames):
-        chunks, shards = counts_layout(context, bins)
-        store.create_array(
-            "histogram/counts", (*shape[1:], bins), chunks=chunks, shards=shards, dtype=counts_dtype(n_frames)
-        )
+        store.delete("histogram/counts")
+        create_counts(context, bins, counts_dtype(n_frames))
     if context.config.input.mode == "copy":
         store.resize("frames/dn", n_frames)
     if context.config.histogram.summaries:

@@ -26,8 +26,6 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import thresholds
 from pchem_pipeline.report.pages.summary import key_numbers, sentence
 from pchem_pipeline.run.fingerprint import status
-from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import Options, StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
@@ -61,15 +59,8 @@ def make_context(
             "ensemble": ensemble,
         }
     )
-    return StageContext(
-        config,
-        folder,
-        RunStore.create(folder / store),
-        executor or SerialExecutor(),
-        Reporter("off", quiet=True),
-        StopRequest(),
-        options=options or Options(),
-    )
+    place = RunStore.create(folder / store)
+    return StageContext(config, folder, place, executor or SerialExecutor(), options=options or Options())
 
 
 def write_fit(context: StageContext, *, tiles: list[str] | None = None, failed: bool = True) -> None:
@@ -459,9 +450,6 @@ def test_ready_made_histograms(tmp_path: Path, n_samples: tuple[int, int]) -> No
         config,
         tmp_path,
         RunStore.create(tmp_path / "run.zarr"),
-        SerialExecutor(),
-        Reporter("off", quiet=True),
-        StopRequest(),
     )
     for stage in ("ingest", "histogram"):
         assert execute(stage, context).state == "complete"

@@ -10,9 +10,7 @@ import pytest
 from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.signals import StopRequest
-from pchem_pipeline.run.stage import Options, StageContext
+from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.fit import together
 from pchem_pipeline.store.run_store import RunStore
@@ -36,9 +34,7 @@ def sensor(folder: Path, noise: float, steps: float, n_frames: int, tile: int) -
         }
     )
     store = RunStore.create(folder / f"run{tile}.zarr")
-    context = StageContext(
-        config, folder, store, SerialExecutor(), Reporter("off", quiet=True), StopRequest(), options=Options()
-    )
+    context = StageContext(config, folder, store, SerialExecutor())
     for stage in ("simulate", "ingest", "histogram", "fit"):
         assert execute(stage, context).state == "complete"
     return context
