@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.compute.executor import Outcome
+from pchem_pipeline.compute.executor import map_all
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.figure import Figure
@@ -122,22 +122,14 @@ def _drawn(jobs: list[PaperFigure], folder: Path, workers: int, reporter: Report
     except OSError as error:
         raise storage_error(error, folder) from error
     written: dict[str, list[Path]] = {}
-    errors: list[BaseException] = []
+
+    def write(job: PaperFigure, files: dict[str, bytes]) -> None:
+        written[job.figure.name] = [folder / name for name in files]
+        for name, content in files.items():
+            write_atomic(folder / name, content)
+
     with reporter.progress("figures", len(jobs), "figure") as advance:
-
-        def on_result(job: PaperFigure, outcome: Outcome) -> None:
-            advance()
-            if outcome.error is not None:
-                errors.append(outcome.error)
-                return
-            written[job.figure.name] = [folder / name for name in outcome.value]
-            for name, content in outcome.value.items():
-                write_atomic(folder / name, content)
-
-        executor = drawing_executor(workers, len(jobs))
-        executor.map(draw_paper_figure, jobs, on_result)
-    if errors:
-        raise errors[0]
+        map_all(drawing_executor(workers, len(jobs)), draw_paper_figure, jobs, write, advance)
     return [path for job in jobs for path in written[job.figure.name]]
 
 

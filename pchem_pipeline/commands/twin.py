@@ -54,7 +54,7 @@ def twin_of(target: Target, *, redraw: int | None = None, shape: tuple[int, int]
     usable = calibration.usable & (calibration.quanta_exposure >= 0.0)
     if not usable.any():
         raise ConfigError(f"{target.store} has no pixel with a fit, so there is nothing to simulate")
-    maps = tuple(store.read(f"fit/{name}") for name in PARAMETERS)
+    maps = tuple(getattr(calibration, name) for name in PARAMETERS)
     if redraw is not None:
         stderr = np.stack([store.read(f"fit/{name}_stderr") for name in PARAMETERS])
         maps = redrawn(maps, stderr, store.read("fit/correlation"), redraw)

@@ -289,8 +289,7 @@ def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]
     """Return the fit of the pixels of some rows, and their laws with their histograms."""
     part = slice(*rows), slice(None)
     values = [store.read(f"fit/{name}", part).astype(np.float64) for name in PARAMETERS]
-    counts = store.read("histogram/counts", (*part, slice(None)))
-    outside = [store.read(f"histogram/{side}", part) for side in ("under", "over")]
+    counts, *outside = (store.read(f"histogram/{name}", part) for name in ("counts", "under", "over"))
     usable = (store.read("fit/fit_status", part) & int(UNTRUSTWORTHY)) == 0
     usable &= np.isfinite(values).all(axis=0)
     usable &= counts.sum(axis=2) >= np.maximum(_FEWEST_SAMPLES, 100.0 * sum(outside))

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.compute.executor import SerialExecutor
+from pchem_pipeline.compute.executor import SerialExecutor, map_all
 from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.count import RowHistograms, choose_bins, most_bins, pixels_by_range
@@ -33,7 +33,6 @@ from pchem_pipeline.stages.samples import sample_targets
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
-    from pchem_pipeline.compute.executor import Outcome
     from pchem_pipeline.frames.histogram_files import HistogramInput
     from pchem_pipeline.store.tiles import Tile
 
@@ -121,7 +120,7 @@ def _decide_bins(context: StageContext, source: FrameSource) -> int:
     limit = most_bins(context.config.histogram.max_bins, source.dtype)
     settings = context.config.histogram
     task = functools.partial(_ranges_of_band, source=source, frames=settings.window_frames, max_bins=limit)
-    outcomes: list[Outcome] = []
+    found: list[NDArray[np.int64]] = []
     n_frames, _, columns = source.shape
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, 0, settings)
     tiles = context.tiles()
@@ -132,11 +131,8 @@ def _decide_bins(context: StageContext, source: FrameSource) -> int:
     # starting other processes takes longer than this does on all but huge sensors
     few = settings.window_frames * math.prod(source.shape[1:]) < _FEW_SAMPLES
     executor = SerialExecutor() if few and not context.executor.shares_memory else context.executor
-    executor.map(task, bands, lambda band, outcome: outcomes.append(outcome))
-    for outcome in outcomes:
-        if outcome.error is not None:
-            raise outcome.error
-    return choose_bins(np.sum([outcome.value for outcome in outcomes], axis=0), limit)
+    map_all(executor, task, bands, lambda band, ranges: found.append(ranges))
+    return choose_bins(np.sum(found, axis=0), limit)
 
 
 def _ranges_of_band(band: Band, *, source: FrameSource, frames: int, max_bins: int) -> NDArray[np.int64]:

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 #: Pixels whose fit is no reference: no value, or a bias that may be one electron off.
 _NO_REFERENCE = FAILED | AMBIGUOUS
-_BAND_BYTES = 64 << 20
 _DARK_LIMIT = 0.01  # e-: more electrons in the dark sample are remarked
 
 
@@ -188,19 +187,10 @@ def _readable(path: Path) -> RunStore:
 
 
 def _sample(store: RunStore, shape: tuple[int, int], place: NDArray[np.int64]) -> Sample:
-    """Read the histograms of some pixels, a band of rows at a time."""
-    counts = store.array("histogram/counts")
-    row_bytes = shape[1] * counts.shape[2] * counts.dtype.itemsize
-    rows = max(store.file_shape("histogram/counts")[0], _BAND_BYTES // max(row_bytes, 1))
-    taken = []
-    for first in range(0, shape[0], rows):
-        last = min(first + rows, shape[0])
-        inside = place[(place >= first * shape[1]) & (place < last * shape[1])] - first * shape[1]
-        if inside.size:
-            band = store.read("histogram/counts", (slice(first, last), slice(None), slice(None)))
-            taken.append(band.reshape(-1, band.shape[2])[inside])
-    origin = store.read("histogram/origin").ravel()[place].astype(np.int64)
-    return Sample(np.concatenate(taken), origin)
+    """Read the histograms of some pixels."""
+    y, x = np.divmod(place, shape[1])
+    counts, origin = (store.read_pixels(f"histogram/{name}", y, x) for name in ("counts", "origin"))
+    return Sample(counts, origin.astype(np.int64))
 
 
 def _reference(store: RunStore, place: NDArray[np.int64]) -> tuple[FloatArray, str]:
