@@ -17,7 +17,6 @@ from pchem_pipeline.compute.executor import Beside, beside
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
-from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.report.data import PixelFit, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
 from pchem_pipeline.report.figures.ensemble import case_name
@@ -268,8 +267,6 @@ def report_data(
         camera=sensor.camera.words(),
         maps=maps,
         fit=run.fit,
-        status_words={int(bit): text for bit, text in MEANINGS.items()},
-        failed_mask=int(FAILED),
         misfits=run.facts["maps"].get("goodness", {}),
         intervals=run.intervals,
         interval_level=config.fit.interval_level,
