@@ -75,15 +75,14 @@ def run(context: StageContext) -> None:
     n_frames, _, nx = source.shape
     rows_of_tile, columns_of_tile = context.tile
     depth = max(1, min(_CHUNK_FRAMES, _BLOCK_BYTES // (rows_of_tile * nx * 2)))
-    if context.fresh or not context.store.has("electrons/electron_number"):
-        context.create(
-            "electrons/electron_number",
-            lengths={"frame": n_frames},
-            chunks={"frame": depth, "x": max(_CHUNK_COLUMNS, columns_of_tile)},
-            # not missing_value: xarray would turn the integers into floats
-            no_number=NO_NUMBER,
-            largest_number=LARGEST_NUMBER,
-        )
+    context.create(
+        "electrons/electron_number",
+        lengths={"frame": n_frames},
+        chunks={"frame": depth, "x": max(_CHUNK_COLUMNS, columns_of_tile)},
+        # not missing_value: xarray would turn the integers into floats
+        no_number=NO_NUMBER,
+        largest_number=LARGEST_NUMBER,
+    )
     depth = context.store.array("electrons/electron_number").chunks[0]
     rows = _BLOCK_BYTES // (depth * nx * 2)
     bands = tile_bands(context, "fit", rows, source.rows_per_read)
