@@ -64,6 +64,8 @@ _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 2
 _SEGMENT_SAMPLES = 1 << 27
 #: Frames that tell the scene while offsets are found, and codes in a DN once they are taken away.
 _SCENE_FRAMES, _PARTS = 256, 4
+#: Frames that tell how wide the histograms are.
+_SEEN_FRAMES = 64
 #: Bytes that a code of a pixel takes while numbers are looked up.
 _BYTES_OF_CODE = 24
 _EXPOSURE = ("exposure", "exposure_stderr", "exposure_stderr_counting", "exposure_stderr_calibration")
@@ -423,9 +425,12 @@ def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
 def _counted(context: StageContext, job: Job, made: _Made) -> Job:
     """Count the frames; return the job with the type of the electron numbers."""
     from pchem_pipeline.model.electrons.electrons import number_type  # loads compiled loops
+    from pchem_pipeline.stages.histogram.histogram import bins_of
 
     n, ny, _ = job.source.shape
-    job = replace(job, bins=_bins(context, made.frames, job.parts), window=min(job.window, n))
+    most = context.config.histogram.max_bins
+    bins = job.parts * bins_of(job.source, _SEEN_FRAMES, most // job.parts, _CHUNK_ROWS)
+    job = replace(job, bins=min(most, bins), window=min(job.window, n))
     names = [f"applied/{name}" for name in _EXPOSURE] if "exposure" in job.kinds else []
     names += ["applied_parts/prior"] if job.learns_prior else []
     _create(context, job, "applied_parts/range", *names, lengths={"end": 2})
@@ -451,23 +456,6 @@ def _counted(context: StageContext, job: Job, made: _Made) -> Job:
     reach = (dn - made.calibration.bias[known]) * made.calibration.conversion_gain[known]
     reach += 9.0 * (made.calibration.read_noise_dn * made.calibration.conversion_gain)[known]
     return replace(job, number_type=number_type(float(reach.max(initial=0.0))))
-
-
-def _bins(context: StageContext, frames: FrameSequence, parts: int) -> int:
-    """Return the bins that the histograms of these frames need."""
-    from pchem_pipeline.model.histogram.count import choose_bins, pixels_by_range
-
-    settings = context.config.histogram
-    head = min(frames.shape[0], 64)
-    wide = settings.max_bins // parts
-    pixels = sum(
-        (
-            pixels_by_range(frames.read(0, head, *band), wide)
-            for band in equal_rows(frames.shape[1], _CHUNK_ROWS)
-        ),
-        start=np.zeros(wide + 2, np.int64),
-    )
-    return min(settings.max_bins, parts * choose_bins(pixels, wide))
 
 
 def _converted(context: StageContext, job: Job) -> None:
