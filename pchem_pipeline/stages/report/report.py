@@ -252,8 +252,6 @@ def report_data(
         integration_time: seconds, or None.
         stages: rows of the table of stages.
     """
-    from pchem_pipeline.config.load import dump_config
-
     maps, facts, sensor = run.maps, dict(run.facts["ensemble"]), run.sensor
     moments, _ = facts.pop("moments", []), facts.pop("missing", {})
     cases = facts.pop("component_cases", COMPONENT_CASES)
