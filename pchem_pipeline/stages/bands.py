@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.store.tiles import Tile
+from pchem_pipeline.store.tiles import Tile, equal_rows
 
 #: bands for each worker: enough to keep all busy to the end
 _BANDS_PER_WORKER = 4
@@ -104,11 +104,6 @@ def cut_rows(ny: int, step: int, workers: int) -> list[tuple[int, int]]:
         First row and end of each band, from top to bottom.
     """
     return equal_rows(ny, step * max(1, -(-ny // step) // (_BANDS_PER_WORKER * workers)))
-
-
-def equal_rows(ny: int, height: int) -> list[tuple[int, int]]:
-    """Return first row and end of bands of ``ny`` rows, from top to bottom; the last may be lower."""
-    return [(y, min(y + height, ny)) for y in range(0, ny, height)]
 
 
 def tile_bands(

@@ -44,10 +44,10 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import stop_on_signals
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.session import Command, with_overrides
-from pchem_pipeline.stages.bands import equal_rows
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.remote_path import local_path, place_of
 from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import equal_rows
 from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
 from pchem_pipeline.use.common_modes import CommonModes, scene_of
 from pchem_pipeline.use.electrons import read_stderr

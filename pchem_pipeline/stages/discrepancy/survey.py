@@ -34,10 +34,10 @@ from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.run.model_versions import model_of
-from pchem_pipeline.stages.bands import equal_rows
 from pchem_pipeline.stages.discrepancy.window import Window, choose_window, frame_blocks
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
 from pchem_pipeline.stages.quick_look import read_sums
+from pchem_pipeline.store.tiles import equal_rows
 
 if TYPE_CHECKING:
     from pchem_pipeline.discrepancy.quick.sums import StackSums

@@ -9,8 +9,8 @@ from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
 from pchem_pipeline.model.errors.fisher import CORRELATION_PAIRS
 from pchem_pipeline.model.fit.status import FitStatus, moves_gain
 from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.stages.bands import equal_rows
 from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import equal_rows
 
 _LARGEST_POOL = 2**19  # pixels: every so many-th of a larger sensor
 _LARGEST_KEPT = 2**22  # pixels, 24 bytes each

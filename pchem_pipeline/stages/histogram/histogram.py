@@ -22,13 +22,14 @@ from pchem_pipeline.model.histogram.odd_frames import odd_frames
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, frame_statistics
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
-from pchem_pipeline.stages.bands import Band, equal_rows, plan_bands
+from pchem_pipeline.stages.bands import Band, plan_bands
 from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, create_counts, row_frames
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import bytes_per_row
 from pchem_pipeline.stages.histogram.odd_frames import leave_out_odd_frames
 from pchem_pipeline.stages.samples import sample_targets
 from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import equal_rows
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.histogram_files import HistogramInput

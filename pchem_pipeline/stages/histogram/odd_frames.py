@@ -13,8 +13,8 @@ from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.histogram.odd_frames import KINDS, FloatArray, IntArray, left_out, odd_words
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, SummaryAccumulator
 from pchem_pipeline.run.frame_source import open_source
-from pchem_pipeline.stages.bands import equal_rows
 from pchem_pipeline.stages.histogram.arrays import COVARIANCES, MAPS, with_block_length
+from pchem_pipeline.store.tiles import equal_rows
 
 if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
