@@ -62,6 +62,10 @@ class Variable:
         """Name of the array inside its group."""
         return self.path.split("/", 1)[1]
 
+    def index(self, region: tuple[slice, slice]) -> tuple[slice, ...]:
+        """Return the index of a region (y, x) of the sensor in the array, whole along other dimensions."""
+        return (*(slice(None),) * self.dims.index("y"), *region)
+
 
 _MAP = ("y", "x")
 #: Values of pixels that no tile was done for, where they are not 0: a fit that was not made, and no value.

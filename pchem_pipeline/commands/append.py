@@ -17,7 +17,6 @@ from pchem_pipeline.config.memory import allowed_bytes, worker_count
 from pchem_pipeline.frames.identity import digest_of, quick_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
-from pchem_pipeline.frames.stream import HashedFrameStream
 from pchem_pipeline.run.fingerprint import setting_values
 from pchem_pipeline.run.input_identity import ingested_identity, keep_identity, known_identity
 from pchem_pipeline.runner.execute import execute
@@ -26,7 +25,7 @@ from pchem_pipeline.stages.fit.start import keep_fit
 from pchem_pipeline.stages.histogram.arrays import extend_arrays
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import single_pass_bytes
-from pchem_pipeline.stages.histogram.single_pass import PREPARED, prepared, stream_rows, whole_mebibytes
+from pchem_pipeline.stages.histogram.single_pass import PREPARED, hashed_frames, prepared
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import remove_files, write_record
 
@@ -86,8 +85,7 @@ def _check_run(context: StageContext) -> None:
     store = context.store
     for name in PREPARED:
         record = store.records.read(name)
-        finished = record is not None and record.finished
-        if record is None or not finished or len(context.tiles_done(name)) < record.keys:
+        if record is None or not (record.finished and store.records.has_all(record)):
             raise StoreError(f"{store.path}: {name} is not complete; run: pchem run {quoted(store.path)}")
         if record.content.get("settings") != setting_values(STAGES[name], context):
             raise StoreError(
@@ -165,19 +163,7 @@ def _go_on(context: StageContext, frames: FrameSequence, added: list[Path]) -> d
     if copies:
         step = math.lcm(step, store.array("frames/dn").chunks[0])
     done = context.sensor.n_frames
-    total = sum(path.stat().st_size for path in added if path.is_file()) >> 20
-    with (
-        context.reporter.progress("ingest and histogram", total, "MiB") as advance,
-        HashedFrameStream(
-            frames,
-            stream_rows(context, frames),
-            step,
-            files=added,
-            first=done,
-            threads=workers,
-            advance=whole_mebibytes(advance),
-        ) as stream,
-    ):
+    with hashed_frames(context, frames, step, added, done) as stream:
         counter = StackCounter(job, stream.bands, workers)
         counter.resume(done)
         write_record(store.path / _BEGUN, {"frames": done})

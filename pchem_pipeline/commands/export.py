@@ -8,17 +8,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import Variable, variables_of
+from pchem_pipeline.commands.figures import warn_if_old
 from pchem_pipeline.frames.formats.map_files import MapImage, write_fits, write_npz, write_tiff
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.pages.emva import COLUMNS as EMVA_COLUMNS
 from pchem_pipeline.report.pages.emva import MAPS as EMVA_MAPS
 from pchem_pipeline.report.pages.emva import emva_rows
-from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.target import Target, find_run
-from pchem_pipeline.runner.session import run_status
+from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
@@ -60,10 +58,8 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
         what = f"{', '.join(unknown)} cannot be written" if unknown else "no format"
         raise ConfigError(f"--format: {what}; choose from {', '.join(FORMATS)}")
     target = find_run(path)
-    store = target.stored()
-    if "summary" not in store.attributes("maps"):
-        raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
-    _say_if_old(target)
+    store = with_maps(target.stored())
+    warn_if_old(target, ("maps",), "written in this state")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -84,13 +80,6 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
     return written
 
 
-def _say_if_old(target: Target) -> None:
-    """Warn where the maps are not those of the present settings and input."""
-    state = next(state for state in run_status(target) if state.stage == "maps")
-    if state.state != "complete":
-        Reporter("off").warning(f"maps: {state.words()}; written in this state")
-
-
 def _images(store: RunStore) -> list[MapImage]:
     chosen: list[Variable] = [v for v in variables_of("maps") if store.has(v.path)]
     chosen += [v for v in variables_of("fit") if v.name in _FROM_FIT and store.has(v.path)]
@@ -99,10 +88,10 @@ def _images(store: RunStore) -> list[MapImage]:
 
 def _header(target: Target, store: RunStore) -> dict[str, Any]:
     """Return the keywords of a FITS file."""
-    sensor = SensorInfo.read(store)
-    time = target.config.input.integration_time or sensor.integration_time
+    sensor = target.sensor(store)
     frames = sensor.n_frames if sensor.kind == "frames" else None
-    return {"CREATOR": "pchem-pipeline", "RUN": store.path.name, "NFRAMES": frames, "EXPTIME": time}
+    facts = {"CREATOR": "pchem-pipeline", "RUN": store.path.name}
+    return {**facts, "NFRAMES": frames, "EXPTIME": sensor.integration_time}
 
 
 def _write_csv(folder: Path, store: RunStore) -> list[Path]:

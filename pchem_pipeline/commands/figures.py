@@ -7,15 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
-from pchem_pipeline.compute.executor import Outcome
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.compute.executor import map_all
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.paper import FORMATS, PaperFigure, draw_paper_figure, read_style_sheet
 from pchem_pipeline.run.progress import ProgressMode, Reporter
-from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.stages.report.drawing import drawing_executor, drawing_workers
 from pchem_pipeline.stages.report.report import gather
@@ -70,11 +69,8 @@ def gather_run(target: Target) -> ReportData:
     Raises:
         StoreError: the run lacks maps or histograms.
     """
-    store = target.stored()
-    if not store.has("maps/conversion_gain"):
-        raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
-    time = target.config.input.integration_time or SensorInfo.read(store).integration_time
-    return gather(store, target.config, time, [])
+    store = with_maps(target.stored())
+    return gather(store, target.config, target.sensor(store).integration_time, [])
 
 
 def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:
@@ -126,22 +122,14 @@ def _drawn(jobs: list[PaperFigure], folder: Path, workers: int, reporter: Report
     except OSError as error:
         raise storage_error(error, folder) from error
     written: dict[str, list[Path]] = {}
-    errors: list[BaseException] = []
+
+    def write(job: PaperFigure, files: dict[str, bytes]) -> None:
+        written[job.figure.name] = [folder / name for name in files]
+        for name, content in files.items():
+            write_atomic(folder / name, content)
+
     with reporter.progress("figures", len(jobs), "figure") as advance:
-
-        def on_result(job: PaperFigure, outcome: Outcome) -> None:
-            advance()
-            if outcome.error is not None:
-                errors.append(outcome.error)
-                return
-            written[job.figure.name] = [folder / name for name in outcome.value]
-            for name, content in outcome.value.items():
-                write_atomic(folder / name, content)
-
-        executor = drawing_executor(workers, len(jobs))
-        executor.map(draw_paper_figure, jobs, on_result)
-    if errors:
-        raise errors[0]
+        map_all(drawing_executor(workers, len(jobs)), draw_paper_figure, jobs, write, advance)
     return [path for job in jobs for path in written[job.figure.name]]
 
 

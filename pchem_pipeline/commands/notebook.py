@@ -35,8 +35,9 @@ from pchem_pipeline.run.model_versions import ModelVersion, model_of, model_vers
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.runner.session import run_status
+from pchem_pipeline.stages.fit.fitted_model import FittedModel
 from pchem_pipeline.stages.report.pixels import bin_masses, pixel_fits, pixel_index
-from pchem_pipeline.stages.report.stored import read_histograms, read_model
+from pchem_pipeline.stages.report.stored import read_histograms
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import read_json
 from pchem_pipeline.store.run_store import RunStore
@@ -342,11 +343,10 @@ class Run:
         fit = self._arrays("fit", ["fit_status", "goodness_p"])
         chosen = [("", int(y), int(x)) for y, x in places]
         index = pixel_index(chosen, self.shape)
-        model = read_model(self._store)
-        histograms = read_histograms(self._store, index, self.shape, model)
+        histograms = read_histograms(self._store, index, self.shape)
         channel = self._sensor.kind == "histograms"
         columns = [np.array([float(maps[name][y, x]) for _, y, x in chosen]) for name in PARAMETERS]
-        masses = bin_masses(columns, histograms, model.at(index))
+        masses = bin_masses(columns, histograms, FittedModel.read(self._store).at(index))
         found = pixel_fits(chosen, maps, fit, histograms, masses, channel=channel)
         return [Pixel(**vars(each)) for each in found]
 

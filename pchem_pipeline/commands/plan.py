@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
+from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.planning.frames import contour_data
 from pchem_pipeline.planning.plan import LEAST_SHARE, Plan, SamplesPlan, plan_one_sample, plan_samples
 from pchem_pipeline.planning.point import Point
@@ -104,12 +104,10 @@ def make_plan(request: PlanRequest) -> str:
 
 def _median_pixel(run: Path) -> dict[str, float]:
     """Return the medians of a run's maps."""
-    from pchem_pipeline.run.target import find_run
+    from pchem_pipeline.run.target import find_run, with_maps
 
-    store = find_run(run).stored()
-    summary = store.attributes("maps").get("summary")
-    if summary is None:
-        raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
+    store = with_maps(find_run(run).stored())
+    summary = store.attributes("maps")["summary"]
     names = ("read_noise_e", "quanta_exposure", "conversion_gain")
     found = {name: summary[name]["median"] for name in names}
     if None in found.values():

@@ -47,29 +47,29 @@ def twin_of(target: Target, *, redraw: int | None = None, shape: tuple[int, int]
     """
     store = target.stored()
     check_run(store)
-    sensor = SensorInfo.read(store)
+    sensor = target.sensor(store)
     if sensor.kind == "histograms":
         raise ConfigError(f"{target.store} was made from ready-made histograms; a run of frames is needed")
     calibration = read_calibration(store)
     usable = calibration.usable & (calibration.quanta_exposure >= 0.0)
     if not usable.any():
         raise ConfigError(f"{target.store} has no pixel with a fit, so there is nothing to simulate")
-    maps = tuple(store.read(f"fit/{name}") for name in PARAMETERS)
+    maps = tuple(getattr(calibration, name) for name in PARAMETERS)
     if redraw is not None:
         stderr = np.stack([store.read(f"fit/{name}_stderr") for name in PARAMETERS])
         maps = redrawn(maps, stderr, store.read("fit/correlation"), redraw)
     truth = twin_maps(maps, usable, _usual_level(store, sensor))
     if shape is not None:
         truth = extrapolated(truth, shape, 0 if redraw is None else redraw)
-    time = target.config.input.integration_time or sensor.integration_time
-    depth = target.config.input.bit_depth or sensor.bit_depth
     settings = SimulateSettings(
         shape=truth.shape,
         n_frames=max(1, sensor.n_frames),
-        bit_depth=depth or _BIT_DEPTH,
+        bit_depth=sensor.bit_depth or _BIT_DEPTH,
         effects=fitted_effects(store),
     )
-    return Twin(truth, settings if time is None else settings.model_copy(update={"integration_time": time}))
+    if (time := sensor.integration_time) is not None:
+        settings = settings.model_copy(update={"integration_time": time})
+    return Twin(truth, settings)
 
 
 def _usual_level(store: RunStore, sensor: SensorInfo) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

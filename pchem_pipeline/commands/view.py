@@ -29,6 +29,7 @@ from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.report.inspector.inspector import packed_facts, served_page
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import find_run
+from pchem_pipeline.stages.fit.fitted_model import FittedModel
 from pchem_pipeline.stages.report.inspector import (
     Listed,
     StoredMaps,
@@ -37,7 +38,7 @@ from pchem_pipeline.stages.report.inspector import (
     packed_map,
 )
 from pchem_pipeline.stages.report.pixels import bin_masses
-from pchem_pipeline.stages.report.stored import read_histograms, read_model
+from pchem_pipeline.stages.report.stored import read_histograms
 from pchem_pipeline.store.run_store import RunStore
 
 ADDRESS = "127.0.0.1"
@@ -163,12 +164,12 @@ class RunView:
             return _text(HTTPStatus.NOT_FOUND, f"no such pixel; the sensor has {ny} x {nx}")
         region = (slice(y, y + 1), slice(x, x + 1))
         index = np.array([y * nx + x])
-        model = read_model(self.store)
-        histograms = read_histograms(self.store, index, self._shape, model)
+        model = FittedModel.read(self.store, region)
+        histograms = read_histograms(self.store, index, self._shape)
         names = PARAMETERS if model.effects else ()
         columns = [self.store.read(f"maps/{name}", region).ravel() for name in names]
-        masses = bin_masses(columns, histograms, model.at(index))
-        deciding = deciding_parameters(columns, model.at(index))
+        masses = bin_masses(columns, histograms, model)
+        deciding = deciding_parameters(columns, model)
         counts, mass = histograms.counts[0], masses[0] if masses else None
         occupied = np.flatnonzero(counts)
         kept = slice(occupied[0], occupied[-1] + 1) if occupied.size else slice(0, 0)

@@ -125,6 +125,31 @@ def beside(threads: int) -> Iterator[Beside]:
         pool.shutdown(cancel_futures=True)
 
 
+def map_all(
+    executor: Executor,
+    function: Callable[[T], Any],
+    items: Sequence[T],
+    take: Callable[[T, Any], None],
+    advance: Callable[[], None] = lambda: None,
+) -> None:
+    """Call ``function`` on each item and ``take(item, value)`` here, in any order.
+
+    The first error is raised when all have ended; ``advance`` is called after each.
+    """
+    errors: list[BaseException] = []
+
+    def on_result(item: T, outcome: Outcome) -> None:
+        advance()
+        if outcome.error is None:
+            take(item, outcome.value)
+        else:
+            errors.append(outcome.error)
+
+    executor.map(function, items, on_result)
+    if errors:
+        raise errors[0]
+
+
 class SerialExecutor:
     """One item after the other, in this thread."""
 

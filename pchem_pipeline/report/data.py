@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,8 +162,6 @@ class ReportData:
         maps: ``name`` and ``name_stderr`` of ``variables.py`` group ``maps`` (y, x); NaN where a fit failed.
         fit: ``fit_status``, ``likelihood_gap``, ``goodness_p``, ... (y, x).
         status_words: bit of ``fit_status`` to its short sentence, gravest first.
-        failed_mask: bits of ``fit_status`` for which the parameters are NaN.
-        flagged_mask: bits for which the value of a pixel is open, whatever its standard error says.
         criteria: limits of the sensor.
         pixels: the shown pixels.
         ensemble: arrays of group ``ensemble``.
@@ -195,6 +193,9 @@ class ReportData:
         samples: the exposures of a run whose input is several samples, or None.
     """
 
+    #: bits of ``fit_status`` for which the parameters are NaN
+    failed_mask: ClassVar[int] = int(FAILED)
+
     title: str
     shape: tuple[int, int]
     kind: str = "unknown"
@@ -204,8 +205,6 @@ class ReportData:
     maps: Mapping[str, FloatArray] = field(default_factory=dict)
     fit: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     status_words: Mapping[int, str] = field(default_factory=lambda: {int(b): t for b, t in MEANINGS.items()})
-    failed_mask: int = int(FAILED)
-    flagged_mask: int = int(FLAGGED)
     criteria: Criteria = field(default_factory=Criteria)
     pixels: Sequence[PixelFit] = ()
     ensemble: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -257,11 +256,11 @@ class ReportData:
     @cached_property
     def flagged(self) -> NDArray[np.bool_]:
         """Pixels with a value that the data leave open by whole electrons, or altogether; shape ``shape``."""
-        return self._with_bits(self.flagged_mask)
+        return self._with_bits(int(FLAGGED))
 
     def flagged_in(self, name: str) -> NDArray[np.bool_]:
         """Tell which pixels the data leave open in one map: a gain is known where the bias is not."""
-        return self._with_bits(self.flagged_mask & int(flags_of(name)))
+        return self._with_bits(int(FLAGGED & flags_of(name)))
 
     def _with_bits(self, bits: int) -> NDArray[np.bool_]:
         status = self.fit.get("fit_status")

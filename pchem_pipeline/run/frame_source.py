@@ -55,7 +55,7 @@ def open_source(context: StageContext) -> FrameSource:
 
     sensor, store = context.sensor, context.store
     record = store.records.read("ingest")
-    if record is None or len(context.tiles_done("ingest")) < record.keys:
+    if record is None or not store.records.has_all(record):
         raise StoreError(f"{store.path}: the input is not complete; run: pchem ingest {quoted(store.path)}")
     expected = (sensor.n_frames, *sensor.shape)
     if sensor.mode == "copy":

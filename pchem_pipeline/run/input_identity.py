@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from pchem_pipeline.base.errors import InputError, StoreError
 from pchem_pipeline.frames.identity import content_identity, quick_identity
 from pchem_pipeline.frames.resolve import input_paths
+from pchem_pipeline.run.progress import whole_mebibytes
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.store.files import cure_of, read_record, write_record
 
@@ -43,7 +43,13 @@ def known_identity(context: StageContext) -> dict[str, Any]:
     if not same_files:
         inspect_input(context)
     with context.reporter.progress("ingest: hash", _mebibytes(quick["files"]), "MiB") as advance:
-        identity = content_identity(paths, _Advance(context, advance))
+        told = whole_mebibytes(advance)
+
+        def hear(count: int) -> None:
+            context.stop.check()
+            told(count)
+
+        identity = content_identity(paths, hear)
     with suppress(StoreError):  # a store that cannot be written is a matter for those who write to it
         keep_identity(context, quick, identity)
     return identity
@@ -112,19 +118,3 @@ def shortened(identity: dict[str, Any]) -> dict[str, Any]:
 
 def _mebibytes(files: list[dict[str, Any]]) -> int:
     return sum(int(file["size"]) for file in files) >> 20
-
-
-class _Advance:
-    """Turns bytes into whole MiB of progress; lets a signal stop the hashing."""
-
-    def __init__(self, context: StageContext, advance: Callable[[int], None]) -> None:
-        self._stop, self._advance = context.stop, advance
-        self._done = self._shown = 0
-
-    def __call__(self, count: int) -> None:
-        self._stop.check()
-        self._done += count
-        whole = self._done >> 20
-        if whole > self._shown:
-            self._advance(whole - self._shown)
-            self._shown = whole

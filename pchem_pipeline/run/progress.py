@@ -32,6 +32,20 @@ class Advance(Protocol):
         """Advance the bar by ``n`` units, or a part of one."""
 
 
+def whole_mebibytes(advance: Advance) -> Callable[[int], None]:
+    """Turn bytes into whole MiB of progress."""
+    done = shown = 0
+
+    def count(n_bytes: int) -> None:
+        nonlocal done, shown
+        done += n_bytes
+        if (done >> 20) > shown:
+            advance((done >> 20) - shown)
+            shown = done >> 20
+
+    return count
+
+
 #: Who hears of the shares of the unit that a thread works on.
 _teller: contextvars.ContextVar[Callable[[float], None] | None] = contextvars.ContextVar(
     "teller", default=None

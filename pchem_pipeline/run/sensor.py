@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.store.run_store import RunStore
+
+if TYPE_CHECKING:
+    from pchem_pipeline.frames.settings import InputSettings
 
 
 @dataclass(frozen=True)
@@ -76,17 +79,22 @@ class SensorInfo:
         """Rows and columns."""
         return self.ny, self.nx
 
-    def adc_limits(self, bit_depth: int | None = None) -> tuple[int, int] | None:
-        """Return first and last code of the ADC, or where samples pile up; None: not known.
-
-        Args:
-            bit_depth: as configured; None: that of the files, else of the type of the samples.
-        """
-        depth, kind = bit_depth or self.bit_depth, np.dtype(self.dtype)
-        if depth is None and kind.kind != "u":
+    @property
+    def adc_limits(self) -> tuple[int, int] | None:
+        """First and last code of ADC or type of the samples, or where these pile up; None: not known."""
+        kind = np.dtype(self.dtype)
+        if self.bit_depth is None and kind.kind != "u":
             return None
         low, high = self.seen_limits
-        return low or 0, high or 2 ** (depth or 8 * kind.itemsize) - 1
+        return low or 0, high or 2 ** (self.bit_depth or 8 * kind.itemsize) - 1
+
+    def with_settings(self, given: InputSettings) -> SensorInfo:
+        """Return it with the bit depth and integration time of a configuration, where it sets them."""
+        return replace(
+            self,
+            bit_depth=given.bit_depth or self.bit_depth,
+            integration_time=given.integration_time or self.integration_time,
+        )
 
     def write(self, store: RunStore) -> None:
         """Keep this in the store."""

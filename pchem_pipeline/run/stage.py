@@ -20,7 +20,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from pchem_pipeline.base.errors import InputError, StoreError, error_words
 from pchem_pipeline.base.variables import LENGTHS, VARIABLES
@@ -40,6 +40,9 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
 
 
+T = TypeVar("T", covariant=True)
+
+
 class Unit(Protocol):
     """A piece of a stage's work."""
 
@@ -55,13 +58,20 @@ class Unit(Protocol):
 
 
 @dataclass(frozen=True)
-class _Whole:
-    key: str = "all"
-    keys: tuple[str, ...] = ("all",)
+class Named(Generic[T]):
+    """A unit that is not a part of the sensor: its name, which is its only marker, and what is done."""
+
+    key: str
+    content: T
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Its only marker."""
+        return (self.key,)
 
 
 #: The only unit of a stage that is not divided.
-WHOLE = _Whole()
+WHOLE = Named("all", None)
 
 AnyUnit = TypeVar("AnyUnit", bound=Unit)
 
@@ -169,9 +179,9 @@ class StageContext:
     config: RunConfig
     base_dir: Path
     store: RunStore
-    executor: Executor
-    reporter: Reporter
-    stop: StopRequest
+    executor: Executor = field(default_factory=SerialExecutor)
+    reporter: Reporter = field(default_factory=lambda: Reporter("off", quiet=True))
+    stop: StopRequest = field(default_factory=StopRequest)
     options: Options = field(default_factory=Options)
     stage: str = ""
     fingerprint: str = ""
@@ -213,12 +223,17 @@ class StageContext:
     @property
     def integration_time(self) -> float | None:
         """Seconds per frame: from the configuration, else from the files."""
-        return self.config.input.integration_time or self.sensor.integration_time
+        return self.sensor.with_settings(self.config.input).integration_time
+
+    @property
+    def bit_depth(self) -> int | None:
+        """Bits of the ADC: from the configuration, else from the files."""
+        return self.sensor.with_settings(self.config.input).bit_depth
 
     @property
     def adc_limits(self) -> tuple[int, int] | None:
         """See `SensorInfo.adc_limits`."""
-        return self.sensor.adc_limits(self.config.input.bit_depth)
+        return self.sensor.with_settings(self.config.input).adc_limits
 
     @property
     def tile(self) -> tuple[int, int]:
@@ -250,27 +265,40 @@ class StageContext:
 
     def create(
         self,
-        name: str,
-        shape: tuple[int, ...],
-        *,
-        chunks: tuple[int, ...],
+        *names: str,
+        lengths: Mapping[str, int] | None = None,
+        chunks: Mapping[str, int] | None = None,
         shards: tuple[int, ...] | None = None,
         dtype: Any = None,
         **attributes: Any,
     ) -> None:
-        """Make an array of this stage, unless the stage resumes and has it."""
-        self.begin()
-        self.created[name] = self.stage
-        if self.fresh or not self.store.has(name):
-            self.store.create_array(
-                name, shape, chunks=chunks, shards=shards, dtype=dtype, attributes=attributes
-            )
+        """Make arrays of this stage with their declared dimensions, unless the stage resumes and has them.
 
-    def create_maps(self, names: Sequence[str], **attributes: Any) -> None:
-        """Make arrays whose first dimensions are (y, x), one tile per chunk; further ones are whole."""
+        Args:
+            names: of the arrays, with their groups.
+            lengths: of dimensions; of y and x the sensor's, chunks a tile, where these are not given.
+            chunks: length of a chunk along dimensions; the whole where none is given.
+            shards: see :meth:`RunStore.create_array`.
+            dtype: only for variables whose type the data decide.
+            attributes: further attributes.
+        """
+        self.begin()
+        sizes, parts = {**LENGTHS, **(lengths or {})}, dict(chunks or {})
+        if "y" not in sizes:
+            sizes |= zip(("y", "x"), self.sensor.shape, strict=True)
+            parts = {**dict(zip(("y", "x"), self.tile, strict=True)), **parts}
         for name in names:
-            rest = tuple(LENGTHS[dim] for dim in VARIABLES[name].dims[2:])
-            self.create(name, (*self.sensor.shape, *rest), chunks=(*self.tile, *rest), **attributes)
+            self.created[name] = self.stage
+            if self.fresh or not self.store.has(name):
+                dims = VARIABLES[name].dims
+                self.store.create_array(
+                    name,
+                    tuple(sizes[dim] for dim in dims),
+                    chunks=tuple(parts.get(dim, sizes[dim]) for dim in dims),
+                    shards=shards,
+                    dtype=dtype,
+                    attributes=attributes,
+                )
 
     def selected(self, units: Sequence[AnyUnit]) -> list[AnyUnit]:
         """Return the units that ``--tiles`` and ``--roi`` choose (all of them without these options)."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.config.load import load_config, make_config, parse_config
 from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.store.files import read_record
 from pchem_pipeline.store.remote_path import place_of
 from pchem_pipeline.store.run_store import RunStore, stored_config
@@ -28,6 +29,14 @@ class Target:
         content[section] = {**content[section], **values}
         return replace(self, config=make_config(content, "the command line"))
 
+    def sensor(self, store: RunStore) -> SensorInfo:
+        """Return its input, with the bit depth and integration time of its configuration, if these are set.
+
+        Raises:
+            StoreError: nothing was ingested yet.
+        """
+        return SensorInfo.read(store).with_settings(self.config.input)
+
     def stored(self, *, writable: bool = False) -> RunStore:
         """Return its store.
 
@@ -39,6 +48,17 @@ class Target:
                 f"there is no run at {self.store} yet; run: pchem run {quoted(self.config_path)}"
             )
         return RunStore.open(self.store, writable=writable)
+
+
+def with_maps(store: RunStore) -> RunStore:
+    """Return a run that has maps.
+
+    Raises:
+        StoreError: it has none.
+    """
+    if "summary" not in store.attributes("maps"):
+        raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
+    return store
 
 
 def find_run(path: Path) -> Target:

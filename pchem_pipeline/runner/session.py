@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, InputError, StoreError
-from pchem_pipeline.compute.executor import Notices, SerialExecutor, make_executor
+from pchem_pipeline.compute.executor import Notices, make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.config.load import dump_config, effects_file, found_model
 from pchem_pipeline.run.compilation import announced
@@ -18,7 +18,7 @@ from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.run.fingerprint import StageState, status
 from pchem_pipeline.run.model_versions import keep_in_force, model_in_force
 from pchem_pipeline.run.progress import ProgressMode, Reporter
-from pchem_pipeline.run.signals import StopRequest, stop_on_signals
+from pchem_pipeline.run.signals import stop_on_signals
 from pchem_pipeline.run.stage import Options, StageContext
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.execute import execute
@@ -212,7 +212,8 @@ def run_status(target: Target, options: Options | None = None) -> list[StageStat
     stages = pipeline_of(target.config)
     if not any((target.store / each).exists() for each in ("zarr.json", ".pchem/stages")):
         return [StageState(name, "missing") for name in stages]
-    context = _reading_context(target, Reporter("off", quiet=True), options or Options())
+    store = RunStore.open(target.store)
+    context = StageContext(target.config, target.base_dir, store, options=options or Options())
     done = (target.store / ".pchem" / "stages" / f"{name}.json" for name in STAGES if STAGES[name].on_demand)
     stages += tuple(place.stem for place in done if place.exists())
     states: list[StageState] = []
@@ -253,13 +254,6 @@ def _plan(target: Target, todo: Sequence[str], command: Command) -> list[str]:
     target = with_overrides(target, command)
     plans = [plan for plan in (STAGES[name].plan for name in todo) if plan is not None]
     return [line for plan in plans for line in imported(plan)(target.config, target.base_dir, todo)]
-
-
-def _reading_context(target: Target, reporter: Reporter, options: Options) -> StageContext:
-    store = RunStore.open(target.store)
-    return StageContext(
-        target.config, target.base_dir, store, SerialExecutor(), reporter, StopRequest(), options=options
-    )
 
 
 def _check_failed_pixels(context: StageContext, name: str) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.store.tiles import Tile
+from pchem_pipeline.store.tiles import Tile, equal_rows
 
 #: bands for each worker: enough to keep all busy to the end
 _BANDS_PER_WORKER = 4
@@ -103,8 +103,7 @@ def cut_rows(ny: int, step: int, workers: int) -> list[tuple[int, int]]:
     Returns:
         First row and end of each band, from top to bottom.
     """
-    height = step * max(1, -(-ny // step) // (_BANDS_PER_WORKER * workers))
-    return [(y, min(y + height, ny)) for y in range(0, ny, height)]
+    return equal_rows(ny, step * max(1, -(-ny // step) // (_BANDS_PER_WORKER * workers)))
 
 
 def tile_bands(

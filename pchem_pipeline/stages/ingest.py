@@ -87,7 +87,7 @@ def run(context: StageContext) -> None:
         context.note(message)
     sensor_of(reader, context, shortened(known_identity(context))).write(context.store)
     if reader.excluded is not None:
-        context.create("frames/excluded", reader.shape[1:], chunks=reader.shape[1:])
+        context.create("frames/excluded", lengths=dict(zip(("y", "x"), reader.shape[1:], strict=True)))
         context.store.write("frames/excluded", (slice(None),) * 2, reader.excluded.astype(np.uint8))
         number = np.count_nonzero(reader.excluded)
         context.note(f"{number} of {reader.excluded.size} pixels excluded by the mask or the marker 2^32-1")
@@ -129,7 +129,8 @@ def create_frames(context: StageContext, reader: FrameSequence) -> None:
     """Make the array that the frames are copied to; say so where the disk may be too small."""
     chunk = chunk_shape(reader.shape, reader.dtype.itemsize)
     shard = shard_shape(reader.shape, chunk)
-    context.create("frames/dn", reader.shape, chunks=chunk, shards=shard, dtype=reader.dtype)
+    lengths, chunks = (dict(zip(("frame", "y", "x"), each, strict=True)) for each in (reader.shape, chunk))
+    context.create("frames/dn", lengths=lengths, chunks=chunks, shards=shard, dtype=reader.dtype)
     _warn_of_a_small_disk(context, math.prod(reader.shape) * reader.dtype.itemsize)
 
 

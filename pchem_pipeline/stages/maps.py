@@ -28,9 +28,10 @@ from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.store.files import without_nan
 
 if TYPE_CHECKING:
-    from pchem_pipeline.store.run_store import RunStore
     from pchem_pipeline.store.tiles import Tile
 
+_OF_FIT = ("correlation", "fit_status", "likelihood_gap")
+_RESIDUALS = ("linearity_residual", "linearity_residual_stderr", "linearity_chi2", "linearity_p")
 _SUMMARISED = (*PARAMETERS, "read_noise_e", "analog_read_noise_e")
 #: of the arrays of a tile that are read and made
 _PIXEL_BYTES = 80 * 8
@@ -98,13 +99,13 @@ def run(context: StageContext) -> None:
     time, line = context.integration_time, _line(context)
     of_time = (context.charge_rate,) if time is not None and line is None else ()
     names = [*_SUMMARISED, *(of_time if line is None else line.names)]
-    context.create_maps([f"maps/{name}" for each in names for name in (each, f"{each}_stderr")])
+    context.create(*(f"maps/{name}" for each in names for name in (each, f"{each}_stderr")))
     ends = [path for each in (*INTERVALS, *of_time) for path in interval_names(each)]
     if context.store.has(f"fit/{ends[0]}"):
-        context.create_maps([f"maps/{name}" for name in ends])
-    context.create_maps(["maps/quality", "maps/goodness_q"])
+        context.create(*(f"maps/{name}" for name in ends))
+    context.create("maps/quality", "maps/goodness_q")
     if line is not None:
-        _create_residuals(context, len(line.x))
+        context.create(*(f"samples/{name}" for name in _RESIDUALS), lengths={"sample": len(line.x)})
     elif not context.sensor.samples:
         _tell_time(context)
     task = functools.partial(
@@ -120,27 +121,19 @@ def run(context: StageContext) -> None:
 
 
 @dataclass(frozen=True)
-class _Line:
+class Line:
     """What slope and offset of several samples are called, and where each stands (NaN: nowhere)."""
 
     names: tuple[str, ...]
     x: tuple[float, ...]
 
 
-def _line(context: StageContext) -> _Line | None:
+def _line(context: StageContext) -> Line | None:
     settings = context.config.input
     x = exposure_axis(settings, context.sensor.samples) if context.sensor.samples else None
     return (
-        None if x is None else _Line(line_map_names(settings.against, context.charge_rate), tuple(x.tolist()))
+        None if x is None else Line(line_map_names(settings.against, context.charge_rate), tuple(x.tolist()))
     )
-
-
-def _create_residuals(context: StageContext, n_samples: int) -> None:
-    """Make the arrays of what the line leaves."""
-    tile, shape = context.tile, context.sensor.shape
-    for name in ("linearity_residual", "linearity_residual_stderr"):
-        context.create(f"samples/{name}", (n_samples, *shape), chunks=(n_samples, *tile))
-    context.create_maps(["samples/linearity_chi2", "samples/linearity_p"])
 
 
 def _do_tile(
@@ -149,34 +142,42 @@ def _do_tile(
     store: Path,
     integration_time: float | None,
     rate: str,
-    line: _Line | None = None,
+    line: Line | None = None,
     n_frames: int | None = None,
 ) -> dict[str, Any]:
     opened = open_store(store)
-    needed = [*PARAMETERS, *(f"{name}_stderr" for name in PARAMETERS), "fit_status", "likelihood_gap"]
+    needed = [*PARAMETERS, *(f"{name}_stderr" for name in PARAMETERS), *_OF_FIT]
     needed += [path for name in INTERVALS for path in interval_names(name) if opened.has(f"fit/{path}")]
-    fit = {name: opened.read(f"fit/{name}", tile.region) for name in needed}
-    fit["correlation"] = opened.read("fit/correlation", (*tile.region, slice(None)))
-    for name, values in maps_tile(fit, integration_time, rate, n_frames).items():
-        opened.write(f"maps/{name}", tile.region, values)
+    fit = opened.read_arrays("fit", needed, tile.region)
+    opened.write_arrays("maps", maps_tile(fit, integration_time, rate, n_frames), tile.region)
     if line is not None:
-        _write_line(opened, tile, line)
+        samples = opened.read_arrays("samples", ("quanta_exposure", "covariance"), tile.region)
+        for group, arrays in zip(("maps", "samples"), line_tile(samples, line), strict=True):
+            opened.write_arrays(group, arrays, tile.region)
     return {}
 
 
-def _write_line(store: RunStore, tile: Tile, line: _Line) -> None:
-    """Draw the line through the exposures of each pixel of a tile, and write what it tells."""
-    cube = (slice(None), *tile.region)
-    exposure = store.read("samples/quanta_exposure", cube).reshape(len(line.x), -1).T
-    covariance = store.read("samples/covariance", tile.region)
+def line_tile(
+    samples: Mapping[str, NDArray[Any]], line: Line
+) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
+    """Return what a line through the exposures of each pixel tells, of the groups ``maps`` and ``samples``.
+
+    Args:
+        samples: ``quanta_exposure`` (sample, y, x) and ``covariance`` (y, x, parameter, parameter) of a tile.
+        line: that is drawn.
+    """
+    exposure, covariance = samples["quanta_exposure"], samples["covariance"]
+    n, *shape = exposure.shape
     maps, left = line_maps(
-        exposure, covariance.reshape(-1, *covariance.shape[2:]), np.array(line.x), line.names
+        exposure.reshape(n, -1).T, covariance.reshape(-1, *covariance.shape[2:]), np.array(line.x), line.names
     )
-    for name, values in maps.items():
-        store.write(f"maps/{name}", tile.region, values.reshape(tile.shape))
-    for name, values in left.items():
-        whole = np.ascontiguousarray(values.T).reshape(*values.shape[1:], *tile.shape)
-        store.write(f"samples/{name}", cube if values.ndim == 2 else tile.region, whole)
+    return (
+        {name: values.reshape(shape) for name, values in maps.items()},
+        {
+            name: np.ascontiguousarray(values.T).reshape(*values.shape[1:], *shape)
+            for name, values in left.items()
+        },
+    )
 
 
 def _summarise(context: StageContext, names: list[str]) -> None:

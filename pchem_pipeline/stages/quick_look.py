@@ -165,4 +165,4 @@ def _codes(store: RunStore, maps: PixelMaps, sensor: SensorInfo) -> CodeSample |
     if sum(part.size for part in origins) < _FEWEST:
         return None
     joined = np.concatenate(counts), np.concatenate(origins), np.concatenate(parameters)
-    return CodeSample(*joined, bool(sensor.samples), sensor.adc_limits())
+    return CodeSample(*joined, bool(sensor.samples), sensor.adc_limits)

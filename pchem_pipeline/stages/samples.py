@@ -36,7 +36,7 @@ class OpenSample:
         where: what messages call it.
         target: its configuration.
         store: opened for reading.
-        sensor: its input.
+        sensor: its input, with the bit depth and integration time of its configuration.
         histogram: fingerprint of its histograms.
     """
 
@@ -45,16 +45,6 @@ class OpenSample:
     store: RunStore
     sensor: SensorInfo
     histogram: str
-
-    @property
-    def bit_depth(self) -> int | None:
-        """Bits of the ADC, where they are known."""
-        return self.target.config.input.bit_depth or self.sensor.bit_depth
-
-    @property
-    def integration_time(self) -> float | None:
-        """Seconds per frame, as its run says."""
-        return self.target.config.input.integration_time or self.sensor.integration_time
 
     def shares_frames(self, other: OpenSample) -> bool:
         """Tell whether it has frames of the same files, and of the same dataset in them, as another."""
@@ -106,7 +96,7 @@ def open_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
             raise StoreError(
                 f"{where}: {store.path} has no histograms; run: pchem histogram {quoted(store.path)}"
             )
-        found.append(OpenSample(where, target, store, SensorInfo.read(store), record.fingerprint))
+        found.append(OpenSample(where, target, store, target.sensor(store), record.fingerprint))
     return found
 
 
@@ -134,7 +124,7 @@ def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
             f"{mine.where} has {sizes[0]} pixels, {first.where} {sizes[1]}; "
             "all samples must show the same region of one sensor"
         )
-    depths = [each.bit_depth for each in (mine, first)]
+    depths = [each.sensor.bit_depth for each in (mine, first)]
     if None not in depths and depths[0] != depths[1]:
         raise ConfigError(
             f"{mine.where} has {depths[0]} bits, {first.where} {depths[1]}; all samples must come from one "
@@ -214,7 +204,7 @@ def _sample(settings: InputSettings, i: int, found: OpenSample) -> Sample:
         found.store.path.name,
         bias,
         found.sensor.n_frames,
-        found.integration_time,
+        found.sensor.integration_time,
         found.target.config.input.kind,
     )
 
@@ -246,7 +236,7 @@ def sample_sensor(config: RunConfig, samples: Sequence[OpenSample]) -> SensorInf
         ny=first.ny,
         nx=first.nx,
         dtype=first.dtype,
-        bit_depth=next((each.bit_depth for each in samples if each.bit_depth is not None), None),
+        bit_depth=next((depth for each in samples if (depth := each.sensor.bit_depth) is not None), None),
         seen_limits=_shared_limits(samples),
         integration_time=None,
         mode="reference",

@@ -98,9 +98,9 @@ def run(context: StageContext) -> None:
         band = min(rows, _BAND_ROWS)
         context.create(
             "truth/electron_number",
-            (electron_units[-1].stop, rows, columns),
+            lengths={"frame": electron_units[-1].stop, "y": rows, "x": columns},
             # the ensemble reads them by bands
-            chunks=(step, band, columns),
+            chunks={"frame": step, "y": band},
             shards=(step, band * math.ceil(rows / band), columns),
         )
     units = [*_frame_units(files), *electron_units]

@@ -173,6 +173,10 @@ class Records:
         except FileNotFoundError:  # whoever works on the stage removed it meanwhile
             return set()
 
+    def has_all(self, record: StageRecord) -> bool:
+        """Tell whether all units of a stage are finished that it has as far as its record knows."""
+        return len(self.done(record.stage, record.fingerprint)) >= record.keys
+
     def summaries(self, stage: str, fingerprint: str) -> dict[str, dict[str, Any]]:
         """Return the summary that each finished unit left, in the order of the keys."""
         keys = sorted(self.done(stage, fingerprint))

@@ -22,7 +22,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -244,6 +244,38 @@ class RunStore:
         array = self.array(name)
         with self._translated(name, region):
             return np.asarray(array[region if region is not None else ...])
+
+    def read_arrays(
+        self, group: str, names: Iterable[str], region: tuple[slice, slice] | None = None
+    ) -> dict[str, NDArray[Any]]:
+        """Return arrays of a group, by name.
+
+        Args:
+            group: of the store.
+            names: of the arrays in it.
+            region: of the sensor, (y, x); None: all of it.
+
+        Raises:
+            StoreError: one is missing or a chunk is corrupt.
+        """
+        paths = {name: f"{group}/{name}" for name in names}
+        return {
+            name: self.read(path, None if region is None else variable_at(path).index(region))
+            for name, path in paths.items()
+        }
+
+    def write_arrays(
+        self, group: str, arrays: Mapping[str, NDArray[Any]], region: tuple[slice, slice]
+    ) -> None:
+        """Write arrays of a region (y, x) of the sensor, whole chunks, into the arrays of a group.
+
+        Raises:
+            LockedError: the work of this thread was overtaken by a later command.
+            StoreError: the file system refused.
+        """
+        for name, values in arrays.items():
+            path = f"{group}/{name}"
+            self.write(path, variable_at(path).index(region), values)
 
     def file_shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of the parts of an array that are a file each, and that one task writes whole."""

@@ -102,6 +102,11 @@ def tile_grid(shape: tuple[int, int], size: TileSize) -> list[Tile]:
     ]
 
 
+def equal_rows(ny: int, height: int) -> list[tuple[int, int]]:
+    """Return first row and end of bands of ``ny`` rows, from top to bottom; the last may be lower."""
+    return [(y, min(y + height, ny)) for y in range(0, ny, height)]
+
+
 _PART = re.compile(r"^(\d+)(?::(\d+))?\.(\d+)(?::(\d+))?$")
 
 

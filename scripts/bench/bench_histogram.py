@@ -13,7 +13,7 @@ import argparse
 import platform
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,6 @@ from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms, histogram_frames
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.summaries import SummaryAccumulator, line_sums
-from pchem_pipeline.stages.histogram.counting import TileCounter
 
 Frames = NDArray[np.uint16]
 
@@ -69,29 +68,31 @@ def ours(frames: Frames, repeat: int) -> RowHistograms:
     bins = expected.counts.shape[2]
     print(f"{bins} bins")
 
-    def count() -> None:
-        histograms = HistogramAccumulator((rows, columns), bins, n_frames)
-        for t in range(0, n_frames, 256):
-            histograms.add(frames[t : t + 256])
-        histograms.finish()
+    def pieces() -> Iterable[Frames]:
+        return (frames[t : t + 256] for t in range(0, n_frames, 256))
 
-    def summarise() -> None:
-        accumulator = SummaryAccumulator((rows, columns), 512)
-        for t in range(0, n_frames, 256):
-            accumulator.add(frames[t : t + 256])
-            line_sums(frames[t : t + 256])
-        accumulator.finish()
+    def count(blocks: Iterable[Frames], *, histograms: bool = True, summaries: bool = True) -> None:
+        counted = HistogramAccumulator((rows, columns), bins, n_frames)
+        summed = SummaryAccumulator((rows, columns), HistogramSettings().block_length(n_frames))
+        for block in blocks:
+            if histograms:
+                counted.add(block)
+            if summaries:
+                summed.add(block)
+                line_sums(block)
+        if histograms:
+            counted.finish()
+        if summaries:
+            summed.finish()
 
-    def whole(settings: HistogramSettings) -> None:
-        counter = TileCounter((rows, columns), bins, n_frames, settings)
-        for t in range(0, n_frames, 256):
-            counter.add(frames[t : t + 256])
-        counter.finish()
-
-    everything, counts_only = HistogramSettings(), HistogramSettings(summaries=False)
-    report("histograms (windows checked, exact under/over)", count, frames.size, repeat)
-    report("summaries alone", summarise, frames.size, repeat)
-    report("histograms and summaries", lambda: whole(everything), frames.size, repeat)
+    report(
+        "histograms (windows checked, exact under/over)",
+        lambda: count(pieces(), summaries=False),
+        frames.size,
+        repeat,
+    )
+    report("summaries alone", lambda: count(pieces(), histograms=False), frames.size, repeat)
+    report("histograms and summaries", lambda: count(pieces()), frames.size, repeat)
     with tempfile.TemporaryDirectory() as folder:
         np.save(Path(folder) / "frames.npy", frames)
         reader = open_frames(InputSettings(files=("frames.npy",)), Path(folder))
@@ -102,16 +103,13 @@ def ours(frames: Frames, repeat: int) -> RowHistograms:
                 end = min(t + 256, n_frames)
                 reader.read_into(buffer[: end - t], t, end)
 
-        def from_file(settings: HistogramSettings) -> None:
-            counter = TileCounter((rows, columns), bins, n_frames, settings)
+        def from_file(*, summaries: bool) -> None:
             with FrameStream(reader, [(0, rows)], 256) as stream:
-                for _, (block,) in stream:
-                    counter.add(block)
-            counter.finish()
+                count((block for _, (block,) in stream), summaries=summaries)
 
         report("reading the file alone (warm)", read, frames.size, repeat)
-        report("file to histograms", lambda: from_file(counts_only), frames.size, repeat)
-        report("file to histograms and summaries", lambda: from_file(everything), frames.size, repeat)
+        report("file to histograms", lambda: from_file(summaries=False), frames.size, repeat)
+        report("file to histograms and summaries", lambda: from_file(summaries=True), frames.size, repeat)
     return expected
 
 

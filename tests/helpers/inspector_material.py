@@ -21,7 +21,7 @@ from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.report.inspector import inspector_data, read_maps
 from pchem_pipeline.stages.report.pixels import choose_inspected
-from pchem_pipeline.stages.report.stored import FittedModel, read_histograms
+from pchem_pipeline.stages.report.stored import read_histograms
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 
@@ -55,7 +55,7 @@ def inspector_of(
     """Return the inspector of a run that was fitted with the PCD."""
     shape, chosen = maps["bias"].shape, choose_inspected(maps, fit, shown)
     entries, exact = read_maps(store, shape, chosen.index)
-    held = read_histograms(store, chosen.index, shape, FittedModel())
+    held = read_histograms(store, chosen.index, shape)
     sample = PixelSample(chosen.index, exact, held.origin, held.counts, reasons=chosen.reasons)
     return inspector_data(store.path.name, shape, entries, sample)
 

@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
+from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.ensemble import case_name
 
@@ -173,8 +173,6 @@ def report_data(shape: tuple[int, int] = (48, 64), *, failed: float = 0.01, seed
             "outlier_share": (rng.random(shape) < 0.01) / 17_750,
             "likelihood_gap": np.where(bad, np.nan, 300.0),
         },
-        status_words={int(bit): text for bit, text in MEANINGS.items()},
-        failed_mask=int(FAILED),
         pixels=pixels,
         misfits={
             "tested": int((~bad).sum()),

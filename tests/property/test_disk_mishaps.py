@@ -41,13 +41,13 @@ def maps_tile(path, tile):
 
 
 def fit_run(context):
-    context.create_maps(["fit/bias"])
+    context.create("fit/bias")
     task = functools.partial(fit_tile, context.store.path, context.config.fit.gap_threshold)
     context.run_units(context.tiles(), task)
 
 
 def maps_run(context):
-    context.create_maps(["maps/bias"])
+    context.create("maps/bias")
     context.run_units(context.tiles(), functools.partial(maps_tile, context.store.path), needs="fit")
 
 

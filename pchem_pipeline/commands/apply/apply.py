@@ -47,6 +47,7 @@ from pchem_pipeline.runner.session import Command, with_overrides
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.remote_path import local_path, place_of
 from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import equal_rows
 from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
 from pchem_pipeline.use.common_modes import CommonModes, scene_of
 from pchem_pipeline.use.electrons import read_stderr
@@ -63,6 +64,8 @@ _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 2
 _SEGMENT_SAMPLES = 1 << 27
 #: Frames that tell the scene while offsets are found, and codes in a DN once they are taken away.
 _SCENE_FRAMES, _PARTS = 256, 4
+#: Frames that tell how wide the histograms are.
+_SEEN_FRAMES = 64
 #: Bytes that a code of a pixel takes while numbers are looked up.
 _BYTES_OF_CODE = 24
 _EXPOSURE = ("exposure", "exposure_stderr", "exposure_stderr_counting", "exposure_stderr_calibration")
@@ -298,32 +301,27 @@ def _chunks(shape: tuple[int, int, int]) -> tuple[int, int, int]:
     return depth, rows, columns
 
 
-def _create(context: StageContext, job: Job, n_segments: int) -> None:
-    """Make the arrays."""
-    n, ny, nx = job.source.shape
-    depth, rows, columns = _chunks((n, ny, nx))
-    cubes = ["electrons"] if "electrons" in job.kinds else []
+def _create(context: StageContext, job: Job, *names: str, **facts: Any) -> None:
+    """Make arrays over whole rows of the sensor; ``facts`` are those of `StageContext.create`."""
+    lengths = dict(zip(("frame", "y", "x"), job.source.shape, strict=True)) | facts.pop("lengths", {})
+    chunks = {"frame": job.depth, "y": _chunks(job.source.shape)[1]} | facts.pop("chunks", {})
+    context.create(*names, lengths=lengths, chunks=chunks, **facts)
+
+
+def _create_converted(context: StageContext, job: Job, n_segments: int) -> None:
+    """Make the arrays of the frames, and of the sums over them."""
+    columns = {"x": _chunks(job.source.shape)[2]}
+    if "electrons" in job.kinds:
+        _create(context, job, "applied/electrons", chunks=columns)
     if "numbers" in job.kinds:
-        cubes += ["electron_number", "number_probability"]
-        cubes += ["expected_number"] if job.expected else []
-    for name in cubes:
-        facts: dict[str, Any] = {}
-        if name == "electron_number":
-            largest = int(np.iinfo(job.number_type).max)
-            # not missing_value: xarray would turn the integers into floats
-            facts = {"dtype": job.number_type, "no_number": largest, "largest_number": largest - 1}
-        context.create(f"applied/{name}", (n, ny, nx), chunks=(depth, rows, columns), **facts)
-    if job.converts:
-        context.create("applied_parts/sums", (n_segments, N_SUMS, ny, nx), chunks=(1, N_SUMS, rows, nx))
-
-
-def _create_counted(context: StageContext, job: Job) -> None:
-    _, ny, nx = job.source.shape
-    rows = _chunks(job.source.shape)[1]
-    context.create("applied_parts/range", (2, ny, nx), chunks=(2, rows, nx))
-    names = [f"applied/{name}" for name in _EXPOSURE] if "exposure" in job.kinds else []
-    for name in [*names, *(["applied_parts/prior"] if job.learns_prior else [])]:
-        context.create(name, (ny, nx), chunks=(rows, nx))
+        largest = int(np.iinfo(job.number_type).max)
+        # not missing_value: xarray would turn the integers into floats
+        facts = {"dtype": job.number_type, "no_number": largest, "largest_number": largest - 1}
+        _create(context, job, "applied/electron_number", chunks=columns, **facts)
+        others = ["number_probability", *(["expected_number"] if job.expected else [])]
+        _create(context, job, *(f"applied/{name}" for name in others), chunks=columns)
+    lengths = {"segment": n_segments, "sum": N_SUMS}
+    _create(context, job, "applied_parts/sums", lengths=lengths, chunks={"segment": 1})
 
 
 # -- the work --------------------------------------------------------------------------------------
@@ -369,22 +367,18 @@ def _rows_of_band(context: StageContext, job: Job, bytes_of_pixel: int) -> int:
     return rows * min(fitting, shared)
 
 
-def _bands(ny: int, step: int) -> list[tuple[int, int]]:
-    return [(y, min(y + step, ny)) for y in range(0, ny, step)]
-
-
 def _with_moments(context: StageContext, job: Job, made: _Made) -> tuple[Job, _Made]:
     """Find the errors of the calibration where the curvature of its likelihood does not tell them."""
     run = RunStore.open(job.run)
     if not doubtful_pixels(run, made.calibration).any():
         return job, made
-    _, ny, nx = job.source.shape
+    _, ny, _ = job.source.shape
     rows = _chunks(job.source.shape)[1]
-    for name, rest in (("covariance", (3, 3)), ("rivals", (2, 4))):
-        context.create(f"applied_parts/{name}", (ny, nx, *rest), chunks=(rows, nx, *rest))
+    lengths = {"row": 3, "column": 3, "side": 2, "quantity": 4}
+    _create(context, job, "applied_parts/covariance", "applied_parts/rivals", lengths=lengths)
     ends = None if job.top is None else (0, job.top)
     task = functools.partial(moments_piece, job=job, settings=context.config.fit, adc_limits=ends)
-    pieces = [Piece("errors", *band, 0, 1) for band in _bands(ny, rows)]
+    pieces = [Piece("errors", *band, 0, 1) for band in equal_rows(ny, rows)]
     context.run_units(pieces, task, unit_name="band", by_tiles=False)
     if context.failed:
         return job, made
@@ -400,19 +394,16 @@ def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
     mean = sum(made.frames.read(t, t + 1)[0].astype(np.float64) for t in chosen) / len(chosen)
     job = replace(job, scene=scene_of(np.asarray(mean), made.calibration))
     parts = job.modes.parts
-    for name, length in (("row_offset", ny), ("column_offset", nx)):
-        context.create(
-            f"applied/{name}",
-            (n, len(parts), length),
-            chunks=(job.depth, len(parts), length),
-            removed=list(job.removed),
-        )
     waves = job.modes.waves
+    lengths, whole = {"part": len(parts), "wave": len(waves), "coefficient": 2}, {"y": ny}
+    names = ("applied/row_offset", "applied/column_offset")
+    _create(context, job, *names, lengths=lengths, chunks=whole, removed=list(job.removed))
     if len(waves):
-        context.create(
+        _create(
+            context,
+            job,
             "applied/wave_offset",
-            (n, len(waves), 2),
-            chunks=(job.depth, len(waves), 2),
+            lengths=lengths,
             cycles_per_row=waves[:, 0].tolist(),
             cycles_per_column=waves[:, 1].tolist(),
             part=waves[:, 3].astype(int).tolist(),
@@ -434,14 +425,19 @@ def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
 def _counted(context: StageContext, job: Job, made: _Made) -> Job:
     """Count the frames; return the job with the type of the electron numbers."""
     from pchem_pipeline.model.electrons.electrons import number_type  # loads compiled loops
+    from pchem_pipeline.stages.histogram.histogram import bins_of
 
     n, ny, _ = job.source.shape
-    job = replace(job, bins=_bins(context, made.frames, job.parts), window=min(job.window, n))
-    _create_counted(context, job)
+    most = context.config.histogram.max_bins
+    bins = job.parts * bins_of(job.source, _SEEN_FRAMES, most // job.parts, _CHUNK_ROWS)
+    job = replace(job, bins=min(most, bins), window=min(job.window, n))
+    names = [f"applied/{name}" for name in _EXPOSURE] if "exposure" in job.kinds else []
+    names += ["applied_parts/prior"] if job.learns_prior else []
+    _create(context, job, "applied_parts/range", *names, lengths={"end": 2})
     bytes_of_pixel = 10 * job.bins + 2 * job.window * made.frames.dtype.itemsize + 200
     step = _rows_of_band(context, job, bytes_of_pixel)
     context.run_units(
-        [Piece("count", *band, 0, n) for band in _bands(ny, step)],
+        [Piece("count", *band, 0, n) for band in equal_rows(ny, step)],
         functools.partial(count_piece, job=job),
         unit_name="band",
         by_tiles=False,
@@ -462,20 +458,6 @@ def _counted(context: StageContext, job: Job, made: _Made) -> Job:
     return replace(job, number_type=number_type(float(reach.max(initial=0.0))))
 
 
-def _bins(context: StageContext, frames: FrameSequence, parts: int) -> int:
-    """Return the bins that the histograms of these frames need."""
-    from pchem_pipeline.model.histogram.count import choose_bins, pixels_by_range
-
-    settings = context.config.histogram
-    head = min(frames.shape[0], 64)
-    wide = settings.max_bins // parts
-    pixels = sum(
-        (pixels_by_range(frames.read(0, head, *band), wide) for band in _bands(frames.shape[1], _CHUNK_ROWS)),
-        start=np.zeros(wide + 2, np.int64),
-    )
-    return min(settings.max_bins, parts * choose_bins(pixels, wide))
-
-
 def _converted(context: StageContext, job: Job) -> None:
     """Write the frames."""
     n, ny, nx = job.source.shape
@@ -489,11 +471,11 @@ def _converted(context: StageContext, job: Job) -> None:
     rows = _chunks(job.source.shape)[1]
     length = job.depth * max(1, -(-_SEGMENT_SAMPLES // (rows * nx * job.depth)))
     starts = range(0, n, length)
-    _create(context, job, len(starts))
+    _create_converted(context, job, len(starts))
     pieces = [
         Piece("write", *band, t0, min(t0 + length, n), number)
         for number, t0 in enumerate(starts)
-        for band in _bands(ny, step)
+        for band in equal_rows(ny, step)
     ]
     context.run_units(
         pieces,

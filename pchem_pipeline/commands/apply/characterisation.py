@@ -14,7 +14,7 @@ from pchem_pipeline.model.fit.status import moves_gain
 from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.maps import electron_shifts
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.stages.fit.fitted_model import fitted_law, fitted_satellites
+from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_satellites
 from pchem_pipeline.use.calibration import Calibration, covariance_of
 
 if TYPE_CHECKING:
@@ -38,11 +38,7 @@ def check_run(store: RunStore) -> str:
         StoreError: the run is not finished as far as its fit.
     """
     record = store.records.read("fit")
-    if (
-        record is None
-        or not record.finished
-        or len(store.records.done("fit", record.fingerprint)) < record.keys
-    ):
+    if record is None or not (record.finished and store.records.has_all(record)):
         raise StoreError(f"{store.path} has no complete fit; run: pchem run {quoted(store.path)}")
     return record.fingerprint
 
@@ -68,7 +64,7 @@ def read_calibration(
     maps = [store.read(f"fit/{name}", region) for name in PARAMETERS]
     stderr = np.stack([store.read(f"fit/{name}_stderr", region) for name in PARAMETERS])
     covariance = covariance_of(stderr, store.read("fit/correlation", region))
-    law = fitted_law(store, maps, region, without=removed)
+    law = FittedModel.read(store, region).law(maps, without=removed)
     if extra_variance is not None:
         law = law.with_variance(dn2=extra_variance.ravel())
     if top is not None:

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError, quoted
+from pchem_pipeline.base.errors import ChangedError, ConfigError
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.commands.compare.arrays import compare_arrays
 from pchem_pipeline.commands.compare.history import (
     HISTORY_CSV,
     HistorySettings,
-    HotPixels,
+    PixelStates,
     history_csv,
     history_rows,
 )
@@ -33,7 +33,7 @@ from pchem_pipeline.report.pages.compare import (
 from pchem_pipeline.report.style.wording import count, measured, short, signed, symbol
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_workers
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.run_store import RunStore
@@ -112,23 +112,18 @@ def comparison_of(
     if not 0 <= tolerance < 1:
         raise ConfigError(f"--tolerance {tolerance:g}: give a relative difference from 0 to below 1")
     targets = [find_run(path) for path in paths]
-    stores = [target.stored() for target in targets]
+    stores = [with_maps(target.stored()) for target in targets]
     for target, store in zip(targets, stores, strict=True):
-        if not store.has("maps/conversion_gain"):
-            raise StoreError(f"{store.path} has no maps yet; run: pchem maps {quoted(store.path)}")
         warn_if_old(target, ("fit", "maps", "ensemble"), f"{store.path} is compared in its present state")
     names = _told_apart([store.path for store in stores])
-    runs = [
-        _facts(label, name, store)
-        for label, name, store in zip(_letters(len(names)), names, stores, strict=True)
-    ]
-    hot = [
-        HotPixels.of(store, target.config.maps.outlier_sigmas)
+    states = [
+        PixelStates.of(store, target.config.maps.outlier_sigmas)
         for store, target in zip(stores, targets, strict=True)
     ]
-    sides = list(zip(runs, targets, stores, hot, strict=True))
+    runs = list(map(_facts, _letters(len(names)), names, stores, states))
+    sides = list(zip(runs, targets, stores, states, strict=True))
     pairs = [_pair(sides[0], side, tolerance, reporter) for side in sides[1:]]
-    rows = history_rows(runs, stores, pairs, history, hot)
+    rows = history_rows(runs, stores, pairs, history, states)
     return Comparison(runs, pairs, tolerance, rows, history.axis, history.rate)
 
 
@@ -138,7 +133,7 @@ def _letters(n: int) -> list[str]:
     return [(singles[i // 26 - 1] if i >= 26 else "") + singles[i % 26] for i in range(n)]
 
 
-_Side = tuple[RunFacts, Target, RunStore, HotPixels]
+_Side = tuple[RunFacts, Target, RunStore, PixelStates]
 
 
 def _told_apart(paths: Sequence[Path]) -> list[str]:
@@ -151,10 +146,9 @@ def _told_apart(paths: Sequence[Path]) -> list[str]:
     return [path.name for path in paths]
 
 
-def _facts(label: str, name: str, store: RunStore) -> RunFacts:
+def _facts(label: str, name: str, store: RunStore, states: PixelStates) -> RunFacts:
     sensor = SensorInfo.read(store)
-    quality = store.read("maps/quality")
-    good, caution, none = (int((quality == grade).sum()) for grade in (GOOD, CAUTION, NO_VALUE))
+    good, caution, none = (int((states.quality == grade).sum()) for grade in (GOOD, CAUTION, NO_VALUE))
     return RunFacts(
         label,
         name,
@@ -186,18 +180,14 @@ def _data_digest(store: RunStore, sensor: SensorInfo) -> str:
 
 
 def _pair(first: _Side, second: _Side, tolerance: float, reporter: Reporter) -> Pair:
-    (one, one_target, one_store, one_hot), (other, other_target, other_store, other_hot) = first, second
+    (one, one_target, one_store, before), (other, other_target, other_store, now) = first, second
     same_data = one.digest == other.digest
     maps: dict[str, Any] = {}
     transitions: list[list[int]] = []
     if one.shape == other.shape:
-        grades = one_store.read("maps/quality"), other_store.read("maps/quality")
-        transitions = (
-            np.histogram2d(grades[0].ravel(), grades[1].ravel(), bins=np.arange(4) - 0.5)[0]
-            .astype(int)
-            .tolist()
-        )
-        good = (grades[0] == GOOD) & (grades[1] == GOOD)
+        grades = before.quality.ravel(), now.quality.ravel()
+        transitions = np.histogram2d(*grades, bins=np.arange(4) - 0.5)[0].astype(int).tolist()
+        good = (before.quality == GOOD) & (now.quality == GOOD)
         for name in MAPS:
             if one_store.has(f"maps/{name}") and other_store.has(f"maps/{name}"):
                 both = [
@@ -208,7 +198,7 @@ def _pair(first: _Side, second: _Side, tolerance: float, reporter: Reporter) -> 
     arrays = compare_arrays(one_store, other_store, tolerance, reporter) if same_data else []
     reasons = {} if same_data else {name: reasons_of_change(found) for name, found in maps.items()}
     words = _words(one, other, arrays, maps, reasons)
-    new, gone = other_hot.new_since(one_hot), one_hot.new_since(other_hot)
+    new, gone = now.new_since(before), before.new_since(now)
     if new or gone:
         words.append(f"Hot pixels: {len(new):,} new, {len(gone):,} gone.")
     return Pair(

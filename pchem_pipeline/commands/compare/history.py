@@ -58,7 +58,7 @@ def history_rows(
     stores: Sequence[RunStore],
     pairs: Sequence[Pair],
     wanted: HistorySettings,
-    hot: Sequence[HotPixels],
+    states: Sequence[PixelStates],
 ) -> list[HistoryRow]:
     """Return a row for each run, in the order given.
 
@@ -67,7 +67,7 @@ def history_rows(
         stores: of them.
         pairs: the first with each of the others.
         wanted: labels, what they are drawn against, and the false-discovery rate.
-        hot: hot pixels of each run.
+        states: of the pixels of each run.
 
     Raises:
         ConfigError: there are labels, but not one for each run; or the frames of a run state no
@@ -91,7 +91,7 @@ def history_rows(
         )
     rows = []
     for i, (run, store) in enumerate(zip(runs, stores, strict=True)):
-        moved, any_moved, compared = _moved(pairs[i - 1], stores[0], store, rate) if i else ({}, 0, 0)
+        moved, any_moved, compared = _moved(pairs[i - 1], states[0], states[i], rate) if i else ({}, 0, 0)
         date, temperature = _date(store, cameras[i]), cameras[i].temperature
         warmth = "" if temperature is None else f"{temperature:.4g} °C"
         label = labels[i] if labels else warmth if against == "temperature" else date
@@ -102,10 +102,10 @@ def history_rows(
                 temperature,
                 {"date": _days(date), "temperature": _number(warmth), "label": _number(label)}[against],
                 run,
-                int(hot[i].hot.sum()),
-                hot[i].new_since(hot[0]),
-                hot[0].new_since(hot[i]),
-                _flags(store),
+                int(states[i].hot.sum()),
+                states[i].new_since(states[0]),
+                states[0].new_since(states[i]),
+                states[i].flags(),
                 _effects(store),
                 moved,
                 any_moved,
@@ -139,27 +139,37 @@ def _number(label: str) -> float:
 
 
 @dataclass(frozen=True)
-class HotPixels:
-    """The hot pixels of a run, as its report has them.
+class PixelStates:
+    """What the pixels of a run are, as its report has them; maps of shape (y, x).
 
     Attributes:
-        hot: which they are, shape (y, x).
-        exposure, stderr: the maps of H, e-, shape (y, x).
+        hot: which are hot.
+        exposure, stderr: H and its error, e-.
+        status: words of the fit.
+        quality: good, caution or no value.
     """
 
     hot: NDArray[np.bool_]
     exposure: NDArray[np.floating]
     stderr: NDArray[np.floating]
+    status: NDArray[np.integer]
+    quality: NDArray[np.integer]
 
     @classmethod
-    def of(cls, store: RunStore, sigmas: float) -> HotPixels:
+    def of(cls, store: RunStore, sigmas: float) -> PixelStates:
         """Read those of a run; ``sigmas`` is its ``maps.outlier_sigmas``."""
-        flagged = (store.read("fit/fit_status") & int(flags_of("quanta_exposure"))) != 0
-        exposure, stderr = (store.read(f"maps/quanta_exposure{end}") for end in ("", "_stderr"))
-        return cls(hot_pixels(exposure, stderr, flagged, sigmas), exposure, stderr)
+        status = store.read("fit/fit_status")
+        names = ("quanta_exposure", "quanta_exposure_stderr", "quality")
+        exposure, stderr, quality = store.read_arrays("maps", names).values()
+        hot = hot_pixels(exposure, stderr, (status & int(flags_of("quanta_exposure"))) != 0, sigmas)
+        return cls(hot, exposure, stderr, status, quality)
 
-    def new_since(self, first: HotPixels) -> tuple[tuple[int, int], ...]:
-        """Return the places of those that were not hot, unless H agrees within its error, if known."""
+    def flags(self) -> dict[str, int]:
+        """Return how many pixels bear each word of the status."""
+        return {str(bit.name).lower(): int(((self.status & int(bit)) != 0).sum()) for bit in FitStatus if bit}
+
+    def new_since(self, first: PixelStates) -> tuple[tuple[int, int], ...]:
+        """Return the places of hot ones that were not hot, unless H agrees within its error, if known."""
         if self.hot.shape != first.hot.shape:
             return ()
         error = np.hypot(np.nan_to_num(self.stderr), np.nan_to_num(first.stderr))
@@ -167,22 +177,16 @@ class HotPixels:
         return tuple((int(y), int(x)) for y, x in np.argwhere(self.hot & ~first.hot & ~near))
 
 
-def _flags(store: RunStore) -> dict[str, int]:
-    """Return how many pixels bear each word of the status."""
-    words = store.read("fit/fit_status")
-    return {str(bit.name).lower(): int(((words & int(bit)) != 0).sum()) for bit in FitStatus if bit}
-
-
 def _effects(store: RunStore) -> tuple[str, ...]:
     version = model_of(store, "fit")
     return () if version is None else tuple(effect.tag for effect in version.effects)
 
 
-def _moved(pair: Pair, one: RunStore, other: RunStore, rate: float) -> tuple[dict[str, int], int, int]:
+def _moved(pair: Pair, one: PixelStates, other: PixelStates, rate: float) -> tuple[dict[str, int], int, int]:
     """Return the pixels whose parameters moved: of each map, of any, and how many were compared."""
     if pair.same_data or not pair.maps:
         return {}, 0, 0
-    good = (one.read("maps/quality") == GOOD) & (other.read("maps/quality") == GOOD)
+    good = (one.quality == GOOD) & (other.quality == GOOD)
     found = {name: moved_pixels(each, good, rate) for name, each in pair.maps.items()}
     any_moved = np.logical_or.reduce(list(found.values()))
     return {name: int(each.sum()) for name, each in found.items()}, int(any_moved.sum()), int(good.sum())

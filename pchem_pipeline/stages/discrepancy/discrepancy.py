@@ -31,7 +31,7 @@ from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.model.histogram.odd_frames import frame_words
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
-from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
+from pchem_pipeline.run.stage import WHOLE, Named, StageContext, nothing_left
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
 from pchem_pipeline.stages.discrepancy.survey import Survey, mean_codes, survey
 from pchem_pipeline.stages.discrepancy.window import (
@@ -48,23 +48,6 @@ _STAGE = "discrepancy"
 #: Settings that the memory, or a clear disagreement, may lower.
 _TAKEN = ("max_samples", "max_pixels", "replicates", "extended_replicates")
 _USUAL_CODES = 128.0  # of the law of a pixel, where there are no histograms yet
-
-
-@dataclass(frozen=True)
-class _Unit:
-    """One simulated stack as a unit of the stage."""
-
-    replicate: Replicate
-
-    @property
-    def key(self) -> str:
-        """Its name."""
-        return self.replicate.key
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Its marker."""
-        return (self.replicate.key,)
 
 
 def run(context: StageContext) -> None:
@@ -176,7 +159,7 @@ class _Search:
         """Return how the frames of a window were taken."""
         return {
             "n_run": self.source.shape[0],
-            "bit_depth": self.context.config.input.bit_depth or self.context.sensor.bit_depth,
+            "bit_depth": self.context.bit_depth,
             "integration_time": self.context.integration_time or 1.0,
             "window": SensorWindow(
                 window.rows,
@@ -257,7 +240,7 @@ def _run_histograms(context: StageContext, before: Sequence[Effect], tell: Calla
         samples, context.config.discrepancy, width=context.sensor.nx, model=before, tell=tell
     )
     _write(context, found)
-    context.run_units([WHOLE], _nothing_left, by_tiles=False)
+    context.run_units([WHOLE], nothing_left, by_tiles=False)
 
 
 def _samples(context: StageContext) -> list[SampleHistograms]:
@@ -287,10 +270,6 @@ def _histograms(store: RunStore) -> SampleHistograms:
     return SampleHistograms(counts.reshape(-1, counts.shape[2]), store.read("histogram/origin").ravel())
 
 
-def _nothing_left(unit: Unit) -> None:
-    """Do nothing: the work of the unit was done beforehand."""
-
-
 class _Ended(BaseException):
     """Takes what ends the stage (a signal, a full disk) past what guards a search against strange effects."""
 
@@ -310,7 +289,7 @@ class _Mapper:
     def __call__(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:
         """Return the statistics of each replicate, or what it raised."""
         replicates = [replace(each, key=self.prefix + each.key) for each in replicates]
-        units = {r.key: _Unit(r) for r in replicates}
+        units = {r.key: Named(r.key, r) for r in replicates}
         self.total += len(units)
         try:
             summaries = self.context.run_units(
@@ -334,8 +313,8 @@ class _Mapper:
         return found
 
 
-def _simulate(unit: _Unit) -> dict[str, float]:
-    return unit.replicate()
+def _simulate(unit: Named[Replicate]) -> dict[str, float]:
+    return unit.content()
 
 
 def _write(context: StageContext, found: Discrepancy) -> None:
@@ -347,7 +326,7 @@ def _write(context: StageContext, found: Discrepancy) -> None:
         dict(zip(names, z_after.tolist(), strict=True)) if found.verdict.steps else None,
         [e for e in found.model if e.tag in found.verdict.effects],
         context.integration_time or 1.0,
-        context.config.input.bit_depth or context.sensor.bit_depth or 16,
+        context.bit_depth or 16,
         found.code_extended,
     )
     for name, array in arrays.items():

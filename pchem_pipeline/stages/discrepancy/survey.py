@@ -37,6 +37,7 @@ from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.stages.discrepancy.window import Window, choose_window, frame_blocks
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
 from pchem_pipeline.stages.quick_look import read_sums
+from pchem_pipeline.store.tiles import equal_rows
 
 if TYPE_CHECKING:
     from pchem_pipeline.discrepancy.quick.sums import StackSums
@@ -151,18 +152,14 @@ def survey(context: StageContext, source: FrameSource, compared: int) -> Survey:
     places = places_of_sums(read_sums(store), shape[1:])
     shares = {} if places is None else {SUMS: 1.0}
     model = model_of(store, "fit")
-    done = all(_complete(context, stage) for stage in ("histogram", "fit"))
+    records = [store.records.read(stage) for stage in ("histogram", "fit")]
+    done = all(record is not None and store.records.has_all(record) for record in records)
     if math.prod(shape) > compared and done and model is not None:
         limit = context.config.compute.max_memory
         memory = None if limit is None else (limit << 20) - resident_bytes()
         here, more = places_of_bands(store, source, plain=not model.effects, memory=memory, left_out=left_out)
         places, shares = (places or {}) | here, shares | more
     return Survey(places or {}, shares, tuple(left_out.tolist()))
-
-
-def _complete(context: StageContext, stage: str) -> bool:
-    record = context.store.records.read(stage)
-    return record is not None and len(context.tiles_done(stage)) >= record.keys
 
 
 def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, Suspect] | None:
@@ -204,7 +201,7 @@ def places_of_bands(
     """
     n, ny, nx = source.shape
     rows, at_once = _band_size(store, (ny, nx), memory)
-    bands = [(first, min(first + rows, ny)) for first in range(0, ny, rows)]
+    bands = equal_rows(ny, rows)
     numbers = np.setdiff1d(_spread_frames(n, _MOST_SAMPLES // (ny * nx)), left_out)
     maps = {name: CellMap.empty((ny, nx)) for name in (*(f"score.{s}" for s in SCORES), "goodness")}
     places: dict[str, Suspect] = {}
@@ -292,8 +289,7 @@ def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]
     """Return the fit of the pixels of some rows, and their laws with their histograms."""
     part = slice(*rows), slice(None)
     values = [store.read(f"fit/{name}", part).astype(np.float64) for name in PARAMETERS]
-    counts = store.read("histogram/counts", (*part, slice(None)))
-    outside = [store.read(f"histogram/{side}", part) for side in ("under", "over")]
+    counts, *outside = (store.read(f"histogram/{name}", part) for name in ("counts", "under", "over"))
     usable = (store.read("fit/fit_status", part) & int(UNTRUSTWORTHY)) == 0
     usable &= np.isfinite(values).all(axis=0)
     usable &= counts.sum(axis=2) >= np.maximum(_FEWEST_SAMPLES, 100.0 * sum(outside))

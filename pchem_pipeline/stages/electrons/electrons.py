@@ -55,8 +55,8 @@ def electrons_tile(
 def read_tables(store: RunStore, rows: slice) -> NumberTables:
     """Return the electron numbers of the codes of some rows of a run."""
     region = rows, slice(None)
-    low, high = (store.read(f"histogram/{name}", region) for name in ("minimum", "maximum"))
-    return electrons_tile(low, high, fitted_pixels(store, region))
+    ends = store.read_arrays("histogram", ("minimum", "maximum"), region)
+    return electrons_tile(**ends, pixels=fitted_pixels(store, region))
 
 
 def run(context: StageContext) -> None:
@@ -72,18 +72,17 @@ def run(context: StageContext) -> None:
             "camera files"
         )
     source = open_source(context)
-    n_frames, ny, nx = source.shape
+    n_frames, _, nx = source.shape
     rows_of_tile, columns_of_tile = context.tile
     depth = max(1, min(_CHUNK_FRAMES, _BLOCK_BYTES // (rows_of_tile * nx * 2)))
-    if context.fresh or not context.store.has("electrons/electron_number"):
-        context.create(
-            "electrons/electron_number",
-            (n_frames, ny, nx),
-            chunks=(depth, rows_of_tile, max(_CHUNK_COLUMNS, columns_of_tile)),
-            # not missing_value: xarray would turn the integers into floats
-            no_number=NO_NUMBER,
-            largest_number=LARGEST_NUMBER,
-        )
+    context.create(
+        "electrons/electron_number",
+        lengths={"frame": n_frames},
+        chunks={"frame": depth, "x": max(_CHUNK_COLUMNS, columns_of_tile)},
+        # not missing_value: xarray would turn the integers into floats
+        no_number=NO_NUMBER,
+        largest_number=LARGEST_NUMBER,
+    )
     depth = context.store.array("electrons/electron_number").chunks[0]
     rows = _BLOCK_BYTES // (depth * nx * 2)
     bands = tile_bands(context, "fit", rows, source.rows_per_read)

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
@@ -32,20 +30,15 @@ from pchem_pipeline.model.ensemble.moments import moment_rows
 from pchem_pipeline.model.ensemble.totals import ERROR_SIZES, EnsembleAxes, EnsembleTotals
 from pchem_pipeline.model.fit.status import flags_of
 from pchem_pipeline.model.histogram.count_numba import count_frames
-from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.progress import parts_told
-from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
 from pchem_pipeline.stages.bands import tile_bands
 from pchem_pipeline.stages.electrons.electrons import read_tables
-from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile
+from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
 from pchem_pipeline.stages.fit.code_sums import on_axis
-from pchem_pipeline.stages.fit.fitted_model import (
-    fitted_effects,
-    fitted_law,
-    fitted_satellites,
-)
+from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_effects, fitted_satellites
 from pchem_pipeline.store.files import without_nan
 
 if TYPE_CHECKING:
@@ -70,15 +63,16 @@ _HISTOGRAM = ("origin", "minimum", "maximum")
 
 @dataclass(frozen=True)
 class _Job:
-    """What every band is told.
+    """What the ensemble is of.
 
     Attributes:
         store: path of the run.
+        config: of the run.
+        sensor: the input.
         axes: axes of the ensemble.
         tiles: number and place of each tile by its key.
-        frames: the chosen frames (first, end), or None for all of the histogram.
+        frames: the chosen frames (first, end), or None where there are none to choose from.
         codes: by tile the samples of all frames, where the fit has counted them; see `CodeSums`.
-        n_frames: of the run.
         source: where frames come from, if any are read.
         truth: first row, first column and first frame of the input in the true electron numbers, or None.
         effects: with which the maps were fitted.
@@ -86,15 +80,21 @@ class _Job:
     """
 
     store: Path
+    config: RunConfig
+    sensor: SensorInfo
     axes: EnsembleAxes
     tiles: dict[str, tuple[int, Tile]]
     frames: tuple[int, int] | None
     codes: dict[str, dict[str, Any]]
-    n_frames: int
     source: FrameSource | None
     truth: tuple[int, int, int] | None
     effects: tuple[Effect, ...]
     limits: tuple[int, int] | None
+
+    @property
+    def counts_anew(self) -> bool:
+        """Whether the chosen frames are some of those in the histograms."""
+        return self.frames not in (None, (0, self.sensor.n_frames))
 
 
 @dataclass(frozen=True)
@@ -121,10 +121,7 @@ class _Fitted:
     def read(cls, store: RunStore, tiles: list[Tile]) -> _Fitted:
         """Read them from the run."""
         bins = store.array("histogram/counts").shape[2]
-        paths = [
-            *(f"fit/{n}" for n in PARAMETERS),
-            *(f"histogram/{n}" for n in ("origin", "minimum", "maximum")),
-        ]
+        paths = [*(f"fit/{n}" for n in PARAMETERS), *(f"histogram/{n}" for n in _HISTOGRAM)]
         *maps, origin, low, high = (_pixels_of(store, path, tiles) for path in paths)
         pixels, mask = UsablePixels.from_maps(maps)
         return cls(pixels, mask, origin[mask], low[mask], high[mask], bins)
@@ -193,13 +190,14 @@ def run(context: StageContext) -> None:
     if axes is None:
         if ready:
             context.note("no pixel has a value, so there is no ensemble; for the reasons see fit_status")
-        context.run_units(tiles, _leave_out, needs="fit")
+        context.run_units(tiles, nothing_left, needs="fit")
         return
     _create(context, axes, len(tiles))
     numbered = {tile.key: (number, tile) for number, tile in enumerate(tiles)}
     codes = {} if frames is None or everything else _codes(context)
-    chosen = None if everything else frames
-    job = _Job(store.path, axes, numbered, chosen, codes, sensor.n_frames, source, truth, effects, limits)
+    job = _Job(
+        store.path, context.config, sensor, axes, numbered, frames, codes, source, truth, effects, limits
+    )
     rows = max(1, _BAND_BYTES // (sensor.nx * fitted.bins * 4))
     bands = tiles if source is None else tile_bands(context, "fit", rows, source.rows_per_read)
     task = functools.partial(_do_band, job=job)
@@ -215,28 +213,8 @@ def run(context: StageContext) -> None:
         if finished != fitted_tiles:
             fitted = _Fitted.read(store, finished)
         made = {"tiles": len(finished), "tiles_missing": context.n_keys - len(finished)}
-        totals = _totals(store, axes, [numbered[tile.key][0] for tile in finished], frames, sensor.n_frames)
-        asked = _Asked(context.config, frames, truth, sensor, limits)
-        _write_result(store, totals, finished, fitted, asked, effects, made)
-
-
-@dataclass(frozen=True)
-class _Asked:
-    """What the ensemble is of.
-
-    Attributes:
-        config: of the run.
-        frames: first and end of the chosen frames, or None where there are none to choose from.
-        truth: row, column and frame of the input's origin in the simulation, or None.
-        sensor: the input.
-        limits: first and last code of the ADC, DN, where samples lie at one of them; else None.
-    """
-
-    config: RunConfig
-    frames: tuple[int, int] | None
-    truth: tuple[int, int, int] | None
-    sensor: SensorInfo
-    limits: tuple[int, int] | None
+        totals = _totals(store, job, [numbered[tile.key][0] for tile in finished])
+        _write_result(store, totals, finished, fitted, job, made)
 
 
 def _codes(context: StageContext) -> dict[str, dict[str, Any]]:
@@ -244,11 +222,6 @@ def _codes(context: StageContext) -> dict[str, dict[str, Any]]:
     record = context.store.records.read("fit")
     made = {} if record is None else context.store.records.summaries("fit", record.fingerprint)
     return {key: summary["codes"] for key, summary in made.items() if "codes" in summary}
-
-
-def _leave_out(tile: Tile) -> dict[str, Any]:
-    """Do nothing for a tile, so that it counts as done."""
-    return {}
 
 
 def _chosen_frames(sensor: SensorInfo, settings: EnsembleSettings) -> tuple[int, int] | None:
@@ -297,7 +270,7 @@ def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:
 def _do_band(band: Band | Tile, *, job: _Job) -> dict[str, Any]:
     """Sum over each tile of a band; frames, where they are needed, are read once for all of them."""
     store = open_store(job.store)
-    chosen = None if job.frames is None else _count(job, band, job.frames)
+    chosen = _count(job, band) if job.counts_anew else None
     errors = {} if job.truth is None else _compare(job, band)
     for key in band.keys:
         number, tile = job.tiles[key]
@@ -314,51 +287,8 @@ def _do_band(band: Band | Tile, *, job: _Job) -> dict[str, Any]:
     return {}
 
 
-@dataclass(frozen=True)
-class _Counted:
-    """Histograms of some rows and columns of the sensor.
-
-    Attributes:
-        counts: samples per bin, shape (y, x, bin).
-        origin: DN of bin 0, shape (y, x).
-        outside: samples outside of the bins, shape (y, x).
-    """
-
-    counts: NDArray[Any]
-    origin: NDArray[np.int64]
-    outside: NDArray[np.uint32]
-
-    def of(self, part: tuple[slice, slice]) -> _Counted:
-        """Return those of a part."""
-        return _Counted(self.counts[part], self.origin[part], self.outside[part])
-
-    def cut(self, low: NDArray[Any], high: NDArray[Any]) -> PixelHistograms:
-        """Return them with as many bins as the widest range needs: a hot pixel widens those of the sensor.
-
-        Args:
-            low: smallest DN of each pixel, shape (y, x).
-            high: largest.
-        """
-        bins = self.counts.shape[2]
-        first, size = _occupied(self.origin, low, high, bins)
-        y, x = np.ogrid[: first.shape[0], : first.shape[1]]
-        kept = self.counts if size == bins else sliding_window_view(self.counts, size, axis=2)[y, x, first]
-        return PixelHistograms(
-            kernel_counts(kept).reshape(first.size, size), (self.origin + first).ravel(), self.outside.ravel()
-        )
-
-
-def _occupied(
-    origin: NDArray[np.int64], low: NDArray[Any], high: NDArray[Any], bins: int
-) -> tuple[NDArray[np.int64], int]:
-    """Return the first of so many bins, the same number for each pixel, between which all samples lie."""
-    begin, end = np.clip(low - origin, 0, bins), np.clip(high + 1 - origin, 0, bins)
-    size = max(1, int(np.max(end - begin)))
-    return np.minimum(begin, bins - size), size
-
-
 def _sum_tile(
-    store: RunStore, tile: Tile, job: _Job, chosen: _Counted | None
+    store: RunStore, tile: Tile, job: _Job, chosen: PixelHistograms | None
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return what a tile adds to the ensemble.
 
@@ -371,7 +301,7 @@ def _sum_tile(
     maps = [store.read(f"fit/{name}", tile.region) for name in PARAMETERS]
     origin, low, high = _ranges(store, tile.region)
     codes = None if chosen is None else job.codes.get(tile.key)
-    counted = _read_counted(store, tile, origin) if codes is None else _uncounted(origin, job.n_frames)
+    counted = _read_counted(store, tile, origin) if codes is None else _uncounted(origin, job.sensor.n_frames)
     errors = _errors(store, tile)
     rows = []
     for part in parts_told(tile.parts(store.array("histogram/counts").shape[2])):
@@ -393,7 +323,7 @@ def _sum_tile(
         samples, outside = on_axis(codes, job.axes.dn)
         integers[job.axes.integers["counts_all"]] = samples
         integers[job.axes.integers["outside_all"]] = outside
-        floats[job.axes.floats["share_all"]] = samples / job.n_frames
+        floats[job.axes.floats["share_all"]] = samples / job.sensor.n_frames
     return integers, floats
 
 
@@ -403,7 +333,7 @@ def _law(
     """Return the law of the samples, with effects and limits of the codes; None: the PCD."""
     if not job.axes.extended:
         return None
-    law = fitted_law(store, maps, place)
+    law = FittedModel.read(store, place).law(maps)
     low, high = job.limits or (None, None)
     return replace(
         law,
@@ -412,23 +342,22 @@ def _law(
     )
 
 
-def _read_counted(store: RunStore, tile: Tile, origin: NDArray[np.int64]) -> _Counted:
+def _read_counted(store: RunStore, tile: Tile, origin: NDArray[np.int64]) -> PixelHistograms:
     """Read the histograms of a tile."""
-    counts, under, over = (
-        store.read(f"histogram/{name}", tile.region) for name in ("counts", "under", "over")
-    )
-    return _Counted(counts, origin, under + over)
+    found = store.read_arrays("histogram", ("counts", "under", "over"), tile.region)
+    return PixelHistograms(found["counts"], origin, found["under"] + found["over"])
 
 
-def _uncounted(origin: NDArray[np.int64], n_frames: int) -> _Counted:
+def _uncounted(origin: NDArray[np.int64], n_frames: int) -> PixelHistograms:
     """Return pixels of whose samples only the number is known."""
     outside = np.full(origin.shape, n_frames, np.uint32)
-    return _Counted(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
+    return PixelHistograms(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
 
 
 def _ranges(store: RunStore, region: tuple[slice, slice]) -> list[NDArray[np.int64]]:
     """Return DN of bin 0, smallest and largest DN of the pixels of a region, (y, x)."""
-    return [store.read(f"histogram/{name}", region).astype(np.int64) for name in _HISTOGRAM]
+    found = store.read_arrays("histogram", _HISTOGRAM, region)
+    return [values.astype(np.int64) for values in found.values()]
 
 
 def _errors(store: RunStore, tile: Tile) -> PixelErrors | None:
@@ -457,19 +386,20 @@ def _stream(job: _Job, band: Band | Tile, frames: tuple[int, int]) -> FrameStrea
     return FrameStream(job.source, [(band.y0, band.y1)], _BLOCK_FRAMES, frames=frames)
 
 
-def _count(job: _Job, band: Band | Tile, frames: tuple[int, int]) -> _Counted:
+def _count(job: _Job, band: Band | Tile) -> PixelHistograms:
     """Histogram the chosen frames of a band; the same samples lie outside as in the stored histograms."""
+    assert job.frames is not None
     store = open_store(job.store)
     like = store.array("histogram/counts")
     origin, low, high = _ranges(store, (slice(band.y0, band.y1), slice(None)))
-    first, size = _occupied(origin, low, high, like.shape[2])
+    first, size = occupied(origin, low, high, like.shape[2])
     origin += first
     counts = np.zeros((*origin.shape, size), like.dtype)
     under, over = np.zeros((2, *origin.shape), dtype=np.uint32)
-    with _stream(job, band, frames) as stream:
+    with _stream(job, band, job.frames) as stream:
         for _, (block,) in stream:
             count_frames(block, origin.astype(np.int32), counts, under, over)
-    return _Counted(counts, origin, under + over)
+    return PixelHistograms(counts, origin, under + over)
 
 
 def _compare(job: _Job, band: Band | Tile) -> dict[str, ErrorTally]:
@@ -497,23 +427,19 @@ def _compare(job: _Job, band: Band | Tile) -> dict[str, ErrorTally]:
     return found
 
 
-def _totals(
-    store: RunStore, axes: EnsembleAxes, rows: list[int], frames: tuple[int, int] | None, n_frames: int
-) -> EnsembleTotals:
-    """Add the rows of the finished tiles.
+def _totals(store: RunStore, job: _Job, rows: list[int]) -> EnsembleTotals:
+    """Add the rows of the finished tiles; without frames every pixel counts the same.
 
     Args:
         store: the run.
-        axes: axes of the ensemble.
+        job: what is summed.
         rows: of the finished tiles in the sums.
-        frames: first and end of the chosen frames, or None where every pixel counts the same.
-        n_frames: frames of the run.
     """
-    samples = (1, 1) if frames is None else (frames[1] - frames[0], n_frames)
+    samples = (1, 1) if job.frames is None else (job.frames[1] - job.frames[0], job.sensor.n_frames)
     integers, floats = (
         sum(store.read(f"ensemble_tiles/{name}", (number, slice(None))) for number in rows) for name in _SUMS
     )
-    return EnsembleTotals(axes, np.asarray(integers), np.asarray(floats), samples)
+    return EnsembleTotals(job.axes, np.asarray(integers), np.asarray(floats), samples)
 
 
 def _write_result(
@@ -521,8 +447,7 @@ def _write_result(
     totals: EnsembleTotals,
     tiles: list[Tile],
     fitted: _Fitted,
-    asked: _Asked,
-    effects: Sequence[Effect],
+    job: _Job,
     facts: dict[str, Any],
 ) -> None:
     """Write the arrays of the group ``ensemble`` and its numbers (attributes of the group).
@@ -536,11 +461,10 @@ def _write_result(
         totals: sums over the tiles.
         tiles: the finished tiles.
         fitted: their pixels.
-        asked: what the ensemble is of.
-        effects: with which the maps were fitted.
+        job: what the ensemble is of.
         facts: further attributes.
     """
-    missing, settings, frames = _missing(asked, totals), asked.config.ensemble, asked.frames
+    missing, settings, frames = _missing(job, totals), job.config.ensemble, job.frames
     pixels = fitted.pixels
     per_pixel: int | NDArray[Any] = totals.samples[0]
     if frames is None:
@@ -554,8 +478,8 @@ def _write_result(
         with np.errstate(divide="ignore"):  # one whose H, or gain, is more open may be off by any number
             wide = np.minimum(2.0 * pixels.maps[0] ** 2 / per_pixel, 0.5 / gap) > 0.25
         weight = bias_weight(np.where(wide | (words & int(flags_of("conversion_gain")) != 0), 0.0, gap))
-    true = _true_pixels(store, asked, tiles, fitted.mask)
-    arrays, found = curves(totals, pixels, settings, asked.limits)
+    true = _true_pixels(store, job, tiles, fitted.mask)
+    arrays, found = curves(totals, pixels, settings, job.limits)
     numbers, electron_facts = electron_numbers_of(totals, pixels, settings)
     arrays |= numbers | components(pixels, numbers["electron_pmf"], weight)
     n, n_all = totals.samples
@@ -571,37 +495,37 @@ def _write_result(
         "component_cases": COMPONENT_CASES,
         "missing": missing,
     }
-    if effects:
-        found["model"] = model_words(effects)
+    if job.effects:
+        found["model"] = model_words(job.effects)
     for name, values in arrays.items():
         store.write_array(f"ensemble/{name}", values)
     store.set_attributes("ensemble", without_nan(found | facts))
 
 
 def _true_pixels(
-    store: RunStore, asked: _Asked, tiles: list[Tile], mask: NDArray[np.bool_]
+    store: RunStore, job: _Job, tiles: list[Tile], mask: NDArray[np.bool_]
 ) -> UsablePixels | None:
     """Return the true parameters of the pixels with a value, if they are all that made the frames."""
-    simulated = asked.config.simulate
-    if asked.truth is None or simulated is None or simulated.effects:
+    simulated = job.config.simulate
+    if job.truth is None or simulated is None or simulated.effects:
         return None
-    y0, x0, _ = asked.truth
-    ny, nx = asked.sensor.shape
+    y0, x0, _ = job.truth
+    ny, nx = job.sensor.shape
     region = (slice(y0, y0 + ny), slice(x0, x0 + nx))
     maps = [_pixels_of(store, f"truth/{name}", tiles, region)[mask] for name in PARAMETERS]
     true, known = UsablePixels.from_maps(maps)
     return true if known.all() else None
 
 
-def _missing(asked: _Asked, totals: EnsembleTotals) -> dict[str, str]:
+def _missing(job: _Job, totals: EnsembleTotals) -> dict[str, str]:
     """Say which parts of the ensemble this run does not have, and why."""
     missing: dict[str, str] = {}
-    if asked.frames is None:
-        missing["frames"] = f"input is {asked.sensor.kind}: the ensemble has all samples"
+    if job.frames is None:
+        missing["frames"] = f"input is {job.sensor.kind}: the ensemble has all samples"
     if totals.count("compared") == 0:
         missing["truth"] = (
             "unknown true electron numbers"
-            if asked.config.simulate is None
+            if job.config.simulate is None
             else "no true electron numbers stored for these frames"
         )
     return missing

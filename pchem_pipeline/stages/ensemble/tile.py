@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.electrons.electrons import KnownPixels, NumberTables, Outcomes, number_tables
@@ -17,34 +18,61 @@ from pchem_pipeline.model.electrons.thresholds import numbers_by_thresholds
 from pchem_pipeline.model.ensemble.ensemble import curve_errors, ensemble_sums, mass_sums, tally
 from pchem_pipeline.model.ensemble.error_sample import PixelErrors
 from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
+from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
 @dataclass(frozen=True)
 class PixelHistograms:
-    """Histograms of some pixels.
+    """Histograms of some pixels, along one axis or of rows and columns of the sensor.
 
     Attributes:
-        counts: samples per bin, shape (n, n_bins).
-        origin: DN of bin 0, shape (n,).
-        outside: samples outside of the bins, shape (n,).
+        counts: samples per bin, shape (..., n_bins).
+        origin: DN of bin 0, shape (...).
+        outside: samples outside of the bins, shape (...).
     """
 
     counts: NDArray[np.integer[Any]]
     origin: NDArray[np.integer[Any]]
     outside: NDArray[np.integer[Any]]
 
-    def of(self, mask: NDArray[np.bool_]) -> PixelHistograms:
+    def of(self, chosen: NDArray[np.bool_] | tuple[slice, slice]) -> PixelHistograms:
         """Return those of the chosen pixels."""
-        if mask.all():
+        if isinstance(chosen, np.ndarray) and chosen.all():
             return self
-        return PixelHistograms(self.counts[mask], self.origin[mask], self.outside[mask])
+        return PixelHistograms(self.counts[chosen], self.origin[chosen], self.outside[chosen])
 
     @property
     def samples(self) -> NDArray[np.int64]:
-        """Number of samples of each pixel, shape (n,)."""
-        return np.asarray(self.counts.sum(axis=1, dtype=np.int64) + self.outside)
+        """Number of samples of each pixel."""
+        return np.asarray(self.counts.sum(axis=-1, dtype=np.int64) + self.outside)
+
+    def cut(self, low: NDArray[Any], high: NDArray[Any]) -> PixelHistograms:
+        """Return them along one axis, with as many bins as the widest range needs.
+
+        A hot pixel widens the histograms of the whole sensor.
+
+        Args:
+            low: smallest DN of each pixel, shape (y, x).
+            high: largest.
+        """
+        bins = self.counts.shape[2]
+        first, size = occupied(self.origin, low, high, bins)
+        y, x = np.ogrid[: first.shape[0], : first.shape[1]]
+        kept = self.counts if size == bins else sliding_window_view(self.counts, size, axis=2)[y, x, first]
+        return PixelHistograms(
+            kernel_counts(kept).reshape(first.size, size), (self.origin + first).ravel(), self.outside.ravel()
+        )
+
+
+def occupied(
+    origin: NDArray[Any], low: NDArray[Any], high: NDArray[Any], bins: int
+) -> tuple[NDArray[np.int64], int]:
+    """Return the first of so many bins, the same number for each pixel, between which all samples lie."""
+    begin, end = np.clip(low - origin, 0, bins), np.clip(high + 1 - origin, 0, bins)
+    size = max(1, int(np.max(end - begin)))
+    return np.minimum(begin, bins - size), size
 
 
 def ensemble_tile(

@@ -1,54 +1,69 @@
-"""The arrays of the group ``fit``."""
+"""The arrays of the groups ``fit`` and ``samples``."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, interval_names, variables_of
+from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, VARIABLES, interval_names, variables_of
 from pchem_pipeline.model.fit.status import MEANINGS, FitStatus
 from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.store.run_store import RunStore
+
+if TYPE_CHECKING:
+    from pchem_pipeline.store.run_store import RunStore
+    from pchem_pipeline.store.tiles import Tile
+
+_OF_SAMPLES = ("quanta_exposure", "quanta_exposure_stderr", "mean", "variance", "covariance")
 
 
-def leave_out_excluded(
-    arrays: Mapping[str, NDArray[Any]], status: str, stores: Iterable[RunStore], region: tuple[slice, slice]
-) -> None:
-    """Take the values of excluded pixels from the arrays of a tile, and give them their word.
+class TileArrays:
+    """The arrays of the groups ``fit`` and ``samples`` of a tile, filled piece by piece.
 
-    Args:
-        arrays: by name, (y, x, ...); of the group ``samples`` (sample, y, x).
-        status: name of the word.
-        stores: of the runs whose frames were fitted.
-        region: of the tile.
+    Attributes:
+        values: by path; pixels of the tile along the dimensions y and x.
     """
-    for store in stores:
-        if not store.has("frames/excluded"):
-            continue
-        excluded = store.read("frames/excluded", region) != 0
-        for name, values in arrays.items():
+
+    def __init__(self, tile: Tile) -> None:
+        self._tile = tile
+        self.values: dict[str, NDArray[Any]] = {}
+
+    def add(self, part: tuple[slice, slice], found: Mapping[str, NDArray[Any]]) -> None:
+        """Take the arrays of a piece of the tile."""
+        for path, values in found.items():
+            variable = VARIABLES[path]
+            y = variable.dims.index("y")
+            shape = (*values.shape[:y], *self._tile.shape, *values.shape[y + 2 :])
+            whole = self.values.setdefault(path, np.empty(shape, values.dtype))
+            whole[variable.index(part)] = values
+
+    def leave_out(self, excluded: NDArray[np.bool_]) -> None:
+        """Take the values of excluded pixels (y, x) away, and give them their word."""
+        for path, values in self.values.items():
             if values.dtype.kind == "f":
-                values[(slice(None), excluded) if first_is_sample(name) else excluded] = np.nan
-        arrays[status][excluded] = int(FitStatus.EXCLUDED)
+                values[(slice(None),) * VARIABLES[path].dims.index("y") + (excluded,)] = np.nan
+        self.values["fit/fit_status"][excluded] = int(FitStatus.EXCLUDED)
+
+    def write(self, store: RunStore) -> None:
+        """Write them into a run."""
+        for path, values in self.values.items():
+            store.write(path, VARIABLES[path].index(self._tile.region), values)
 
 
-def first_is_sample(name: str) -> bool:
-    """Tell whether the first dimension of an array is the sample."""
-    return name.startswith("samples/") and name != "samples/covariance"
-
-
-def create_fit_maps(context: StageContext) -> None:
-    """Make the maps that the fit will have; the words of its status are explained with them."""
+def create_fit_arrays(context: StageContext) -> None:
+    """Make the arrays that the fit will have; the words of its status are explained with them."""
     left_out = {"fit_status", *(() if context.model.effects else FREE_SATELLITES)}
     if context.config.fit.intervals == "normal":
         left_out |= {path for name in INTERVALS for path in interval_names(name)}
-    context.create_maps([v.path for v in variables_of("fit") if v.name not in left_out])
-    context.create_maps(
-        ["fit/fit_status"],
+    context.create(*(v.path for v in variables_of("fit") if v.name not in left_out))
+    context.create(
+        "fit/fit_status",
         flag_masks=[int(bit) for bit in MEANINGS],
         flag_meanings=" ".join(str(bit.name).lower() for bit in MEANINGS),
         flag_sentences={str(bit.name).lower(): sentence for bit, sentence in MEANINGS.items()},
     )
+    if n := len(context.sensor.samples):
+        lengths = {"sample": n, "sample_parameter": n + 3, "sample_parameter_2": n + 3}
+        context.create(*(f"samples/{name}" for name in _OF_SAMPLES), lengths=lengths)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,18 +23,23 @@ from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.run.model_versions import ModelVersion, read_added_exposure
 from pchem_pipeline.run.progress import parts_told
 from pchem_pipeline.run.stage import StageContext, open_store
-from pchem_pipeline.stages.fit.arrays import create_fit_maps, leave_out_excluded
+from pchem_pipeline.stages.fit.arrays import TileArrays, create_fit_arrays
 from pchem_pipeline.stages.fit.code_sums import CodeSums
 from pchem_pipeline.stages.fit.fitted_model import pixel_places
 from pchem_pipeline.stages.fit.model_fit import fit_arrays, fit_model
-from pchem_pipeline.stages.fit.samples import fit_samples
+from pchem_pipeline.stages.fit.samples import SampleFit, fit_samples_tile
 from pchem_pipeline.stages.fit.start import drop_fit, kept_fit
 from pchem_pipeline.stages.fit.together import judge_sensor
+from pchem_pipeline.stages.samples import sample_targets
+from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile
 
 _HISTOGRAM = ("counts", "origin", "under", "over")
+#: what the summaries of the tiles count
+_COUNTED = ("pixels", "poor", "rounded")
+_SUSPICIOUS_SHARE = 0.2  # of pixels in poor agreement, from which the samples themselves are in doubt
 #: of all that is kept of a pixel of a tile until it is written, twice
 _PIXEL_BYTES = 2 * 40 * 8
 
@@ -79,32 +85,75 @@ def fit_tile(
     return {name: array.reshape(shape + array.shape[1:]) for name, array in arrays.items()}
 
 
+@dataclass(frozen=True)
+class _Job:
+    """How tiles are fitted.
+
+    Attributes:
+        store: path of the run.
+        samples: paths of the runs of its samples; none of a run of one.
+        how: several samples are fitted.
+        model: of the run.
+    """
+
+    store: Path
+    samples: tuple[Path, ...]
+    how: SampleFit
+    model: ModelVersion
+
+    def tile(
+        self,
+        histograms: Sequence[Mapping[str, NDArray[Any]]],
+        start: NDArray[np.float64] | None = None,
+        added: AddedExposure | None = None,
+        places: PixelPlaces | None = None,
+    ) -> dict[str, NDArray[Any]]:
+        """Return the arrays of some pixels by path; the arguments are those of the two tile functions."""
+        how = self.how
+        if self.samples:
+            return fit_samples_tile(histograms, how, places)
+        options = (how.settings, how.adc_limits, how.effects, how.set_aside, start, added, places)
+        return {f"fit/{name}": values for name, values in fit_tile(histograms[0], *options).items()}
+
+
 def run(context: StageContext) -> None:
-    """Fit every tile whose histograms are there.
+    """Fit every tile whose histograms are there, all samples of a run together.
 
     Raises:
         StoreError: the histograms are missing, or the store refuses.
     """
-    if context.sensor.samples:
-        fit_samples(context)
-        return
-    create_fit_maps(context)
-    if not context.executor.shares_memory:
-        _compile(context.store.array("histogram/counts").dtype, context.model.effects)
-    task = functools.partial(
-        _do_tile,
-        store=context.store.path,
-        settings=context.config.fit,
-        adc_limits=context.adc_limits,
-        model=context.model,
+    samples, store, model = context.sensor.samples, context.store, context.model
+    create_fit_arrays(context)
+    how = SampleFit(
+        [sample.bias for sample in samples],
+        context.sensor.shown,
+        context.config.fit,
+        context.adc_limits,
+        model.effects,
+        model.settings.set_aside_e,
     )
-    counts = context.store.array("histogram/counts")
-    held = context.tile_pixels * (2 * counts.shape[2] * counts.dtype.itemsize + _PIXEL_BYTES)
-    done = context.run_units(context.tiles(), task, needs="histogram", unit_bytes=held)
-    judge_sensor(context)
-    if len(done) == context.n_keys:
-        drop_fit(context.store.path)
-    biased, pixels = (sum(tile.get(key, 0) for tile in done.values()) for key in ("rounded", "pixels"))
+    runs = tuple(target.store for target in sample_targets(context.config, context.base_dir))
+    job = _Job(store.path, runs, how, model)
+    counts = [each.array("histogram/counts") for each in ([RunStore.open(run) for run in runs] or [store])]
+    if not context.executor.shares_memory:
+        _compile(job, counts[0].dtype)
+    pixel_bytes = 2 * sum(each.shape[2] * each.dtype.itemsize for each in counts) + _PIXEL_BYTES
+    done = context.run_units(
+        context.tiles(),
+        functools.partial(_do_tile, job=job),
+        needs="histogram",
+        unit_bytes=context.tile_pixels * pixel_bytes,
+    )
+    if not samples:
+        judge_sensor(context)
+        if len(done) == context.n_keys:
+            drop_fit(store.path)
+    pixels, poor, biased = (sum(tile.get(key, 0) for tile in done.values()) for key in _COUNTED)
+    if poor > _SUSPICIOUS_SHARE * pixels:
+        context.note(
+            f"{100 * poor / pixels:.0f} % of the pixels disagree with common g, mu and sigma for all "
+            "samples: check that all have the same sensor, gain, offset and temperature"
+        )
     if biased:
         share = f"{100 * biased / pixels:.1f} %" if biased >= 0.001 * pixels else "fewer than 0.1 %"
         context.note(
@@ -113,57 +162,51 @@ def run(context: StageContext) -> None:
         )
 
 
-def _compile(dtype: np.dtype[Any], effects: Sequence[Effect]) -> None:
+def _compile(job: _Job, dtype: np.dtype[Any]) -> None:
     """Compile the kernels once, into the cache, before other processes do it all at the same time."""
-    histogram = {name: np.zeros((1, 1), np.int32) for name in ("origin", "under", "over")}
-    everywhere = [effect.at_place(None) for effect in effects]
-    fit_tile({"counts": np.ones((1, 1, 8), dtype), **histogram}, FitSettings(), None, everywhere)
+    histogram: dict[str, NDArray[Any]] = {name: np.zeros((1, 1), np.int32) for name in _HISTOGRAM[1:]}
+    histogram["counts"] = np.ones((1, 1, 8), dtype)
+    everywhere = [effect.at_place(None) for effect in job.how.effects]
+    how = replace(job.how, effects=everywhere, adc_limits=None)
+    replace(job, how=how).tile([histogram] * max(1, len(job.samples)))
 
 
-def _do_tile(
-    tile: Tile,
-    *,
-    store: Path,
-    settings: FitSettings,
-    adc_limits: tuple[int, int] | None,
-    model: ModelVersion,
-) -> dict[str, Any]:
+def _do_tile(tile: Tile, *, job: _Job) -> dict[str, Any]:
     """Fit one tile of the store; the summary counts its pixels, and the samples of each code."""
-    run_store = open_store(store)
-    histogram = {name: run_store.read(f"histogram/{name}", tile.region) for name in _HISTOGRAM}
-    start = kept_fit(store, tile.region)
-    effects, set_aside = model.effects, model.settings.set_aside_e
-    added = read_added_exposure(run_store, model, tile.region)
-    arrays: dict[str, NDArray[Any]] = {}
-    bins = histogram["counts"].shape[2]
-    codes = CodeSums(histogram["origin"], bins)
+    store = open_store(job.store)
+    runs = [RunStore.open(path) for path in job.samples] or [store]
+    histograms = [each.read_arrays("histogram", _HISTOGRAM, tile.region) for each in runs]
+    start = added = codes = None
+    bins = sum(each["counts"].shape[2] for each in histograms)
+    if not job.samples:
+        start, added = kept_fit(job.store, tile.region), read_added_exposure(store, job.model, tile.region)
+        codes = CodeSums(histograms[0]["origin"], bins)
+    arrays = TileArrays(tile)
     for part in parts_told(tile.parts(bins)):
-        some = {name: values[part] for name, values in histogram.items()}
-        found = fit_tile(
+        some = [{name: values[part] for name, values in each.items()} for each in histograms]
+        found = job.tile(
             some,
-            settings,
-            adc_limits,
-            effects,
-            set_aside,
             None if start is None else start[part],
             None if added is None else added.of(part),
-            pixel_places(run_store, tile.within(part)),
+            pixel_places(store, tile.within(part)),
         )
-        codes.add(some, found)
-        for name, values in found.items():
-            whole = arrays.setdefault(name, np.empty(tile.shape + values.shape[2:], values.dtype))
-            whole[part] = values
-    leave_out_excluded(arrays, "fit_status", [run_store], tile.region)
-    for name, array in arrays.items():
-        run_store.write(f"fit/{name}", tile.region, array)
-    words = arrays["fit_status"]
+        if codes is not None:
+            codes.add(some[0], {name: found[f"fit/{name}"] for name in PARAMETERS})
+        arrays.add(part, found)
+    for each in runs:
+        if each.has("frames/excluded"):
+            arrays.leave_out(each.read("frames/excluded", tile.region) != 0)
+    arrays.write(store)
+    words = arrays.values["fit/fit_status"]
     summary: dict[str, Any] = {
         "pixels": int(words.size),
         "failed": int(np.count_nonzero(words & np.uint16(int(FAILED & ~FitStatus.EXCLUDED)))),
-        "codes": codes.content(),
     }
-    if settings.likelihood == "density" and not effects:
-        counts = histogram["counts"].sum(axis=2, dtype=np.float64)
-        biased = biased_by_rounding([arrays[name].ravel() for name in PARAMETERS], counts.ravel())
-        summary["rounded"] = int(np.count_nonzero(biased))
+    if codes is None:
+        return {**summary, "poor": int(np.count_nonzero(words & np.uint16(int(FitStatus.POOR_FIT))))}
+    summary["codes"] = codes.content()
+    if job.how.settings.likelihood == "density" and not job.how.effects:
+        frames = histograms[0]["counts"].sum(axis=2, dtype=np.float64)
+        maps = [arrays.values[f"fit/{name}"].ravel() for name in PARAMETERS]
+        summary["rounded"] = int(np.count_nonzero(biased_by_rounding(maps, frames.ravel())))
     return summary

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
-from pchem_pipeline.run.model_versions import Region, model_of, read_added_exposure
+from pchem_pipeline.run.model_versions import ModelVersion, Region, model_of, read_added_exposure
 from pchem_pipeline.run.sensor import SensorInfo
 
 if TYPE_CHECKING:
@@ -33,14 +34,49 @@ def fitted_effects(store: RunStore) -> tuple[Effect, ...]:
     return () if version is None else version.effects
 
 
-def fitted_added_exposure(store: RunStore, region: Region | None = None) -> AddedExposure | None:
-    """Return the exposure that the effects of the stored fit add to the pixels of a region; None: nothing.
+@dataclass(frozen=True)
+class FittedModel:
+    """The model with which pixels of a run were fitted; without effects the PCD.
 
-    Args:
-        store: the run.
-        region: of the sensor; None: all of it.
+    Attributes:
+        effects: in their order.
+        added: exposure that they add to the pixels, (j, n), the pixels in one axis; None: nothing.
+        version: of the run's model; None without a fit.
+        places: of the pixels; None: not known.
     """
-    return read_added_exposure(store, model_of(store, "fit"), region)
+
+    effects: tuple[Effect, ...] = ()
+    added: AddedExposure | None = None
+    version: ModelVersion | None = None
+    places: PixelPlaces | None = None
+
+    @classmethod
+    def read(cls, store: RunStore, region: Region | None = None) -> FittedModel:
+        """Read that of the pixels of a region of the sensor; None: all of it."""
+        version = model_of(store, "fit")
+        if version is None or not version.effects:
+            return cls(version=version)
+        added = read_added_exposure(store, version, region)
+        places = pixel_places(store, region)
+        return cls(version.effects, None if added is None else added.flat(), version, places)
+
+    def at(self, index: NDArray[np.int64]) -> FittedModel:
+        """Return the model of some of the pixels."""
+        return replace(
+            self,
+            added=None if self.added is None else self.added.of(index),
+            places=None if self.places is None else self.places.of(index),
+        )
+
+    def law(self, maps: Sequence[NDArray[np.float64]], *, without: Sequence[str] = ()) -> SampleLaw:
+        """Return the law of the samples of the pixels.
+
+        Args:
+            maps: their fitted (H, g, mu, sigma); NaN where the fit failed.
+            without: tags of effects to leave out.
+        """
+        effects = [effect for effect in self.effects if effect.tag not in without]
+        return sample_law(effects, pixel_maps(maps, np.ones(maps[0].shape, bool)), self.added, self.places)
 
 
 def pixel_places(store: RunStore, region: Region | None = None) -> PixelPlaces:
@@ -48,26 +84,6 @@ def pixel_places(store: RunStore, region: Region | None = None) -> PixelPlaces:
     sensor = SensorInfo.read(store)
     frames = sensor.n_frames if sensor.kind == "frames" else 0
     return PixelPlaces.of_block(region, sensor.shape, np.arange(frames))
-
-
-def fitted_law(
-    store: RunStore,
-    maps: Sequence[NDArray[np.float64]],
-    region: Region | None = None,
-    *,
-    without: Sequence[str] = (),
-) -> SampleLaw:
-    """Return the law of the samples of the pixels of a region, under the model of the stored fit.
-
-    Args:
-        store: the run.
-        maps: fitted (H, g, mu, sigma) of the region; NaN where the fit failed.
-        region: of the sensor; None: all of it.
-        without: tags of effects to leave out.
-    """
-    effects = [effect for effect in fitted_effects(store) if effect.tag not in without]
-    known = pixel_maps(maps, np.ones(maps[0].shape, bool))
-    return sample_law(effects, known, fitted_added_exposure(store, region), pixel_places(store, region))
 
 
 def fitted_satellites(
@@ -85,4 +101,5 @@ def fitted_pixels(store: RunStore, region: Region | None = None) -> KnownPixels:
     from pchem_pipeline.model.electrons.electrons import KnownPixels  # loads compiled loops
 
     maps = [store.read(f"fit/{name}", region) for name in PARAMETERS]
-    return KnownPixels(maps, fitted_law(store, maps, region), fitted_satellites(store, region))
+    law = FittedModel.read(store, region).law(maps)
+    return KnownPixels(maps, law, fitted_satellites(store, region))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,10 +10,18 @@ from pchem_pipeline.model.errors.fisher import CORRELATION_PAIRS
 from pchem_pipeline.model.fit.status import FitStatus, moves_gain
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import equal_rows
 
 _LARGEST_POOL = 2**19  # pixels: every so many-th of a larger sensor
 _LARGEST_KEPT = 2**22  # pixels, 24 bytes each
 _GAIN, _SIGMA = 1, 3  # places in ``variables.PARAMETERS``
+_READ = (
+    "conversion_gain",
+    "read_noise_dn",
+    "conversion_gain_stderr",
+    "read_noise_dn_stderr",
+    "likelihood_gap",
+)
 _PAIR = CORRELATION_PAIRS.index((_GAIN, _SIGMA))
 
 _Region = tuple[slice, slice]
@@ -32,7 +38,7 @@ def judge_sensor(context: StageContext) -> int:
         StoreError: the store refuses.
     """
     store, shape = context.store, context.sensor.shape
-    bands = list(_bands(shape, context.tile[0]))
+    bands = [(slice(*rows), slice(0, shape[1])) for rows in equal_rows(shape[0], context.tile[0])]
     every = -(-shape[0] * shape[1] // _LARGEST_POOL)
     kept: dict[int, Judged] = {}  # of a sensor that is not large: nothing is read twice
     chosen = []
@@ -61,24 +67,13 @@ def judge_sensor(context: StageContext) -> int:
     return found
 
 
-def _bands(shape: tuple[int, int], rows: int) -> Iterator[_Region]:
-    """Return the rows of the sensor, as high as a tile: whole chunks."""
-    for first in range(0, shape[0], rows):
-        yield slice(first, min(first + rows, shape[0])), slice(0, shape[1])
-
-
 def _exposure(store: RunStore, band: _Region) -> NDArray[np.float64]:
     return store.read("fit/quanta_exposure", band).ravel()
 
 
 def _judged(store: RunStore, band: _Region) -> Judged:
     """Return the pixels of a band, in order; NaN where they are not fitted."""
-    gain, sigma, of_gain, of_sigma, gap = (
-        store.read(f"fit/{name}", band).ravel()
-        for name in (
-            "conversion_gain", "read_noise_dn", "conversion_gain_stderr", "read_noise_dn_stderr",
-            "likelihood_gap",
-        )
-    )  # fmt: skip
+    fit = store.read_arrays("fit", _READ, band)
+    gain, sigma, of_gain, of_sigma, gap = (values.ravel() for values in fit.values())
     together = store.read("fit/correlation", (*band, slice(_PAIR, _PAIR + 1))).ravel()
     return Judged(*noise_of(gain, sigma, of_gain, of_sigma, together), gap)

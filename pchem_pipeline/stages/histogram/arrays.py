@@ -32,19 +32,14 @@ def row_frames(ny: int) -> int:
 
 
 def create_counts(context: StageContext, bins: int, dtype: Any) -> None:
-    """Make the array of the histograms: a file for each tile, of pieces that can be read by themselves."""
-    chunks, shards = counts_layout(context, bins)
-    shape = (*context.sensor.shape, bins)
-    context.create("histogram/counts", shape, chunks=chunks, shards=shards, dtype=dtype)
-
-
-def counts_layout(context: StageContext, bins: int) -> tuple[tuple[int, ...], tuple[int, ...] | None]:
-    """Return the chunks of the histograms, and the shards; None where a chunk is a tile."""
+    """Make the arrays of the histograms; counts are a file for each tile, of pieces that are read alone."""
     tile = tuple(min(size, length) for size, length in zip(context.tile, context.sensor.shape, strict=True))
-    if math.prod(tile) <= _FEW_PIXELS:
-        return (*tile, bins), None
-    read = (_part(side, most) for side, most in zip(tile, (_READ_ROWS, _READ_COLUMNS), strict=True))
-    return (*read, bins), (*tile, bins)
+    chunks, shards = {}, None
+    if math.prod(tile) > _FEW_PIXELS:
+        chunks = {"y": _part(tile[0], _READ_ROWS), "x": _part(tile[1], _READ_COLUMNS)}
+        shards = (*tile, bins)
+    context.create("histogram/counts", lengths={"bin": bins}, chunks=chunks, shards=shards, dtype=dtype)
+    context.create(*(f"histogram/{name}" for name in MAPS))
 
 
 def _part(side: int, most: int) -> int:
@@ -56,28 +51,23 @@ def _part(side: int, most: int) -> int:
 def create_arrays(context: StageContext, shape: tuple[int, int, int], bins: int) -> None:
     """Make the arrays of the stage for a stack of some shape (frames, rows, columns)."""
     n_frames, ny, nx = shape
-    settings, tile = context.config.histogram, context.tile
+    settings = context.config.histogram
     create_counts(context, bins, counts_dtype(n_frames))
-    context.create_maps([f"histogram/{name}" for name in MAPS])
     if not settings.summaries:
         context.store.set_attributes("summary", {"missing": "histogram.summaries: false"})
         return
-    context.create_maps([f"summary/{name}" for name in COVARIANCES])
-    for name, length in (("open_sums", 7), ("open_covariances", 3)):
-        context.create(f"summary/{name}", (length, ny, nx), chunks=(length, *tile))
     length = settings.block_length(n_frames)
     starts = block_starts(n_frames, length)
-    rows = max(tile[0], ROW_GROUP)
-    for name in ("block_sum", "block_sum_square"):
-        context.create(f"summary/{name}", (starts.size, ny, nx), chunks=(CHUNK_BLOCKS, rows, nx))
-    for name in ("row_sum", "row_sum_square"):
-        context.create(f"summary/{name}", (n_frames, ny), chunks=(row_frames(ny), rows))
+    lengths = {"frame": n_frames, "block": starts.size, "row_group": -(-ny // ROW_GROUP), "sum": 7, "lag": 3}
     context.create(
-        "summary/column_sum",
-        (n_frames, -(-ny // ROW_GROUP), nx),
-        chunks=(COLUMN_FRAMES, rows // ROW_GROUP, nx),
-        rows=ROW_GROUP,
+        *(f"summary/{name}" for name in (*COVARIANCES, "open_sums", "open_covariances")), lengths=lengths
     )
+    rows = max(context.tile[0], ROW_GROUP)
+    chunks = {"frame": row_frames(ny), "block": CHUNK_BLOCKS, "y": rows, "x": nx}
+    names = ("block_sum", "block_sum_square", "row_sum", "row_sum_square")
+    context.create(*(f"summary/{name}" for name in names), lengths=lengths, chunks=chunks)
+    chunks |= {"frame": COLUMN_FRAMES, "row_group": rows // ROW_GROUP}
+    context.create("summary/column_sum", lengths=lengths, chunks=chunks, rows=ROW_GROUP)
     if context.fresh:
         context.store.write_array("summary/block_start", starts, {"frames": n_frames, "block": length})
 
@@ -94,10 +84,8 @@ def extend_arrays(context: StageContext, shape: tuple[int, int, int], bins: int)
     length = with_block_length(context.config.histogram, store).block_length(n_frames)
     open_store.cache_clear()
     if store.array("histogram/counts").dtype != counts_dtype(n_frames):
-        chunks, shards = counts_layout(context, bins)
-        store.create_array(
-            "histogram/counts", (*shape[1:], bins), chunks=chunks, shards=shards, dtype=counts_dtype(n_frames)
-        )
+        store.delete("histogram/counts")
+        create_counts(context, bins, counts_dtype(n_frames))
     if context.config.input.mode == "copy":
         store.resize("frames/dn", n_frames)
     if context.config.histogram.summaries:

@@ -20,7 +20,7 @@ from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistog
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,
-    CovarianceMaps,
+    BlockSums,
     OpenSums,
     SummaryAccumulator,
     line_sums,
@@ -35,69 +35,6 @@ if TYPE_CHECKING:
 _HISTOGRAMS = ("counts", "origin", "under", "over", "minimum", "maximum")
 _ALONG_TIME = ("block_sum", "block_sum_square", "row_sum", "row_sum_square", "column_sum")
 _OPEN = ("open_sums", "open_covariances")
-
-Emit = Callable[[str, NDArray[Any]], None]
-
-
-class TileCounter:
-    """Histograms and summaries of the pixels of some rows, in memory."""
-
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        bins: int,
-        n_frames: int,
-        settings: HistogramSettings,
-        emit: Emit | None = None,
-    ) -> None:
-        """Begin with no frames.
-
-        Args:
-            shape: rows (from the top of a group of rows) and columns.
-            bins: bins of a pixel.
-            n_frames: number of frames to come.
-            settings: the section ``histogram``.
-            emit: told of each piece of the arrays along time as it comes: the variable's name in the group
-                ``summary``, and its next rows (first axis: frame or block).
-        """
-        self._emit: Emit = emit or (lambda name, part: None)
-        self._histograms = HistogramAccumulator(shape, bins, n_frames)
-        self._summaries = (
-            SummaryAccumulator(shape, settings.block_length(n_frames)) if settings.summaries else None
-        )
-
-    def resume(self, histograms: HistogramAccumulator, summaries: SummaryAccumulator | None) -> None:
-        """Go on from frames that were counted before."""
-        self._histograms, self._summaries = histograms, summaries
-
-    def add(self, frames: NDArray[Any]) -> None:
-        """Take the next frames, (frame, y, x); the first time those that decide the windows.
-
-        Raises:
-            InputError: DN of more than 24 bits.
-        """
-        self._histograms.add(frames)
-        if self._summaries is not None:
-            for sums in self._summaries.add(frames):
-                self._emit_parts({name: part[None] for name, part in vars(sums).items()})
-            self._emit_parts(vars(line_sums(frames)))
-
-    def open_sums(self) -> OpenSums | None:
-        """Return what the summaries need to go on later, to be taken before `finish`."""
-        return None if self._summaries is None else self._summaries.open_sums()
-
-    def finish(self) -> tuple[RowHistograms, CovarianceMaps | None]:
-        """Return the histograms, and the covariances, or None without summaries."""
-        if self._summaries is None:
-            return self._histograms.finish(), None
-        rest, covariances = self._summaries.finish()
-        for sums in rest:
-            self._emit_parts({name: part[None] for name, part in vars(sums).items()})
-        return self._histograms.finish(), covariances
-
-    def _emit_parts(self, parts: dict[str, NDArray[Any]]) -> None:
-        for name, part in parts.items():
-            self._emit(name, part)
 
 
 class _AlongTime:
@@ -230,59 +167,71 @@ class _BandCounter:
         self._done = dict.fromkeys(_ALONG_TIME, 0)
         self._settings, self._shape = with_block_length(job.settings, open_store(job.store)), job.shape
         shape = (y1 - y0, job.shape[2])
-        self._counter = TileCounter(shape, job.bins, job.shape[0], self._settings, self._emit)
-        first = self._settings.summaries and y0 == 0
-        self._spectrum = FrameSpectrum((min(shape[0], ROW_GROUP), shape[1])) if first else None
+        self._histograms = HistogramAccumulator(shape, job.bins, job.shape[0])
+        self._summaries: SummaryAccumulator | None = None
+        self._spectrum: FrameSpectrum | None = None
+        if self._settings.summaries:
+            self._summaries = SummaryAccumulator(shape, self._settings.block_length(job.shape[0]))
+            self._spectrum = FrameSpectrum((min(shape[0], ROW_GROUP), shape[1])) if y0 == 0 else None
 
     def resume(self, n_frames: int) -> None:
         """Go on behind the frames that the run has counted, see `StackCounter.resume`."""
         opened, self._spectrum = open_store(self._store), None  # that of the first frames is there
-        held = RowHistograms(**{name: self._read(f"histogram/{name}") for name in _HISTOGRAMS})
-        histograms = HistogramAccumulator.resumed(held, self._shape[0])
-        if not self._settings.summaries:
-            self._counter.resume(histograms, None)
+        region = self._rows, slice(None)
+        held = RowHistograms(**opened.read_arrays("histogram", _HISTOGRAMS, region))
+        self._histograms = HistogramAccumulator.resumed(held, self._shape[0])
+        if self._summaries is None:
             return
-        region = (slice(None), self._rows, slice(None))
-        state = OpenSums(*(opened.read(f"summary/{name}", region) for name in _OPEN))
+        state = OpenSums(*opened.read_arrays("summary", _OPEN, region).values())
         length = self._settings.block_length(n_frames)
-        self._counter.resume(histograms, SummaryAccumulator.resumed(state, n_frames, length))
+        self._summaries = SummaryAccumulator.resumed(state, n_frames, length)
         blocks = n_frames // length
         self._done = {name: blocks if name.startswith("block") else n_frames for name in _ALONG_TIME}
 
-    def _read(self, name: str) -> NDArray[Any]:
-        return open_store(self._store).read(name, (self._rows,))
-
     def add(self, frames: NDArray[Any]) -> None:
-        """Take the next frames, (frame, y, x) of these rows; see `TileCounter.add`."""
-        self._counter.add(frames)
+        """Take the next frames, (frame, y, x) of these rows; the first time those that decide the windows.
+
+        Raises:
+            InputError: DN of more than 24 bits.
+        """
+        self._histograms.add(frames)
+        if self._summaries is not None:
+            for sums in self._summaries.add(frames):
+                self._add_sums(sums)
+            for name, part in vars(line_sums(frames)).items():
+                self._along(name).add(part)
         if self._spectrum is not None:
             self._spectrum.add(frames[:, :ROW_GROUP])
 
     def finish(self) -> None:
         """Write all that was not written on the way."""
-        state = self._counter.open_sums()
-        histograms, covariances = self._counter.finish()
-        # it knows this one, and this one it: what both hold would wait for the search for cyclic garbage
-        del self._counter
-        for each in self._series.values():
-            each.flush()
-        opened = open_store(self._store)
-        for name, values in vars(histograms).items():
+        histograms, summaries = self._histograms, self._summaries
+        del self._histograms, self._summaries  # what is done holds no memory
+        opened, region = open_store(self._store), (self._rows, slice(None))
+        if summaries is not None:
+            state = summaries.open_sums()
+            rest, covariances = summaries.finish()
+            for sums in rest:
+                self._add_sums(sums)
+            for each in self._series.values():
+                each.flush()
+            opened.write_arrays("summary", vars(covariances), region)
+            opened.write_arrays("summary", dict(zip(_OPEN, vars(state).values(), strict=True)), region)
+        for name, values in vars(histograms.finish()).items():
             # file by file: of each that is written there are copies in memory
             step = opened.file_shape(f"histogram/{name}")[1]
             for x in range(0, values.shape[1], step):
                 opened.write(f"histogram/{name}", (self._rows, slice(x, x + step)), values[:, x : x + step])
         if self._spectrum is not None:
             opened.set_attributes("summary", {"spectrum": self._spectrum.line()})
-        if covariances is not None:
-            for name, values in vars(covariances).items():
-                opened.write(f"summary/{name}", (self._rows, slice(None)), values)
-        if state is not None:
-            for name, values in zip(_OPEN, vars(state).values(), strict=True):
-                opened.write(f"summary/{name}", (slice(None), self._rows, slice(None)), values)
 
-    def _emit(self, name: str, part: NDArray[Any]) -> None:
+    def _add_sums(self, sums: BlockSums) -> None:
+        for name, part in vars(sums).items():
+            self._along(name).add(part[None])
+
+    def _along(self, name: str) -> _AlongTime:
+        """Return what gathers an array along time."""
         if name not in self._series:
             rows = self._groups if name == "column_sum" else self._rows
             self._series[name] = _AlongTime(self._store, f"summary/{name}", rows, self._done[name])
-        self._series[name].add(part)
+        return self._series[name]

@@ -14,14 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.count import RowHistograms, choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.odd_frames import odd_frames
-from pchem_pipeline.model.histogram.summaries import frame_statistics
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP, frame_statistics
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
 from pchem_pipeline.stages.bands import Band, plan_bands
@@ -31,15 +29,11 @@ from pchem_pipeline.stages.histogram.memory import bytes_per_row
 from pchem_pipeline.stages.histogram.odd_frames import leave_out_odd_frames
 from pchem_pipeline.stages.samples import sample_targets
 from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import equal_rows
 
 if TYPE_CHECKING:
-    from pchem_pipeline.compute.executor import Outcome
     from pchem_pipeline.frames.histogram_files import HistogramInput
     from pchem_pipeline.store.tiles import Tile
-
-#: samples that one process looks through in a second or so
-_FEW_SAMPLES = 1 << 31
-
 
 # -- the stage ----------------------------------------------------------------------------------
 
@@ -118,33 +112,30 @@ def _pixels_outside(context: StageContext, area: Band | Tile) -> int:
 
 def _decide_bins(context: StageContext, source: FrameSource) -> int:
     """Return the number of bins of the sensor, from its first frames."""
-    limit = most_bins(context.config.histogram.max_bins, source.dtype)
-    settings = context.config.histogram
-    task = functools.partial(_ranges_of_band, source=source, frames=settings.window_frames, max_bins=limit)
-    outcomes: list[Outcome] = []
-    n_frames, _, columns = source.shape
+    settings, (n_frames, ny, columns) = context.config.histogram, source.shape
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, 0, settings)
-    tiles = context.tiles()
-    most = _band_bytes(context) // row
-    everything = {tile.key for tile in tiles}
-    bands = plan_bands(tiles, everything, most, context.executor.workers, source.rows_per_read)
+    most, together = max(ROW_GROUP, _band_bytes(context) // row), min(source.rows_per_read, ny)
     context.stop.check()
-    # starting other processes takes longer than this does on all but huge sensors
-    few = settings.window_frames * math.prod(source.shape[1:]) < _FEW_SAMPLES
-    executor = SerialExecutor() if few and not context.executor.shares_memory else context.executor
-    executor.map(task, bands, lambda band, outcome: outcomes.append(outcome))
-    for outcome in outcomes:
-        if outcome.error is not None:
-            raise outcome.error
-    return choose_bins(np.sum([outcome.value for outcome in outcomes], axis=0), limit)
+    limit = most_bins(settings.max_bins, source.dtype)
+    return bins_of(source, settings.window_frames, limit, most // together * together or most)
 
 
-def _ranges_of_band(band: Band, *, source: FrameSource, frames: int, max_bins: int) -> NDArray[np.int64]:
-    n_frames, _, columns = source.shape
-    frames = min(frames, n_frames)
-    block = np.empty((frames, band.y1 - band.y0, columns), source.dtype)
-    source.read_into(block, 0, frames, band.y0, band.y1)
-    return pixels_by_range(block, max_bins)
+def bins_of(source: FrameSource, frames: int, most: int, rows: int) -> int:
+    """Return the number of bins that the histograms of a sensor need.
+
+    Args:
+        source: its frames.
+        frames: the first ones, which are looked at.
+        most: number of bins at most.
+        rows: that are read at once.
+    """
+    n_frames, ny, columns = source.shape
+    ranges = np.zeros(most + 2, np.int64)
+    for y0, y1 in equal_rows(ny, rows):
+        block = np.empty((min(frames, n_frames), y1 - y0, columns), source.dtype)
+        source.read_into(block, 0, block.shape[0], y0, y1)
+        ranges += pixels_by_range(block, most)
+    return choose_bins(ranges, most)
 
 
 def _do_band(band: Band, *, job: CountJob, source: FrameSource, threads: int) -> None:
@@ -205,15 +196,13 @@ def _copy_shown_sample(context: StageContext) -> None:
 def _copied(context: StageContext, counts: Any, missing: str, task: Callable[[Tile], Any]) -> None:
     """Make the arrays, as wide as ``counts``, and do all tiles; summaries are ``missing`` for that reason."""
     create_counts(context, counts.shape[2], counts.dtype)
-    context.create_maps([f"histogram/{name}" for name in MAPS])
     context.store.set_attributes("summary", {"missing": missing})
     context.run_units(context.tiles(), task)
 
 
 def _copy_sample_tile(tile: Tile, *, store: Path, sample: Path) -> None:
-    source, target = RunStore.open(sample), open_store(store)
-    for name in ("counts", *MAPS):
-        target.write(f"histogram/{name}", tile.region, source.read(f"histogram/{name}", tile.region))
+    arrays = RunStore.open(sample).read_arrays("histogram", ("counts", *MAPS), tile.region)
+    open_store(store).write_arrays("histogram", arrays, tile.region)
 
 
 def _copy_tile(tile: Tile, *, store: Path, given: HistogramInput) -> None:
@@ -228,5 +217,4 @@ def _copy_tile(tile: Tile, *, store: Path, given: HistogramInput) -> None:
         minimum=(origin + occupied.argmax(axis=2)).astype(np.int32),
         maximum=(origin + last - occupied[:, :, ::-1].argmax(axis=2)).astype(np.int32),
     )
-    for name, part in vars(values).items():
-        open_store(store).write(f"histogram/{name}", tile.region, part)
+    open_store(store).write_arrays("histogram", vars(values), tile.region)

@@ -14,6 +14,7 @@ from pchem_pipeline.model.histogram.odd_frames import KINDS, FloatArray, IntArra
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, SummaryAccumulator
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.stages.histogram.arrays import COVARIANCES, MAPS, with_block_length
+from pchem_pipeline.store.tiles import equal_rows
 
 if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
@@ -87,7 +88,7 @@ def _leave_out_of_sums(context: StageContext, changed: IntArray, out: IntArray) 
     length = with_block_length(context.config.histogram, store).block_length(n_frames)
     kept = ~np.isin(np.arange(n_frames), out)
     step = max(context.tile[0], ROW_GROUP)
-    for rows in ((y0, min(y0 + step, ny)) for y0 in range(0, ny, step)):
+    for rows in equal_rows(ny, step):
         band = (slice(None), slice(*rows), slice(None))
         state = OpenSums(*(store.read(f"summary/open_{name}", band) for name in ("sums", "covariances")))
         sums = SummaryAccumulator.resumed(state, n_frames, length)

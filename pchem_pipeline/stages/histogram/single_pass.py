@@ -12,8 +12,8 @@ from __future__ import annotations
 import functools
 import itertools
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,12 +24,13 @@ from pchem_pipeline.compute.environment import cpu_seconds
 from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.config.memory import allowed_bytes, worker_count
 from pchem_pipeline.frames.histogram_files import is_histogram_input
-from pchem_pipeline.frames.identity import quick_identity
+from pchem_pipeline.frames.identity import file_size, quick_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.frames.stream import HashedFrameStream
 from pchem_pipeline.model.histogram.count import choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.run.input_identity import identity_is_new, keep_identity
+from pchem_pipeline.run.progress import whole_mebibytes
 from pchem_pipeline.run.stage import Prepared, StageContext
 from pchem_pipeline.stages import ingest
 from pchem_pipeline.stages.bands import cut_rows
@@ -39,8 +40,9 @@ from pchem_pipeline.stages.histogram.memory import single_pass_bytes, single_pas
 from pchem_pipeline.stages.table import STAGES
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pchem_pipeline.frames.sequence import FrameSequence
-    from pchem_pipeline.frames.stream import Rows
 
 #: the stages whose arrays one pass makes
 PREPARED = ("ingest", "histogram")
@@ -62,20 +64,9 @@ def count_in_one_pass(context: StageContext) -> None:
         return
     paths = input_paths(context.config.input, context.base_dir)
     quick = quick_identity(paths)
-    total = sum(int(file["size"]) for file in quick["files"]) >> 20
     for name in PREPARED:
         context.store.records.forget(name)
-    with (
-        context.reporter.progress("ingest and histogram", total, "MiB") as advance,
-        HashedFrameStream(
-            frames,
-            stream_rows(context, frames),
-            context.config.histogram.window_frames,
-            files=paths,
-            threads=worker_count(context.config),
-            advance=whole_mebibytes(advance),
-        ) as stream,
-    ):
+    with hashed_frames(context, frames, context.config.histogram.window_frames, paths) as stream:
         if not _count(context, frames, stream):
             return
         identity = stream.identity()
@@ -91,10 +82,35 @@ def prepared(frames: FrameSequence, clock: tuple[float, float]) -> dict[str, Pre
     return {"ingest": Prepared(frames), "histogram": Prepared(frames, clock)}
 
 
-def stream_rows(context: StageContext, frames: FrameSequence) -> list[Rows]:
-    """Return the bands of rows that the workers share."""
-    step = single_pass_rows(context.config, frames.shape, frames.dtype)
-    return cut_rows(frames.shape[1], step, worker_count(context.config))
+@contextmanager
+def hashed_frames(
+    context: StageContext, frames: FrameSequence, step: int, files: Sequence[Path], first: int = 0
+) -> Iterator[HashedFrameStream]:
+    """Open the stream of frames whose files are hashed as they are read, by bands that the workers share.
+
+    Args:
+        context: of the run.
+        frames: all of them.
+        step: frames of a block.
+        files: that are read.
+        first: frame that they begin with.
+    """
+    workers = worker_count(context.config)
+    rows = single_pass_rows(context.config, frames.shape, frames.dtype)
+    total = sum(file_size(path) for path in files) >> 20
+    with (
+        context.reporter.progress("ingest and histogram", total, "MiB") as advance,
+        HashedFrameStream(
+            frames,
+            cut_rows(frames.shape[1], rows, workers),
+            step,
+            files=files,
+            first=first,
+            threads=workers,
+            advance=whole_mebibytes(advance),
+        ) as stream,
+    ):
+        yield stream
 
 
 def _is_wanted(context: StageContext) -> bool:
@@ -121,20 +137,6 @@ def _fits(context: StageContext, frames: FrameSequence, bins: int) -> bool:
     """Tell whether the memory allowed is enough."""
     need = single_pass_bytes(context.config, frames.shape, frames.dtype, bins)
     return need <= allowed_bytes(context.config, worker_count(context.config))
-
-
-def whole_mebibytes(advance: Callable[[int], None]) -> Callable[[int], None]:
-    """Turn bytes into whole MiB of progress."""
-    done = shown = 0
-
-    def count(n_bytes: int) -> None:
-        nonlocal done, shown
-        done += n_bytes
-        if (done >> 20) > shown:
-            advance((done >> 20) - shown)
-            shown = done >> 20
-
-    return count
 
 
 def _count(context: StageContext, frames: FrameSequence, stream: HashedFrameStream) -> bool:

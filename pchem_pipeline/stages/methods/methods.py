@@ -24,7 +24,7 @@ from pchem_pipeline.methods.registry import methods
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.methods.study import StudyPoint, study_point
 from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
-from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.run.stage import Named, StageContext, open_store
 from pchem_pipeline.stages.methods.chosen import methods_settings
 from pchem_pipeline.stages.methods.other_runs import open_other_runs
 from pchem_pipeline.stages.methods.result import METHODS_FILE
@@ -34,21 +34,11 @@ if TYPE_CHECKING:
 
 #: Pixels whose fit is no reference: no value, or a bias that may be one electron off.
 _NO_REFERENCE = FAILED | AMBIGUOUS
-_BAND_BYTES = 64 << 20
 _DARK_LIMIT = 0.01  # e-: more electrons in the dark sample are remarked
 
 
-@dataclass(frozen=True)
-class _Unit:
-    """The run's pixels, or one read noise of the simulation."""
-
-    key: str
-    point: StudyPoint | None = None
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Its marker."""
-        return (self.key,)
+#: The run's pixels (None), or one read noise of the simulation.
+_Unit = Named[StudyPoint | None]
 
 
 @dataclass(frozen=True)
@@ -63,8 +53,8 @@ class _Task:
     def __call__(self, unit: _Unit) -> dict[str, Any]:
         """Compare the methods and return the numbers as plain data."""
         numbers = Settings(self.settings.em_iterations, self.settings.em_tolerance)
-        if unit.point is not None:
-            return study_point(unit.point, numbers)
+        if unit.content is not None:
+            return study_point(unit.content, numbers)
         return _compare_run(self, numbers)
 
 
@@ -114,13 +104,11 @@ def run(context: StageContext) -> None:
     settings = methods_settings(context)
     others = open_other_runs(context.store, context.base_dir, settings.with_runs)
     n_pixels = min(settings.pixels, context.sensor.ny * context.sensor.nx)
-    for name in ("pixel_y", "pixel_x"):
-        context.create(f"methods/{name}", (n_pixels,), chunks=(n_pixels,))
     names = list(methods())
-    for name in PARAMETERS:
-        shape = (len(names), n_pixels)
-        context.create(f"methods/{name}", shape, chunks=shape, methods=names)
-    units = [_Unit("run"), *_study_units(context, settings)]
+    lengths = {"method": len(names), "pixel": n_pixels}
+    context.create("methods/pixel_y", "methods/pixel_x", lengths=lengths)
+    context.create(*(f"methods/{name}" for name in PARAMETERS), lengths=lengths, methods=names)
+    units = [_Unit("run", None), *_study_units(context, settings)]
     task = _Task(context.store.path, tuple(o.path for o in others), settings, context.adc_limits)
     found = context.run_units(units, task, unit_name="part", by_tiles=False)
     if not {unit.key for unit in units} <= found.keys():
@@ -138,9 +126,8 @@ def run(context: StageContext) -> None:
 
 
 def _conditions(units: Sequence[_Unit]) -> dict[str, Any] | None:
-    if not units or units[0].point is None:
+    if not units or (point := units[0].content) is None:
         return None
-    point = units[0].point
     names = ("quanta_exposure", "conversion_gain", "n_frames", "n_pixels")
     return {name: getattr(point, name) for name in names}
 
@@ -200,19 +187,10 @@ def _readable(path: Path) -> RunStore:
 
 
 def _sample(store: RunStore, shape: tuple[int, int], place: NDArray[np.int64]) -> Sample:
-    """Read the histograms of some pixels, a band of rows at a time."""
-    counts = store.array("histogram/counts")
-    row_bytes = shape[1] * counts.shape[2] * counts.dtype.itemsize
-    rows = max(store.file_shape("histogram/counts")[0], _BAND_BYTES // max(row_bytes, 1))
-    taken = []
-    for first in range(0, shape[0], rows):
-        last = min(first + rows, shape[0])
-        inside = place[(place >= first * shape[1]) & (place < last * shape[1])] - first * shape[1]
-        if inside.size:
-            band = store.read("histogram/counts", (slice(first, last), slice(None), slice(None)))
-            taken.append(band.reshape(-1, band.shape[2])[inside])
-    origin = store.read("histogram/origin").ravel()[place].astype(np.int64)
-    return Sample(np.concatenate(taken), origin)
+    """Read the histograms of some pixels."""
+    y, x = np.divmod(place, shape[1])
+    counts, origin = (store.read_pixels(f"histogram/{name}", y, x) for name in ("counts", "origin"))
+    return Sample(counts, origin.astype(np.int64))
 
 
 def _reference(store: RunStore, place: NDArray[np.int64]) -> tuple[FloatArray, str]:

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from pchem_pipeline.compute.environment import available_workers
 from pchem_pipeline.compute.executor import (
     Executor,
-    Outcome,
     PoolExecutor,
     SerialExecutor,
     can_start_processes,
+    map_all,
 )
 from pchem_pipeline.compute.memory import BASE_BYTES, SECOND_PROGRAM_BYTES
 from pchem_pipeline.compute.settings import ComputeSettings
@@ -51,20 +51,10 @@ def draw_by_workers(workers: int, reporter: Reporter, label: str) -> DrawAll:
 
     def draw(figures: Sequence[Figure], settings: ReportSettings) -> Mapping[str, Drawn]:
         drawn: dict[str, Drawn] = {}
-        errors: list[BaseException] = []
+        task = functools.partial(draw_figure, settings=settings)
         executor = drawing_executor(workers, len(figures))
         with reporter.progress(label, len(figures), "figure") as advance:
-
-            def on_result(figure: Figure, outcome: Outcome) -> None:
-                advance()
-                if outcome.error is None:
-                    drawn[figure.name] = outcome.value
-                else:
-                    errors.append(outcome.error)
-
-            executor.map(functools.partial(draw_figure, settings=settings), figures, on_result)
-        if errors:
-            raise errors[0]
+            map_all(executor, task, figures, lambda each, value: drawn.update({each.name: value}), advance)
         return drawn
 
     return draw

@@ -20,13 +20,12 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, VARIABLES, Variable
 from pchem_pipeline.compute.executor import call_all
-from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
 from pchem_pipeline.report.inspector.packing import PackedMap, choose_scale, pack_map, some_of
-from pchem_pipeline.stages.report.stored import FittedModel
+from pchem_pipeline.stages.fit.fitted_model import FittedModel
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
@@ -329,8 +328,6 @@ def deciding_parameters(
     known = np.flatnonzero(np.isfinite(columns).all(axis=0))
     deciding = np.full((4, columns[0].size), np.nan)
     if known.size:
-        some = model.at(known)
         kept = [column[known] for column in columns]
-        maps = pixel_maps(kept, np.ones(known.size, bool))
-        deciding[:, known] = nearest_pcd(kept, sample_law(some.effects, maps, some.added, some.places))
+        deciding[:, known] = nearest_pcd(kept, model.at(known).law(kept))
     return deciding

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.model.fit.status import MEANINGS, describe
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.data import MAP_NAMES, PixelFit
 from pchem_pipeline.report.inspector.packing import some_of
 from pchem_pipeline.report.style.wording import symbol
-from pchem_pipeline.stages.report.stored import FittedModel, PixelHistograms
+from pchem_pipeline.stages.fit.fitted_model import FittedModel
+from pchem_pipeline.stages.report.stored import PixelHistograms
 from pchem_pipeline.store.tiles import MAX_BINS
 
 #: Pixels for each reason: a flag, a poor fit, an extreme value, a large standard error.
@@ -169,8 +169,7 @@ def bin_masses(
     known = np.flatnonzero(np.isfinite(columns).all(axis=0))
     if known.size:
         kept = [column[known] for column in columns]
-        some = model.at(known)
-        law = sample_law(some.effects, pixel_maps(kept, np.ones(known.size, bool)), some.added, some.places)
+        law = model.at(known).law(kept)
         codes = histograms.origin[known][:, None] + np.arange(counts[0].size)
         amplitude, weight = histograms.satellites[:, known]
         found[known] = sample_mass(law, kept, codes, satellites=(amplitude, weight))

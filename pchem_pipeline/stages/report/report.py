@@ -17,7 +17,6 @@ from pchem_pipeline.compute.executor import Beside, beside
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
-from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.report.data import PixelFit, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
 from pchem_pipeline.report.figures.ensemble import case_name
@@ -194,7 +193,7 @@ def _of_pixels(store: RunStore, run: StoredRun, config: RunConfig) -> _Pixels:
     places, bins = [(y, x) for _, y, x in shown], store.array("histogram/counts").shape[2]
     full = choose_inspected(run.maps, run.fit, places, _suspects(run), bins=bins)
     index = np.concatenate([pixel_index(shown, run.sensor.shape), full.index])
-    histograms = read_histograms(store, index, run.sensor.shape, run.model)
+    histograms = read_histograms(store, index, run.sensor.shape)
     drawn, held, some = slice(0, len(shown)), slice(len(shown), None), slice(0, len(shown) + _SOME_MASSES)
     masses = bin_masses(_parameters(run, index[some]), histograms.of(some), run.model.at(index[some]))
     channel = run.sensor.kind == "histograms"
@@ -253,8 +252,6 @@ def report_data(
         integration_time: seconds, or None.
         stages: rows of the table of stages.
     """
-    from pchem_pipeline.config.load import dump_config
-
     maps, facts, sensor = run.maps, dict(run.facts["ensemble"]), run.sensor
     moments, _ = facts.pop("moments", []), facts.pop("missing", {})
     cases = facts.pop("component_cases", COMPONENT_CASES)
@@ -268,8 +265,6 @@ def report_data(
         camera=sensor.camera.words(),
         maps=maps,
         fit=run.fit,
-        status_words={int(bit): text for bit, text in MEANINGS.items()},
-        failed_mask=int(FAILED),
         misfits=run.facts["maps"].get("goodness", {}),
         intervals=run.intervals,
         interval_level=config.fit.interval_level,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,16 +21,11 @@ from pchem_pipeline.base.variables import (
 from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
 from pchem_pipeline.model.fit.status import FAILED
-from pchem_pipeline.run.model_versions import model_of, read_added_exposure
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.stages.fit.fitted_model import pixel_places
+from pchem_pipeline.stages.fit.fitted_model import FittedModel
 from pchem_pipeline.stages.methods.result import read_methods
 
 if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-    from pchem_pipeline.effects.framework.compose import PixelPlaces
-    from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.run.model_versions import ModelVersion
     from pchem_pipeline.store.records import StageRecord
     from pchem_pipeline.store.run_store import RunStore
 
@@ -42,31 +37,6 @@ _ARRAYS: dict[str, tuple[str, ...]] = {
     "truth": (*PARAMETERS, "read_noise_e"),
     "samples": ("quanta_exposure", "mean", "variance", "linearity_residual", "linearity_p"),
 }
-
-
-@dataclass(frozen=True)
-class FittedModel:
-    """The model with which the pixels of a run were fitted; without effects the PCD.
-
-    Attributes:
-        effects: in their order.
-        added: exposure that they add to single pixels, (j, n), the pixels in one axis; None: nothing.
-        version: of the run's model; None without a fit.
-        places: of the pixels; None: not known.
-    """
-
-    effects: tuple[Effect, ...] = ()
-    added: AddedExposure | None = None
-    version: ModelVersion | None = None
-    places: PixelPlaces | None = None
-
-    def at(self, index: NDArray[np.int64]) -> FittedModel:
-        """Return the model of some pixels."""
-        return replace(
-            self,
-            added=None if self.added is None else self.added.of(index),
-            places=None if self.places is None else self.places.of(index),
-        )
 
 
 @dataclass(frozen=True)
@@ -135,7 +105,7 @@ def read_run(store: RunStore, threads: int = 1) -> StoredRun:
     Raises:
         StoreError: an array is missing or corrupt.
     """
-    verdict, methods, model = read_verdict(store.path), read_methods(store), read_model(store)
+    verdict, methods, model = read_verdict(store.path), read_methods(store), FittedModel.read(store)
     sensor, record = SensorInfo.read(store), store.records.read("report")
     there = [
         (group, name)
@@ -165,25 +135,13 @@ def read_run(store: RunStore, threads: int = 1) -> StoredRun:
     )  # fmt: skip
 
 
-def read_model(store: RunStore) -> FittedModel:
-    """Read the model with which a run was fitted."""
-    version = model_of(store, "fit")
-    added = None if version is None else read_added_exposure(store, version, None)
-    effects = () if version is None else version.effects
-    places = pixel_places(store) if effects else None
-    return FittedModel(effects, None if added is None else added.flat(), version, places)
-
-
-def read_histograms(
-    store: RunStore, index: NDArray[np.int64], shape: tuple[int, int], model: FittedModel
-) -> PixelHistograms:
+def read_histograms(store: RunStore, index: NDArray[np.int64], shape: tuple[int, int]) -> PixelHistograms:
     """Read the histograms of pixels.
 
     Args:
         store: the run.
         index: ``y * nx + x`` of each.
         shape: of the sensor.
-        model: of the fit; without effects there are no satellite levels.
 
     Raises:
         StoreError: an array is missing or corrupt.

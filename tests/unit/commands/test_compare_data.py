@@ -5,7 +5,7 @@ import csv
 import numpy as np
 
 from pchem_pipeline.commands.compare.compare import _data_digest
-from pchem_pipeline.commands.compare.history import HotPixels, history_csv
+from pchem_pipeline.commands.compare.history import PixelStates, history_csv
 from pchem_pipeline.report.comparison import HistoryRow, RunFacts
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.store.records import StageRecord
@@ -34,8 +34,9 @@ def test_labels_are_no_formulas_of_a_spreadsheet():
 
 def test_a_pixel_is_newly_hot_unless_its_exposure_agrees_within_the_errors_that_are_known():
     exposure = np.array([[1.0, 6.0, 6.0, 60.0]])
-    hot = HotPixels(exposure > 5.5, exposure, np.array([[0.1, 0.1, 0.1, np.nan]]))
+    nothing = np.zeros((2, 1, 4), np.uint8)
+    hot = PixelStates(exposure > 5.5, exposure, np.array([[0.1, 0.1, 0.1, np.nan]]), *nothing)
     before = np.array([[1.0, 5.4, 1.0, 1.0]])
-    first = HotPixels(before > 5.5, before, np.full((1, 4), 0.1))
+    first = PixelStates(before > 5.5, before, np.full((1, 4), 0.1), *nothing)
     assert hot.new_since(first) == ((0, 2), (0, 3))
     assert first.new_since(hot) == ()

@@ -42,13 +42,13 @@ def double_tile(path, tile):
 
 
 def fit_run(context):
-    context.create_maps(["fit/bias"])
+    context.create("fit/bias")
     value = context.config.fit.gap_threshold
     context.run_units(context.tiles(), functools.partial(number_tile, context.store.path, value))
 
 
 def maps_run(context):
-    context.create_maps(["maps/bias"])
+    context.create("maps/bias")
     context.run_units(context.tiles(), functools.partial(double_tile, context.store.path), needs="fit")
 
 
@@ -294,18 +294,18 @@ def test_a_stage_stopped_before_its_first_unit_starts_anew(make, monkeypatch):
     execute("fit", make())
     context = make("fit: {gap_threshold: 9}")
     context.stop.signal = signal.SIGTERM
-    monkeypatch.setattr(context, "create_maps", lambda names: context.stop.check())
+    monkeypatch.setattr(context, "create", lambda name: context.stop.check())
     with pytest.raises(InterruptedRunError):
         execute("fit", context)
     # it had not made any, and what was there is not lost
     assert context.store.has("fit/bias")
     assert execute("fit", make()).state == "complete"
 
-    def create_some(names):
+    def create_some(name):
         context.begin()
         context.stop.check()
 
-    monkeypatch.setattr(context, "create_maps", create_some)
+    monkeypatch.setattr(context, "create", create_some)
     with pytest.raises(InterruptedRunError):
         execute("fit", context)
     assert not context.store.has("fit/bias")

@@ -241,11 +241,7 @@ def test_the_work_is_that_of_all_searches_and_looks(monkeypatch):
     rng = np.random.default_rng(2)
     light = 11.0 * (rng.poisson(2.0, (400, 32, 32)) + 0.3 * rng.standard_normal((400, 32, 32)))
     values = np.rint(100.0 + light).astype(np.uint16)
-    context = SimpleNamespace(
-        config=SimpleNamespace(input=SimpleNamespace(bit_depth=12)),
-        sensor=SimpleNamespace(bit_depth=12),
-        integration_time=1.0,
-    )
+    context = SimpleNamespace(bit_depth=12, integration_time=1.0)
     search = discrepancy._Search(context, Stack(values), (), None, Survey({}, {}), lambda _: None)
     named = SimpleNamespace(verdict=verdict_of("named").costing(30.04), model=())
     monkeypatch.setattr(discrepancy, "find_discrepancies", lambda *_, **__: named)
@@ -268,12 +264,7 @@ def test_a_verdict_is_not_lost_where_no_pixel_of_the_other_window_can_be_used():
     notes: list[str] = []
     values = np.full((400, 24, 24), 7, np.uint16)
     values[:, 12:, 12:] += np.arange(400, dtype=np.uint16)[:, None, None] % 5
-    context = SimpleNamespace(
-        config=SimpleNamespace(input=SimpleNamespace(bit_depth=12)),
-        sensor=SimpleNamespace(bit_depth=12),
-        integration_time=1.0,
-        note=notes.append,
-    )
+    context = SimpleNamespace(bit_depth=12, integration_time=1.0, note=notes.append)
     seen = Survey({}, {})
     search = discrepancy._Search(context, Stack(values), (), None, seen, lambda _: None)
     window = Window(np.arange(400), (12, 24), (12, 24))

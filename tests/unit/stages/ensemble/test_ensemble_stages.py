@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import written_fit
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.base.variables import PARAMETERS, variables_of
@@ -26,8 +27,6 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import thresholds
 from pchem_pipeline.report.pages.summary import key_numbers, sentence
 from pchem_pipeline.run.fingerprint import status
-from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import Options, StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
@@ -61,45 +60,17 @@ def make_context(
             "ensemble": ensemble,
         }
     )
-    return StageContext(
-        config,
-        folder,
-        RunStore.create(folder / store),
-        executor or SerialExecutor(),
-        Reporter("off", quiet=True),
-        StopRequest(),
-        options=options or Options(),
-    )
+    place = RunStore.create(folder / store)
+    return StageContext(config, folder, place, executor or SerialExecutor(), options=options or Options())
 
 
 def write_fit(context: StageContext, *, tiles: list[str] | None = None, failed: bool = True) -> None:
     """What the fit stage leaves behind, with the truth as its estimate."""
-    store, shape = context.store, context.sensor.shape
-    y0, _, x0, _ = context.config.input.roi or (0, 0, 0, 0)
-    region = (slice(y0, y0 + shape[0]), slice(x0, x0 + shape[1]))
-    status = np.zeros(shape, dtype=np.uint16)
-    bad = np.zeros(shape, dtype=bool)
+    status = np.zeros(context.sensor.shape, dtype=np.uint16)
     if failed:
-        bad[FAILED_PIXEL] = True
-    status[bad] = int(FitStatus.NOT_CONVERGED)
+        status[FAILED_PIXEL] = int(FitStatus.NOT_CONVERGED)
     status[0, 0] = int(FitStatus.POOR_FIT)
-    chosen = [tile for tile in context.tiles() if tiles is None or tile.key in tiles]
-    there = np.zeros(shape, dtype=bool)
-    for tile in chosen:
-        there[tile.region] = True
-    for name in PARAMETERS:
-        values = np.where(bad | ~there, np.nan, store.read(f"truth/{name}", region))
-        store.write_array(f"fit/{name}", values)
-        store.write_array(f"fit/{name}_stderr", 0.01 * np.abs(values))
-    store.write_array("fit/correlation", np.zeros((*shape, 6)))
-    for name, value in {"chi2": 50.0, "dof": 50.0, "p": 0.5}.items():
-        store.write_array(f"fit/goodness_{name}", np.where(bad | ~there, np.nan, value))
-    store.write_array("fit/outlier_share", np.zeros(shape))
-    store.write_array("fit/likelihood_gap", np.where(bad | ~there, np.nan, 100.0))
-    store.write_array("fit/fit_status", status)
-    store.records.write(StageRecord("fit", 1, "truth", {}, keys=len(context.tiles())))
-    for tile in chosen:
-        store.records.mark("fit", "truth", tile.key, {})
+    written_fit.write_fit(context, status, status == int(FitStatus.NOT_CONVERGED), tiles)
 
 
 @pytest.fixture(scope="module")
@@ -459,9 +430,6 @@ def test_ready_made_histograms(tmp_path: Path, n_samples: tuple[int, int]) -> No
         config,
         tmp_path,
         RunStore.create(tmp_path / "run.zarr"),
-        SerialExecutor(),
-        Reporter("off", quiet=True),
-        StopRequest(),
     )
     for stage in ("ingest", "histogram"):
         assert execute(stage, context).state == "complete"

@@ -8,12 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.signals import StopRequest
-from pchem_pipeline.run.stage import Options, StageContext
+from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.fit import together
 from pchem_pipeline.store.run_store import RunStore
@@ -38,9 +35,7 @@ def fitted(folder: Path, *before: str, **sections: dict[str, Any]) -> StageConte
     """A run up to its fit, and what comes before it."""
     config = RunConfig.model_validate(sections)
     store = RunStore.create(folder / config.run.store)
-    context = StageContext(
-        config, folder, store, SerialExecutor(), Reporter("off", quiet=True), StopRequest(), options=Options()
-    )
+    context = StageContext(config, folder, store)
     for stage in (*before, "ingest", "histogram", "fit"):
         assert execute(stage, context).state == "complete"
     return context

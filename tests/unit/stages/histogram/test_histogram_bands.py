@@ -102,10 +102,13 @@ def test_a_band_that_is_done_holds_no_memory(tmp_path, monkeypatch):
         def write(self, name, region, data):
             pass
 
+        def write_arrays(self, group, arrays, region):
+            pass
+
     monkeypatch.setattr(counting, "open_store", lambda path: Store())
     job = counting.CountJob(tmp_path, frames.shape, 64, HistogramSettings())
     counter = counting.StackCounter(job, [(0, 64)])
-    held = weakref.ref(counter._counters[0]._counter)
+    held = weakref.ref(counter._counters[0]._histograms)
     gc.disable()  # nothing but the end of the counter may free it
     try:
         counter.count([(0, [frames])])

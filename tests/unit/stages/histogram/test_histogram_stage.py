@@ -15,9 +15,7 @@ from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.histogram.summaries import SummaryAccumulator
-from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import Options, StageContext, open_store
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.histogram import arrays, histogram
@@ -78,8 +76,6 @@ def make_context(
         folder,
         store,
         executor or SerialExecutor(),
-        Reporter("off", quiet=True),
-        StopRequest(),
         options=options or Options(),
     )
 
@@ -247,9 +243,7 @@ def test_ready_made_histograms_are_copied(tmp_path):
     store = RunStore.create(tmp_path / "run.zarr")
     config = RunConfig.model_validate({"input": {"files": ["a.csv", "b.csv"], "format": "histogram"}})
     ingest(store, SensorInfo("histograms", 70001, 1, 2, "uint32", None, None, "copy", {}), None)
-    context = StageContext(
-        config, tmp_path, store, SerialExecutor(), Reporter("off", quiet=True), StopRequest()
-    )
+    context = StageContext(config, tmp_path, store)
     assert execute("histogram", context).state == "complete"
     counts = store.read("histogram/counts")
     assert counts.dtype == np.uint32

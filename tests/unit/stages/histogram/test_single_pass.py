@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.runner.execute import execute
@@ -88,8 +87,6 @@ def make_context(folder: Path, store: str, *, workers: int = 2, **sections: dict
         folder,
         RunStore.create(folder / store),
         make_executor(config.compute),
-        Reporter("off", quiet=True),
-        StopRequest(),
     )
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.written_fit import write_fit
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.compute.executor import SerialExecutor, beside
+from pchem_pipeline.compute.executor import beside
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.fit.status import FitStatus
@@ -21,15 +21,12 @@ from pchem_pipeline.report.pages.report_json import report_numbers
 from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.run.fingerprint import status
-from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.report import report
 from pchem_pipeline.stages.report.pixels import choose_pixels
 from pchem_pipeline.stages.report.report import gather
 from pchem_pipeline.stages.table import STAGES
-from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 
 NY, NX, FRAMES = 16, 24, 200
@@ -43,26 +40,7 @@ def make_context(folder: Path, settings: dict[str, object] | None = None, **run:
             "report": {"figure_formats": [], "dpi": 72, **(settings or {})},
         }
     )
-    store, reporter = RunStore.create(folder / "run.zarr"), Reporter("off", quiet=True)
-    return StageContext(config, folder, store, SerialExecutor(), reporter, StopRequest())
-
-
-def write_fit(context: StageContext, status_map: np.ndarray, lost: np.ndarray) -> None:
-    """What the stage fit leaves behind."""
-    store = context.store
-    for name in PARAMETERS:
-        values = np.where(lost, np.nan, store.read(f"truth/{name}"))
-        store.write_array(f"fit/{name}", values)
-        store.write_array(f"fit/{name}_stderr", 0.01 * np.abs(values))
-    store.write_array("fit/correlation", np.zeros((*lost.shape, 6)))
-    for name, value in {"chi2": 50.0, "dof": 50.0, "p": 0.5}.items():
-        store.write_array(f"fit/goodness_{name}", np.where(lost, np.nan, value))
-    store.write_array("fit/outlier_share", np.zeros(lost.shape))
-    store.write_array("fit/likelihood_gap", np.where(lost, np.nan, 100.0))
-    store.write_array("fit/fit_status", status_map)
-    store.records.write(StageRecord("fit", 1, "truth", {}, keys=len(context.tiles())))
-    for tile in context.tiles():
-        store.records.mark("fit", "truth", tile.key, {})
+    return StageContext(config, folder, RunStore.create(folder / "run.zarr"))
 
 
 @pytest.fixture(scope="module")
