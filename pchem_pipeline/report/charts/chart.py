@@ -22,8 +22,8 @@ Shape = Literal["o", "s", "x", "D", "d", "^", "v", "<", "P", "X", "*", "h", "|"]
 
 #: Widths of one column and of a page of a journal, mm; columns stand side by side beyond half as much again.
 COLUMN_MM, PAGE_MM = 88.0, 180.0
-#: Colours of a scale, and the number that stands for none of them.
-SHADES = NO_COLOUR = 255
+#: Colours of a scale.
+SHADES = 255
 #: Height of a map over its width, at most; ratio of its sides beyond which pixels are not square.
 TALLEST, LONGEST = 1.6, 4.0
 #: Letters of a tick's text for a millimetre of a stack's width; height of a row with a text, and of each
@@ -184,23 +184,27 @@ class Image(Mark):
 
     Attributes:
         values: of the pixels, NaN where there is none.
-        edges: values between one colour and the next, rising.
         x: left and right end on the axis of x.
         y: end of the first and of the last row on the upright axis.
         scale: name of a scale of colours, or the colours themselves, one more than edges.
         none: colour of pixels without a value.
-        bar: places along a bar of the colours, 0 to 1, and their texts; empty: no bar.
-        unit: what the bar shows.
+        ends: values with the first and the last colour, in equal steps between; others have the nearest one.
+        edges: instead of these the values between one colour and the next, rising.
+        bar: places along a bar of the colours, 0 to 1, and their texts; empty: as the renderer finds them.
+        unit: what the bar shows; empty: no bar.
+        whole: ticks of the bar at whole numbers alone.
     """
 
     values: Values
-    edges: Values
     x: tuple[float, float]
     y: tuple[float, float]
     scale: str | tuple[str, ...] = ""
     none: str = "no_value"
+    ends: tuple[float, float] = (0.0, 1.0)
+    edges: Values | None = None
     bar: tuple[tuple[float, str], ...] = ()
     unit: str = ""
+    whole: bool = False
 
     def shown(self, dots: float) -> tuple[Values, tuple[float, float], tuple[float, float]]:
         """Return the rows and columns that so many dots from left to right can show, and the ends of these.
@@ -218,11 +222,12 @@ class Image(Mark):
         y, x = ends
         return some, x, y
 
-    def index(self, values: Values) -> NDArray[np.uint8]:
-        """Return the number of the colour of values; 255 where there is none."""
-        found = np.searchsorted(self.edges, values, side="right").astype(np.uint8)
-        found[np.isnan(values)] = NO_COLOUR
-        return found
+    def levels(self, values: Values) -> Values:
+        """Return values as they are coloured: themselves, or with edges the middle of the colour, 0 to 1."""
+        if self.edges is None:
+            return values
+        index = np.searchsorted(self.edges, values, side="right").astype(np.float32)
+        return np.where(np.isnan(values), np.nan, (index + 0.5) / (len(self.edges) + 1))
 
 
 @dataclass(frozen=True)

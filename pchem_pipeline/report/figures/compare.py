@@ -13,21 +13,17 @@ from pchem_pipeline.report.charts.chart import (
     Axis,
     Chart,
     Dash,
-    Image,
     Level,
     Line,
     Panel,
-    Points,
     Span,
     Stack,
-    Steps,
 )
 from pchem_pipeline.report.comparison import Pair, RunFacts
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.maps import image_stack, is_strip, place_of
+from pchem_pipeline.report.figures.stacks import pull_stack, sensor_stack
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.stretch import even_bar, even_edges
 from pchem_pipeline.report.style.wording import count, measured, plain, power_of_ten, short, signed, symbol
 
 FloatArray = NDArray[np.float64]
@@ -134,21 +130,12 @@ def difference_chart(z: FloatArray, n_far: int, title: str, *, same_data: bool) 
     known = finite(z)
     limit = _limit(known, _LEAST if not same_data else 0.0)
     unit, label = _unit(limit)
-    values, end = z / unit, limit / unit
-    if is_strip(z.shape):
-        marks = (
-            Span(-2.0, 2.0, colour="band"),
-            Points(np.arange(z.size), values.ravel(), size=3.0, label=label),
-        )
-        x = Axis("channel", -0.5, z.size - 0.5, whole=True)
-        top = Stack((Panel(Axis(label), marks),), x, plain(title), height_mm=40.0)
-    else:
-        bar = even_bar(-end, end)
-        image = Image(values, even_edges(-end, end), *place_of(z.shape), scale=DIVERGING, bar=bar, unit=label)
-        top = image_stack(image, title=plain(title))
+    end = limit / unit
+    top = sensor_stack(z / unit, (-end, end), label, scale=DIVERGING, title=plain(title))
     edge = limit if same_data else max(limit, FAR)
     note = f"{count(n_far, 'good pixel')} beyond ±{FAR:g}"
-    return Chart((top, _distribution(known / unit, edge / unit, label, note, chance=not same_data)))
+    pulls = pull_stack(known / unit, edge / unit, f"difference ({label})", note, normal=not same_data)
+    return Chart((top, pulls))
 
 
 def _unit(limit: float) -> tuple[float, str]:
@@ -164,20 +151,6 @@ def _limit(known: FloatArray, least: float) -> float:
         return max(least, 1.0)
     quantile = float(np.quantile(sizes, 0.99))
     return max(least, quantile if quantile > 0 else float(sizes.max()))
-
-
-def _distribution(known: FloatArray, edge: float, label: str, note: str, *, chance: bool) -> Stack:
-    """Return the histogram of differences, those beyond the edge in the last bins, beside N(0, 1)."""
-    counts, edges = np.histogram(np.clip(known, -edge, edge), 60, (-edge, edge))
-    marks: tuple[Steps | Line, ...] = (Steps(edges, counts, filled=True, colour="bars"),)
-    highest = float(np.max(counts, initial=1))
-    if chance:
-        x = np.linspace(-edge, edge, 601)
-        normal = known.size * (edges[1] - edges[0]) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-        marks += (Line(x, normal, width=0.9),)
-        highest = max(highest, float(normal.max()))
-    panel = Panel(Axis("pixels", 0.5, 5.0 * highest, log=True), marks, note=note)
-    return Stack((panel,), Axis(f"difference ({label})", -edge, edge), height_mm=36.0)
 
 
 def ensembles_chart(tables: Sequence[DataTable]) -> Chart:

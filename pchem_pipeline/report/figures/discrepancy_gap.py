@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,6 @@ from pchem_pipeline.report.charts.chart import (
     Level,
     Line,
     Mark,
-    Panel,
     Points,
     Shape,
     Span,
@@ -30,7 +29,8 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.style.wording import plain, short
+from pchem_pipeline.report.figures.stacks import pull_axis, row_stack
+from pchem_pipeline.report.style.wording import short
 
 #: The gap is shown in millionths of a nat per sample.
 MICRO = 1e6
@@ -258,13 +258,6 @@ def _limits(
     return min(10.0 ** math.floor(math.log10(least)), top / 100.0), top
 
 
-def _rows(labels: Sequence[str], marks: Sequence[Mark], x: Axis) -> Stack:
-    """Return marks in rows that have a text each, from top to bottom."""
-    rows = tuple((float(row), plain(label)) for row, label in enumerate(labels))
-    y = Axis("", -0.6, len(labels) - 0.5, ticks=rows, down=True)
-    return Stack((Panel(y, tuple(marks)),), x, height_mm=30.0)
-
-
 def _gap_axis(ends: tuple[float, float]) -> tuple[Axis, list[Mark]]:
     """Return the axis of gaps, and a line at each power of ten."""
     powers = range(math.ceil(math.log10(ends[0])) + 1, math.ceil(math.log10(ends[1])))
@@ -285,7 +278,7 @@ def _gap_rows(bars: Sequence[GapBar], floor: float, ends: tuple[float, float]) -
         if math.isfinite(bar.low) and math.isfinite(bar.high):
             marks.append(_bar_line(row, max(bar.low, left), max(bar.high, left), _ROLES[bar.role][0], 1.6))
         marks.append(_point(bar.gap, row, left, bar.role))
-    return _rows([bar.label for bar in bars], marks, x)
+    return row_stack([bar.label for bar in bars], marks, x)
 
 
 def _family_rows(parts: Sequence[tuple[str, float, float]], ends: tuple[float, float]) -> Stack:
@@ -298,7 +291,7 @@ def _family_rows(parts: Sequence[tuple[str, float, float]], ends: tuple[float, f
             if math.isfinite(value):
                 label = labels.pop(role, "") if value > ends[0] else ""
                 marks.append(_point(value, row, ends[0], role, label))
-    return _rows([words for words, _, _ in parts], marks, x)
+    return row_stack([words for words, _, _ in parts], marks, x)
 
 
 def _bar_line(row: int, low: float, high: float, colour: str, width: float) -> Line:
@@ -333,9 +326,5 @@ def pulls_chart(rows: Sequence[Pull]) -> Chart:
             marks.append(Points(values[role][known], places[known], shape, 4.5, colour=colour, label=words))
     known_values = np.concatenate(list(values.values()))
     reach = max(float(np.nanmax(np.abs(known_values), initial=0.0)), 6.0)
-    x = Axis("deviation (sigma)", -1.4 * reach, 1.4 * reach)
-    if reach > 12.0:
-        steps = [t for t in (2, 4, 10, 100, 1000, 10_000, 100_000) if t <= 1.3 * reach]
-        signed = [*(-t for t in reversed(steps)), 0, *steps]
-        x = replace(x, linear_to=4.0, ticks=tuple((float(t), f"{t:g}".replace("-", "−")) for t in signed))
-    return Chart((_rows([row.sentence or row.statistic for row in rows], marks, x),), legend=(2, 2))
+    x = pull_axis("deviation (sigma)", 1.4 * reach, 4.0)
+    return Chart((row_stack([row.sentence or row.statistic for row in rows], marks, x),), legend=(2, 2))

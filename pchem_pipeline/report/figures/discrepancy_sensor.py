@@ -23,16 +23,13 @@ from pchem_pipeline.report.charts.chart import (
     Panel,
     Points,
     Shape,
-    Span,
     Stack,
-    Steps,
 )
 from pchem_pipeline.report.data import CHANNELS, DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.maps import image_stack, is_strip, place_of
+from pchem_pipeline.report.figures.stacks import is_strip, place_of, pull_stack, sensor_stack
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.stretch import even_bar, even_edges
 from pchem_pipeline.report.style.wording import count
 
 FloatArray = NDArray[np.float64]
@@ -262,34 +259,38 @@ def sensor_chart(
         flagged: pixels (y, x) of the sensor named in the verdict; they are ringed.
         origin: row and column of the sensor of the maps' first pixel.
     """
-    shown = [
-        _channels(each) if is_strip(each.z.shape) else _map_stack(each, flagged, origin) for each in maps
-    ]
-    below = [_distribution(each, _inside(each, origin)) for each in maps]
+    shown, below = [], []
+    for each in maps:
+        inside = _inside(each, origin)
+        known = finite(each.z)
+        edge = float(np.clip(np.abs(known).max() if known.size else 5.0, 5.0, 15.0))
+        part = None if inside is None else each.z[inside]
+        note = f"{count(each.outliers, 'pixel')} beyond ±5"
+        shown.append(_map_stack(each, inside, flagged, origin))
+        below.append(pull_stack(known, edge, "standard deviations", note, part=part))
     return Chart((*shown, *below), (1.0,) * len(maps))
 
 
-def _map_stack(each: PixelMap, flagged: Sequence[tuple[int, int]], origin: tuple[int, int]) -> Stack:
-    (y0, x0), (ny, nx) = origin, each.z.shape
+def _map_stack(
+    each: PixelMap,
+    inside: NDArray[np.bool_] | None,
+    flagged: Sequence[tuple[int, int]],
+    origin: tuple[int, int],
+) -> Stack:
     limit = _LEAST
     if each.far > 0:
         limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
-    image = Image(
-        each.z, even_edges(-limit, limit), *place_of(each.z.shape, origin), scale=DIVERGING,
-        bar=even_bar(-limit, limit), unit="sigma",
+    rings, beyond = np.zeros(each.z.shape, bool), np.abs(np.nan_to_num(each.z)) > _STANDS_OUT
+    for y, x in np.asarray(flagged).reshape(-1, 2) - origin:
+        if 0 <= y < rings.shape[0] and 0 <= x < rings.shape[1]:
+            rings[y, x] = True
+    if beyond.sum() <= _MOST_RINGS:
+        rings |= beyond
+    return sensor_stack(
+        each.z, (-limit, limit), "sigma", *(() if inside is None else (_outline(inside, origin),)),
+        ringed=rings if rings.sum() <= _MOST_RINGS and not is_strip(rings.shape) else None,
+        origin=origin, title=each.title, scale=DIVERGING,
     )  # fmt: skip
-    inside = _inside(each, origin)
-    marks: list[Mark] = []
-    if inside is not None:
-        marks.append(_outline(inside, origin))
-    rings = {(y, x) for y, x in flagged if y0 <= y < y0 + ny and x0 <= x < x0 + nx}
-    beyond = np.argwhere(np.abs(np.nan_to_num(each.z)) > _STANDS_OUT)
-    if len(beyond) <= _MOST_RINGS:
-        rings |= {(y0 + int(y), x0 + int(x)) for y, x in beyond}
-    if 0 < len(rings) <= _MOST_RINGS:
-        ys, xs = np.array(sorted(rings)).T
-        marks.append(Points(xs, ys, size=5.0, face="none", colour="ink"))
-    return image_stack(image, *marks, title=each.title)
 
 
 def _inside(each: PixelMap, origin: tuple[int, int]) -> NDArray[np.bool_] | None:
@@ -322,30 +323,6 @@ def _outline(inside: NDArray[np.bool_], origin: tuple[int, int]) -> Line:
     return Line(xs, ys, colour="ink", width=1.1)
 
 
-def _channels(each: PixelMap) -> Stack:
-    """Return a line of channels."""
-    z, label = each.z.ravel(), "standard deviations"
-    points = Points(np.arange(z.size), z, size=3.0, label=label, listed=False)
-    x = Axis("channel", -0.5, z.size - 0.5, whole=True)
-    return Stack((Panel(Axis(label), (Span(-2.0, 2.0, colour="band"), points)),), x, each.title)
-
-
-def _distribution(each: PixelMap, inside: NDArray[np.bool_] | None = None) -> Stack:
-    known = finite(each.z)
-    edge = float(np.clip(np.abs(known).max() if known.size else 5.0, 5.0, 15.0))
-    counts, edges = np.histogram(np.clip(known, -edge, edge), 60, (-edge, edge))
-    marks: list[Mark] = [Steps(edges, counts, filled=True, colour="bars")]
-    if inside is not None:
-        part = np.histogram(np.clip(finite(each.z[inside]), -edge, edge), edges)[0]
-        marks.append(Steps(edges, part, colour="vermilion", width=0.9))
-    x = np.linspace(-edge, edge, 301)
-    chance = known.size * (edges[1] - edges[0]) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-    marks.append(Line(x, chance, width=0.9))
-    y = Axis("pixels", 0.5, max(3.0 * float(chance.max()), 3.0), log=True)
-    panel = Panel(y, tuple(marks), note=f"{count(each.outliers, 'pixel')} beyond ±5")
-    return Stack((panel,), Axis("standard deviations", -edge, edge), height_mm=30.0)
-
-
 def lines_chart(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int] = (0, 0)) -> Chart:
     """Return the means of rows and of columns: the first frames as a picture, and the scatter of each line.
 
@@ -370,12 +347,7 @@ def _frames(image: NDArray[Any] | None, line: str, channel: str, first: int) -> 
     if image is None or image.size == 0:
         return Stack((Panel(y, (), note="not kept"),), x, title, height_mm=46.0)
     across, down = place_of(image.T.shape, (first, 0))
-    marks = (
-        Image(
-            image.T, even_edges(-_LEAST, _LEAST), across, down, scale=DIVERGING,
-            bar=even_bar(-_LEAST, _LEAST), unit="sigma",
-        ),
-    )  # fmt: skip
+    marks = (Image(image.T, across, down, scale=DIVERGING, ends=(-_LEAST, _LEAST), unit="sigma"),)
     x = replace(x, low=across[0], high=across[1])
     panel = Panel(replace(y, low=down[0], high=down[1], down=True), marks)
     return Stack((panel,), x, title, height_mm=46.0)

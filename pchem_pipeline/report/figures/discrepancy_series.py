@@ -27,12 +27,13 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import CHANNELS, DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.figures.stacks import pull_axis
 from pchem_pipeline.report.style.wording import count, short
 
 FloatArray = NDArray[np.float64]
 
-#: Residuals beyond this many standard deviations make their axis logarithmic outside of it.
-_LINEAR = 8.0
+#: Standard deviations to which the axis of residuals is linear.
+_LINEAR = 4.0
 #: Number of stretches of the run over which frames are averaged.
 _STRETCHES = 24
 #: Factor and unit in which frames are shown, by what is shown of them, and the label of the axis.
@@ -211,24 +212,13 @@ def codes_chart(table: DataTable, marked: Sequence[Place] = ()) -> Chart:
         below.append(Sticks(dn[where], residual[where], colour=colour, width=_bar(dn.size), label=label))
     largest = int(np.argmax(np.abs(residual)))
     reach = 1.25 * max(float(np.abs(residual).max()), 4.0)
-    y = _residual_axis(float(abs(residual[largest])), reach)
+    y = pull_axis("(obs. − exp.) / √exp.", reach, _LINEAR)
     note = f"largest: {residual[largest]:+.1f} at {dn[largest]:.0f} DN".replace("-", "−")
     bottom = Panel(
         y, tuple(below), 1.25, legend="upper right", columns=2, room=(1.6, 1.6), note=note,
         corner="lower left",
     )  # fmt: skip
     return Chart((Stack((top, bottom), Axis("DN", float(edges[0]), float(edges[-1])), height_mm=86.0),))
-
-
-def _residual_axis(largest: float, reach: float) -> Axis:
-    """Return the axis of the residuals: logarithmic to both sides where one is large."""
-    label = "(obs. − exp.) / √exp."
-    if largest <= _LINEAR:
-        return Axis(label, -reach, reach)
-    some = [tick for tick in (4, 10, 100, 1000, 10_000, 100_000) if tick <= 2.0 * largest]
-    ticks = [*(-tick for tick in reversed(some)), 0, *some]
-    texts = tuple((float(tick), f"{tick:g}".replace("-", "−")) for tick in ticks)
-    return Axis(label, -reach, reach, linear_to=_LINEAR, ticks=texts)
 
 
 def _bar(n: int) -> float:

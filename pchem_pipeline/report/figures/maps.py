@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.charts.chart import (
-    LONGEST,
     Axis,
     Bars,
     Chart,
@@ -28,6 +27,7 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import FEW_CHANNELS, LINE_MAPS, MAP_NAMES, ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.figures.stacks import channel_axis, image_stack, is_strip, place_of
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import DisplayRange, histogram_edges, robust_range
 from pchem_pipeline.report.style.stretch import map_colours
@@ -35,10 +35,6 @@ from pchem_pipeline.report.style.wording import count, measured, percent, plain,
 
 FloatArray = NDArray[np.float64]
 
-#: Sensors with so few rows or columns are drawn as points, not as an image.
-_STRIP = 2
-#: Most channels of which each has a tick.
-_FEW_TICKS = 12
 #: Colours of the reasons of a fit status: a good fit, each reason in its order, not fitted yet.
 _STATUS_COLOURS = (
     "band",
@@ -195,11 +191,6 @@ def histogram_table(values: NDArray[Any] | Ordered, name: str, most: int, part: 
     return DataTable(columns, dict.fromkeys(list(columns)[:2], stored_unit(name)), part)
 
 
-def is_strip(shape: tuple[int, ...]) -> bool:
-    """Tell whether a sensor is a line of channels, drawn as points instead of an image."""
-    return min(shape) < _STRIP
-
-
 def map_chart(
     tables: Sequence[DataTable],
     name: str,
@@ -224,29 +215,8 @@ def map_chart(
     known = known or Ordered.of(full)
     edges, bar = map_colours(known, stretch)
     keys = (("no_value", f"no value: {count(known.n_missing, 'pixel')}"),) if known.n_missing else ()
-    image = Image(full, edges, *place_of(full.shape), bar=bar, unit=f"{sign} ({unit})")
+    image = Image(full, *place_of(full.shape), edges=edges, bar=bar, unit=f"{sign} ({unit})")
     return Chart((_histogram_stack(known, tables[1], label), image_stack(image)), keys=keys)
-
-
-def place_of(
-    shape: tuple[int, ...], origin: tuple[int, int] = (0, 0)
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the ends of a map on the axes x and y.
-
-    Args:
-        shape: rows and columns.
-        origin: row and column of its first pixel.
-    """
-    y, x = ((first - 0.5, first + n - 0.5) for first, n in zip(origin, shape, strict=True))
-    return x, y
-
-
-def image_stack(image: Image, *others: Mark, title: str = "") -> Stack:
-    """Return a map of the sensor, square pixels unless it is very long, with other marks over it."""
-    rows, columns = image.values.shape
-    x, y = Axis("x (pixel)", *image.x, whole=True), Axis("y (pixel)", *image.y, whole=True, down=True)
-    square = 1.0 / LONGEST <= rows / columns <= LONGEST
-    return Stack((Panel(y, (image, *others), square=square),), x, title, height_mm=76.0)
 
 
 def _histogram_stack(
@@ -290,15 +260,10 @@ def _channels_chart(tables: Sequence[DataTable], values: FloatArray, label: str)
         bottom = low * (high / low) ** 0.03 if y.log else low + 0.03 * (high - low)
         crosses = Points(missing, np.full(missing.size, bottom), mark="x", size=4.0, colour="vermilion")
         marks, remark, y = (points, crosses), f"{remark} (×)", replace(y, low=low, high=high)
-    stack = Stack((Panel(y, marks, note=remark),), _channel_axis(values.size), height_mm=52.0)
+    stack = Stack((Panel(y, marks, note=remark),), channel_axis(values.size), height_mm=52.0)
     if not many:
         return Chart((stack,))
     return Chart((_histogram_stack(Ordered.of(values), tables[1], label, height_mm=40.0), stack))
-
-
-def _channel_axis(n_channels: int) -> Axis:
-    ticks = tuple((float(i), str(i)) for i in range(n_channels)) if n_channels <= _FEW_TICKS else ()
-    return Axis("channel", -0.5, n_channels - 0.5, whole=True, ticks=ticks)
 
 
 def _padded(shown: DisplayRange) -> tuple[float, float]:
@@ -387,7 +352,7 @@ def status_chart(
     ]
     if not is_strip(status.shape):
         edges = np.arange(last) + 0.5
-        image = Image(colour, edges, *place_of(status.shape), scale=_STATUS_COLOURS)
+        image = Image(colour, *place_of(status.shape), edges=edges, scale=_STATUS_COLOURS)
         return Chart((image_stack(image),), keys=tuple(keys))
     flat = colour.ravel()
     bars = []
@@ -396,7 +361,7 @@ def status_chart(
         ends = np.zeros(places.size), np.ones(places.size)
         bars.append(Bars(places, *ends, broad=0.9, colour=found, label=text, listed=False))
     panel = Panel(Axis("", 0.0, 1.0, ticks=((-1.0, ""),)), tuple(bars))
-    return Chart((Stack((panel,), _channel_axis(status.size), height_mm=30.0),), keys=tuple(keys))
+    return Chart((Stack((panel,), channel_axis(status.size), height_mm=30.0),), keys=tuple(keys))
 
 
 def _share(part: int, whole: int) -> str:

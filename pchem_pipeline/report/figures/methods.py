@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.figures.stacks import row_stack
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import short
 
@@ -179,13 +181,11 @@ def _run(known: Sequence[Mapping[str, Any]], letter: str) -> Stack:
         ):
             if value is not None:
                 marks.append(Points(np.array([100 * value]), np.array([row]), **what))
-    rows = tuple((float(row), method["title"]) for row, method in enumerate(known))
-    y = Axis("", -0.6, len(known) - 0.4, ticks=rows, down=True)
-    stack = Stack((Panel(y, tuple(marks)),), Axis("error of the gain (%)", log=True), height_mm=30.0)
+    titles = [method["title"] for method in known]
+    stack = row_stack(titles, marks, Axis("error of the gain (%)", log=True), f"{letter}this run's pixels")
     # a method that repeats the reference has no scatter against it
     low, high = x_window(stack)
-    x = Axis("error of the gain (%)", max(low, _RANGE[0]), high, log=True)
-    return Stack(stack.panels, x, f"{letter}this run's pixels", height_mm=30.0)
+    return replace(stack, x=replace(stack.x, low=max(low, _RANGE[0]), high=high))
 
 
 def gain_rmse(point: Mapping[str, Any], name: str) -> float | None:

@@ -24,7 +24,6 @@ from pchem_pipeline.report.charts.chart import (
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.stretch import even_edges
 from pchem_pipeline.report.style.wording import power_of_ten
 
 FloatArray = NDArray[np.float64]
@@ -114,7 +113,7 @@ def _stack(x: FloatArray, y: FloatArray, frames: FloatArray, words: str, mark: A
     across, power = np.log10(x), np.log10(np.where(np.isfinite(frames), np.clip(frames, 1.0, None), np.nan))
     fine = _finer(power)
     places, heights = (np.linspace(a[0], a[-1], n) for a, n in ((across, fine.shape[1]), (y, fine.shape[0])))
-    marks: list[Mark] = [Image(fine, even_edges(*_ENDS), _half_steps(across), _half_steps(y))]
+    marks: list[Mark] = [Image(fine, _half_steps(across), _half_steps(y), ends=_ENDS)]
     for level in _LEVELS:
         contour = _crossing(fine, heights, float(level))
         if np.isfinite(contour).any():

@@ -11,12 +11,10 @@ from pchem_pipeline.report.charts.chart import (
     Axis,
     Bars,
     Chart,
-    Image,
     Level,
     Line,
     Mark,
     Panel,
-    Points,
     Span,
     Stack,
     Steps,
@@ -24,10 +22,9 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.maps import image_stack, is_strip, place_of
+from pchem_pipeline.report.figures.stacks import is_strip, sensor_stack
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.stretch import even_bar, even_edges
 from pchem_pipeline.report.style.wording import count, percent, symbol
 
 FloatArray = NDArray[np.float64]
@@ -173,26 +170,10 @@ def goodness_chart(table: DataTable, false_discovery_rate: float) -> Chart:
     )
     high = 1.05 * max(float(counts.max()), mean + 2 * spread)
     left = Stack((Panel(Axis("pixels", 0.0, high), marks),), Axis("p-value of the goodness of fit", 0.0, 1.0))
-    found = np.argwhere(table["q"] <= false_discovery_rate)
-    if is_strip(deviate.shape):
-        values, places = deviate.ravel(), found.max(axis=1)
-        return Chart((left, _channels(values, "misfit (σ)", _ring(places, values[places]))), _TWO)
-    rings = (_ring(found[:, 1], found[:, 0]),) if 0 < len(found) <= _MOST_MARKS else ()
-    image = Image(
-        deviate, even_edges(*_DEVIATES), *place_of(deviate.shape), bar=even_bar(*_DEVIATES, whole=True),
-        unit="misfit (σ)",
-    )  # fmt: skip
-    return Chart((left, image_stack(image, *rings)), _TWO)
-
-
-def _ring(x: NDArray[np.int64], y: NDArray[np.int64]) -> Points:
-    return Points(x, y, size=5.0, face="none", colour="vermilion")
-
-
-def _channels(values: FloatArray, label: str, *others: Mark) -> Stack:
-    """Return a value of each channel of a line."""
-    points = Points(np.arange(values.size), values, size=2.5, label=label, listed=False)
-    return Stack((Panel(Axis(label), (points, *others)),), Axis("channel", whole=True))
+    found = table["q"] <= false_discovery_rate
+    ringed = found if is_strip(found.shape) or found.sum() <= _MOST_MARKS else None
+    right = sensor_stack(deviate, _DEVIATES, "misfit (σ)", ringed=ringed, ring="vermilion", whole=True)
+    return Chart((left, right), _TWO)
 
 
 def left_out_chart(share: FloatArray, n_frames: int | None) -> Chart:
@@ -215,13 +196,10 @@ def left_out_chart(share: FloatArray, n_frames: int | None) -> Chart:
     y = Axis("pixels", 0.0, 1.18 * max(float(counts.max()), 1.0), whole=True)
     note = f"{count(int(hit.size), 'pixel')} of {samples.size:,} with any"
     left = Stack((Panel(y, (Steps(edges, counts, filled=True, colour="bars"),), note=note),), x)
-    if is_strip(samples.shape):
-        return Chart((left, _channels(np.where(lost, samples, 0.0).ravel(), label)), _TWO)
-    image = Image(
-        samples, even_edges(0.0, top), *place_of(samples.shape), scale="from_paper", none="paper",
-        bar=even_bar(0.0, top, whole=bool(n_frames)), unit=label,
-    )  # fmt: skip
-    return Chart((left, image_stack(image)), _TWO)
+    shown = np.where(lost, samples, 0.0) if is_strip(samples.shape) else samples
+    whole = bool(n_frames)
+    right = sensor_stack(shown, (0.0, top), label, scale="from_paper", none="paper", whole=whole)
+    return Chart((left, right), _TWO)
 
 
 def uncertainty_chart(maps: DataTable, ensemble: DataTable) -> Chart:
