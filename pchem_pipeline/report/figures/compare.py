@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,27 +76,25 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
     )
 
 
-def ensembles_figures(runs: Sequence[RunFacts]) -> list[Figure]:
+def ensembles_figures(runs: Sequence[RunFacts]) -> Iterator[Figure]:
     """Return the ensembles of runs over each other, where at least two have one."""
     runs = [run for run in runs if "density" in run.ensemble]
     if len(runs) < 2:
-        return []
+        return
     highest = (run.ensemble["dn"][int(np.argmax(run.ensemble["density"]))] for run in runs)
     peaks = ", ".join(f"{run.title}: {int(dn)} DN" for run, dn in zip(runs, highest, strict=True))
     tables = ensemble_tables(runs)
-    return [
-        Figure(
-            "ensembles",
-            "",
-            "Ensemble histograms of the runs",
-            "All pixels of each run together, raw and after two-point non-uniformity correction. Strips: "
-            f"difference from {runs[0].label} in counting errors; gray band: ±2.",
-            f"Ensemble histograms of the runs; highest peaks at {peaks}.",
-            tables,
-            ensembles_chart(tables),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "ensembles",
+        "",
+        "Ensemble histograms of the runs",
+        "All pixels of each run together, raw and after two-point non-uniformity correction. Strips: "
+        f"difference from {runs[0].label} in counting errors; gray band: ±2.",
+        f"Ensemble histograms of the runs; highest peaks at {peaks}.",
+        tables,
+        ensembles_chart(tables),
+        PAGE_MM,
+    )
 
 
 def ensemble_tables(runs: Sequence[RunFacts]) -> tuple[DataTable, ...]:

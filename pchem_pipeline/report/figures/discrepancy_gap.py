@@ -7,7 +7,7 @@ noise.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,60 +44,49 @@ _FAMILY_WORDS = {
     "space": "rows, columns, neighbours",
 }
 
-_GAP_CAPTION = (
-    "Gap before and after with 95 % intervals, the floor (gray: sampling noise), and the remaining gap with "
-    "the next best effect and with an unrelated control instead, fitted in the same way. Open triangles at "
-    "the edge are gaps below the axis. By family of statistics: before and after."
-)
-_PULLS_CAPTION = (
-    "The largest deviations from the model, before (circles) and after effects were added (diamonds). The "
-    "gray band is 2 sigma; the largest of some hundred statistics is near 3 sigma by sampling noise."
-)
 
-
-def gap_figures(data: DiscrepancyData) -> list[Figure]:
+def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the gap before and after, against its floor."""
     found = data.found
     tables = gap_tables(found)
     if not tables:
-        return []
-    return [
-        Figure(
-            "discrepancy_gap",
-            "shown",
-            "The gap against its floor",
-            _GAP_CAPTION,
-            f"Gap in micronats (10⁻⁶ nats) per sample: {_gap_alt(found)}.",
-            tables,
-            gap_chart(gap_bars(found), families(found), MICRO * found.gap.floor),
-            PAGE_MM,
-        )
-    ]
+        return
+    yield Figure(
+        "discrepancy_gap",
+        "shown",
+        "The gap against its floor",
+        "Gap before and after with 95 % intervals, the floor (gray: sampling noise), and the remaining gap "
+        "with the next best effect and with an unrelated control instead, fitted in the same way. Open "
+        "triangles at the edge are gaps below the axis. By family of statistics: before and after.",
+        f"Gap in micronats (10⁻⁶ nats) per sample: {_gap_alt(found)}.",
+        tables,
+        gap_chart(gap_bars(found), families(found), MICRO * found.gap.floor),
+        PAGE_MM,
+    )
 
 
-def pull_figures(data: DiscrepancyData) -> list[Figure]:
+def pull_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the figure of the largest deviations before and after."""
     rows = largest_pulls(data)
     if not rows:
-        return []
+        return
     columns: dict[str, Sequence[Any]] = {
         "statistic": [row.statistic for row in rows],
         "sentence": [row.sentence for row in rows],
         "before": [row.before for row in rows],
         "after": [row.after for row in rows],
     }
-    return [
-        Figure(
-            "discrepancy_pulls",
-            "shown",
-            "Largest deviations, before and after",
-            _PULLS_CAPTION,
-            f"In sigma. {_pull_text(rows)}.",
-            (DataTable(columns, dict.fromkeys(("before", "after"), "standard deviations")),),
-            pulls_chart(rows),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "discrepancy_pulls",
+        "shown",
+        "Largest deviations, before and after",
+        "The largest deviations from the model, before (circles) and after effects were added (diamonds). "
+        "The gray band is 2 sigma; the largest of some hundred statistics is near 3 sigma by sampling noise.",
+        f"In sigma. {_pull_text(rows)}.",
+        (DataTable(columns, dict.fromkeys(("before", "after"), "standard deviations")),),
+        pulls_chart(rows),
+        PAGE_MM,
+    )
 
 
 def gap_tables(found: Verdict) -> tuple[DataTable, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -39,17 +39,6 @@ _LEAST, _MOST = 4.0, 12.0
 #: A pixel beyond this is counted, and ringed if such pixels are few.
 _STANDS_OUT, _MOST_RINGS = 5.0, 60
 
-_MAPS_CAPTION = (
-    "Statistics of each pixel: those with a deviating region (outlined), then goodness of fit and the most "
-    "deviating ones. Below each map: histogram of all pixels (gray), of the outlined region (red) and under "
-    "the model (line). A shift of the whole histogram is an effect in all pixels, long tails an effect in "
-    "few; these are ringed in the map."
-)
-_LINES_CAPTION = (
-    "Left and middle: means of rows and of columns of the first frames. Right: scatter of each row or "
-    "column over all frames, relative to independent pixels (1). Stripes in the readout are row or column "
-    "noise, slanted lines are periodic pickup."
-)
 
 _SCORE_WORDS = {
     "C2": "charge: variance beyond Poisson (C2)",
@@ -76,11 +65,11 @@ _PAIR_WORDS = {
 LINE_WORDS = {"row": "rows", "column": "columns"}
 
 
-def sensor_figures(data: DiscrepancyData) -> list[Figure]:
+def sensor_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the maps of statistics of each pixel."""
     maps = [each for each in largest_maps(data.arrays, regions_of(data)) if finite(each.z).size]
     if not maps:
-        return []
+        return
     origin = data.found.examined.origin
     flagged = [pixel for place in data.found.where for pixel in place.pixels]
     words = []
@@ -93,41 +82,40 @@ def sensor_figures(data: DiscrepancyData) -> list[Figure]:
         )
     columns = {each.title: each.z for each in maps}
     table = DataTable(columns, dict.fromkeys(columns, "standard deviations"), origin=origin)
-    return [
-        Figure(
-            "discrepancy_maps",
-            "where",
-            "On the sensor",
-            _MAPS_CAPTION,
-            "Maps in sigma. " + "; ".join(words).replace("-", "−") + ".",
-            (table,),
-            sensor_chart(maps, flagged, origin),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "discrepancy_maps",
+        "where",
+        "On the sensor",
+        "Statistics of each pixel: those with a deviating region (outlined), then goodness of fit and the "
+        "most deviating ones. Below each map: histogram of all pixels (gray), of the outlined region (red) "
+        "and under the model (line). A shift of the whole histogram is an effect in all pixels, long tails "
+        "an effect in few; these are ringed in the map.",
+        "Maps in sigma. " + "; ".join(words).replace("-", "−") + ".",
+        (table,),
+        sensor_chart(maps, flagged, origin),
+        PAGE_MM,
+    )
 
 
-def line_figures(data: DiscrepancyData) -> list[Figure]:
+def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the means of rows and columns, and their scatter."""
     origin = data.found.examined.origin
     tables = line_tables(data.arrays, origin)
     if not tables:
-        return []
+        return
     words = [_line_text(line, np.asarray(data.arrays[f"{line}_rms"])) for line in _lines(data.arrays)]
-    return [
-        Figure(
-            "discrepancy_lines",
-            "where",
-            "Rows and columns",
-            _LINES_CAPTION,
-            "Scatter of the means over the frames, relative to independent pixels (1). "
-            + "; ".join(words)
-            + ".",
-            tables,
-            lines_chart(data.arrays, origin),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "discrepancy_lines",
+        "where",
+        "Rows and columns",
+        "Left and middle: means of rows and of columns of the first frames. Right: scatter of each row or "
+        "column over all frames, relative to independent pixels (1). Stripes in the readout are row or "
+        "column noise, slanted lines are periodic pickup.",
+        "Scatter of the means over the frames, relative to independent pixels (1). " + "; ".join(words) + ".",
+        tables,
+        lines_chart(data.arrays, origin),
+        PAGE_MM,
+    )
 
 
 def _lines(arrays: Mapping[str, NDArray[Any]]) -> list[str]:
@@ -281,7 +269,7 @@ def _map_stack(
     if each.far > 0:
         limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
     rings, beyond = np.zeros(each.z.shape, bool), np.abs(np.nan_to_num(each.z)) > _STANDS_OUT
-    for y, x in np.asarray(flagged).reshape(-1, 2) - origin:
+    for y, x in ((y - origin[0], x - origin[1]) for y, x in flagged):
         if 0 <= y < rings.shape[0] and 0 <= x < rings.shape[1]:
             rings[y, x] = True
     if beyond.sum() <= _MOST_RINGS:

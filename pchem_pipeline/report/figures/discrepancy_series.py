@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,28 +45,15 @@ _LABELS = {
 }
 _PANEL_MM, _AXIS_MM = 42.0, 12.0
 
-_CODES_CAPTION = (
-    "All usable pixels together. Top: samples at each DN (gray) and expectation from the fitted PCDs (black; "
-    "with added effects: purple). Bottom: difference from the plain model in sigma, even and odd DN in two "
-    "colours; the gray band is 2 sigma. A single tall line is saturation or clipping, alternating colours "
-    "are differential nonlinearity of the ADC, a slow wave is integral nonlinearity. Yellow: codes named in "
-    "the verdict."
-)
-_FRAMES_CAPTION = (
-    "Dots: frame means over all usable pixels, and the excess of squared residuals of each frame (noise). "
-    "Blue: means over stretches of the run; the gray band is 2 sigma of their sampling noise. Dashed: time "
-    "course of the named effects, if deterministic. Yellow: frames named in the verdict."
-)
 
-
-def code_figures(data: DiscrepancyData) -> list[Figure]:
+def code_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the counts of each DN and their residuals."""
     if not _has(data, "code_dn", "code_observed", "code_expected"):
-        return []
+        return
     table = code_table(data.arrays)
     dn, residual = table["dn"], table["residual"]
     if dn.size == 0:
-        return []
+        return
     order = np.argsort(-np.abs(residual))[:3]
     largest = ", ".join(f"{residual[i]:+.1f} at {dn[i]:.0f} DN" for i in order).replace("-", "−")
     even = dn % 2 == 0
@@ -78,24 +65,26 @@ def code_figures(data: DiscrepancyData) -> list[Figure]:
         f"square {np.sqrt(np.mean(residual**2)):.2f} (expected below 1); largest {largest}; mean "
         f"{comb.replace('-', '−')}."
     )
-    return [
-        Figure(
-            "discrepancy_codes",
-            "where",
-            "Along the digital numbers",
-            _CODES_CAPTION,
-            alt,
-            (table,),
-            codes_chart(table, data.found.where),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "discrepancy_codes",
+        "where",
+        "Along the digital numbers",
+        "All usable pixels together. Top: samples at each DN (gray) and expectation from the fitted PCDs "
+        "(black; with added effects: purple). Bottom: difference from the plain model in sigma, even and "
+        "odd DN in two colours; the gray band is 2 sigma. A single tall line is saturation or clipping, "
+        "alternating colours are differential nonlinearity of the ADC, a slow wave is integral "
+        "nonlinearity. Yellow: codes named in the verdict.",
+        alt,
+        (table,),
+        codes_chart(table, data.found.where),
+        PAGE_MM,
+    )
 
 
-def frame_figures(data: DiscrepancyData) -> list[Figure]:
+def frame_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the means of the frames along the run."""
     if not _has(data, "frame_number", "frame_charge", "frame_readout"):
-        return []
+        return
     frames, stretches = frame_tables(data.arrays)
     by_channel = np.asarray(data.arrays.get("frame_sd", np.full(2, np.nan)), dtype=np.float64)
     sds = {**dict(zip(CHANNELS, by_channel.tolist(), strict=True)), "noise": 1.0}
@@ -111,18 +100,18 @@ def frame_figures(data: DiscrepancyData) -> list[Figure]:
             f"along the run {short(drift)} {unit}"
         )
     path = "; the time course of the named effects is drawn over them" if _model("readout") in frames else ""
-    return [
-        Figure(
-            "discrepancy_frames",
-            "where",
-            "Along time",
-            _FRAMES_CAPTION,
-            f"Means of {count(int(frames['frame'].size), 'frame')}. {'; '.join(words)}{path}.",
-            (frames, stretches),
-            frames_chart(frames, stretches, sds, data.found.where),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "discrepancy_frames",
+        "where",
+        "Along time",
+        "Dots: frame means over all usable pixels, and the excess of squared residuals of each frame "
+        "(noise). Blue: means over stretches of the run; the gray band is 2 sigma of their sampling noise. "
+        "Dashed: time course of the named effects, if deterministic. Yellow: frames named in the verdict.",
+        f"Means of {count(int(frames['frame'].size), 'frame')}. {'; '.join(words)}{path}.",
+        (frames, stretches),
+        frames_chart(frames, stretches, sds, data.found.where),
+        PAGE_MM,
+    )
 
 
 def _has(data: DiscrepancyData, *names: str) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,97 +39,81 @@ _PREDICTIONS: dict[str, tuple[str, str, Dash]] = {
 #: Parts of the figure: (part, axis, prefix of the data, prefix of the predictions, unit).
 _HALVES = (("raw", "dn", "", "epcd_", "DN"), ("nuced", "electrons", "nuced_", "nuced_", "e-"))
 
-_ENSEMBLE_CAPTION = (
-    "Histogram of all pixels over the chosen frames (gray), raw at the top and after two-point non-"
-    "uniformity correction at the bottom, with peaks at whole electrons. Lines: prediction "
-    "from the fitted parameters, as the exact mean over the pixels, with the parameters' joint "
-    "histogram (dependent), and with the product of their four histograms (independent). Strips: data"
-    " minus prediction; gray: 2 sigma of sampling noise. The model describes the data if the RMSE is "
-    "close to the sampling noise."
-)
-_ELECTRONS_CAPTION = (
-    "Gray: share of each estimated electron number. Dots: probability p(k) from the map of H. Crosses: "
-    "expected share of the estimates, which confuse neighbouring numbers. Below: estimate minus "
-    "expectation; gray: 2 sigma of sampling noise."
-)
-_COMPONENTS_CAPTION = (
-    "Standard deviation of the component of electron number k, raw (left or top) and after non-"
-    "uniformity correction (right or bottom). For each line a set of parameters is constant over the "
-    "pixels; gray: the remaining of the sixteen sets. Where a line is flat the peaks are resolved at "
-    "every signal."
-)
 
 _SYMBOLS = {"mu": "μ", "sigma": "σ", "sigma2": "σ²"}
 #: Cases of Appendix B that are drawn in colour.
 _HIGHLIGHTED = ("none", "g", "H, g", "g, μ, σ²", "H, g, μ, σ²")
 
 
-def ensemble_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def ensemble_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the ensemble histograms with their predictions."""
     tables = ensemble_tables(data.ensemble)
     if not tables:
-        return []
+        return
     rmse = dict(data.ensemble_facts.get("rmse", {}))
     numbers = ", ".join(f"{name.replace('_', ' ')} {scientific(value)}" for name, value in rmse.items())
-    return [
-        Figure(
-            "ensemble",
-            "summary",
-            "Ensemble histogram and its prediction",
-            _ENSEMBLE_CAPTION,
-            "Ensemble histogram before and after non-uniformity correction with predictions. "
-            f"RMSE: {numbers}.",
-            tables,
-            ensemble_chart(tables, rmse, data.ensemble_facts.get("n_frames")),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "ensemble",
+        "summary",
+        "Ensemble histogram and its prediction",
+        "Histogram of all pixels over the chosen frames (gray), raw at the top and after two-point non-"
+        "uniformity correction at the bottom, with peaks at whole electrons. Lines: prediction "
+        "from the fitted parameters, as the exact mean over the pixels, with the parameters' joint "
+        "histogram (dependent), and with the product of their four histograms (independent). Strips: data"
+        " minus prediction; gray: 2 sigma of sampling noise. The model describes the data if the RMSE is "
+        "close to the sampling noise.",
+        f"Ensemble histogram before and after non-uniformity correction with predictions. RMSE: {numbers}.",
+        tables,
+        ensemble_chart(tables, rmse, data.ensemble_facts.get("n_frames")),
+        PAGE_MM,
+    )
 
 
-def electron_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def electron_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the estimated electron numbers against their prediction."""
     arrays = data.ensemble
     if "electron_mass" not in arrays:
-        return []
+        return
     mass, pmf = arrays["electron_mass"], arrays["electron_pmf"]
     first = ", ".join(f"k = {k}: {mass[k]:.4f} against {pmf[k]:.4f}" for k in range(min(5, mass.size)))
     names = ("k", "electron_counts", "electron_mass", "electron_pmf", "electron_pmf_map")
     table = DataTable({name: arrays[name] for name in names if name in arrays}, {"k": "e-"})
-    return [
-        Figure(
-            "electron_numbers",
-            "electrons",
-            "Estimated electron numbers",
-            _ELECTRONS_CAPTION,
-            f"Share of each electron number among the estimates against the prediction; {first}.",
-            (table,),
-            electrons_chart(table),
-        )
-    ]
+    yield Figure(
+        "electron_numbers",
+        "electrons",
+        "Estimated electron numbers",
+        "Gray: share of each estimated electron number. Dots: probability p(k) from the map of H. Crosses: "
+        "expected share of the estimates, which confuse neighbouring numbers. Below: estimate minus "
+        "expectation; gray: 2 sigma of sampling noise.",
+        f"Share of each electron number among the estimates against the prediction; {first}.",
+        (table,),
+        electrons_chart(table),
+    )
 
 
-def component_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def component_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the widths of the components of the ensemble (Appendix B)."""
     variance = data.ensemble.get("component_variance")
     if variance is None or not np.isfinite(variance).any():
-        return []
+        return
     cases = data.component_cases or [f"case {i}" for i in range(variance.shape[0])]
     table = component_table(variance, cases, data.ensemble.get("nuced_component_variance"))
     width = table[_held(cases[0])]
-    return [
-        Figure(
-            "component_widths",
-            "components",
-            "Width of the components of the ensemble",
-            _COMPONENTS_CAPTION + bias_remark(data),
-            "Standard deviation of the ensemble's component k, nothing held constant: "
-            f"{short(float(width[0]))} DN at k = 0, "
-            f"{short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
-            (table,),
-            components_chart(table, [c for c in _HIGHLIGHTED if c in cases]),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "component_widths",
+        "components",
+        "Width of the components of the ensemble",
+        "Standard deviation of the component of electron number k, raw (left or top) and after non-"
+        "uniformity correction (right or bottom). For each line a set of parameters is constant over the "
+        "pixels; gray: the remaining of the sixteen sets. Where a line is flat the peaks are resolved at "
+        f"every signal.{bias_remark(data)}",
+        "Standard deviation of the ensemble's component k, nothing held constant: "
+        f"{short(float(width[0]))} DN at k = 0, "
+        f"{short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
+        (table,),
+        components_chart(table, [c for c in _HIGHLIGHTED if c in cases]),
+        PAGE_MM,
+    )
 
 
 def bias_remark(data: ReportData) -> str:

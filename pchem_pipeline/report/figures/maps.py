@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -59,14 +59,6 @@ _CAPTIONS = {
     "dark_signal": "Dark signal: quanta exposure at light level 0.",
     "charge_per_level": "Charge per light level: slope of the quanta exposure against the light level.",
 }
-_READ_NOISE_CAPTION = (
-    "Read noise, quantisation included. Blue line: median; shaded: 5 to 95 % of the pixels. "
-    "{below} of the {noun}s with a value are below 0.4 e⁻."
-)
-_STATUS_CAPTION = (
-    "Light gray: good fit. A pixel with several reasons has the colour of the first; the numbers count"
-    " every reason."
-)
 
 
 #: Maps that have a figure, in their order.
@@ -106,47 +98,45 @@ def _map_alt(data: ReportData, name: str, what: str) -> str:
     )
 
 
-def read_noise_figures(data: ReportData, settings: ReportSettings) -> list[Figure]:
+def read_noise_figures(data: ReportData, settings: ReportSettings) -> Iterator[Figure]:
     """Return the histogram of the read noise; a line of few channels is shown with the maps."""
     if not data.has_values("read_noise_e") or data.few_channels:
-        return []
+        return
     known = data.ordered("read_noise_e")
     below = percent(known.n_below(0.4), known.size)
     bins = histogram_table(known, "read_noise_e", settings.histogram_bins)
-    return [
-        Figure(
-            "read_noise_histogram",
-            "",
-            "Read noise of the pixels",
-            _READ_NOISE_CAPTION.format(below=below, noun=data.noun),
-            _map_alt(data, "read_noise_e", "Histogram")
-            + f" {below} of the {data.noun}s with a value are below 0.4 e⁻.",
-            (bins,),
-            read_noise_chart(known, bins),
-        )
-    ]
+    yield Figure(
+        "read_noise_histogram",
+        "",
+        "Read noise of the pixels",
+        "Read noise, quantisation included. Blue line: median; shaded: 5 to 95 % of the pixels. "
+        f"{below} of the {data.noun}s with a value are below 0.4 e⁻.",
+        _map_alt(data, "read_noise_e", "Histogram")
+        + f" {below} of the {data.noun}s with a value are below 0.4 e⁻.",
+        (bins,),
+        read_noise_chart(known, bins),
+    )
 
 
-def status_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def status_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the map of the fit status."""
     status = data.fit.get("fit_status")
     if status is None:
-        return []
+        return
     rows = status_counts(status, data.status_words)
     parts = [f"{count(int(((status == 0) & ~data.unfitted).sum()), data.noun)} with a good fit"]
     parts += [f"{count(n, data.noun)}: {text}" for _, text, n in rows]
     reasons = dict(zip(("bit", "meaning", "pixels"), map(list, zip(*rows, strict=True)), strict=False))
-    return [
-        Figure(
-            "fit_status",
-            "status",
-            "Fit status of the pixels",
-            _STATUS_CAPTION,
-            "Map of the fit status. " + "; ".join(parts) + ".",
-            (DataTable({"fit_status": status}), *([DataTable(reasons, part="reasons")] if rows else [])),
-            status_chart(status, rows, data.unfitted),
-        )
-    ]
+    yield Figure(
+        "fit_status",
+        "status",
+        "Fit status of the pixels",
+        "Light gray: good fit. A pixel with several reasons has the colour of the first; the numbers count"
+        " every reason.",
+        "Map of the fit status. " + "; ".join(parts) + ".",
+        (DataTable({"fit_status": status}), *([DataTable(reasons, part="reasons")] if rows else [])),
+        status_chart(status, rows, data.unfitted),
+    )
 
 
 def map_tables(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,15 +30,6 @@ from pchem_pipeline.report.figures.stacks import row_stack
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import short
 
-_CAPTION = (
-    "Left or top: simulated pixels at the exposure and gain of this run, same total number of frames for "
-    "every method; hollow symbols: no answer for more than a tenth of the pixels. Lines without symbols: "
-    "smallest possible errors (Cramer-Rao bound) from one sample, and from a dark and a bright one; dotted "
-    "line: above this read noise photon transfer is more precise than one sample. Right or bottom: pixels "
-    "of this run; filled: root mean square error, hollow: robust scatter, bar: bound. "
-    "Errors are clipped at 180 %."
-)
-
 #: Method to the hue, or colour, of its line, and its marker.
 _MARKS: dict[str, tuple[str, Shape]] = {
     "pchem_em": ("blue", "o"),
@@ -59,29 +50,32 @@ _OTHER: tuple[str, Shape] = ("#666666", "h")
 _RANGE = (0.03, 60.0)  # %
 
 
-def method_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def method_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the figure of the comparison, where one was made."""
     result = data.methods
     if result is None:
-        return []
+        return
     known = [method for method in result["methods"] if method["errors"]]
     words = [
         f"{method['title']}: {percent_text(method['errors']['conversion_gain'].get('rmse'))} %"
         for method in known
     ]
     crossing = f" {crossing_text(result['study'])}." if result["study"] else ""
-    return [
-        Figure(
-            "methods_gain_error",
-            "methods",
-            "Error of the conversion gain by each method",
-            _CAPTION,
-            f"Root mean square error of the gain on this run's pixels. {'; '.join(words)}.{crossing}",
-            method_tables(result),
-            methods_chart(result),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "methods_gain_error",
+        "methods",
+        "Error of the conversion gain by each method",
+        "Left or top: simulated pixels at the exposure and gain of this run, same total number of frames "
+        "for every method; hollow symbols: no answer for more than a tenth of the pixels. Lines without "
+        "symbols: smallest possible errors (Cramer-Rao bound) from one sample, and from a dark and a bright "
+        "one; dotted line: above this read noise photon transfer is more precise than one sample. Right or "
+        "bottom: pixels of this run; filled: root mean square error, hollow: robust scatter, bar: bound. "
+        "Errors are clipped at 180 %.",
+        f"Root mean square error of the gain on this run's pixels. {'; '.join(words)}.{crossing}",
+        method_tables(result),
+        methods_chart(result),
+        PAGE_MM,
+    )
 
 
 def method_tables(result: Mapping[str, Any]) -> tuple[DataTable, ...]:

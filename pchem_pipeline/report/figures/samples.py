@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -23,39 +23,29 @@ AXES = {
     "light_level": ("light level", "", ("charge_per_level",), "dark_signal"),
 }
 
-_LINE_CAPTION = (
-    "Quanta exposure against {against}, with the median line of the pixels. Below: median residual "
-    "with its standard error."
-)
-_TRANSFER_CAPTION = (
-    "Medians over the pixels. Curve: prediction from the median parameters of the joint fit, not fitted "
-    "to the points."
-)
 
-
-def exposure_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def exposure_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the exposures on their line, where samples lie on one."""
     samples = data.samples
     if samples is None or samples.against not in AXES:
-        return []
+        return
     slope = slope_of(data)
     if slope is None or not samples.on_line:
-        return []
+        return
     words, noun = AXES[samples.against][0], symbol(slope)[1]
     table = exposure_table(samples)
     line = (_median(data.maps[slope]), *middle(data.maps[AXES[samples.against][3]])[:2])
     centre, error, _low, _high = middle(data.maps[slope])
-    return [
-        Figure(
-            "exposures",
-            "exposures",
-            f"{noun.capitalize()} as the slope of H",
-            _LINE_CAPTION.format(against=words),
-            f"Exposures on a line; median {noun} {measured(centre, error, symbol(slope)[2])}.",
-            (table,),
-            exposures_chart(table, line),
-        )
-    ]
+    yield Figure(
+        "exposures",
+        "exposures",
+        f"{noun.capitalize()} as the slope of H",
+        f"Quanta exposure against {words}, with the median line of the pixels. Below: median residual "
+        "with its standard error.",
+        f"Exposures on a line; median {noun} {measured(centre, error, symbol(slope)[2])}.",
+        (table,),
+        exposures_chart(table, line),
+    )
 
 
 def slope_of(data: ReportData) -> str | None:
@@ -65,26 +55,25 @@ def slope_of(data: ReportData) -> str | None:
     return next((name for name in AXES[data.samples.against][2] if data.has_values(name)), None)
 
 
-def transfer_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def transfer_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return variance against mean of the samples, with the curve of the fit."""
     samples = data.samples
     if samples is None or not data.has_values("conversion_gain"):
-        return []
+        return
     table = transfer_table(samples, data.maps["bias"])
     fitted = {name: _median(data.maps[name]) for name in ("conversion_gain", "read_noise_dn")}
     medians = zip(table["sample"], table["variance"], strict=True)
-    return [
-        Figure(
-            "photon_transfer",
-            "photon-transfer",
-            "Variance against mean",
-            _TRANSFER_CAPTION,
-            "Variance against mean above the bias: "
-            + "; ".join(f"{name} {short(float(value))} DN²" for name, value in medians),
-            (table,),
-            transfer_chart(table, fitted),
-        )
-    ]
+    yield Figure(
+        "photon_transfer",
+        "photon-transfer",
+        "Variance against mean",
+        "Medians over the pixels. Curve: prediction from the median parameters of the joint fit, not fitted "
+        "to the points.",
+        "Variance against mean above the bias: "
+        + "; ".join(f"{name} {short(float(value))} DN²" for name, value in medians),
+        (table,),
+        transfer_chart(table, fitted),
+    )
 
 
 def _median(values: NDArray[Any]) -> float:

@@ -29,19 +29,6 @@ _CLIP = 6.0
 _AT_ONCE = 1 << 21
 _WIDTH = 1.2533  # standard error of a median over that of a mean
 
-_FRAMES = (
-    "Top: mean of all pixels{averaged}; gray: 2 sigma for independent pixels. Below: power spectrum relative "
-    "to independent pixels (1): mean and maximum of neighbouring frequencies."
-)
-_PROFILES = (
-    "Median of the pixels' mean signal over each row and column; gray: median of the sensor ± 2 sigma for "
-    "independent pixels."
-)
-_SPECTRA = (
-    "Top: fixed pattern (means of rows and columns over all frames, hot pixels clipped). Below: noise of "
-    "rows and columns from frame to frame. 1: independent pixels."
-)
-
 
 def stability_figures(sums: StackSums | None) -> list[Figure]:
     """Return means against frame, row and column, and their spectra, where the run has the sums."""
@@ -63,9 +50,15 @@ def _frame_figure(sums: StackSums) -> Figure:
         f"{short(float(power['largest'].max()), 2)} times the expected one."
     )
     return Figure(
-        "frame_means", "stability", "Mean of the frames", _FRAMES.format(averaged=averaged), alt,
-        (means, power), frames_chart(means, power),
-    )  # fmt: skip
+        "frame_means",
+        "stability",
+        "Mean of the frames",
+        f"Top: mean of all pixels{averaged}; gray: 2 sigma for independent pixels. Below: power spectrum "
+        "relative to independent pixels (1): mean and maximum of neighbouring frequencies.",
+        alt,
+        (means, power),
+        frames_chart(means, power),
+    )
 
 
 def _profile_figure(sums: StackSums) -> Figure | None:
@@ -79,10 +72,15 @@ def _profile_figure(sums: StackSums) -> Figure | None:
         outside = int(((table["mean signal"] < low) | (table["mean signal"] > high)).sum())
         words.append(f"{outside} of {count(low.size, table.part)} outside 2 sigma")
     return Figure(
-        "profiles", "stability", "Profiles of rows and columns", _PROFILES,
+        "profiles",
+        "stability",
+        "Profiles of rows and columns",
+        "Median of the pixels' mean signal over each row and column; gray: median of the sensor ± 2 sigma "
+        "for independent pixels.",
         f"Profiles of the mean signal: {'; '.join(words)}.",
-        tuple(tables), profiles_chart(tables),
-    )  # fmt: skip
+        tuple(tables),
+        profiles_chart(tables),
+    )
 
 
 def _spectrum_figure(sums: StackSums) -> Figure | None:
@@ -94,10 +92,15 @@ def _spectrum_figure(sums: StackSums) -> Figure | None:
         for table in (*fixed, *temporal)
     ]
     return Figure(
-        "spatial_spectra", "stability", "Spectra of rows and columns", _SPECTRA,
+        "spatial_spectra",
+        "stability",
+        "Spectra of rows and columns",
+        "Top: fixed pattern (means of rows and columns over all frames, hot pixels clipped). Below: noise of "
+        "rows and columns from frame to frame. 1: independent pixels.",
         f"Largest power relative to independent pixels: {', '.join(largest)}.",
-        (*fixed, *temporal), spectra_chart(fixed, temporal),
-    )  # fmt: skip
+        (*fixed, *temporal),
+        spectra_chart(fixed, temporal),
+    )
 
 
 def frame_table(sums: StackSums) -> DataTable:

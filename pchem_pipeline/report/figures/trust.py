@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,28 +42,11 @@ _TWO = (1.0, 1.15)
 _UNCERTAIN = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
 _GOODNESS = ("p", "chi2", "dof", "q")
 
-_GOODNESS_CAPTION = (
-    "p-values of the goodness of fit of all pixels (blue): uniform where the model holds (line; gray: 2 "
-    "sigma), with a peak at 0 from pixels that the model does not describe. Map: chi-square as standard "
-    "normal deviate, clipped at −4 and 6; circles: misfits at a false-discovery rate of {rate:g}."
-)
-_LEFT_OUT_CAPTION = (
-    "Samples where the fitted model expects fewer than {floor:g} frames per DN are excluded from the "
-    "likelihood. Left: number of pixels by excluded samples. Right: map; white: none. Without outliers, "
-    "about one pixel in two hundred has an excluded sample."
-)
-_UNCERTAINTY_CAPTION = (
-    "Left: share of each map's variance over the pixels that is noise of the estimates; near 100 % "
-    "(dotted) the map shows only noise: take more frames. Right: predicted density of the ensemble "
-    "(black), its standard error from the errors of the maps (blue), and the sampling noise of the "
-    "data (light blue)."
-)
 
-
-def goodness_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def goodness_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the p-values and the map of the goodness of fit."""
     if not data.misfits or any(f"goodness_{name}" not in data.fit for name in _GOODNESS):
-        return []
+        return
     facts = data.misfits
     rate = float(facts["false_discovery_rate"])
     columns = {name: data.fit[f"goodness_{name}"] for name in _GOODNESS}
@@ -71,65 +56,66 @@ def goodness_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
         f"p-values and misfit of {count(int(facts['tested']), data.noun)}; "
         f"{count(int(facts['misfits']), 'misfit')} at a false-discovery rate of {rate:g}."
     )
-    return [
-        Figure(
-            "goodness",
-            "goodness",
-            "Goodness of fit of all pixels",
-            _GOODNESS_CAPTION.format(rate=rate),
-            text,
-            (table,),
-            goodness_chart(table, rate),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "goodness",
+        "goodness",
+        "Goodness of fit of all pixels",
+        "p-values of the goodness of fit of all pixels (blue): uniform where the model holds (line; gray: 2 "
+        "sigma), with a peak at 0 from pixels that the model does not describe. Map: chi-square as standard "
+        f"normal deviate, clipped at −4 and 6; circles: misfits at a false-discovery rate of {rate:g}.",
+        text,
+        (table,),
+        goodness_chart(table, rate),
+        PAGE_MM,
+    )
 
 
-def left_out_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def left_out_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return where the tail guard left samples out of the fit."""
     share = data.fit.get("outlier_share")
     if share is None or not data.misfits.get("tail_guard"):
-        return []
+        return
     hit = int((share > 0).sum())
-    return [
-        Figure(
-            "left_out",
-            "goodness",
-            "Samples excluded from the fit",
-            _LEFT_OUT_CAPTION.format(floor=data.misfits["tail_guard"]),
-            f"{count(hit, data.noun)} of {share.size:,} with excluded samples, at most "
-            f"{percent(float(np.max(share, initial=0.0)), 1.0)} of their frames.",
-            (DataTable({"share left out": share}),),
-            left_out_chart(share, data.n_frames),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "left_out",
+        "goodness",
+        "Samples excluded from the fit",
+        f"Samples where the fitted model expects fewer than {data.misfits['tail_guard']:g} frames per DN "
+        "are excluded from the likelihood. Left: number of pixels by excluded samples. Right: map; white: "
+        "none. Without outliers, about one pixel in two hundred has an excluded sample.",
+        f"{count(hit, data.noun)} of {share.size:,} with excluded samples, at most "
+        f"{percent(float(np.max(share, initial=0.0)), 1.0)} of their frames.",
+        (DataTable({"share left out": share}),),
+        left_out_chart(share, data.n_frames),
+        PAGE_MM,
+    )
 
 
-def uncertainty_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def uncertainty_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the part of the maps that is noise, and the error of the predicted ensemble."""
     shares = noise_shares(data, _UNCERTAIN)
     arrays = data.ensemble
     if not shares or "epcd_exact" not in arrays:
-        return []
+        return
     words = ", ".join(f"{symbol(name)[1]} {percent(min(value, 1.0), 1.0)}" for name, value in shares.items())
     maps = DataTable({"map": list(shares), "share of the variance": list(shares.values())}, part="maps")
     names = ("dn", "counts", "epcd_exact", "epcd_stderr")
     columns = {name: arrays[name] for name in names if name in arrays}
     units = {"dn": "DN", "epcd_exact": "1/DN", "epcd_stderr": "1/DN"}
     ensemble = DataTable(columns, units, "ensemble")
-    return [
-        Figure(
-            "uncertainty",
-            "uncertainty",
-            "Noise in the maps and in the prediction",
-            _UNCERTAINTY_CAPTION,
-            f"Share of noise in the variance of the maps: {words}.",
-            (maps, ensemble),
-            uncertainty_chart(maps, ensemble),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "uncertainty",
+        "uncertainty",
+        "Noise in the maps and in the prediction",
+        "Left: share of each map's variance over the pixels that is noise of the estimates; near 100 % "
+        "(dotted) the map shows only noise: take more frames. Right: predicted density of the ensemble "
+        "(black), its standard error from the errors of the maps (blue), and the sampling noise of the "
+        "data (light blue).",
+        f"Share of noise in the variance of the maps: {words}.",
+        (maps, ensemble),
+        uncertainty_chart(maps, ensemble),
+        PAGE_MM,
+    )
 
 
 def noise_shares(data: ReportData, names: tuple[str, ...]) -> dict[str, float]:

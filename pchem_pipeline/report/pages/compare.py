@@ -92,8 +92,8 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
     """
     many = len(found.pairs) > _MOST_DRAWN
     maps = {pair.other.label: [] if many else difference_figures(pair) for pair in found.pairs}
-    whole = ensembles_figures([found.runs[0], *found.runs[1:][-_MOST_DRAWN:]])
-    times = history_figures(found.history, found.against)
+    whole = list(ensembles_figures([found.runs[0], *found.runs[1:][-_MOST_DRAWN:]]))
+    times = list(history_figures(found.history, found.against))
     every = [*whole, *times, *(each for figures in maps.values() for each in figures)]
     drawn = (draw or draw_here)(every, _SETTINGS)
 
