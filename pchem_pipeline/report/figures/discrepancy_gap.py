@@ -48,7 +48,7 @@ _FAMILY_WORDS = {
 def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the gap before and after, against its floor."""
     found = data.found
-    tables = gap_tables(found)
+    tables = _gap_tables(found)
     if not tables:
         return
     yield Figure(
@@ -60,7 +60,7 @@ def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "triangles at the edge are gaps below the axis. By family of statistics: before and after.",
         f"Gap in micronats (10⁻⁶ nats) per sample: {_gap_alt(found)}.",
         tables,
-        gap_chart(gap_bars(found), families(found), MICRO * found.gap.floor),
+        _gap_chart(gap_bars(found), families(found), MICRO * found.gap.floor),
         PAGE_MM,
     )
 
@@ -84,12 +84,12 @@ def pull_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "The gray band is 2 sigma; the largest of some hundred statistics is near 3 sigma by sampling noise.",
         f"In sigma. {_pull_text(rows)}.",
         (DataTable(columns, dict.fromkeys(("before", "after"), "standard deviations")),),
-        pulls_chart(rows),
+        _pulls_chart(rows),
         PAGE_MM,
     )
 
 
-def gap_tables(found: Verdict) -> tuple[DataTable, ...]:
+def _gap_tables(found: Verdict) -> tuple[DataTable, ...]:
     """Return the gap of each model, with its interval and the floor, and by family of statistics."""
     bars, parts, floor = gap_bars(found), families(found), MICRO * found.gap.floor
     if not bars:
@@ -218,14 +218,8 @@ _ROLES: dict[str, tuple[str, Shape]] = {
 }
 
 
-def gap_chart(bars: Sequence[GapBar], families: Sequence[tuple[str, float, float]], floor: float) -> Chart:
-    """Return the gap before and after against its floor, with rivals, and by family.
-
-    Args:
-        bars: of :func:`gap_bars`, at least one.
-        families: of :func:`families`.
-        floor: 1e-6 nats; NaN where it is not known.
-    """
+def _gap_chart(bars: Sequence[GapBar], families: Sequence[tuple[str, float, float]], floor: float) -> Chart:
+    """Return the gap before and after against its floor (1e-6 nats), with rivals, and by family."""
     ends = _limits(bars, families, floor)
     stacks = [_gap_rows(bars, floor, ends)]
     if families:
@@ -296,12 +290,8 @@ def _point(value: float, row: int, left: float, role: str, label: str = "") -> P
     return Points(np.array([left * 1.12]), y, "<", 5.0, face="paper", colour=colour)
 
 
-def pulls_chart(rows: Sequence[Pull]) -> Chart:
-    """Return the largest pulls before and after, in sigma.
-
-    Args:
-        rows: the statistics, the farthest first; ``after`` is NaN where nothing was added.
-    """
+def _pulls_chart(rows: Sequence[Pull]) -> Chart:
+    """Return the largest pulls before and after, in sigma."""
     marks: list[Mark] = [Span(-2.0, 2.0, "x", colour="band"), Level(0.0, "x", colour="ink", width=0.6)]
     places = np.arange(len(rows))
     values = {role: np.array([getattr(row, role) for row in rows]) for role in ("before", "after")}

@@ -92,7 +92,7 @@ def sensor_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "an effect in few; these are ringed in the map.",
         "Maps in sigma. " + "; ".join(words).replace("-", "−") + ".",
         (table,),
-        sensor_chart(maps, flagged, origin),
+        _sensor_chart(maps, flagged, origin),
         PAGE_MM,
     )
 
@@ -100,7 +100,7 @@ def sensor_figures(data: DiscrepancyData) -> Iterator[Figure]:
 def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the means of rows and columns, and their scatter."""
     origin = data.found.examined.origin
-    tables = line_tables(data.arrays, origin)
+    tables = _line_tables(data.arrays, origin)
     if not tables:
         return
     words = [_line_text(line, np.asarray(data.arrays[f"{line}_rms"])) for line in _lines(data.arrays)]
@@ -113,7 +113,7 @@ def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "column noise, slanted lines are periodic pickup.",
         "Scatter of the means over the frames, relative to independent pixels (1). " + "; ".join(words) + ".",
         tables,
-        lines_chart(data.arrays, origin),
+        _lines_chart(data.arrays, origin),
         PAGE_MM,
     )
 
@@ -122,13 +122,8 @@ def _lines(arrays: Mapping[str, NDArray[Any]]) -> list[str]:
     return [line for line in LINE_WORDS if arrays.get(f"{line}_rms", np.empty(0)).size]
 
 
-def line_tables(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int]) -> tuple[DataTable, ...]:
-    """Return the scatter of each row and column, and their means in the first frames.
-
-    Args:
-        arrays: group ``discrepancy`` of the store.
-        origin: row and column of the sensor of the first of them.
-    """
+def _line_tables(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int]) -> tuple[DataTable, ...]:
+    """Return the scatter of each row and column, and their means in the first frames."""
     tables = []
     for line in _lines(arrays):
         axis, first = ("y", origin[0]) if line == "row" else ("x", origin[1])
@@ -237,16 +232,10 @@ def _pixel_map(words: str, values: NDArray[Any], region: Region | None = None) -
     return PixelMap(words, z, float(max(departures)), outliers, region)
 
 
-def sensor_chart(
+def _sensor_chart(
     maps: Sequence[PixelMap], flagged: Sequence[tuple[int, int]] = (), origin: tuple[int, int] = (0, 0)
 ) -> Chart:
-    """Return maps of statistics of each pixel, and below their histograms with that under the model.
-
-    Args:
-        maps: as :func:`largest_maps` returns them.
-        flagged: pixels (y, x) of the sensor named in the verdict; they are ringed.
-        origin: row and column of the sensor of the maps' first pixel.
-    """
+    """Return maps of statistics of each pixel, and below their histograms with that under the model."""
     shown, below = [], []
     for each in maps:
         inside = _inside(each, origin)
@@ -268,7 +257,8 @@ def _map_stack(
     limit = _LEAST
     if each.far > 0:
         limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
-    rings, beyond = np.zeros(each.z.shape, bool), np.abs(np.nan_to_num(each.z)) > _STANDS_OUT
+    beyond: NDArray[np.bool_] = np.abs(np.nan_to_num(each.z)) > _STANDS_OUT
+    rings = np.zeros_like(beyond)
     for y, x in ((y - origin[0], x - origin[1]) for y, x in flagged):
         if 0 <= y < rings.shape[0] and 0 <= x < rings.shape[1]:
             rings[y, x] = True
@@ -311,13 +301,8 @@ def _outline(inside: NDArray[np.bool_], origin: tuple[int, int]) -> Line:
     return Line(xs, ys, colour="ink", width=1.1)
 
 
-def lines_chart(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int] = (0, 0)) -> Chart:
-    """Return the means of rows and of columns: the first frames as a picture, and the scatter of each line.
-
-    Args:
-        arrays: ``row_image``, ``row_rms``, ``column_image``, ``column_rms`` of group ``discrepancy``.
-        origin: row and column of the sensor of the first of them.
-    """
+def _lines_chart(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int] = (0, 0)) -> Chart:
+    """Return the means of rows and columns: the first frames as a picture, and the scatter of each line."""
     stacks = []
     for line in _lines(arrays):
         image, first = arrays.get(f"{line}_image"), origin[0 if line == "row" else 1]

@@ -76,7 +76,7 @@ def code_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "nonlinearity. Yellow: codes named in the verdict.",
         alt,
         (table,),
-        codes_chart(table, data.found.where),
+        _codes_chart(table, data.found.where),
         PAGE_MM,
     )
 
@@ -85,7 +85,7 @@ def frame_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the means of the frames along the run."""
     if not _has(data, "frame_number", "frame_charge", "frame_readout"):
         return
-    frames, stretches = frame_tables(data.arrays)
+    frames, stretches = _frame_tables(data.arrays)
     by_channel = np.asarray(data.arrays.get("frame_sd", np.full(2, np.nan)), dtype=np.float64)
     sds = {**dict(zip(CHANNELS, by_channel.tolist(), strict=True)), "noise": 1.0}
     sds = {shown: sd for shown, sd in sds.items() if shown in frames}
@@ -109,7 +109,7 @@ def frame_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "Dashed: time course of the named effects, if deterministic. Yellow: frames named in the verdict.",
         f"Means of {count(int(frames['frame'].size), 'frame')}. {'; '.join(words)}{path}.",
         (frames, stretches),
-        frames_chart(frames, stretches, sds, data.found.where),
+        _frames_chart(frames, stretches, sds, data.found.where),
         PAGE_MM,
     )
 
@@ -143,13 +143,8 @@ def code_table(arrays: Mapping[str, NDArray[Any]]) -> DataTable:
 _NAMED = "expected with added effects"
 
 
-def frame_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, DataTable]:
-    """Return the means of the frames in both channels and their noise, and means over stretches of the run.
-
-    Args:
-        arrays: ``frame_number``, ``frame_charge``, ``frame_readout``, ``frame_noise`` if it is known and,
-            where there is a path of the named effects, ``frame_charge_model`` and ``frame_readout_model``.
-    """
+def _frame_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, DataTable]:
+    """Return means of the frames in both channels and their noise, and means over stretches of the run."""
     number = np.asarray(arrays["frame_number"], dtype=np.float64)
     columns, means = {"frame": number}, dict[str, FloatArray]()
     units: dict[str, str] = {}
@@ -169,13 +164,8 @@ def _model(channel: str) -> str:
     return f"{channel}, named effects"
 
 
-def codes_chart(table: DataTable, marked: Sequence[Place] = ()) -> Chart:
-    """Return the chart of counts per DN and their residuals; even and odd codes differ in colour.
-
-    Args:
-        table: of :func:`code_table`.
-        marked: places whose interval of DN is shaded.
-    """
+def _codes_chart(table: DataTable, marked: Sequence[Place] = ()) -> Chart:
+    """Return the chart of counts per DN and their residuals; even and odd codes differ in colour."""
     dn, observed, expected, residual = (table[name] for name in ("dn", "observed", "expected", "residual"))
     edges = np.append(dn - 0.5, dn[-1] + 0.5)
     shaded = [
@@ -248,17 +238,10 @@ def parity_difference(number: NDArray[Any], values: FloatArray, sd: float) -> fl
     return float((values[even].mean() - values[~even].mean()) / error)
 
 
-def frames_chart(
+def _frames_chart(
     frames: DataTable, stretches: DataTable, sds: Mapping[str, float], marked: Sequence[Place] = ()
 ) -> Chart:
-    """Return the chart of the frames in both channels and of their noise, with the path of named effects.
-
-    Args:
-        frames: of :func:`frame_tables`.
-        stretches: likewise.
-        sds: sampling noise of a frame mean, in the stored unit, by panel.
-        marked: places whose frames are shaded.
-    """
+    """Return the chart of the frames in both channels and of their noise, with the path of named effects."""
     panels = []
     for channel, sd in sds.items():
         shaded = [

@@ -60,7 +60,7 @@ def history_figures(rows: Sequence[HistoryRow], against: Against) -> Iterator[Fi
         "Medians of the maps with their standard errors; band: scatter of the pixels.",
         f"From {first.label} to {last.label}: {words}.",
         (table,),
-        history_chart(table, tuple(shown), axis, () if ordered else _labels(rows)),
+        _history_chart(table, tuple(shown), axis, () if ordered else _labels(rows)),
         PAGE_MM,
     )
 
@@ -74,17 +74,10 @@ def _labels(rows: Sequence[HistoryRow]) -> tuple[tuple[float, str], ...]:
     return tuple((float(i), texts[i]) for i in range(0, len(rows), every))
 
 
-def history_chart(
+def _history_chart(
     table: DataTable, names: tuple[str, ...], axis: str, ticks: tuple[tuple[float, str], ...] = ()
 ) -> Chart:
-    """Return the chart with a panel for each map: median with its error, and the scatter of the pixels.
-
-    Args:
-        table: of the figure.
-        names: the maps.
-        axis: column against which they are drawn.
-        ticks: places and texts on it; empty: as the renderer finds them.
-    """
+    """Return the chart with a panel for each map: median with its error, and the scatter of the pixels."""
     order = np.argsort(table[axis], kind="stable")
     at = table[axis].astype(np.float64)[order]
     panels = []

@@ -72,18 +72,14 @@ def method_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
         "bottom: pixels of this run; filled: root mean square error, hollow: robust scatter, bar: bound. "
         "Errors are clipped at 180 %.",
         f"Root mean square error of the gain on this run's pixels. {'; '.join(words)}.{crossing}",
-        method_tables(result),
-        methods_chart(result),
+        _method_tables(result),
+        _methods_chart(result),
         PAGE_MM,
     )
 
 
-def method_tables(result: Mapping[str, Any]) -> tuple[DataTable, ...]:
-    """Return the errors on simulated pixels, where there are any, and on the pixels of the run.
-
-    Args:
-        result: content of ``methods.json``.
-    """
+def _method_tables(result: Mapping[str, Any]) -> tuple[DataTable, ...]:
+    """Return the errors on simulated pixels, where there are any, and on the pixels of the run."""
     tables = []
     if result["study"]:
         study = result["study"]
@@ -109,12 +105,8 @@ def percent_text(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.3g}"
 
 
-def methods_chart(result: Mapping[str, Any]) -> Chart:
-    """Return the error of the gain against the read noise (simulated), and that on the run's own pixels.
-
-    Args:
-        result: content of ``methods.json``.
-    """
+def _methods_chart(result: Mapping[str, Any]) -> Chart:
+    """Return the error of the gain against the read noise (simulated), and that on the run's own pixels."""
     study, known = result["study"], [m for m in result["methods"] if m["errors"]]
     letters = ("(a) ", "(b) ") if study and known else ("", "")
     stacks = [_study(study, letters[0])] if study else []

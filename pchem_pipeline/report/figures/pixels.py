@@ -103,7 +103,7 @@ def pixel_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
         "expected) / √expected; gray band: 2 sigma. In a good fit about one line in twenty is outside the "
         "band, without a pattern. Uncertainties are standard errors of the fit.",
         "Histograms with fitted densities. " + "; ".join(words) + ".",
-        fit_tables(data.pixels),
+        _fit_tables(data.pixels),
         pixels_chart(data.pixels),
         PAGE_MM if len(data.pixels) > 1 else COLUMN_MM,
     )
@@ -140,7 +140,7 @@ def cell_tables(parameters: Mapping[str, float], pixel: PixelFit | None = None) 
     return density, between, DataTable(frames, {"dn": "DN"}, "histogram")
 
 
-def fit_tables(pixels: Sequence[PixelFit]) -> tuple[DataTable, DataTable]:
+def _fit_tables(pixels: Sequence[PixelFit]) -> tuple[DataTable, DataTable]:
     """Return the histograms of pixels with what their fits expect, and their parameters."""
     parts = [_pixel_columns(pixel) for pixel in pixels]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

@@ -43,7 +43,7 @@ def rounding_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
         "are fitted, unless fit.likelihood is density.",
         f"At {short(step)} DN per electron, in standard errors per pixel: {', '.join(words)}.",
         (table,),
-        rounding_chart(table, gain),
+        _rounding_chart(table, gain),
     )
 
 
@@ -79,13 +79,8 @@ def rounding_curves(data: ReportData) -> dict[str, NDArray[np.float64]]:
 _HUES = ("blue", "vermilion", "green", "orange")
 
 
-def rounding_chart(table: DataTable, gain: NDArray[Any]) -> Chart:
-    """Return the chart of the bias of the density's estimates against 1/g, with the range of this sensor.
-
-    Args:
-        table: from :func:`rounding_curves`.
-        gain: map of the conversion gain, e-/DN.
-    """
+def _rounding_chart(table: DataTable, gain: NDArray[Any]) -> Chart:
+    """Return the chart of the bias of the density's estimates against 1/g, with the range of this sensor."""
     steps = table["1/g"]
     low, high = (1.0 / float(q) for q in np.quantile(finite(gain), [0.99, 0.01]))
     lines = [

@@ -33,7 +33,7 @@ def exposure_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     if slope is None or not samples.on_line:
         return
     words, noun = AXES[samples.against][0], symbol(slope)[1]
-    table = exposure_table(samples)
+    table = _exposure_table(samples)
     line = (_median(data.maps[slope]), *middle(data.maps[AXES[samples.against][3]])[:2])
     centre, error, _low, _high = middle(data.maps[slope])
     yield Figure(
@@ -44,7 +44,7 @@ def exposure_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
         "with its standard error.",
         f"Exposures on a line; median {noun} {measured(centre, error, symbol(slope)[2])}.",
         (table,),
-        exposures_chart(table, line),
+        _exposures_chart(table, line),
     )
 
 
@@ -60,7 +60,7 @@ def transfer_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     samples = data.samples
     if samples is None or not data.has_values("conversion_gain"):
         return
-    table = transfer_table(samples, data.maps["bias"])
+    table = _transfer_table(samples, data.maps["bias"])
     fitted = {name: _median(data.maps[name]) for name in ("conversion_gain", "read_noise_dn")}
     medians = zip(table["sample"], table["variance"], strict=True)
     yield Figure(
@@ -72,7 +72,7 @@ def transfer_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
         "Variance against mean above the bias: "
         + "; ".join(f"{name} {short(float(value))} DN²" for name, value in medians),
         (table,),
-        transfer_chart(table, fitted),
+        _transfer_chart(table, fitted),
     )
 
 
@@ -80,7 +80,7 @@ def _median(values: NDArray[Any]) -> float:
     return float(np.median(finite(values)))
 
 
-def exposure_table(samples: Samples) -> DataTable:
+def _exposure_table(samples: Samples) -> DataTable:
     """Return medians over the pixels of H and of its residuals, of the samples on the line."""
     words, unit, *_ = AXES[samples.against]
     chosen = samples.on_line
@@ -99,13 +99,8 @@ def exposure_table(samples: Samples) -> DataTable:
     return DataTable(columns, dict.fromkeys(list(columns)[2:], "e-") | {words: unit})
 
 
-def transfer_table(samples: Samples, bias: NDArray[Any]) -> DataTable:
-    """Return medians over the pixels of mean above the bias and variance of each sample.
-
-    Args:
-        samples: with their ``mean`` and ``variance``, (sample, y, x).
-        bias: map of mu, DN.
-    """
+def _transfer_table(samples: Samples, bias: NDArray[Any]) -> DataTable:
+    """Return medians over the pixels of mean above the bias (DN) and variance (DN^2) of each sample."""
     mean = np.array([middle(each) for each in samples.arrays["mean"] - bias])
     variance = np.array([middle(each) for each in samples.arrays["variance"]])
     columns: dict[str, Any] = {
@@ -132,15 +127,11 @@ def middle(values: NDArray[Any]) -> tuple[float, float, float, float]:
     return centre, 0.5 * float(ends[1] - ends[0]), low, high
 
 
-def exposures_chart(table: DataTable, line: tuple[float, float, float]) -> Chart:
+def _exposures_chart(table: DataTable, line: tuple[float, float, float]) -> Chart:
     """Return the chart of H against time or light with its line, and the residuals below.
 
     Points are medians over the pixels, bars the 16 to 84 % range between pixels; the error bars of the
     residuals are standard errors of the median.
-
-    Args:
-        table: of :func:`exposure_table`.
-        line: slope, offset and standard error of the offset, e-.
     """
     against = list(table.columns)[1]
     places, exposures, (slope, offset) = table[against].astype(np.float64), table["H"], line[:2]
@@ -175,15 +166,11 @@ def _residuals(places: NDArray[np.float64], table: DataTable) -> Panel:
     return Panel(Axis(label, -most, most), (zero, points))
 
 
-def transfer_chart(table: DataTable, fitted: Mapping[str, float]) -> Chart:
+def _transfer_chart(table: DataTable, fitted: Mapping[str, float]) -> Chart:
     """Return the chart of variance against mean above the bias with the curve of the joint fit.
 
     Photon transfer: ``variance = sigma^2 + (mean - mu) / g`` in DN. Points are medians over the pixels; the
     curve has the median parameters.
-
-    Args:
-        table: of :func:`transfer_table`.
-        fitted: medians of ``conversion_gain`` and ``read_noise_dn``.
     """
     x, y, kinds = (table[name] for name in ("mean above the bias", "variance", "kind"))
     gain, noise = fitted["conversion_gain"], fitted["read_noise_dn"]

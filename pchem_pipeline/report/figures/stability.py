@@ -57,7 +57,7 @@ def _frame_figure(sums: StackSums) -> Figure:
         "relative to independent pixels (1): mean and maximum of neighbouring frequencies.",
         alt,
         (means, power),
-        frames_chart(means, power),
+        _frames_chart(means, power),
     )
 
 
@@ -79,7 +79,7 @@ def _profile_figure(sums: StackSums) -> Figure | None:
         "for independent pixels.",
         f"Profiles of the mean signal: {'; '.join(words)}.",
         tuple(tables),
-        profiles_chart(tables),
+        _profiles_chart(tables),
     )
 
 
@@ -99,7 +99,7 @@ def _spectrum_figure(sums: StackSums) -> Figure | None:
         "rows and columns from frame to frame. 1: independent pixels.",
         f"Largest power relative to independent pixels: {', '.join(largest)}.",
         (*fixed, *temporal),
-        spectra_chart(fixed, temporal),
+        _spectra_chart(fixed, temporal),
     )
 
 
@@ -196,13 +196,8 @@ def _spectrum(power: FloatArray, length: int, part: str, unit: str) -> DataTable
 _CHANCE_LABEL = "chance"
 
 
-def frames_chart(means: DataTable, power: DataTable) -> Chart:
-    """Return the chart of the mean of the frames, and its spectrum below.
-
-    Args:
-        means: of :func:`frame_table`.
-        power: of :func:`power_table`.
-    """
+def _frames_chart(means: DataTable, power: DataTable) -> Chart:
+    """Return the chart of the mean of the frames, and its spectrum below."""
     x, centre, error = means["frame"], float(means["mean"].mean()), means["error of chance"]
     band = Band(x, centre - 2 * error, centre + 2 * error, colour="band", label=_CHANCE_LABEL)
     line = Line(x, means["mean"], width=0.7, label="mean")
@@ -223,12 +218,8 @@ def frames_chart(means: DataTable, power: DataTable) -> Chart:
     )
 
 
-def profiles_chart(tables: Sequence[DataTable]) -> Chart:
-    """Return the chart of the profiles of rows and columns.
-
-    Args:
-        tables: of :func:`profile_table`.
-    """
+def _profiles_chart(tables: Sequence[DataTable]) -> Chart:
+    """Return the chart of the profiles of rows and columns."""
     stacks = []
     for table in tables:
         name = next(iter(table.columns))
@@ -240,13 +231,8 @@ def profiles_chart(tables: Sequence[DataTable]) -> Chart:
     return Chart(tuple(stacks))
 
 
-def spectra_chart(fixed: Sequence[DataTable], temporal: Sequence[DataTable]) -> Chart:
-    """Return the chart of spatial spectra of the fixed pattern, and below of the noise of rows and columns.
-
-    Args:
-        fixed: of :func:`pattern_spectra`.
-        temporal: of :func:`line_spectra`.
-    """
+def _spectra_chart(fixed: Sequence[DataTable], temporal: Sequence[DataTable]) -> Chart:
+    """Return the chart of spatial spectra: of the fixed pattern, and below of the noise."""
     stacks = []
     for tables, title in ((fixed, "fixed pattern"), (temporal, "noise")):
         lines = []

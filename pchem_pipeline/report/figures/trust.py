@@ -65,7 +65,7 @@ def goodness_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
         f"normal deviate, clipped at −4 and 6; circles: misfits at a false-discovery rate of {rate:g}.",
         text,
         (table,),
-        goodness_chart(table, rate),
+        _goodness_chart(table, rate),
         PAGE_MM,
     )
 
@@ -113,7 +113,7 @@ def uncertainty_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]
         "data (light blue).",
         f"Share of noise in the variance of the maps: {words}.",
         (maps, ensemble),
-        uncertainty_chart(maps, ensemble),
+        _uncertainty_chart(maps, ensemble),
         PAGE_MM,
     )
 
@@ -138,13 +138,8 @@ def noise_shares(data: ReportData, names: tuple[str, ...]) -> dict[str, float]:
     return found
 
 
-def goodness_chart(table: DataTable, false_discovery_rate: float) -> Chart:
-    """Return the p-values of all pixels against what chance gives, and a map of the goodness of fit.
-
-    Args:
-        table: ``p``, ``q`` and ``misfit``, each (y, x).
-        false_discovery_rate: pixels with a q-value up to it are marked.
-    """
+def _goodness_chart(table: DataTable, false_discovery_rate: float) -> Chart:
+    """Return the p-values of all pixels against what chance gives, and a map of the goodness of fit."""
     deviate, known = table["misfit"], finite(table["p"])
     counts, edges = np.histogram(known, _P_BINS, (0.0, 1.0))
     mean = known.size / _P_BINS
@@ -188,13 +183,8 @@ def left_out_chart(share: FloatArray, n_frames: int | None) -> Chart:
     return Chart((left, right), _TWO)
 
 
-def uncertainty_chart(maps: DataTable, ensemble: DataTable) -> Chart:
-    """Return the chart of how much of each map is noise of the estimates, and how sure the prediction is.
-
-    Args:
-        maps: parts of the maps' variance that the errors of the estimates make, by map.
-        ensemble: ``dn``, ``counts``, ``epcd_exact``, and ``epcd_stderr`` where it is known.
-    """
+def _uncertainty_chart(maps: DataTable, ensemble: DataTable) -> Chart:
+    """Return the chart of how much of each map is noise of the estimates, and how sure the prediction is."""
     return Chart((_noise_stack(maps), _error_stack(ensemble)), _TWO)
 
 
