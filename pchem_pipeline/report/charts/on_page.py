@@ -20,9 +20,8 @@ from pchem_pipeline.report.charts.chart import (
     Stack,
     Steps,
     Values,
+    extremes,
     fewer_steps,
-    some_points,
-    thinned,
     x_window,
     y_window,
 )
@@ -147,11 +146,15 @@ def _fewer(mark: Mark) -> Mark:
     """Return a mark with no more numbers than a screen shows."""
     match mark:
         case Line():
-            x, y = thinned(mark.x, mark.y, _COLUMNS)
-            return replace(mark, x=x, y=y)
+            kept = extremes(mark.x, mark.y, _COLUMNS)
+            return replace(mark, x=mark.x[kept], y=mark.y[kept])
+        case Points() if mark.y.size > _STEPS:
+            # with every k-th between them the cloud is as dense as before
+            some = np.arange(0, mark.y.size, -(-2 * mark.y.size // _STEPS))
+            kept = np.union1d(some, extremes(mark.x, mark.y, _STEPS // 4))
+            error = None if mark.error is None else mark.error[:, kept]
+            return replace(mark, x=mark.x[kept], y=mark.y[kept], error=error)
         case Steps():
             edges, values = fewer_steps(mark.edges, mark.values, _STEPS)
             return replace(mark, edges=edges, values=values)
-        case Points():
-            return some_points(mark, _STEPS)
     return mark

@@ -31,9 +31,8 @@ from pchem_pipeline.report.charts.chart import (
     Steps,
     Sticks,
     Words,
+    extremes,
     fewer_steps,
-    some_points,
-    thinned,
     x_window,
     y_window,
 )
@@ -240,18 +239,19 @@ def test_long_curves_keep_their_extremes_and_gaps() -> None:
     x, y = np.arange(100_000.0), rng.standard_normal(100_000)
     y[70_123], y[20_001] = 50.0, -40.0
     y[30_000:40_000] = np.nan
-    few_x, few_y = thinned(x, y, 500)
-    assert few_x.size == few_y.size == 1000
-    assert (np.nanmax(few_y), np.nanmin(few_y)) == (50.0, -40.0)
-    assert np.isnan(few_y[(few_x > 30_200) & (few_x < 39_800)]).all()
-    assert np.all(np.diff(few_x) >= 0)
-    assert thinned(x[:900], y[:900], 500)[1] is not few_y
-    np.testing.assert_array_equal(thinned(x[:900], y[:900], 500)[1], y[:900])
-    points = some_points(Points(x, y, error=np.ones((2, y.size))), 4000)
-    assert 2000 <= points.y.size <= 4000
-    assert points.error is not None
-    assert points.error.shape == (2, points.y.size)
-    assert {50.0, -40.0} <= set(points.y.tolist())
+    kept = extremes(x, y, 500)
+    assert kept.size == 1000
+    assert {70_123, 20_001} <= set(kept.tolist())
+    assert np.isnan(y[kept[(kept > 30_200) & (kept < 39_800)]]).all()
+    assert np.all(np.diff(kept) >= 0)
+    np.testing.assert_array_equal(extremes(x[:900], y[:900], 500), np.arange(900))
+    points = Points(x, y, error=np.ones((2, y.size)))
+    [few] = page_chart(Chart((Stack((Panel(Axis("y"), (points,)),), Axis("x")),)))["stacks"][0]["panels"][0][
+        "marks"
+    ]
+    assert 2000 <= len(few["y"]) <= 4000
+    assert len(few["error"][1]) == len(few["y"])
+    assert {50.0, -40.0} <= set(few["y"])
     edges, steps = fewer_steps(np.append(x, 100_000.0), np.abs(y), 3000)
     assert edges.size == steps.size + 1 <= 3001
     assert (edges[0], edges[-1], np.nanmax(steps)) == (0.0, 100_000.0, 50.0)
