@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -60,7 +60,7 @@ def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "triangles at the edge are gaps below the axis. By family of statistics: before and after.",
         f"Gap in micronats (10⁻⁶ nats) per sample: {_gap_alt(found)}.",
         tables,
-        _gap_chart(gap_bars(found), families(found), MICRO * found.gap.floor),
+        _gap_chart(gap_bars(found), _families(found), MICRO * found.gap.floor),
         PAGE_MM,
     )
 
@@ -89,28 +89,22 @@ def pull_figures(data: DiscrepancyData) -> Iterator[Figure]:
     )
 
 
+_GAP_UNIT = "1e-6 nats/sample"
+
+
 def _gap_tables(found: Verdict) -> tuple[DataTable, ...]:
     """Return the gap of each model, with its interval and the floor, and by family of statistics."""
-    bars, parts, floor = gap_bars(found), families(found), MICRO * found.gap.floor
+    bars, parts = gap_bars(found), _families(found)
     if not bars:
         return ()
-    columns: dict[str, Sequence[Any]] = {
-        "model": [bar.label for bar in bars],
-        "role": [bar.role for bar in bars],
-        "gap": [bar.gap for bar in bars],
-        "low": [bar.low for bar in bars],
-        "high": [bar.high for bar in bars],
-        "floor": [floor] * len(bars),
-    }
-    gaps = DataTable(columns, dict.fromkeys(("gap", "low", "high", "floor"), _GAP_UNIT))
-    if not parts:
-        return (gaps,)
-    names, before, after = (list(column) for column in zip(*parts, strict=True))
-    units = dict.fromkeys(("before", "after"), _GAP_UNIT)
-    return gaps, DataTable({"family": names, "before": before, "after": after}, units, "families")
-
-
-_GAP_UNIT = "1e-6 nats/sample"
+    names = [each.name for each in fields(GapBar)]
+    columns = {name: [getattr(bar, name) for bar in bars] for name in names}
+    columns = {"model": columns.pop("label"), **columns, "floor": [MICRO * found.gap.floor] * len(bars)}
+    tables = [DataTable(columns, dict.fromkeys(("gap", "low", "high", "floor"), _GAP_UNIT))]
+    if parts:
+        families = dict(zip(("family", "before", "after"), map(list, zip(*parts, strict=True)), strict=True))
+        tables.append(DataTable(families, dict.fromkeys(("before", "after"), _GAP_UNIT), "families"))
+    return tuple(tables)
 
 
 def largest_pulls(data: DiscrepancyData) -> list[Pull]:
@@ -163,13 +157,13 @@ def gap_text(gap: float) -> str:
 
 @dataclass(frozen=True)
 class GapBar:
-    """One line of the gap's figure: its label, the gap and interval in 1e-6 nats, and its role."""
+    """One line of the gap's figure: its label, its role, the gap and its interval in 1e-6 nats."""
 
     label: str
+    role: str
     gap: float
     low: float
     high: float
-    role: str
 
 
 def gap_bars(found: Verdict) -> list[GapBar]:
@@ -193,10 +187,10 @@ def gap_bars(found: Verdict) -> list[GapBar]:
 
 
 def _bar(words: str, value: float, interval: tuple[float, float], role: str) -> GapBar:
-    return GapBar(words, MICRO * value, MICRO * interval[0], MICRO * interval[1], role)
+    return GapBar(words, role, MICRO * value, MICRO * interval[0], MICRO * interval[1])
 
 
-def families(found: Verdict) -> list[tuple[str, float, float]]:
+def _families(found: Verdict) -> list[tuple[str, float, float]]:
     """Return the gap of each family of statistics before and after, 1e-6 nats, largest first."""
     with_families = [step for step in found.steps if step.families.before]
     if not with_families:
@@ -258,8 +252,7 @@ def _gap_rows(bars: Sequence[GapBar], floor: float, ends: tuple[float, float]) -
             Words(floor, 0.93, "\u00a0floor", "left", colour="ink"),
         ]
     for row, bar in enumerate(bars):
-        if math.isfinite(bar.low) and math.isfinite(bar.high):
-            marks.append(_bar_line(row, max(bar.low, left), max(bar.high, left), _ROLES[bar.role][0], 1.6))
+        marks += _bar_line(row, max(bar.low, left), max(bar.high, left), _ROLES[bar.role][0], 1.6)
         marks.append(_point(bar.gap, row, left, bar.role))
     return row_stack([bar.label for bar in bars], marks, x)
 
@@ -268,8 +261,7 @@ def _family_rows(parts: Sequence[tuple[str, float, float]], ends: tuple[float, f
     x, marks = _gap_axis(ends)
     labels = {"before": "before", "after": "after"}
     for row, (_, before, after) in enumerate(parts):
-        if math.isfinite(after) and math.isfinite(before):
-            marks.append(_bar_line(row, max(before, ends[0]), max(after, ends[0]), "bars", 1.2))
+        marks += _bar_line(row, max(before, ends[0]), max(after, ends[0]), "bars", 1.2)
         for value, role in ((before, "before"), (after, "after")):
             if math.isfinite(value):
                 label = labels.pop(role, "") if value > ends[0] else ""
@@ -277,8 +269,10 @@ def _family_rows(parts: Sequence[tuple[str, float, float]], ends: tuple[float, f
     return row_stack([words for words, _, _ in parts], marks, x)
 
 
-def _bar_line(row: int, low: float, high: float, colour: str, width: float) -> Line:
-    return Line(np.array([low, high]), np.array([row, row]), colour=colour, width=width)
+def _bar_line(row: int, low: float, high: float, colour: str, width: float) -> list[Line]:
+    """Return a line along a row; none where an end of it is not known."""
+    ends = np.array([low, high])
+    return [Line(ends, np.array([row, row]), colour=colour, width=width)] if np.isfinite(ends).all() else []
 
 
 def _point(value: float, row: int, left: float, role: str, label: str = "") -> Points:
@@ -296,8 +290,7 @@ def _pulls_chart(rows: Sequence[Pull]) -> Chart:
     places = np.arange(len(rows))
     values = {role: np.array([getattr(row, role) for row in rows]) for role in ("before", "after")}
     for row, (before, after) in enumerate(zip(*values.values(), strict=True)):
-        if math.isfinite(after) and math.isfinite(before):
-            marks.append(_bar_line(row, before, after, "bars", 1.4))
+        marks += _bar_line(row, before, after, "bars", 1.4)
     for role, words in (("before", "plain model"), ("after", "with effects")):
         known = np.isfinite(values[role])
         if known.any():

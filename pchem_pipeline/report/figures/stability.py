@@ -193,29 +193,27 @@ def _spectrum(power: FloatArray, length: int, part: str, unit: str) -> DataTable
     return DataTable({"frequency": frequency, "power": power}, {"frequency": f"1/{unit}"}, part)
 
 
-_CHANCE_LABEL = "chance"
-
-
 def _frames_chart(means: DataTable, power: DataTable) -> Chart:
     """Return the chart of the mean of the frames, and its spectrum below."""
-    x, centre, error = means["frame"], float(means["mean"].mean()), means["error of chance"]
-    band = Band(x, centre - 2 * error, centre + 2 * error, colour="band", label=_CHANCE_LABEL)
-    line = Line(x, means["mean"], width=0.7, label="mean")
+    centre, error = float(means["mean"].mean()), means["error of chance"]
     spectrum = (
         Line(power["frequency"], power["largest"], colour="sky", width=0.6, label="largest"),
         Line(power["frequency"], power["power"], label="mean power"),
         _one(),
     )
-    return Chart(
-        (
-            Stack((Panel(Axis("mean (DN)"), (band, line)),), Axis("frame"), height_mm=44.0),
-            Stack(
-                (Panel(Axis("power / chance", log=True), spectrum),),
-                Axis("frequency (1/frame)", log=True),
-                height_mm=44.0,
-            ),
-        )
-    )
+    panel = Panel(Axis("power / chance", log=True), spectrum)
+    below = Stack((panel,), Axis("frequency (1/frame)", log=True), height_mm=44.0)
+    ends = centre - 2 * error, centre + 2 * error
+    return Chart((_series(means["frame"], means["mean"], ends, "mean", "frame", 0.7), below))
+
+
+def _series(
+    x: FloatArray, y: FloatArray, ends: tuple[FloatArray, FloatArray], what: str, axis: str, width: float
+) -> Stack:
+    """Return a series in DN over the band in which chance leaves it."""
+    band = Band(x, *ends, colour="band", label="chance")
+    panel = Panel(Axis(f"{what} (DN)"), (band, Line(x, y, width=width, label=what)))
+    return Stack((panel,), Axis(axis), height_mm=44.0)
 
 
 def _profiles_chart(tables: Sequence[DataTable]) -> Chart:
@@ -223,11 +221,9 @@ def _profiles_chart(tables: Sequence[DataTable]) -> Chart:
     stacks = []
     for table in tables:
         name = next(iter(table.columns))
-        x = table[name]
-        band = Band(x, table["chance from"], table["chance to"], colour="band", label=_CHANCE_LABEL)
-        line = Line(x, table["mean signal"], width=0.8, label="median")
-        panel = Panel(Axis("median (DN)"), (band, line))
-        stacks.append(Stack((panel,), Axis(f"{table.part} {name} (pixel)"), height_mm=44.0))
+        ends = table["chance from"], table["chance to"]
+        axis = f"{table.part} {name} (pixel)"
+        stacks.append(_series(table[name], table["mean signal"], ends, "median", axis, 0.8))
     return Chart(tuple(stacks))
 
 
