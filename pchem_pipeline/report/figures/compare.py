@@ -20,11 +20,21 @@ from pchem_pipeline.report.charts.chart import (
     Stack,
 )
 from pchem_pipeline.report.comparison import Pair, RunFacts
+from pchem_pipeline.report.figures.ensemble import HALVES
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.figures.stacks import pull_stack, sensor_stack
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.wording import count, measured, plain, power_of_ten, short, signed, symbol
+from pchem_pipeline.report.style.wording import (
+    count,
+    measured,
+    plain,
+    power_of_ten,
+    short,
+    signed,
+    symbol,
+    unit_text,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -35,11 +45,6 @@ _LINES: tuple[Dash, ...] = ("-", "--", "-.", ":")
 _LEAST = 4.0
 #: Strips of differences reach at least so far, standard errors: beyond their band of two.
 _LEAST_STRIP = 3.0
-#: Halves of an ensemble: (part, axis, prefix of the data, unit, title).
-_HALVES = (
-    ("raw", "dn", "", "DN", "raw ensemble"),
-    ("nuced", "electrons", "nuced_", "e⁻", "after non-uniformity correction"),
-)
 
 
 def difference_figures(pair: Pair) -> list[Figure]:
@@ -103,14 +108,13 @@ def ensemble_tables(runs: Sequence[RunFacts]) -> tuple[DataTable, ...]:
     The error is that of counting.
     """
     tables = []
-    for part, axis, prefix, unit, _ in _HALVES:
+    for part, axis, prefix, _, unit, *_ in HALVES:
         if not all(axis in run.ensemble and np.sum(run.ensemble[f"{prefix}counts"]) > 0 for run in runs):
             continue
         curves = [_curve(run, axis, prefix) for run in runs]
         names = np.concatenate([[run.title] * x.size for run, (x, _, _) in zip(runs, curves, strict=True)])
         x, density, error = (np.concatenate(each) for each in zip(*curves, strict=True))
-        stored = unit.replace("e⁻", "e-")
-        units = {"signal": stored, "density": f"1/{stored}", "standard error": f"1/{stored}"}
+        units = {"signal": unit, "density": f"1/{unit}", "standard error": f"1/{unit}"}
         columns = {"run": names, "signal": x, "density": density, "standard error": error}
         tables.append(DataTable(columns, units, part))
     return tuple(tables)
@@ -159,8 +163,8 @@ def ensembles_chart(tables: Sequence[DataTable]) -> Chart:
     Args:
         tables: of :func:`ensemble_tables`.
     """
-    words = {part: (unit, title) for part, _, _, unit, title in _HALVES}
-    stacks = tuple(_one_half(table, *words[table.part]) for table in tables)
+    titles = {half.part: half.title for half in HALVES}
+    stacks = tuple(_one_half(table, unit_text(table.units["signal"]), titles[table.part]) for table in tables)
     return Chart(stacks, empty="no ensemble histograms")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +36,24 @@ _PREDICTIONS: dict[str, tuple[str, str, Dash]] = {
     "dependent": ("dependent parameters", "blue", "--"),
     "exact": ("exact mean over pixels", "ink", "-"),
 }
-#: Parts of the figure: (part, axis, prefix of the data, prefix of the predictions, unit).
-_HALVES = (("raw", "dn", "", "epcd_", "DN"), ("nuced", "electrons", "nuced_", "nuced_", "e-"))
+
+
+class Half(NamedTuple):
+    """An ensemble of a run: its part of the figure, axis, prefixes of data and predictions, unit, words."""
+
+    part: str
+    axis: str
+    data: str
+    model: str
+    unit: str
+    words: str
+    title: str
+
+
+HALVES = (
+    Half("raw", "dn", "", "epcd_", "DN", "raw data", "raw ensemble"),
+    Half("nuced", "electrons", "nuced_", "nuced_", "e-", "NUCed data", "after non-uniformity correction"),
+)
 
 
 _SYMBOLS = {"mu": "μ", "sigma": "σ", "sigma2": "σ²"}
@@ -141,7 +157,7 @@ def ensemble_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, ...]
             ``electrons``, ``nuced_counts``, ``nuced_density``, ``nuced_exact``, ...
     """
     tables = []
-    for part, axis, data, model, unit in _HALVES:
+    for part, axis, data, model, unit, *_ in HALVES:
         if axis not in arrays or f"{data}density" not in arrays:
             continue
         columns = {axis: arrays[axis], "counts": arrays[f"{data}counts"]}
@@ -186,16 +202,16 @@ def ensemble_chart(
         rmse: RMSE of each prediction under its name, and ``noise_floor``, ``nuced_noise_floor``.
         n_frames: frames in the histogram, for the legend.
     """
-    halves = [_Half(table, rmse, n_frames) for table in tables if table["counts"].sum() > 0]
+    halves = [_Drawn(table, rmse, n_frames) for table in tables if table["counts"].sum() > 0]
     stacks = tuple(stack for half in halves for stack in (_bulk_stack(half), _tail_stack(half)))
     return Chart(stacks, (2.4, 1.0), empty="no ensemble histogram")
 
 
-class _Half:
+class _Drawn:
     """One half of the figure: data and predictions on one axis."""
 
     def __init__(self, table: DataTable, rmse: Mapping[str, float], n_frames: int | None) -> None:
-        _, axis, data, model, unit = next(half for half in _HALVES if half[0] == table.part)
+        _, axis, data, model, unit, words, self.title = next(h for h in HALVES if h.part == table.part)
         self.unit = unit.replace("e-", "e⁻")
         self.x = table[axis].astype(np.float64)
         self.step = float(np.median(np.diff(self.x))) if self.x.size > 1 else 1.0
@@ -203,7 +219,6 @@ class _Half:
         self.density = table[f"{data}density"].astype(np.float64)
         self.models = {each: table[model + each] for each in _PREDICTIONS if model + each in table}
         self.floor = rmse.get(f"{data}noise_floor")
-        words, self.title = _HALF_WORDS[table.part]
         self.label = f"{words}, {n_frames:,} frames" if n_frames else words
         self.rmse = {each: rmse[model + each] for each in _PREDICTIONS if model + each in rmse}
 
@@ -223,14 +238,7 @@ class _Half:
         return found
 
 
-#: Name of the data and title of each half.
-_HALF_WORDS = {
-    "raw": ("raw data", "raw ensemble"),
-    "nuced": ("NUCed data", "after non-uniformity correction"),
-}
-
-
-def _bulk(half: _Half) -> slice:
+def _bulk(half: _Drawn) -> slice:
     """Return the bins that can be seen on a linear axis: above 1/300 of the peak, the last 0.2 % left out."""
     rest = np.cumsum(half.counts) / half.counts.sum()
     seen = np.flatnonzero((half.density > half.density.max() / 300.0) & (rest > 5e-4) & (rest < 0.998))
@@ -240,7 +248,7 @@ def _bulk(half: _Half) -> slice:
     return slice(max(int(seen[0]) - margin, 0), int(seen[-1]) + margin + 1)
 
 
-def _bulk_stack(half: _Half) -> Stack:
+def _bulk_stack(half: _Drawn) -> Stack:
     where = _bulk(half)
     bars = half.bars(where)
     lines = half.lines(where, {suffix: model[where] for suffix, model in half.models.items()})
@@ -253,7 +261,7 @@ def _bulk_stack(half: _Half) -> Stack:
     return Stack((top, _strip(half, where)), ends, half.title, height_mm=78.0)
 
 
-def _strip(half: _Half, where: slice) -> Panel:
+def _strip(half: _Drawn, where: slice) -> Panel:
     density = half.density[where]
     noise = np.sqrt(np.maximum(density, 0.0) / (max(float(half.counts.sum()), 1.0) * half.step))
     differences = {suffix: density - model[where] for suffix, model in half.models.items()}
@@ -272,7 +280,7 @@ def _power(values: Sequence[FloatArray]) -> int:
     return int(np.floor(np.log10(largest))) if largest > 0 else 0
 
 
-def _tail_stack(half: _Half) -> Stack:
+def _tail_stack(half: _Drawn) -> Stack:
     """Return the whole range on a logarithmic axis, down to less than one count."""
     where = shown_bins(half.counts, tail=0.0)
     low, high = 0.3 / (float(half.counts.sum()) * half.step), 3.0 * float(half.density.max())

@@ -91,8 +91,7 @@ def pixel_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
         return
     words = []
     for pixel in data.pixels:
-        names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
-        numbers = ", ".join(_value_text(pixel, name) for name in names)
+        numbers = ", ".join(f"{symbol(name)[1]} {_value_text(pixel, name)}" for name in _TITLE_NAMES)
         state = f" ({pixel.status})" if pixel.status else ""
         words.append(f"{pixel.label} {pixel.place}: {numbers}{state}".strip())
     yield Figure(
@@ -110,9 +109,8 @@ def pixel_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
 
 
 def _value_text(pixel: PixelFit, name: str) -> str:
-    _, words, unit = symbol(name)
     nan = float("nan")
-    return f"{words} {measured(pixel.parameters.get(name, nan), pixel.stderr.get(name, nan), unit)}"
+    return measured(pixel.parameters.get(name, nan), pixel.stderr.get(name, nan), symbol(name)[2])
 
 
 def cell_tables(parameters: Mapping[str, float], pixel: PixelFit | None = None) -> tuple[DataTable, ...]:
@@ -347,13 +345,8 @@ def _title(pixel: PixelFit, letter: str) -> str:
     head = " ".join(part for part in (f"({letter})" if letter else "", plain(cut(pixel.label, 40))) if part)
     lines = [f"{head}: {pixel.place}" if head else pixel.place]
     if has_fit(pixel.parameters):
-        words = []
-        for name in _TITLE_NAMES:
-            sign, _, unit = symbol(name)
-            if name in pixel.parameters:
-                words.append(
-                    f"{sign} = {measured(pixel.parameters[name], pixel.stderr.get(name, float('nan')), unit)}"
-                )
+        known = (name for name in _TITLE_NAMES if name in pixel.parameters)
+        words = [f"{symbol(name)[0]} = {_value_text(pixel, name)}" for name in known]
         lines += ["   ".join(words[i : i + 2]) for i in range(0, len(words), 2)]
     if pixel.status:
         lines += textwrap.wrap(

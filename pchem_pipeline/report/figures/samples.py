@@ -34,8 +34,8 @@ def exposure_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
         return
     words, noun = AXES[samples.against][0], symbol(slope)[1]
     table = _exposure_table(samples)
-    line = (_median(data.maps[slope]), *middle(data.maps[AXES[samples.against][3]])[:2])
-    centre, error, _low, _high = middle(data.maps[slope])
+    centre, error = middle(data.maps[slope])[:2]
+    line = (centre, *middle(data.maps[AXES[samples.against][3]])[:2])
     yield Figure(
         "exposures",
         "exposures",
@@ -61,7 +61,7 @@ def transfer_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     if samples is None or not data.has_values("conversion_gain"):
         return
     table = _transfer_table(samples, data.maps["bias"])
-    fitted = {name: _median(data.maps[name]) for name in ("conversion_gain", "read_noise_dn")}
+    fitted = {name: middle(data.maps[name])[0] for name in ("conversion_gain", "read_noise_dn")}
     medians = zip(table["sample"], table["variance"], strict=True)
     yield Figure(
         "photon_transfer",
@@ -74,10 +74,6 @@ def transfer_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
         (table,),
         _transfer_chart(table, fitted),
     )
-
-
-def _median(values: NDArray[Any]) -> float:
-    return float(np.median(finite(values)))
 
 
 def _exposure_table(samples: Samples) -> DataTable:

@@ -12,7 +12,6 @@ import numpy as np
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.model.checks.map_parts import Parts
 from pchem_pipeline.model.fit.status import FLAGGED, FitStatus, flags_of
-from pchem_pipeline.model.maps.maps import MapSummary
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.pages.criteria import Criterion, criteria
@@ -86,11 +85,6 @@ def pixel_counts(data: ReportData) -> PixelCounts:
     wanted = (status & int(FitStatus.EXCLUDED)) == 0
     failed = (((status & data.failed_mask) != 0) | data.unfitted) & wanted
     return PixelCounts(int(wanted.sum()), int(failed.sum()), int(((status != 0) & ~failed & wanted).sum()))
-
-
-def summaries(data: ReportData) -> dict[str, MapSummary]:
-    """Describe every map by order statistics, flagged pixels left out."""
-    return {name: data.summary(name) for name in data.maps if not name.endswith("_stderr")}
 
 
 def key_numbers(data: ReportData, *, with_flagged: bool = False) -> list[KeyNumber]:
