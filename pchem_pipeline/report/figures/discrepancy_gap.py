@@ -60,7 +60,7 @@ def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "triangles at the edge are gaps below the axis. By family of statistics: before and after.",
         f"Gap in micronats (10⁻⁶ nats) per sample: {_gap_alt(found)}.",
         tables,
-        _gap_chart(gap_bars(found), _families(found), MICRO * found.gap.floor),
+        _gap_chart(gap_bars(found), families(found), MICRO * found.gap.floor),
         PAGE_MM,
     )
 
@@ -94,7 +94,7 @@ _GAP_UNIT = "1e-6 nats/sample"
 
 def _gap_tables(found: Verdict) -> tuple[DataTable, ...]:
     """Return the gap of each model, with its interval and the floor, and by family of statistics."""
-    bars, parts = gap_bars(found), _families(found)
+    bars, parts = gap_bars(found), families(found)
     if not bars:
         return ()
     names = [each.name for each in fields(GapBar)]
@@ -102,8 +102,8 @@ def _gap_tables(found: Verdict) -> tuple[DataTable, ...]:
     columns = {"model": columns.pop("label"), **columns, "floor": [MICRO * found.gap.floor] * len(bars)}
     tables = [DataTable(columns, dict.fromkeys(("gap", "low", "high", "floor"), _GAP_UNIT))]
     if parts:
-        families = dict(zip(("family", "before", "after"), map(list, zip(*parts, strict=True)), strict=True))
-        tables.append(DataTable(families, dict.fromkeys(("before", "after"), _GAP_UNIT), "families"))
+        shares = dict(zip(("family", "before", "after"), map(list, zip(*parts, strict=True)), strict=True))
+        tables.append(DataTable(shares, dict.fromkeys(("before", "after"), _GAP_UNIT), "families"))
     return tuple(tables)
 
 
@@ -190,7 +190,7 @@ def _bar(words: str, value: float, interval: tuple[float, float], role: str) -> 
     return GapBar(words, role, MICRO * value, MICRO * interval[0], MICRO * interval[1])
 
 
-def _families(found: Verdict) -> list[tuple[str, float, float]]:
+def families(found: Verdict) -> list[tuple[str, float, float]]:
     """Return the gap of each family of statistics before and after, 1e-6 nats, largest first."""
     with_families = [step for step in found.steps if step.families.before]
     if not with_families:
