@@ -10,6 +10,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -22,8 +23,8 @@ Shape = Literal["o", "s", "x", "D", "d", "^", "v", "<", "P", "X", "*", "h", "|"]
 
 #: Widths of one column and of a page of a journal, mm; columns stand side by side beyond half as much again.
 COLUMN_MM, PAGE_MM = 88.0, 180.0
-#: Colours of a scale, and the number that stands for none of them.
-SHADES = NO_COLOUR = 255
+#: Colours of a scale.
+SHADES = 255
 #: Height of a map over its width, at most; ratio of its sides beyond which pixels are not square.
 TALLEST, LONGEST = 1.6, 4.0
 #: Letters of a tick's text for a millimetre of a stack's width; height of a row with a text, and of each
@@ -184,23 +185,27 @@ class Image(Mark):
 
     Attributes:
         values: of the pixels, NaN where there is none.
-        edges: values between one colour and the next, rising.
         x: left and right end on the axis of x.
         y: end of the first and of the last row on the upright axis.
         scale: name of a scale of colours, or the colours themselves, one more than edges.
         none: colour of pixels without a value.
-        bar: places along a bar of the colours, 0 to 1, and their texts; empty: no bar.
-        unit: what the bar shows.
+        ends: values with the first and the last colour, in equal steps between; others have the nearest one.
+        edges: instead of these the values between one colour and the next, rising.
+        bar: places along a bar of the colours, 0 to 1, and their texts; empty: as the renderer finds them.
+        unit: what the bar shows; empty: no bar.
+        whole: ticks of the bar at whole numbers alone.
     """
 
     values: Values
-    edges: Values
     x: tuple[float, float]
     y: tuple[float, float]
     scale: str | tuple[str, ...] = ""
     none: str = "no_value"
+    ends: tuple[float, float] = (0.0, 1.0)
+    edges: Values | None = None
     bar: tuple[tuple[float, str], ...] = ()
     unit: str = ""
+    whole: bool = False
 
     def shown(self, dots: float) -> tuple[Values, tuple[float, float], tuple[float, float]]:
         """Return the rows and columns that so many dots from left to right can show, and the ends of these.
@@ -218,11 +223,12 @@ class Image(Mark):
         y, x = ends
         return some, x, y
 
-    def index(self, values: Values) -> NDArray[np.uint8]:
-        """Return the number of the colour of values; 255 where there is none."""
-        found = np.searchsorted(self.edges, values, side="right").astype(np.uint8)
-        found[np.isnan(values)] = NO_COLOUR
-        return found
+    def levels(self, values: Values) -> Values:
+        """Return values as they are coloured: themselves, or with edges the middle of the colour, 0 to 1."""
+        if self.edges is None:
+            return values
+        index = np.searchsorted(self.edges, values, side="right").astype(np.float32)
+        return np.where(np.isnan(values), np.nan, (index + 0.5) / (len(self.edges) + 1))
 
 
 @dataclass(frozen=True)
@@ -376,28 +382,24 @@ def tick_rows(axis: Axis, width_mm: float) -> Axis:
     return replace(axis, ticks=tuple(ticks))
 
 
-def thinned(x: Values, y: Values, columns: int) -> tuple[Values, Values]:
-    """Return a curve with the least and the largest value of each of so many columns of the axis.
+def extremes(x: Values, y: Values, columns: int) -> NDArray[np.int64]:
+    """Return the indices of the lowest and the highest of each of so many stretches of points, in order.
 
-    It looks the same where it is drawn that wide or narrower; curves of up to two points a column are
-    returned as they are, also those that do not go from left to right. Gaps (NaN) that fill a column stay.
+    Drawn that wide or narrower they look like all points, which are kept where they are no more than two a
+    stretch, or do not go from left to right. A stretch without a value (NaN) stays a gap.
 
     Args:
         x: places, (n,).
         y: values, (n,).
-        columns: number of them.
+        columns: number of stretches.
     """
     if x.size <= 2 * columns or np.any(np.diff(x) < 0):
-        return x, y
-    starts = np.unique(np.linspace(0, x.size, columns + 1).astype(np.int64)[:-1])
-    ends = np.append(starts[1:], x.size)
+        return np.arange(x.size)
+    starts = np.linspace(0, x.size, columns + 1).astype(np.int64)
     known = np.isfinite(y)
-    lowest = np.minimum.reduceat(np.where(known, y, np.inf), starts)
-    highest = np.maximum.reduceat(np.where(known, y, -np.inf), starts)
-    both = np.stack([lowest, highest], axis=1)
-    both[~np.isfinite(both)] = np.nan
-    places = np.stack([x[starts], x[ends - 1]], axis=1)
-    return places.ravel(), both.ravel()
+    both = (np.where(known, values, np.inf) for values in (y, -y))
+    found = [a + int(values[a:b].argmin()) for values in both for a, b in pairwise(starts.tolist())]
+    return np.sort(np.array(found))
 
 
 def fewer_steps(edges: Values, values: Values, most: int) -> tuple[Values, Values]:
@@ -407,17 +409,3 @@ def fewer_steps(edges: Values, values: Values, most: int) -> tuple[Values, Value
         return edges, values
     starts = np.arange(0, values.size, together)
     return np.append(edges[starts], edges[-1]), np.fmax.reduceat(values, starts)
-
-
-def some_points(mark: Points, most: int) -> Points:
-    """Return points of which there are no more than so many: every k-th, and the lowest and the highest."""
-    if mark.y.size <= most:
-        return mark
-    chosen = {*range(0, mark.y.size, -(-2 * mark.y.size // most))}
-    for block in np.array_split(np.arange(mark.y.size), most // 4):
-        known = block[np.isfinite(mark.y[block])]
-        if known.size:
-            chosen |= {int(known[np.argmin(mark.y[known])]), int(known[np.argmax(mark.y[known])])}
-    kept = np.sort(np.fromiter(chosen, dtype=np.int64))
-    error = None if mark.error is None else mark.error[:, kept]
-    return replace(mark, x=mark.x[kept], y=mark.y[kept], error=error)

@@ -4,30 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import MISSING, fields, replace
 from typing import Any
 
 import numpy as np
 
 from pchem_pipeline.report.charts.chart import (
     Axis,
-    Band,
-    Bars,
     Chart,
-    Level,
+    Image,
     Line,
     Mark,
     Panel,
     Points,
-    Span,
     Stack,
     Steps,
-    Sticks,
     Values,
-    Words,
+    extremes,
     fewer_steps,
-    some_points,
-    thinned,
     x_window,
     y_window,
 )
@@ -126,42 +120,41 @@ def rounded(values: Values, ends: Ends, log: bool = False) -> list[float | None]
 
 
 def _mark(mark: Mark, x: _Rounding, y: _Rounding) -> dict[str, Any]:
-    found: dict[str, Any] = {"kind": type(mark).__name__.lower(), "colour": mark.colour}
-    if mark.label:
-        found["label"] = without_formulas(mark.label)
-    if mark.dash != "-":
-        found["dash"] = mark.dash
-    if mark.width != Mark.width:
-        found["width"] = mark.width
-    if mark.alpha != 1.0:
-        found["alpha"] = mark.alpha
-    return found | _numbers(mark, x, y)
+    """Return what the page draws of a mark; what it has as every other is left out."""
+    if isinstance(mark, Image):
+        raise TypeError("the page cannot draw an Image")
+    mark = _fewer(mark)
+    found: dict[str, Any] = {"kind": type(mark).__name__.lower()}
+    for field in fields(mark):
+        name, value = _NAMES.get(field.name, field.name), getattr(mark, field.name)
+        if field.name == "error":
+            found |= {} if value is None else {name: [y(each) for each in np.nan_to_num(value)]}
+        elif isinstance(value, np.ndarray):
+            found[name] = x.places(value) if name == "x" else y(value)
+        elif field.name in _ON_PAPER or value == getattr(Mark, field.name, None):
+            continue
+        elif value or field.default is MISSING:
+            found[field.name] = without_formulas(value) if isinstance(value, str) else value
+    return found
 
 
-def _numbers(mark: Mark, x: _Rounding, y: _Rounding) -> dict[str, Any]:
-    """Return what a mark has beside colour and label."""
+#: What the page's script calls arrays of a mark, and what paper alone shows of one.
+_NAMES, _ON_PAPER = {"edges": "x", "values": "y", "high": "y"}, ("listed", "face", "cap")
+
+
+def _fewer(mark: Mark) -> Mark:
+    """Return a mark with no more numbers than a screen shows."""
     match mark:
         case Line():
-            places, values = thinned(mark.x, mark.y, _COLUMNS)
-            more = {name: value for name, value in (("dots", mark.dots), ("step", mark.step)) if value}
-            return {"x": x.places(places), "y": y(values), **more}
+            kept = extremes(mark.x, mark.y, _COLUMNS)
+            return replace(mark, x=mark.x[kept], y=mark.y[kept])
+        case Points() if mark.y.size > _STEPS:
+            # with every k-th between them the cloud is as dense as before
+            some = np.arange(0, mark.y.size, -(-2 * mark.y.size // _STEPS))
+            kept = np.union1d(some, extremes(mark.x, mark.y, _STEPS // 4))
+            error = None if mark.error is None else mark.error[:, kept]
+            return replace(mark, x=mark.x[kept], y=mark.y[kept], error=error)
         case Steps():
             edges, values = fewer_steps(mark.edges, mark.values, _STEPS)
-            return {"x": x.places(edges), "y": y(values), "filled": mark.filled}
-        case Bars():
-            return {"x": x.places(mark.x), "low": y(mark.low), "y": y(mark.high), "broad": mark.broad}
-        case Sticks():
-            return {"x": x.places(mark.x), "y": y(mark.y)}
-        case Points():
-            mark = some_points(mark, _STEPS)
-            error = {} if mark.error is None else {"error": [y(np.nan_to_num(each)) for each in mark.error]}
-            return {"x": x.places(mark.x), "y": y(mark.y), "mark": mark.mark, "size": mark.size, **error}
-        case Band():
-            return {"x": x.places(mark.x), "low": y(mark.low), "y": y(mark.high), "step": mark.step}
-        case Level():
-            return {"at": mark.at, "axis": mark.axis}
-        case Span():
-            return {"low": mark.low, "high": mark.high, "axis": mark.axis}
-        case Words():
-            return {"x": mark.x, "up": mark.up, "text": without_formulas(mark.text), "align": mark.align}
-    raise TypeError(f"the page cannot draw a {type(mark).__name__}")
+            return replace(mark, edges=edges, values=values)
+    return mark

@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, NullLocator, ScalarFormatter
 
 from pchem_pipeline.report.charts.chart import (
-    NO_COLOUR,
+    SHADES,
     Axis,
     Band,
     Bars,
@@ -44,6 +44,8 @@ from pchem_pipeline.report.style.style import Drawing, Look, colours_of, inches,
 _LINE_MM, _LETTERS, _BESIDE_MM = 3.5, 0.66, 12.0
 #: Rows or columns of a map up to which a vector file keeps each pixel.
 _MOST_KEPT = 800
+#: Ticks of a bar of colours at most.
+_BAR_TICKS = 5
 _DASHES: dict[Dash, Any] = {"-...": (0, (5, 1, 1, 1, 1, 1)), "..": (0, (1, 1))}
 #: Points beyond which they are an image in a vector file.
 _MOST_POINTS = 1000
@@ -263,20 +265,21 @@ def _draw_image(axes: Axes, mark: Image) -> None:
     beside = axes.get_subplotspec()
     columns = 1 if beside is None else beside.get_topmost_subplotspec().get_gridspec().ncols
     values, x, y = mark.shown(inches(look.width_mm) * look.dpi / columns)
-    index = mark.index(values)
     colours = _colours(mark, look).with_extremes(bad=colour_of(mark.none, look.palette))
-    shown = np.where(index == NO_COLOUR, np.nan, (index + 0.5) / colours.N).astype(np.float32)
+    low, high = mark.ends
     axes.set_facecolor(colour_of(mark.none, look.palette))
     # a vector file keeps the pixels as they are, but for more of them than it can show
     kept = "none" if max(mark.values.shape) <= _MOST_KEPT else "nearest"
     image = axes.imshow(
-        shown, colours, vmin=0.0, vmax=1.0, origin="upper", interpolation=kept, aspect=axes.get_aspect(),
-        extent=(*x, *y[::-1]),
+        mark.levels(values).astype(np.float32), colours, vmin=low, vmax=high, origin="upper",
+        interpolation=kept, aspect=axes.get_aspect(), extent=(*x, *y[::-1]),
     )  # fmt: skip
-    if mark.bar:
-        places, texts = zip(*mark.bar, strict=True)
-        bar = axes.figure.colorbar(image, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), ticks=list(places))
-        bar.ax.set_yticklabels(list(texts))
+    if mark.unit:
+        places, texts = [place for place, _ in mark.bar], [text for _, text in mark.bar]
+        ticks: Any = places or MaxNLocator(_BAR_TICKS, integer=mark.whole)
+        bar = axes.figure.colorbar(image, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), ticks=ticks)
+        if texts:
+            bar.ax.set_yticklabels(texts)
         bar.ax.minorticks_off()
         bar.set_label(mark.unit)
 
@@ -285,5 +288,5 @@ def _colours(mark: Image, look: Look) -> Colormap:
     """Return the colours of a map."""
     if isinstance(mark.scale, str):
         name = colour_of(mark.scale, look.palette) or str(mpl.rcParams["image.cmap"])
-        return mpl.colormaps[name].resampled(NO_COLOUR)
+        return mpl.colormaps[name].resampled(SHADES)
     return ListedColormap([colour_of(each, look.palette) for each in mark.scale])

@@ -1,11 +1,11 @@
 """All figures of a run in the order of its pages: the one list that pages, files and notebooks take from.
 
-A new figure is a function that returns it (a list: empty where the run has no data for it) and a row here.
+A new figure is a function that yields it, or nothing where the run has no data for it, and a row here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from pchem_pipeline.report.data import DiscrepancyData, ReportData
 from pchem_pipeline.report.figures import (
@@ -25,7 +25,9 @@ from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.settings import ReportSettings
 
 #: Makers of the figures of the report, each with the names that it can give.
-REPORT_FIGURES: tuple[tuple[Callable[[ReportData, ReportSettings], list[Figure]], tuple[str, ...]], ...] = (
+REPORT_FIGURES: tuple[
+    tuple[Callable[[ReportData, ReportSettings], Iterable[Figure]], tuple[str, ...]], ...
+] = (
     (pixels.cell_figures, ("cluster_edges_example", "cluster_edges_pixel")),
     (pixels.pixel_figures, ("pixel_fits",)),
     (samples.exposure_figures, ("exposures",)),
@@ -34,7 +36,7 @@ REPORT_FIGURES: tuple[tuple[Callable[[ReportData, ReportSettings], list[Figure]]
     (trust.left_out_figures, ("left_out",)),
     (maps.read_noise_figures, ("read_noise_histogram",)),
     (maps.map_figures, tuple(f"map_{name}" for name in maps.DRAWN_MAPS)),
-    (lambda data, _: list(data.stability), ("frame_means", "profiles", "spatial_spectra")),
+    (lambda data, _: data.stability, ("frame_means", "profiles", "spatial_spectra")),
     (ensemble.ensemble_figures, ("ensemble",)),
     (ensemble.electron_figures, ("electron_numbers",)),
     (ensemble.component_figures, ("component_widths",)),
@@ -46,7 +48,7 @@ REPORT_FIGURES: tuple[tuple[Callable[[ReportData, ReportSettings], list[Figure]]
 )
 
 #: Makers of the figures of a verdict; ``section`` is the id of a part of its page.
-DISCREPANCY_FIGURES: tuple[tuple[Callable[[DiscrepancyData], list[Figure]], str], ...] = (
+DISCREPANCY_FIGURES: tuple[tuple[Callable[[DiscrepancyData], Iterable[Figure]], str], ...] = (
     (discrepancy_sensor.sensor_figures, "discrepancy_maps"),
     (discrepancy_series.code_figures, "discrepancy_codes"),
     (discrepancy_series.frame_figures, "discrepancy_frames"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,22 +13,28 @@ from pchem_pipeline.report.charts.chart import (
     Axis,
     Chart,
     Dash,
-    Image,
     Level,
     Line,
     Panel,
-    Points,
     Span,
     Stack,
-    Steps,
 )
 from pchem_pipeline.report.comparison import Pair, RunFacts
+from pchem_pipeline.report.figures.ensemble import HALVES
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.maps import image_stack, is_strip, place_of
+from pchem_pipeline.report.figures.stacks import pull_stack, sensor_stack
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.stretch import even_bar, even_edges
-from pchem_pipeline.report.style.wording import count, measured, plain, power_of_ten, short, signed, symbol
+from pchem_pipeline.report.style.wording import (
+    count,
+    measured,
+    plain,
+    power_of_ten,
+    short,
+    signed,
+    symbol,
+    unit_text,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -39,11 +45,6 @@ _LINES: tuple[Dash, ...] = ("-", "--", "-.", ":")
 _LEAST = 4.0
 #: Strips of differences reach at least so far, standard errors: beyond their band of two.
 _LEAST_STRIP = 3.0
-#: Halves of an ensemble: (part, axis, prefix of the data, unit, title).
-_HALVES = (
-    ("raw", "dn", "", "DN", "raw ensemble"),
-    ("nuced", "electrons", "nuced_", "e⁻", "after non-uniformity correction"),
-)
 
 
 def difference_figures(pair: Pair) -> list[Figure]:
@@ -80,27 +81,25 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
     )
 
 
-def ensembles_figures(runs: Sequence[RunFacts]) -> list[Figure]:
+def ensembles_figures(runs: Sequence[RunFacts]) -> Iterator[Figure]:
     """Return the ensembles of runs over each other, where at least two have one."""
     runs = [run for run in runs if "density" in run.ensemble]
     if len(runs) < 2:
-        return []
+        return
     highest = (run.ensemble["dn"][int(np.argmax(run.ensemble["density"]))] for run in runs)
     peaks = ", ".join(f"{run.title}: {int(dn)} DN" for run, dn in zip(runs, highest, strict=True))
     tables = ensemble_tables(runs)
-    return [
-        Figure(
-            "ensembles",
-            "",
-            "Ensemble histograms of the runs",
-            "All pixels of each run together, raw and after two-point non-uniformity correction. Strips: "
-            f"difference from {runs[0].label} in counting errors; gray band: ±2.",
-            f"Ensemble histograms of the runs; highest peaks at {peaks}.",
-            tables,
-            ensembles_chart(tables),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "ensembles",
+        "",
+        "Ensemble histograms of the runs",
+        "All pixels of each run together, raw and after two-point non-uniformity correction. Strips: "
+        f"difference from {runs[0].label} in counting errors; gray band: ±2.",
+        f"Ensemble histograms of the runs; highest peaks at {peaks}.",
+        tables,
+        ensembles_chart(tables),
+        PAGE_MM,
+    )
 
 
 def ensemble_tables(runs: Sequence[RunFacts]) -> tuple[DataTable, ...]:
@@ -109,14 +108,13 @@ def ensemble_tables(runs: Sequence[RunFacts]) -> tuple[DataTable, ...]:
     The error is that of counting.
     """
     tables = []
-    for part, axis, prefix, unit, _ in _HALVES:
+    for part, axis, prefix, _, unit, *_ in HALVES:
         if not all(axis in run.ensemble and np.sum(run.ensemble[f"{prefix}counts"]) > 0 for run in runs):
             continue
         curves = [_curve(run, axis, prefix) for run in runs]
         names = np.concatenate([[run.title] * x.size for run, (x, _, _) in zip(runs, curves, strict=True)])
         x, density, error = (np.concatenate(each) for each in zip(*curves, strict=True))
-        stored = unit.replace("e⁻", "e-")
-        units = {"signal": stored, "density": f"1/{stored}", "standard error": f"1/{stored}"}
+        units = {"signal": unit, "density": f"1/{unit}", "standard error": f"1/{unit}"}
         columns = {"run": names, "signal": x, "density": density, "standard error": error}
         tables.append(DataTable(columns, units, part))
     return tuple(tables)
@@ -134,21 +132,12 @@ def difference_chart(z: FloatArray, n_far: int, title: str, *, same_data: bool) 
     known = finite(z)
     limit = _limit(known, _LEAST if not same_data else 0.0)
     unit, label = _unit(limit)
-    values, end = z / unit, limit / unit
-    if is_strip(z.shape):
-        marks = (
-            Span(-2.0, 2.0, colour="band"),
-            Points(np.arange(z.size), values.ravel(), size=3.0, label=label),
-        )
-        x = Axis("channel", -0.5, z.size - 0.5, whole=True)
-        top = Stack((Panel(Axis(label), marks),), x, plain(title), height_mm=40.0)
-    else:
-        bar = even_bar(-end, end)
-        image = Image(values, even_edges(-end, end), *place_of(z.shape), scale=DIVERGING, bar=bar, unit=label)
-        top = image_stack(image, title=plain(title))
+    end = limit / unit
+    top = sensor_stack(z / unit, (-end, end), label, scale=DIVERGING, title=plain(title))
     edge = limit if same_data else max(limit, FAR)
     note = f"{count(n_far, 'good pixel')} beyond ±{FAR:g}"
-    return Chart((top, _distribution(known / unit, edge / unit, label, note, chance=not same_data)))
+    pulls = pull_stack(known / unit, edge / unit, f"difference ({label})", note, normal=not same_data)
+    return Chart((top, pulls))
 
 
 def _unit(limit: float) -> tuple[float, str]:
@@ -166,20 +155,6 @@ def _limit(known: FloatArray, least: float) -> float:
     return max(least, quantile if quantile > 0 else float(sizes.max()))
 
 
-def _distribution(known: FloatArray, edge: float, label: str, note: str, *, chance: bool) -> Stack:
-    """Return the histogram of differences, those beyond the edge in the last bins, beside N(0, 1)."""
-    counts, edges = np.histogram(np.clip(known, -edge, edge), 60, (-edge, edge))
-    marks: tuple[Steps | Line, ...] = (Steps(edges, counts, filled=True, colour="bars"),)
-    highest = float(np.max(counts, initial=1))
-    if chance:
-        x = np.linspace(-edge, edge, 601)
-        normal = known.size * (edges[1] - edges[0]) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-        marks += (Line(x, normal, width=0.9),)
-        highest = max(highest, float(normal.max()))
-    panel = Panel(Axis("pixels", 0.5, 5.0 * highest, log=True), marks, note=note)
-    return Stack((panel,), Axis(f"difference ({label})", -edge, edge), height_mm=36.0)
-
-
 def ensembles_chart(tables: Sequence[DataTable]) -> Chart:
     """Return the chart of the ensemble histograms of runs over each other, raw and NUCed (fig:ensemble_plot).
 
@@ -188,8 +163,8 @@ def ensembles_chart(tables: Sequence[DataTable]) -> Chart:
     Args:
         tables: of :func:`ensemble_tables`.
     """
-    words = {part: (unit, title) for part, _, _, unit, title in _HALVES}
-    stacks = tuple(_one_half(table, *words[table.part]) for table in tables)
+    titles = {half.part: half.title for half in HALVES}
+    stacks = tuple(_one_half(table, unit_text(table.units["signal"]), titles[table.part]) for table in tables)
     return Chart(stacks, empty="no ensemble histograms")
 
 

@@ -7,8 +7,8 @@ noise.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,6 @@ from pchem_pipeline.report.charts.chart import (
     Level,
     Line,
     Mark,
-    Panel,
     Points,
     Shape,
     Span,
@@ -30,7 +29,8 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.style.wording import plain, short
+from pchem_pipeline.report.figures.stacks import pull_axis, row_stack
+from pchem_pipeline.report.style.wording import short
 
 #: The gap is shown in millionths of a nat per sample.
 MICRO = 1e6
@@ -44,84 +44,67 @@ _FAMILY_WORDS = {
     "space": "rows, columns, neighbours",
 }
 
-_GAP_CAPTION = (
-    "Gap before and after with 95 % intervals, the floor (gray: sampling noise), and the remaining gap with "
-    "the next best effect and with an unrelated control instead, fitted in the same way. Open triangles at "
-    "the edge are gaps below the axis. By family of statistics: before and after."
-)
-_PULLS_CAPTION = (
-    "The largest deviations from the model, before (circles) and after effects were added (diamonds). The "
-    "gray band is 2 sigma; the largest of some hundred statistics is near 3 sigma by sampling noise."
-)
 
-
-def gap_figures(data: DiscrepancyData) -> list[Figure]:
+def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the gap before and after, against its floor."""
     found = data.found
-    tables = gap_tables(found)
+    tables = _gap_tables(found)
     if not tables:
-        return []
-    return [
-        Figure(
-            "discrepancy_gap",
-            "shown",
-            "The gap against its floor",
-            _GAP_CAPTION,
-            f"Gap in micronats (10⁻⁶ nats) per sample: {_gap_alt(found)}.",
-            tables,
-            gap_chart(gap_bars(found), families(found), MICRO * found.gap.floor),
-            PAGE_MM,
-        )
-    ]
+        return
+    yield Figure(
+        "discrepancy_gap",
+        "shown",
+        "The gap against its floor",
+        "Gap before and after with 95 % intervals, the floor (gray: sampling noise), and the remaining gap "
+        "with the next best effect and with an unrelated control instead, fitted in the same way. Open "
+        "triangles at the edge are gaps below the axis. By family of statistics: before and after.",
+        f"Gap in micronats (10⁻⁶ nats) per sample: {_gap_alt(found)}.",
+        tables,
+        _gap_chart(gap_bars(found), families(found), MICRO * found.gap.floor),
+        PAGE_MM,
+    )
 
 
-def pull_figures(data: DiscrepancyData) -> list[Figure]:
+def pull_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the figure of the largest deviations before and after."""
     rows = largest_pulls(data)
     if not rows:
-        return []
+        return
     columns: dict[str, Sequence[Any]] = {
         "statistic": [row.statistic for row in rows],
         "sentence": [row.sentence for row in rows],
         "before": [row.before for row in rows],
         "after": [row.after for row in rows],
     }
-    return [
-        Figure(
-            "discrepancy_pulls",
-            "shown",
-            "Largest deviations, before and after",
-            _PULLS_CAPTION,
-            f"In sigma. {_pull_text(rows)}.",
-            (DataTable(columns, dict.fromkeys(("before", "after"), "standard deviations")),),
-            pulls_chart(rows),
-            PAGE_MM,
-        )
-    ]
-
-
-def gap_tables(found: Verdict) -> tuple[DataTable, ...]:
-    """Return the gap of each model, with its interval and the floor, and by family of statistics."""
-    bars, parts, floor = gap_bars(found), families(found), MICRO * found.gap.floor
-    if not bars:
-        return ()
-    columns: dict[str, Sequence[Any]] = {
-        "model": [bar.label for bar in bars],
-        "role": [bar.role for bar in bars],
-        "gap": [bar.gap for bar in bars],
-        "low": [bar.low for bar in bars],
-        "high": [bar.high for bar in bars],
-        "floor": [floor] * len(bars),
-    }
-    gaps = DataTable(columns, dict.fromkeys(("gap", "low", "high", "floor"), _GAP_UNIT))
-    if not parts:
-        return (gaps,)
-    names, before, after = (list(column) for column in zip(*parts, strict=True))
-    units = dict.fromkeys(("before", "after"), _GAP_UNIT)
-    return gaps, DataTable({"family": names, "before": before, "after": after}, units, "families")
+    yield Figure(
+        "discrepancy_pulls",
+        "shown",
+        "Largest deviations, before and after",
+        "The largest deviations from the model, before (circles) and after effects were added (diamonds). "
+        "The gray band is 2 sigma; the largest of some hundred statistics is near 3 sigma by sampling noise.",
+        f"In sigma. {_pull_text(rows)}.",
+        (DataTable(columns, dict.fromkeys(("before", "after"), "standard deviations")),),
+        _pulls_chart(rows),
+        PAGE_MM,
+    )
 
 
 _GAP_UNIT = "1e-6 nats/sample"
+
+
+def _gap_tables(found: Verdict) -> tuple[DataTable, ...]:
+    """Return the gap of each model, with its interval and the floor, and by family of statistics."""
+    bars, parts = gap_bars(found), families(found)
+    if not bars:
+        return ()
+    names = [each.name for each in fields(GapBar)]
+    columns = {name: [getattr(bar, name) for bar in bars] for name in names}
+    columns = {"model": columns.pop("label"), **columns, "floor": [MICRO * found.gap.floor] * len(bars)}
+    tables = [DataTable(columns, dict.fromkeys(("gap", "low", "high", "floor"), _GAP_UNIT))]
+    if parts:
+        shares = dict(zip(("family", "before", "after"), map(list, zip(*parts, strict=True)), strict=True))
+        tables.append(DataTable(shares, dict.fromkeys(("before", "after"), _GAP_UNIT), "families"))
+    return tuple(tables)
 
 
 def largest_pulls(data: DiscrepancyData) -> list[Pull]:
@@ -174,13 +157,13 @@ def gap_text(gap: float) -> str:
 
 @dataclass(frozen=True)
 class GapBar:
-    """One line of the gap's figure: its label, the gap and interval in 1e-6 nats, and its role."""
+    """One line of the gap's figure: its label, its role, the gap and its interval in 1e-6 nats."""
 
     label: str
+    role: str
     gap: float
     low: float
     high: float
-    role: str
 
 
 def gap_bars(found: Verdict) -> list[GapBar]:
@@ -204,7 +187,7 @@ def gap_bars(found: Verdict) -> list[GapBar]:
 
 
 def _bar(words: str, value: float, interval: tuple[float, float], role: str) -> GapBar:
-    return GapBar(words, MICRO * value, MICRO * interval[0], MICRO * interval[1], role)
+    return GapBar(words, role, MICRO * value, MICRO * interval[0], MICRO * interval[1])
 
 
 def families(found: Verdict) -> list[tuple[str, float, float]]:
@@ -229,14 +212,8 @@ _ROLES: dict[str, tuple[str, Shape]] = {
 }
 
 
-def gap_chart(bars: Sequence[GapBar], families: Sequence[tuple[str, float, float]], floor: float) -> Chart:
-    """Return the gap before and after against its floor, with rivals, and by family.
-
-    Args:
-        bars: of :func:`gap_bars`, at least one.
-        families: of :func:`families`.
-        floor: 1e-6 nats; NaN where it is not known.
-    """
+def _gap_chart(bars: Sequence[GapBar], families: Sequence[tuple[str, float, float]], floor: float) -> Chart:
+    """Return the gap before and after against its floor (1e-6 nats), with rivals, and by family."""
     ends = _limits(bars, families, floor)
     stacks = [_gap_rows(bars, floor, ends)]
     if families:
@@ -258,13 +235,6 @@ def _limits(
     return min(10.0 ** math.floor(math.log10(least)), top / 100.0), top
 
 
-def _rows(labels: Sequence[str], marks: Sequence[Mark], x: Axis) -> Stack:
-    """Return marks in rows that have a text each, from top to bottom."""
-    rows = tuple((float(row), plain(label)) for row, label in enumerate(labels))
-    y = Axis("", -0.6, len(labels) - 0.5, ticks=rows, down=True)
-    return Stack((Panel(y, tuple(marks)),), x, height_mm=30.0)
-
-
 def _gap_axis(ends: tuple[float, float]) -> tuple[Axis, list[Mark]]:
     """Return the axis of gaps, and a line at each power of ten."""
     powers = range(math.ceil(math.log10(ends[0])) + 1, math.ceil(math.log10(ends[1])))
@@ -282,27 +252,27 @@ def _gap_rows(bars: Sequence[GapBar], floor: float, ends: tuple[float, float]) -
             Words(floor, 0.93, "\u00a0floor", "left", colour="ink"),
         ]
     for row, bar in enumerate(bars):
-        if math.isfinite(bar.low) and math.isfinite(bar.high):
-            marks.append(_bar_line(row, max(bar.low, left), max(bar.high, left), _ROLES[bar.role][0], 1.6))
+        marks += _bar_line(row, max(bar.low, left), max(bar.high, left), _ROLES[bar.role][0], 1.6)
         marks.append(_point(bar.gap, row, left, bar.role))
-    return _rows([bar.label for bar in bars], marks, x)
+    return row_stack([bar.label for bar in bars], marks, x)
 
 
 def _family_rows(parts: Sequence[tuple[str, float, float]], ends: tuple[float, float]) -> Stack:
     x, marks = _gap_axis(ends)
     labels = {"before": "before", "after": "after"}
     for row, (_, before, after) in enumerate(parts):
-        if math.isfinite(after) and math.isfinite(before):
-            marks.append(_bar_line(row, max(before, ends[0]), max(after, ends[0]), "bars", 1.2))
+        marks += _bar_line(row, max(before, ends[0]), max(after, ends[0]), "bars", 1.2)
         for value, role in ((before, "before"), (after, "after")):
             if math.isfinite(value):
                 label = labels.pop(role, "") if value > ends[0] else ""
                 marks.append(_point(value, row, ends[0], role, label))
-    return _rows([words for words, _, _ in parts], marks, x)
+    return row_stack([words for words, _, _ in parts], marks, x)
 
 
-def _bar_line(row: int, low: float, high: float, colour: str, width: float) -> Line:
-    return Line(np.array([low, high]), np.array([row, row]), colour=colour, width=width)
+def _bar_line(row: int, low: float, high: float, colour: str, width: float) -> list[Line]:
+    """Return a line along a row; none where an end of it is not known."""
+    ends = np.array([low, high])
+    return [Line(ends, np.array([row, row]), colour=colour, width=width)] if np.isfinite(ends).all() else []
 
 
 def _point(value: float, row: int, left: float, role: str, label: str = "") -> Points:
@@ -314,18 +284,13 @@ def _point(value: float, row: int, left: float, role: str, label: str = "") -> P
     return Points(np.array([left * 1.12]), y, "<", 5.0, face="paper", colour=colour)
 
 
-def pulls_chart(rows: Sequence[Pull]) -> Chart:
-    """Return the largest pulls before and after, in sigma.
-
-    Args:
-        rows: the statistics, the farthest first; ``after`` is NaN where nothing was added.
-    """
+def _pulls_chart(rows: Sequence[Pull]) -> Chart:
+    """Return the largest pulls before and after, in sigma."""
     marks: list[Mark] = [Span(-2.0, 2.0, "x", colour="band"), Level(0.0, "x", colour="ink", width=0.6)]
     places = np.arange(len(rows))
     values = {role: np.array([getattr(row, role) for row in rows]) for role in ("before", "after")}
     for row, (before, after) in enumerate(zip(*values.values(), strict=True)):
-        if math.isfinite(after) and math.isfinite(before):
-            marks.append(_bar_line(row, before, after, "bars", 1.4))
+        marks += _bar_line(row, before, after, "bars", 1.4)
     for role, words in (("before", "plain model"), ("after", "with effects")):
         known = np.isfinite(values[role])
         if known.any():
@@ -333,9 +298,5 @@ def pulls_chart(rows: Sequence[Pull]) -> Chart:
             marks.append(Points(values[role][known], places[known], shape, 4.5, colour=colour, label=words))
     known_values = np.concatenate(list(values.values()))
     reach = max(float(np.nanmax(np.abs(known_values), initial=0.0)), 6.0)
-    x = Axis("deviation (sigma)", -1.4 * reach, 1.4 * reach)
-    if reach > 12.0:
-        steps = [t for t in (2, 4, 10, 100, 1000, 10_000, 100_000) if t <= 1.3 * reach]
-        signed = [*(-t for t in reversed(steps)), 0, *steps]
-        x = replace(x, linear_to=4.0, ticks=tuple((float(t), f"{t:g}".replace("-", "−")) for t in signed))
-    return Chart((_rows([row.sentence or row.statistic for row in rows], marks, x),), legend=(2, 2))
+    x = pull_axis("deviation (sigma)", 1.4 * reach, 4.0)
+    return Chart((row_stack([row.sentence or row.statistic for row in rows], marks, x),), legend=(2, 2))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,16 +23,13 @@ from pchem_pipeline.report.charts.chart import (
     Panel,
     Points,
     Shape,
-    Span,
     Stack,
-    Steps,
 )
 from pchem_pipeline.report.data import CHANNELS, DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.maps import image_stack, is_strip, place_of
+from pchem_pipeline.report.figures.stacks import is_strip, place_of, pull_stack, sensor_stack
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.stretch import even_bar, even_edges
 from pchem_pipeline.report.style.wording import count
 
 FloatArray = NDArray[np.float64]
@@ -42,17 +39,6 @@ _LEAST, _MOST = 4.0, 12.0
 #: A pixel beyond this is counted, and ringed if such pixels are few.
 _STANDS_OUT, _MOST_RINGS = 5.0, 60
 
-_MAPS_CAPTION = (
-    "Statistics of each pixel: those with a deviating region (outlined), then goodness of fit and the most "
-    "deviating ones. Below each map: histogram of all pixels (gray), of the outlined region (red) and under "
-    "the model (line). A shift of the whole histogram is an effect in all pixels, long tails an effect in "
-    "few; these are ringed in the map."
-)
-_LINES_CAPTION = (
-    "Left and middle: means of rows and of columns of the first frames. Right: scatter of each row or "
-    "column over all frames, relative to independent pixels (1). Stripes in the readout are row or column "
-    "noise, slanted lines are periodic pickup."
-)
 
 _SCORE_WORDS = {
     "C2": "charge: variance beyond Poisson (C2)",
@@ -79,11 +65,11 @@ _PAIR_WORDS = {
 LINE_WORDS = {"row": "rows", "column": "columns"}
 
 
-def sensor_figures(data: DiscrepancyData) -> list[Figure]:
+def sensor_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the maps of statistics of each pixel."""
     maps = [each for each in largest_maps(data.arrays, regions_of(data)) if finite(each.z).size]
     if not maps:
-        return []
+        return
     origin = data.found.examined.origin
     flagged = [pixel for place in data.found.where for pixel in place.pixels]
     words = []
@@ -96,54 +82,48 @@ def sensor_figures(data: DiscrepancyData) -> list[Figure]:
         )
     columns = {each.title: each.z for each in maps}
     table = DataTable(columns, dict.fromkeys(columns, "standard deviations"), origin=origin)
-    return [
-        Figure(
-            "discrepancy_maps",
-            "where",
-            "On the sensor",
-            _MAPS_CAPTION,
-            "Maps in sigma. " + "; ".join(words).replace("-", "−") + ".",
-            (table,),
-            sensor_chart(maps, flagged, origin),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "discrepancy_maps",
+        "where",
+        "On the sensor",
+        "Statistics of each pixel: those with a deviating region (outlined), then goodness of fit and the "
+        "most deviating ones. Below each map: histogram of all pixels (gray), of the outlined region (red) "
+        "and under the model (line). A shift of the whole histogram is an effect in all pixels, long tails "
+        "an effect in few; these are ringed in the map.",
+        "Maps in sigma. " + "; ".join(words).replace("-", "−") + ".",
+        (table,),
+        _sensor_chart(maps, flagged, origin),
+        PAGE_MM,
+    )
 
 
-def line_figures(data: DiscrepancyData) -> list[Figure]:
+def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the means of rows and columns, and their scatter."""
     origin = data.found.examined.origin
-    tables = line_tables(data.arrays, origin)
+    tables = _line_tables(data.arrays, origin)
     if not tables:
-        return []
+        return
     words = [_line_text(line, np.asarray(data.arrays[f"{line}_rms"])) for line in _lines(data.arrays)]
-    return [
-        Figure(
-            "discrepancy_lines",
-            "where",
-            "Rows and columns",
-            _LINES_CAPTION,
-            "Scatter of the means over the frames, relative to independent pixels (1). "
-            + "; ".join(words)
-            + ".",
-            tables,
-            lines_chart(data.arrays, origin),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "discrepancy_lines",
+        "where",
+        "Rows and columns",
+        "Left and middle: means of rows and of columns of the first frames. Right: scatter of each row or "
+        "column over all frames, relative to independent pixels (1). Stripes in the readout are row or "
+        "column noise, slanted lines are periodic pickup.",
+        "Scatter of the means over the frames, relative to independent pixels (1). " + "; ".join(words) + ".",
+        tables,
+        _lines_chart(data.arrays, origin),
+        PAGE_MM,
+    )
 
 
 def _lines(arrays: Mapping[str, NDArray[Any]]) -> list[str]:
     return [line for line in LINE_WORDS if arrays.get(f"{line}_rms", np.empty(0)).size]
 
 
-def line_tables(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int]) -> tuple[DataTable, ...]:
-    """Return the scatter of each row and column, and their means in the first frames.
-
-    Args:
-        arrays: group ``discrepancy`` of the store.
-        origin: row and column of the sensor of the first of them.
-    """
+def _line_tables(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int]) -> tuple[DataTable, ...]:
+    """Return the scatter of each row and column, and their means in the first frames."""
     tables = []
     for line in _lines(arrays):
         axis, first = ("y", origin[0]) if line == "row" else ("x", origin[1])
@@ -252,44 +232,43 @@ def _pixel_map(words: str, values: NDArray[Any], region: Region | None = None) -
     return PixelMap(words, z, float(max(departures)), outliers, region)
 
 
-def sensor_chart(
+def _sensor_chart(
     maps: Sequence[PixelMap], flagged: Sequence[tuple[int, int]] = (), origin: tuple[int, int] = (0, 0)
 ) -> Chart:
-    """Return maps of statistics of each pixel, and below their histograms with that under the model.
-
-    Args:
-        maps: as :func:`largest_maps` returns them.
-        flagged: pixels (y, x) of the sensor named in the verdict; they are ringed.
-        origin: row and column of the sensor of the maps' first pixel.
-    """
-    shown = [
-        _channels(each) if is_strip(each.z.shape) else _map_stack(each, flagged, origin) for each in maps
-    ]
-    below = [_distribution(each, _inside(each, origin)) for each in maps]
+    """Return maps of statistics of each pixel, and below their histograms with that under the model."""
+    shown, below = [], []
+    for each in maps:
+        inside = _inside(each, origin)
+        known = finite(each.z)
+        edge = float(np.clip(np.abs(known).max() if known.size else 5.0, 5.0, 15.0))
+        part = None if inside is None else each.z[inside]
+        note = f"{count(each.outliers, 'pixel')} beyond ±5"
+        shown.append(_map_stack(each, inside, flagged, origin))
+        below.append(pull_stack(known, edge, "standard deviations", note, part=part))
     return Chart((*shown, *below), (1.0,) * len(maps))
 
 
-def _map_stack(each: PixelMap, flagged: Sequence[tuple[int, int]], origin: tuple[int, int]) -> Stack:
-    (y0, x0), (ny, nx) = origin, each.z.shape
+def _map_stack(
+    each: PixelMap,
+    inside: NDArray[np.bool_] | None,
+    flagged: Sequence[tuple[int, int]],
+    origin: tuple[int, int],
+) -> Stack:
     limit = _LEAST
     if each.far > 0:
         limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
-    image = Image(
-        each.z, even_edges(-limit, limit), *place_of(each.z.shape, origin), scale=DIVERGING,
-        bar=even_bar(-limit, limit), unit="sigma",
+    beyond: NDArray[np.bool_] = np.abs(np.nan_to_num(each.z)) > _STANDS_OUT
+    rings = np.zeros_like(beyond)
+    for y, x in ((y - origin[0], x - origin[1]) for y, x in flagged):
+        if 0 <= y < rings.shape[0] and 0 <= x < rings.shape[1]:
+            rings[y, x] = True
+    if beyond.sum() <= _MOST_RINGS:
+        rings |= beyond
+    return sensor_stack(
+        each.z, (-limit, limit), "sigma", *(() if inside is None else (_outline(inside, origin),)),
+        ringed=rings if rings.sum() <= _MOST_RINGS and not is_strip(rings.shape) else None,
+        origin=origin, title=each.title, scale=DIVERGING,
     )  # fmt: skip
-    inside = _inside(each, origin)
-    marks: list[Mark] = []
-    if inside is not None:
-        marks.append(_outline(inside, origin))
-    rings = {(y, x) for y, x in flagged if y0 <= y < y0 + ny and x0 <= x < x0 + nx}
-    beyond = np.argwhere(np.abs(np.nan_to_num(each.z)) > _STANDS_OUT)
-    if len(beyond) <= _MOST_RINGS:
-        rings |= {(y0 + int(y), x0 + int(x)) for y, x in beyond}
-    if 0 < len(rings) <= _MOST_RINGS:
-        ys, xs = np.array(sorted(rings)).T
-        marks.append(Points(xs, ys, size=5.0, face="none", colour="ink"))
-    return image_stack(image, *marks, title=each.title)
 
 
 def _inside(each: PixelMap, origin: tuple[int, int]) -> NDArray[np.bool_] | None:
@@ -322,37 +301,8 @@ def _outline(inside: NDArray[np.bool_], origin: tuple[int, int]) -> Line:
     return Line(xs, ys, colour="ink", width=1.1)
 
 
-def _channels(each: PixelMap) -> Stack:
-    """Return a line of channels."""
-    z, label = each.z.ravel(), "standard deviations"
-    points = Points(np.arange(z.size), z, size=3.0, label=label, listed=False)
-    x = Axis("channel", -0.5, z.size - 0.5, whole=True)
-    return Stack((Panel(Axis(label), (Span(-2.0, 2.0, colour="band"), points)),), x, each.title)
-
-
-def _distribution(each: PixelMap, inside: NDArray[np.bool_] | None = None) -> Stack:
-    known = finite(each.z)
-    edge = float(np.clip(np.abs(known).max() if known.size else 5.0, 5.0, 15.0))
-    counts, edges = np.histogram(np.clip(known, -edge, edge), 60, (-edge, edge))
-    marks: list[Mark] = [Steps(edges, counts, filled=True, colour="bars")]
-    if inside is not None:
-        part = np.histogram(np.clip(finite(each.z[inside]), -edge, edge), edges)[0]
-        marks.append(Steps(edges, part, colour="vermilion", width=0.9))
-    x = np.linspace(-edge, edge, 301)
-    chance = known.size * (edges[1] - edges[0]) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-    marks.append(Line(x, chance, width=0.9))
-    y = Axis("pixels", 0.5, max(3.0 * float(chance.max()), 3.0), log=True)
-    panel = Panel(y, tuple(marks), note=f"{count(each.outliers, 'pixel')} beyond ±5")
-    return Stack((panel,), Axis("standard deviations", -edge, edge), height_mm=30.0)
-
-
-def lines_chart(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int] = (0, 0)) -> Chart:
-    """Return the means of rows and of columns: the first frames as a picture, and the scatter of each line.
-
-    Args:
-        arrays: ``row_image``, ``row_rms``, ``column_image``, ``column_rms`` of group ``discrepancy``.
-        origin: row and column of the sensor of the first of them.
-    """
+def _lines_chart(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int] = (0, 0)) -> Chart:
+    """Return the means of rows and columns: the first frames as a picture, and the scatter of each line."""
     stacks = []
     for line in _lines(arrays):
         image, first = arrays.get(f"{line}_image"), origin[0 if line == "row" else 1]
@@ -370,12 +320,7 @@ def _frames(image: NDArray[Any] | None, line: str, channel: str, first: int) -> 
     if image is None or image.size == 0:
         return Stack((Panel(y, (), note="not kept"),), x, title, height_mm=46.0)
     across, down = place_of(image.T.shape, (first, 0))
-    marks = (
-        Image(
-            image.T, even_edges(-_LEAST, _LEAST), across, down, scale=DIVERGING,
-            bar=even_bar(-_LEAST, _LEAST), unit="sigma",
-        ),
-    )  # fmt: skip
+    marks = (Image(image.T, across, down, scale=DIVERGING, ends=(-_LEAST, _LEAST), unit="sigma"),)
     x = replace(x, low=across[0], high=across[1])
     panel = Panel(replace(y, low=down[0], high=down[1], down=True), marks)
     return Stack((panel,), x, title, height_mm=46.0)

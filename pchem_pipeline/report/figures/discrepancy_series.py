@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,12 +27,13 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import CHANNELS, DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.figures.stacks import pull_axis
 from pchem_pipeline.report.style.wording import count, short
 
 FloatArray = NDArray[np.float64]
 
-#: Residuals beyond this many standard deviations make their axis logarithmic outside of it.
-_LINEAR = 8.0
+#: Standard deviations to which the axis of residuals is linear.
+_LINEAR = 4.0
 #: Number of stretches of the run over which frames are averaged.
 _STRETCHES = 24
 #: Factor and unit in which frames are shown, by what is shown of them, and the label of the axis.
@@ -44,28 +45,15 @@ _LABELS = {
 }
 _PANEL_MM, _AXIS_MM = 42.0, 12.0
 
-_CODES_CAPTION = (
-    "All usable pixels together. Top: samples at each DN (gray) and expectation from the fitted PCDs (black; "
-    "with added effects: purple). Bottom: difference from the plain model in sigma, even and odd DN in two "
-    "colours; the gray band is 2 sigma. A single tall line is saturation or clipping, alternating colours "
-    "are differential nonlinearity of the ADC, a slow wave is integral nonlinearity. Yellow: codes named in "
-    "the verdict."
-)
-_FRAMES_CAPTION = (
-    "Dots: frame means over all usable pixels, and the excess of squared residuals of each frame (noise). "
-    "Blue: means over stretches of the run; the gray band is 2 sigma of their sampling noise. Dashed: time "
-    "course of the named effects, if deterministic. Yellow: frames named in the verdict."
-)
 
-
-def code_figures(data: DiscrepancyData) -> list[Figure]:
+def code_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the counts of each DN and their residuals."""
     if not _has(data, "code_dn", "code_observed", "code_expected"):
-        return []
+        return
     table = code_table(data.arrays)
     dn, residual = table["dn"], table["residual"]
     if dn.size == 0:
-        return []
+        return
     order = np.argsort(-np.abs(residual))[:3]
     largest = ", ".join(f"{residual[i]:+.1f} at {dn[i]:.0f} DN" for i in order).replace("-", "−")
     even = dn % 2 == 0
@@ -77,25 +65,27 @@ def code_figures(data: DiscrepancyData) -> list[Figure]:
         f"square {np.sqrt(np.mean(residual**2)):.2f} (expected below 1); largest {largest}; mean "
         f"{comb.replace('-', '−')}."
     )
-    return [
-        Figure(
-            "discrepancy_codes",
-            "where",
-            "Along the digital numbers",
-            _CODES_CAPTION,
-            alt,
-            (table,),
-            codes_chart(table, data.found.where),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "discrepancy_codes",
+        "where",
+        "Along the digital numbers",
+        "All usable pixels together. Top: samples at each DN (gray) and expectation from the fitted PCDs "
+        "(black; with added effects: purple). Bottom: difference from the plain model in sigma, even and "
+        "odd DN in two colours; the gray band is 2 sigma. A single tall line is saturation or clipping, "
+        "alternating colours are differential nonlinearity of the ADC, a slow wave is integral "
+        "nonlinearity. Yellow: codes named in the verdict.",
+        alt,
+        (table,),
+        _codes_chart(table, data.found.where),
+        PAGE_MM,
+    )
 
 
-def frame_figures(data: DiscrepancyData) -> list[Figure]:
+def frame_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the means of the frames along the run."""
     if not _has(data, "frame_number", "frame_charge", "frame_readout"):
-        return []
-    frames, stretches = frame_tables(data.arrays)
+        return
+    frames, stretches = _frame_tables(data.arrays)
     by_channel = np.asarray(data.arrays.get("frame_sd", np.full(2, np.nan)), dtype=np.float64)
     sds = {**dict(zip(CHANNELS, by_channel.tolist(), strict=True)), "noise": 1.0}
     sds = {shown: sd for shown, sd in sds.items() if shown in frames}
@@ -110,18 +100,18 @@ def frame_figures(data: DiscrepancyData) -> list[Figure]:
             f"along the run {short(drift)} {unit}"
         )
     path = "; the time course of the named effects is drawn over them" if _model("readout") in frames else ""
-    return [
-        Figure(
-            "discrepancy_frames",
-            "where",
-            "Along time",
-            _FRAMES_CAPTION,
-            f"Means of {count(int(frames['frame'].size), 'frame')}. {'; '.join(words)}{path}.",
-            (frames, stretches),
-            frames_chart(frames, stretches, sds, data.found.where),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "discrepancy_frames",
+        "where",
+        "Along time",
+        "Dots: frame means over all usable pixels, and the excess of squared residuals of each frame "
+        "(noise). Blue: means over stretches of the run; the gray band is 2 sigma of their sampling noise. "
+        "Dashed: time course of the named effects, if deterministic. Yellow: frames named in the verdict.",
+        f"Means of {count(int(frames['frame'].size), 'frame')}. {'; '.join(words)}{path}.",
+        (frames, stretches),
+        _frames_chart(frames, stretches, sds, data.found.where),
+        PAGE_MM,
+    )
 
 
 def _has(data: DiscrepancyData, *names: str) -> bool:
@@ -153,13 +143,8 @@ def code_table(arrays: Mapping[str, NDArray[Any]]) -> DataTable:
 _NAMED = "expected with added effects"
 
 
-def frame_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, DataTable]:
-    """Return the means of the frames in both channels and their noise, and means over stretches of the run.
-
-    Args:
-        arrays: ``frame_number``, ``frame_charge``, ``frame_readout``, ``frame_noise`` if it is known and,
-            where there is a path of the named effects, ``frame_charge_model`` and ``frame_readout_model``.
-    """
+def _frame_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, DataTable]:
+    """Return means of the frames in both channels and their noise, and means over stretches of the run."""
     number = np.asarray(arrays["frame_number"], dtype=np.float64)
     columns, means = {"frame": number}, dict[str, FloatArray]()
     units: dict[str, str] = {}
@@ -179,13 +164,8 @@ def _model(channel: str) -> str:
     return f"{channel}, named effects"
 
 
-def codes_chart(table: DataTable, marked: Sequence[Place] = ()) -> Chart:
-    """Return the chart of counts per DN and their residuals; even and odd codes differ in colour.
-
-    Args:
-        table: of :func:`code_table`.
-        marked: places whose interval of DN is shaded.
-    """
+def _codes_chart(table: DataTable, marked: Sequence[Place] = ()) -> Chart:
+    """Return the chart of counts per DN and their residuals; even and odd codes differ in colour."""
     dn, observed, expected, residual = (table[name] for name in ("dn", "observed", "expected", "residual"))
     edges = np.append(dn - 0.5, dn[-1] + 0.5)
     shaded = [
@@ -211,24 +191,13 @@ def codes_chart(table: DataTable, marked: Sequence[Place] = ()) -> Chart:
         below.append(Sticks(dn[where], residual[where], colour=colour, width=_bar(dn.size), label=label))
     largest = int(np.argmax(np.abs(residual)))
     reach = 1.25 * max(float(np.abs(residual).max()), 4.0)
-    y = _residual_axis(float(abs(residual[largest])), reach)
+    y = pull_axis("(obs. − exp.) / √exp.", reach, _LINEAR)
     note = f"largest: {residual[largest]:+.1f} at {dn[largest]:.0f} DN".replace("-", "−")
     bottom = Panel(
         y, tuple(below), 1.25, legend="upper right", columns=2, room=(1.6, 1.6), note=note,
         corner="lower left",
     )  # fmt: skip
     return Chart((Stack((top, bottom), Axis("DN", float(edges[0]), float(edges[-1])), height_mm=86.0),))
-
-
-def _residual_axis(largest: float, reach: float) -> Axis:
-    """Return the axis of the residuals: logarithmic to both sides where one is large."""
-    label = "(obs. − exp.) / √exp."
-    if largest <= _LINEAR:
-        return Axis(label, -reach, reach)
-    some = [tick for tick in (4, 10, 100, 1000, 10_000, 100_000) if tick <= 2.0 * largest]
-    ticks = [*(-tick for tick in reversed(some)), 0, *some]
-    texts = tuple((float(tick), f"{tick:g}".replace("-", "−")) for tick in ticks)
-    return Axis(label, -reach, reach, linear_to=_LINEAR, ticks=texts)
 
 
 def _bar(n: int) -> float:
@@ -269,17 +238,10 @@ def parity_difference(number: NDArray[Any], values: FloatArray, sd: float) -> fl
     return float((values[even].mean() - values[~even].mean()) / error)
 
 
-def frames_chart(
+def _frames_chart(
     frames: DataTable, stretches: DataTable, sds: Mapping[str, float], marked: Sequence[Place] = ()
 ) -> Chart:
-    """Return the chart of the frames in both channels and of their noise, with the path of named effects.
-
-    Args:
-        frames: of :func:`frame_tables`.
-        stretches: likewise.
-        sds: sampling noise of a frame mean, in the stored unit, by panel.
-        marked: places whose frames are shaded.
-    """
+    """Return the chart of the frames in both channels and of their noise, with the path of named effects."""
     panels = []
     for channel, sd in sds.items():
         shaded = [

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,100 +36,100 @@ _PREDICTIONS: dict[str, tuple[str, str, Dash]] = {
     "dependent": ("dependent parameters", "blue", "--"),
     "exact": ("exact mean over pixels", "ink", "-"),
 }
-#: Parts of the figure: (part, axis, prefix of the data, prefix of the predictions, unit).
-_HALVES = (("raw", "dn", "", "epcd_", "DN"), ("nuced", "electrons", "nuced_", "nuced_", "e-"))
 
-_ENSEMBLE_CAPTION = (
-    "Histogram of all pixels over the chosen frames (gray), raw at the top and after two-point non-"
-    "uniformity correction at the bottom, with peaks at whole electrons. Lines: prediction "
-    "from the fitted parameters, as the exact mean over the pixels, with the parameters' joint "
-    "histogram (dependent), and with the product of their four histograms (independent). Strips: data"
-    " minus prediction; gray: 2 sigma of sampling noise. The model describes the data if the RMSE is "
-    "close to the sampling noise."
+
+class Half(NamedTuple):
+    """An ensemble of a run: its part of the figure, axis, prefixes of data and predictions, unit, words."""
+
+    part: str
+    axis: str
+    data: str
+    model: str
+    unit: str
+    words: str
+    title: str
+
+
+HALVES = (
+    Half("raw", "dn", "", "epcd_", "DN", "raw data", "raw ensemble"),
+    Half("nuced", "electrons", "nuced_", "nuced_", "e-", "NUCed data", "after non-uniformity correction"),
 )
-_ELECTRONS_CAPTION = (
-    "Gray: share of each estimated electron number. Dots: probability p(k) from the map of H. Crosses: "
-    "expected share of the estimates, which confuse neighbouring numbers. Below: estimate minus "
-    "expectation; gray: 2 sigma of sampling noise."
-)
-_COMPONENTS_CAPTION = (
-    "Standard deviation of the component of electron number k, raw (left or top) and after non-"
-    "uniformity correction (right or bottom). For each line a set of parameters is constant over the "
-    "pixels; gray: the remaining of the sixteen sets. Where a line is flat the peaks are resolved at "
-    "every signal."
-)
+
 
 _SYMBOLS = {"mu": "μ", "sigma": "σ", "sigma2": "σ²"}
 #: Cases of Appendix B that are drawn in colour.
 _HIGHLIGHTED = ("none", "g", "H, g", "g, μ, σ²", "H, g, μ, σ²")
 
 
-def ensemble_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def ensemble_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the ensemble histograms with their predictions."""
     tables = ensemble_tables(data.ensemble)
     if not tables:
-        return []
+        return
     rmse = dict(data.ensemble_facts.get("rmse", {}))
     numbers = ", ".join(f"{name.replace('_', ' ')} {scientific(value)}" for name, value in rmse.items())
-    return [
-        Figure(
-            "ensemble",
-            "summary",
-            "Ensemble histogram and its prediction",
-            _ENSEMBLE_CAPTION,
-            "Ensemble histogram before and after non-uniformity correction with predictions. "
-            f"RMSE: {numbers}.",
-            tables,
-            ensemble_chart(tables, rmse, data.ensemble_facts.get("n_frames")),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "ensemble",
+        "summary",
+        "Ensemble histogram and its prediction",
+        "Histogram of all pixels over the chosen frames (gray), raw at the top and after two-point non-"
+        "uniformity correction at the bottom, with peaks at whole electrons. Lines: prediction "
+        "from the fitted parameters, as the exact mean over the pixels, with the parameters' joint "
+        "histogram (dependent), and with the product of their four histograms (independent). Strips: data"
+        " minus prediction; gray: 2 sigma of sampling noise. The model describes the data if the RMSE is "
+        "close to the sampling noise.",
+        f"Ensemble histogram before and after non-uniformity correction with predictions. RMSE: {numbers}.",
+        tables,
+        ensemble_chart(tables, rmse, data.ensemble_facts.get("n_frames")),
+        PAGE_MM,
+    )
 
 
-def electron_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def electron_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the estimated electron numbers against their prediction."""
     arrays = data.ensemble
     if "electron_mass" not in arrays:
-        return []
+        return
     mass, pmf = arrays["electron_mass"], arrays["electron_pmf"]
     first = ", ".join(f"k = {k}: {mass[k]:.4f} against {pmf[k]:.4f}" for k in range(min(5, mass.size)))
     names = ("k", "electron_counts", "electron_mass", "electron_pmf", "electron_pmf_map")
     table = DataTable({name: arrays[name] for name in names if name in arrays}, {"k": "e-"})
-    return [
-        Figure(
-            "electron_numbers",
-            "electrons",
-            "Estimated electron numbers",
-            _ELECTRONS_CAPTION,
-            f"Share of each electron number among the estimates against the prediction; {first}.",
-            (table,),
-            electrons_chart(table),
-        )
-    ]
+    yield Figure(
+        "electron_numbers",
+        "electrons",
+        "Estimated electron numbers",
+        "Gray: share of each estimated electron number. Dots: probability p(k) from the map of H. Crosses: "
+        "expected share of the estimates, which confuse neighbouring numbers. Below: estimate minus "
+        "expectation; gray: 2 sigma of sampling noise.",
+        f"Share of each electron number among the estimates against the prediction; {first}.",
+        (table,),
+        electrons_chart(table),
+    )
 
 
-def component_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def component_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the widths of the components of the ensemble (Appendix B)."""
     variance = data.ensemble.get("component_variance")
     if variance is None or not np.isfinite(variance).any():
-        return []
+        return
     cases = data.component_cases or [f"case {i}" for i in range(variance.shape[0])]
     table = component_table(variance, cases, data.ensemble.get("nuced_component_variance"))
     width = table[_held(cases[0])]
-    return [
-        Figure(
-            "component_widths",
-            "components",
-            "Width of the components of the ensemble",
-            _COMPONENTS_CAPTION + bias_remark(data),
-            "Standard deviation of the ensemble's component k, nothing held constant: "
-            f"{short(float(width[0]))} DN at k = 0, "
-            f"{short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
-            (table,),
-            components_chart(table, [c for c in _HIGHLIGHTED if c in cases]),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "component_widths",
+        "components",
+        "Width of the components of the ensemble",
+        "Standard deviation of the component of electron number k, raw (left or top) and after non-"
+        "uniformity correction (right or bottom). For each line a set of parameters is constant over the "
+        "pixels; gray: the remaining of the sixteen sets. Where a line is flat the peaks are resolved at "
+        f"every signal.{bias_remark(data)}",
+        "Standard deviation of the ensemble's component k, nothing held constant: "
+        f"{short(float(width[0]))} DN at k = 0, "
+        f"{short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
+        (table,),
+        components_chart(table, [c for c in _HIGHLIGHTED if c in cases]),
+        PAGE_MM,
+    )
 
 
 def bias_remark(data: ReportData) -> str:
@@ -157,7 +157,7 @@ def ensemble_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, ...]
             ``electrons``, ``nuced_counts``, ``nuced_density``, ``nuced_exact``, ...
     """
     tables = []
-    for part, axis, data, model, unit in _HALVES:
+    for part, axis, data, model, unit, *_ in HALVES:
         if axis not in arrays or f"{data}density" not in arrays:
             continue
         columns = {axis: arrays[axis], "counts": arrays[f"{data}counts"]}
@@ -202,34 +202,43 @@ def ensemble_chart(
         rmse: RMSE of each prediction under its name, and ``noise_floor``, ``nuced_noise_floor``.
         n_frames: frames in the histogram, for the legend.
     """
-    halves = [_Half(table) for table in tables if table["counts"].sum() > 0]
-    stacks = []
-    for half in halves:
-        labels = _labels(half, rmse, n_frames)
-        floor = rmse.get("noise_floor" if half.raw else "nuced_noise_floor")
-        stacks += [_bulk_stack(half, labels, floor), _tail_stack(half, labels)]
-    return Chart(tuple(stacks), (2.4, 1.0), empty="no ensemble histogram")
+    halves = [_Drawn(table, rmse, n_frames) for table in tables if table["counts"].sum() > 0]
+    stacks = tuple(stack for half in halves for stack in (_bulk_stack(half), _tail_stack(half)))
+    return Chart(stacks, (2.4, 1.0), empty="no ensemble histogram")
 
 
-class _Half:
+class _Drawn:
     """One half of the figure: data and predictions on one axis."""
 
-    def __init__(self, table: DataTable) -> None:
-        _, axis, data, model, unit = next(half for half in _HALVES if half[0] == table.part)
-        self.raw = table.part == "raw"
+    def __init__(self, table: DataTable, rmse: Mapping[str, float], n_frames: int | None) -> None:
+        _, axis, data, model, unit, words, self.title = next(h for h in HALVES if h.part == table.part)
         self.unit = unit.replace("e-", "e⁻")
         self.x = table[axis].astype(np.float64)
         self.step = float(np.median(np.diff(self.x))) if self.x.size > 1 else 1.0
         self.counts = table["counts"].astype(np.float64)
         self.density = table[f"{data}density"].astype(np.float64)
         self.models = {each: table[model + each] for each in _PREDICTIONS if model + each in table}
+        self.floor = rmse.get(f"{data}noise_floor")
+        self.label = f"{words}, {n_frames:,} frames" if n_frames else words
+        self.rmse = {each: rmse[model + each] for each in _PREDICTIONS if model + each in rmse}
 
-    def edges(self, where: slice) -> FloatArray:
+    def bars(self, where: slice, **style: Any) -> Steps:
+        """Return the data as gray bars."""
         x = self.x[where]
-        return np.append(x - self.step / 2, x[-1] + self.step / 2)
+        edges = np.append(x - self.step / 2, x[-1] + self.step / 2)
+        return Steps(edges, self.density[where], filled=True, colour="bars", label=self.label, **style)
+
+    def lines(self, where: slice, values: Mapping[str, FloatArray], **style: Any) -> list[Line]:
+        """Return a line for each prediction."""
+        found = []
+        for suffix, each in values.items():
+            words, hue, dash = _PREDICTIONS[suffix]
+            label = f"{words}, RMSE {scientific(self.rmse[suffix])}" if suffix in self.rmse else words
+            found.append(Line(self.x[where], each, colour=hue, dash=dash, label=label, **style))
+        return found
 
 
-def _bulk(half: _Half) -> slice:
+def _bulk(half: _Drawn) -> slice:
     """Return the bins that can be seen on a linear axis: above 1/300 of the peak, the last 0.2 % left out."""
     rest = np.cumsum(half.counts) / half.counts.sum()
     seen = np.flatnonzero((half.density > half.density.max() / 300.0) & (rest > 5e-4) & (rest < 0.998))
@@ -239,49 +248,28 @@ def _bulk(half: _Half) -> slice:
     return slice(max(int(seen[0]) - margin, 0), int(seen[-1]) + margin + 1)
 
 
-def _labels(half: _Half, rmse: Mapping[str, float], n_frames: int | None) -> dict[str, str]:
-    """Return what the legend says of the data (``""``) and of each prediction."""
-    data = "raw data" if half.raw else "NUCed data"
-    found = {"": f"{data}, {n_frames:,} frames" if n_frames else data}
-    for suffix, (words, _, _) in _PREDICTIONS.items():
-        name = ("epcd_" if half.raw else "nuced_") + suffix
-        found[suffix] = f"{words}, RMSE {scientific(rmse[name])}" if name in rmse else words
-    return found
-
-
-def _bulk_stack(half: _Half, labels: Mapping[str, str], floor: float | None) -> Stack:
+def _bulk_stack(half: _Drawn) -> Stack:
     where = _bulk(half)
-    edges, x = half.edges(where), half.x[where]
-    marks: list[Line | Steps] = [
-        Steps(edges, half.density[where], filled=True, colour="bars", label=labels[""])
-    ]
-    for suffix, model in half.models.items():
-        _, hue, dash = _PREDICTIONS[suffix]
-        marks.append(Line(x, model[where], colour=hue, dash=dash, label=labels[suffix]))
-    if floor is not None:
-        words = f"sampling noise alone, RMSE {scientific(floor)}"
-        marks.append(Line(np.empty(0), np.empty(0), colour="none", label=words))
+    bars = half.bars(where)
+    lines = half.lines(where, {suffix: model[where] for suffix, model in half.models.items()})
+    if half.floor is not None:
+        words = f"sampling noise alone, RMSE {scientific(half.floor)}"
+        lines.append(Line(np.empty(0), np.empty(0), colour="none", label=words))
     y = Axis(f"density (1/{half.unit})", low=0.0)
-    top = Panel(y, tuple(marks), 3.2, legend="upper right", room=(1.3, 1.75))
-    title = "raw ensemble" if half.raw else "after non-uniformity correction"
-    ends = Axis(f"signal ({half.unit})", float(edges[0]), float(edges[-1]))
-    return Stack((top, _strip(half, where, labels)), ends, title, height_mm=78.0)
+    top = Panel(y, (bars, *lines), 3.2, legend="upper right", room=(1.3, 1.75))
+    ends = Axis(f"signal ({half.unit})", float(bars.edges[0]), float(bars.edges[-1]))
+    return Stack((top, _strip(half, where)), ends, half.title, height_mm=78.0)
 
 
-def _strip(half: _Half, where: slice, labels: Mapping[str, str]) -> Panel:
-    density, x = half.density[where], half.x[where]
+def _strip(half: _Drawn, where: slice) -> Panel:
+    density = half.density[where]
     noise = np.sqrt(np.maximum(density, 0.0) / (max(float(half.counts.sum()), 1.0) * half.step))
     differences = {suffix: density - model[where] for suffix, model in half.models.items()}
     power = _power([2.0 * noise, *differences.values()])
     scale = 10.0**-power
-    band = Band(x, -2.0 * scale * noise, 2.0 * scale * noise, colour="band", step=True)
-    lines = [
-        Line(
-            x, scale * difference, colour=_PREDICTIONS[suffix][1], dash=_PREDICTIONS[suffix][2],
-            width=0.8, label=labels[suffix], listed=False,
-        )
-        for suffix, difference in differences.items()
-    ]  # fmt: skip
+    band = Band(half.x[where], -2.0 * scale * noise, 2.0 * scale * noise, colour="band", step=True)
+    scaled = {suffix: scale * difference for suffix, difference in differences.items()}
+    lines = half.lines(where, scaled, width=0.8, listed=False)
     zero = Level(0.0, colour="ink", width=0.5)
     return Panel(Axis(f"data − model\n({power_of_ten(power) or 1}/{half.unit})"), (band, *lines, zero), 1.0)
 
@@ -292,22 +280,13 @@ def _power(values: Sequence[FloatArray]) -> int:
     return int(np.floor(np.log10(largest))) if largest > 0 else 0
 
 
-def _tail_stack(half: _Half, labels: Mapping[str, str]) -> Stack:
+def _tail_stack(half: _Drawn) -> Stack:
     """Return the whole range on a logarithmic axis, down to less than one count."""
     where = shown_bins(half.counts, tail=0.0)
-    total = float(half.counts.sum())
-    low, high = 0.3 / (total * half.step), 3.0 * float(half.density.max())
-    data = Steps(
-        half.edges(where), half.density[where], filled=True, colour="bars", label=labels[""], listed=False
-    )
-    lines = [
-        Line(
-            half.x[where], np.maximum(model[where], 1e-3 * low), colour=_PREDICTIONS[suffix][1],
-            dash=_PREDICTIONS[suffix][2], width=0.9, label=labels[suffix], listed=False,
-        )
-        for suffix, model in half.models.items()
-    ]  # fmt: skip
-    panel = Panel(Axis("", low, high, log=True), (data, *lines))
+    low, high = 0.3 / (float(half.counts.sum()) * half.step), 3.0 * float(half.density.max())
+    models = {suffix: np.maximum(model[where], 1e-3 * low) for suffix, model in half.models.items()}
+    lines = half.lines(where, models, width=0.9, listed=False)
+    panel = Panel(Axis("", low, high, log=True), (half.bars(where, listed=False), *lines))
     x = Axis(f"signal ({half.unit})")
     return Stack((panel,), x, "all values, logarithmic", height_mm=78.0, wide=True)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -21,11 +21,11 @@ _SHORTEST = 0.04
 _AXES = {"date": "days since the first", "temperature": "sensor temperature, °C", "label": "label"}
 
 
-def history_figures(rows: Sequence[HistoryRow], against: Against) -> list[Figure]:
+def history_figures(rows: Sequence[HistoryRow], against: Against) -> Iterator[Figure]:
     """Return the medians of the maps of each run; none for fewer than two runs."""
     shown = [name for name in _SHOWN if all(name in row.run.summary for row in rows)]
     if len(rows) < 2 or not shown:
-        return []
+        return
     places = np.array([row.place for row in rows])
     ordered = bool(np.isfinite(places).all() and np.unique(places).size > 1)
     by_date = ordered and against == "date"
@@ -53,18 +53,16 @@ def history_figures(rows: Sequence[HistoryRow], against: Against) -> list[Figure
         f"{symbol(name)[2]}"
         for name in shown
     )
-    return [
-        Figure(
-            "history",
-            "",
-            "The camera over time",
-            "Medians of the maps with their standard errors; band: scatter of the pixels.",
-            f"From {first.label} to {last.label}: {words}.",
-            (table,),
-            history_chart(table, tuple(shown), axis, () if ordered else _labels(rows)),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "history",
+        "",
+        "The camera over time",
+        "Medians of the maps with their standard errors; band: scatter of the pixels.",
+        f"From {first.label} to {last.label}: {words}.",
+        (table,),
+        _history_chart(table, tuple(shown), axis, () if ordered else _labels(rows)),
+        PAGE_MM,
+    )
 
 
 def _labels(rows: Sequence[HistoryRow]) -> tuple[tuple[float, str], ...]:
@@ -76,17 +74,10 @@ def _labels(rows: Sequence[HistoryRow]) -> tuple[tuple[float, str], ...]:
     return tuple((float(i), texts[i]) for i in range(0, len(rows), every))
 
 
-def history_chart(
+def _history_chart(
     table: DataTable, names: tuple[str, ...], axis: str, ticks: tuple[tuple[float, str], ...] = ()
 ) -> Chart:
-    """Return the chart with a panel for each map: median with its error, and the scatter of the pixels.
-
-    Args:
-        table: of the figure.
-        names: the maps.
-        axis: column against which they are drawn.
-        ticks: places and texts on it; empty: as the renderer finds them.
-    """
+    """Return the chart with a panel for each map: median with its error, and the scatter of the pixels."""
     order = np.argsort(table[axis], kind="stable")
     at = table[axis].astype(np.float64)[order]
     panels = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.charts.chart import (
-    LONGEST,
     Axis,
     Bars,
     Chart,
@@ -28,6 +27,7 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import FEW_CHANNELS, LINE_MAPS, MAP_NAMES, ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.figures.stacks import channel_axis, image_stack, is_strip, place_of
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import DisplayRange, histogram_edges, robust_range
 from pchem_pipeline.report.style.stretch import map_colours
@@ -35,10 +35,6 @@ from pchem_pipeline.report.style.wording import count, measured, percent, plain,
 
 FloatArray = NDArray[np.float64]
 
-#: Sensors with so few rows or columns are drawn as points, not as an image.
-_STRIP = 2
-#: Most channels of which each has a tick.
-_FEW_TICKS = 12
 #: Colours of the reasons of a fit status: a good fit, each reason in its order, not fitted yet.
 _STATUS_COLOURS = (
     "band",
@@ -63,14 +59,6 @@ _CAPTIONS = {
     "dark_signal": "Dark signal: quanta exposure at light level 0.",
     "charge_per_level": "Charge per light level: slope of the quanta exposure against the light level.",
 }
-_READ_NOISE_CAPTION = (
-    "Read noise, quantisation included. Blue line: median; shaded: 5 to 95 % of the pixels. "
-    "{below} of the {noun}s with a value are below 0.4 e⁻."
-)
-_STATUS_CAPTION = (
-    "Light gray: good fit. A pixel with several reasons has the colour of the first; the numbers count"
-    " every reason."
-)
 
 
 #: Maps that have a figure, in their order.
@@ -110,47 +98,45 @@ def _map_alt(data: ReportData, name: str, what: str) -> str:
     )
 
 
-def read_noise_figures(data: ReportData, settings: ReportSettings) -> list[Figure]:
+def read_noise_figures(data: ReportData, settings: ReportSettings) -> Iterator[Figure]:
     """Return the histogram of the read noise; a line of few channels is shown with the maps."""
     if not data.has_values("read_noise_e") or data.few_channels:
-        return []
+        return
     known = data.ordered("read_noise_e")
     below = percent(known.n_below(0.4), known.size)
     bins = histogram_table(known, "read_noise_e", settings.histogram_bins)
-    return [
-        Figure(
-            "read_noise_histogram",
-            "",
-            "Read noise of the pixels",
-            _READ_NOISE_CAPTION.format(below=below, noun=data.noun),
-            _map_alt(data, "read_noise_e", "Histogram")
-            + f" {below} of the {data.noun}s with a value are below 0.4 e⁻.",
-            (bins,),
-            read_noise_chart(known, bins),
-        )
-    ]
+    yield Figure(
+        "read_noise_histogram",
+        "",
+        "Read noise of the pixels",
+        "Read noise, quantisation included. Blue line: median; shaded: 5 to 95 % of the pixels. "
+        f"{below} of the {data.noun}s with a value are below 0.4 e⁻.",
+        _map_alt(data, "read_noise_e", "Histogram")
+        + f" {below} of the {data.noun}s with a value are below 0.4 e⁻.",
+        (bins,),
+        read_noise_chart(known, bins),
+    )
 
 
-def status_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def status_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the map of the fit status."""
     status = data.fit.get("fit_status")
     if status is None:
-        return []
+        return
     rows = status_counts(status, data.status_words)
     parts = [f"{count(int(((status == 0) & ~data.unfitted).sum()), data.noun)} with a good fit"]
     parts += [f"{count(n, data.noun)}: {text}" for _, text, n in rows]
     reasons = dict(zip(("bit", "meaning", "pixels"), map(list, zip(*rows, strict=True)), strict=False))
-    return [
-        Figure(
-            "fit_status",
-            "status",
-            "Fit status of the pixels",
-            _STATUS_CAPTION,
-            "Map of the fit status. " + "; ".join(parts) + ".",
-            (DataTable({"fit_status": status}), *([DataTable(reasons, part="reasons")] if rows else [])),
-            status_chart(status, rows, data.unfitted),
-        )
-    ]
+    yield Figure(
+        "fit_status",
+        "status",
+        "Fit status of the pixels",
+        "Light gray: good fit. A pixel with several reasons has the colour of the first; the numbers count"
+        " every reason.",
+        "Map of the fit status. " + "; ".join(parts) + ".",
+        (DataTable({"fit_status": status}), *([DataTable(reasons, part="reasons")] if rows else [])),
+        status_chart(status, rows, data.unfitted),
+    )
 
 
 def map_tables(
@@ -195,11 +181,6 @@ def histogram_table(values: NDArray[Any] | Ordered, name: str, most: int, part: 
     return DataTable(columns, dict.fromkeys(list(columns)[:2], stored_unit(name)), part)
 
 
-def is_strip(shape: tuple[int, ...]) -> bool:
-    """Tell whether a sensor is a line of channels, drawn as points instead of an image."""
-    return min(shape) < _STRIP
-
-
 def map_chart(
     tables: Sequence[DataTable],
     name: str,
@@ -224,29 +205,8 @@ def map_chart(
     known = known or Ordered.of(full)
     edges, bar = map_colours(known, stretch)
     keys = (("no_value", f"no value: {count(known.n_missing, 'pixel')}"),) if known.n_missing else ()
-    image = Image(full, edges, *place_of(full.shape), bar=bar, unit=f"{sign} ({unit})")
+    image = Image(full, *place_of(full.shape), edges=edges, bar=bar, unit=f"{sign} ({unit})")
     return Chart((_histogram_stack(known, tables[1], label), image_stack(image)), keys=keys)
-
-
-def place_of(
-    shape: tuple[int, ...], origin: tuple[int, int] = (0, 0)
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the ends of a map on the axes x and y.
-
-    Args:
-        shape: rows and columns.
-        origin: row and column of its first pixel.
-    """
-    y, x = ((first - 0.5, first + n - 0.5) for first, n in zip(origin, shape, strict=True))
-    return x, y
-
-
-def image_stack(image: Image, *others: Mark, title: str = "") -> Stack:
-    """Return a map of the sensor, square pixels unless it is very long, with other marks over it."""
-    rows, columns = image.values.shape
-    x, y = Axis("x (pixel)", *image.x, whole=True), Axis("y (pixel)", *image.y, whole=True, down=True)
-    square = 1.0 / LONGEST <= rows / columns <= LONGEST
-    return Stack((Panel(y, (image, *others), square=square),), x, title, height_mm=76.0)
 
 
 def _histogram_stack(
@@ -290,15 +250,10 @@ def _channels_chart(tables: Sequence[DataTable], values: FloatArray, label: str)
         bottom = low * (high / low) ** 0.03 if y.log else low + 0.03 * (high - low)
         crosses = Points(missing, np.full(missing.size, bottom), mark="x", size=4.0, colour="vermilion")
         marks, remark, y = (points, crosses), f"{remark} (×)", replace(y, low=low, high=high)
-    stack = Stack((Panel(y, marks, note=remark),), _channel_axis(values.size), height_mm=52.0)
+    stack = Stack((Panel(y, marks, note=remark),), channel_axis(values.size), height_mm=52.0)
     if not many:
         return Chart((stack,))
     return Chart((_histogram_stack(Ordered.of(values), tables[1], label, height_mm=40.0), stack))
-
-
-def _channel_axis(n_channels: int) -> Axis:
-    ticks = tuple((float(i), str(i)) for i in range(n_channels)) if n_channels <= _FEW_TICKS else ()
-    return Axis("channel", -0.5, n_channels - 0.5, whole=True, ticks=ticks)
 
 
 def _padded(shown: DisplayRange) -> tuple[float, float]:
@@ -387,7 +342,7 @@ def status_chart(
     ]
     if not is_strip(status.shape):
         edges = np.arange(last) + 0.5
-        image = Image(colour, edges, *place_of(status.shape), scale=_STATUS_COLOURS)
+        image = Image(colour, *place_of(status.shape), edges=edges, scale=_STATUS_COLOURS)
         return Chart((image_stack(image),), keys=tuple(keys))
     flat = colour.ravel()
     bars = []
@@ -396,7 +351,7 @@ def status_chart(
         ends = np.zeros(places.size), np.ones(places.size)
         bars.append(Bars(places, *ends, broad=0.9, colour=found, label=text, listed=False))
     panel = Panel(Axis("", 0.0, 1.0, ticks=((-1.0, ""),)), tuple(bars))
-    return Chart((Stack((panel,), _channel_axis(status.size), height_mm=30.0),), keys=tuple(keys))
+    return Chart((Stack((panel,), channel_axis(status.size), height_mm=30.0),), keys=tuple(keys))
 
 
 def _share(part: int, whole: int) -> str:

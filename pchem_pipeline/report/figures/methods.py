@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,17 +26,9 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.figures.stacks import row_stack
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import short
-
-_CAPTION = (
-    "Left or top: simulated pixels at the exposure and gain of this run, same total number of frames for "
-    "every method; hollow symbols: no answer for more than a tenth of the pixels. Lines without symbols: "
-    "smallest possible errors (Cramer-Rao bound) from one sample, and from a dark and a bright one; dotted "
-    "line: above this read noise photon transfer is more precise than one sample. Right or bottom: pixels "
-    "of this run; filled: root mean square error, hollow: robust scatter, bar: bound. "
-    "Errors are clipped at 180 %."
-)
 
 #: Method to the hue, or colour, of its line, and its marker.
 _MARKS: dict[str, tuple[str, Shape]] = {
@@ -57,37 +50,36 @@ _OTHER: tuple[str, Shape] = ("#666666", "h")
 _RANGE = (0.03, 60.0)  # %
 
 
-def method_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def method_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the figure of the comparison, where one was made."""
     result = data.methods
     if result is None:
-        return []
+        return
     known = [method for method in result["methods"] if method["errors"]]
     words = [
         f"{method['title']}: {percent_text(method['errors']['conversion_gain'].get('rmse'))} %"
         for method in known
     ]
     crossing = f" {crossing_text(result['study'])}." if result["study"] else ""
-    return [
-        Figure(
-            "methods_gain_error",
-            "methods",
-            "Error of the conversion gain by each method",
-            _CAPTION,
-            f"Root mean square error of the gain on this run's pixels. {'; '.join(words)}.{crossing}",
-            method_tables(result),
-            methods_chart(result),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "methods_gain_error",
+        "methods",
+        "Error of the conversion gain by each method",
+        "Left or top: simulated pixels at the exposure and gain of this run, same total number of frames "
+        "for every method; hollow symbols: no answer for more than a tenth of the pixels. Lines without "
+        "symbols: smallest possible errors (Cramer-Rao bound) from one sample, and from a dark and a bright "
+        "one; dotted line: above this read noise photon transfer is more precise than one sample. Right or "
+        "bottom: pixels of this run; filled: root mean square error, hollow: robust scatter, bar: bound. "
+        "Errors are clipped at 180 %.",
+        f"Root mean square error of the gain on this run's pixels. {'; '.join(words)}.{crossing}",
+        _method_tables(result),
+        _methods_chart(result),
+        PAGE_MM,
+    )
 
 
-def method_tables(result: Mapping[str, Any]) -> tuple[DataTable, ...]:
-    """Return the errors on simulated pixels, where there are any, and on the pixels of the run.
-
-    Args:
-        result: content of ``methods.json``.
-    """
+def _method_tables(result: Mapping[str, Any]) -> tuple[DataTable, ...]:
+    """Return the errors on simulated pixels, where there are any, and on the pixels of the run."""
     tables = []
     if result["study"]:
         study = result["study"]
@@ -113,12 +105,8 @@ def percent_text(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.3g}"
 
 
-def methods_chart(result: Mapping[str, Any]) -> Chart:
-    """Return the error of the gain against the read noise (simulated), and that on the run's own pixels.
-
-    Args:
-        result: content of ``methods.json``.
-    """
+def _methods_chart(result: Mapping[str, Any]) -> Chart:
+    """Return the error of the gain against the read noise (simulated), and that on the run's own pixels."""
     study, known = result["study"], [m for m in result["methods"] if m["errors"]]
     letters = ("(a) ", "(b) ") if study and known else ("", "")
     stacks = [_study(study, letters[0])] if study else []
@@ -179,13 +167,11 @@ def _run(known: Sequence[Mapping[str, Any]], letter: str) -> Stack:
         ):
             if value is not None:
                 marks.append(Points(np.array([100 * value]), np.array([row]), **what))
-    rows = tuple((float(row), method["title"]) for row, method in enumerate(known))
-    y = Axis("", -0.6, len(known) - 0.4, ticks=rows, down=True)
-    stack = Stack((Panel(y, tuple(marks)),), Axis("error of the gain (%)", log=True), height_mm=30.0)
+    titles = [method["title"] for method in known]
+    stack = row_stack(titles, marks, Axis("error of the gain (%)", log=True), f"{letter}this run's pixels")
     # a method that repeats the reference has no scatter against it
     low, high = x_window(stack)
-    x = Axis("error of the gain (%)", max(low, _RANGE[0]), high, log=True)
-    return Stack(stack.panels, x, f"{letter}this run's pixels", height_mm=30.0)
+    return replace(stack, x=replace(stack.x, low=max(low, _RANGE[0]), high=high))
 
 
 def gain_rmse(point: Mapping[str, Any], name: str) -> float | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,52 +49,35 @@ _MOST_NUMBERS = 18
 _LETTERS = "abcdefghijklmnop"
 _TITLE_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 
-_EXAMPLE_CAPTION = (
-    "The example of Hendrickson et al. (2023): density of a PCD with H = 1.8 e⁻ and a read noise of "
-    "0.33 e⁻ (line), and the limits between the most probable electron numbers (dashed)."
-)
-_CELLS_CAPTION = (
-    "Histogram of the pixel (gray), its fitted density (line), and the limits between the most probable "
-    "electron numbers (dashed)."
-)
-_FITS_CAPTION = (
-    "Gray: share of the frames at each digital number. Black: fitted density. Below: (observed − "
-    "expected) / √expected; gray band: 2 sigma. In a good fit about one line in twenty is outside the "
-    "band, without a pattern. Uncertainties are standard errors of the fit."
-)
 
-
-def cell_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def cell_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the cells of the electron number, for the paper's example and for a pixel of the run."""
     example = cell_tables(PAPER_EXAMPLE)
-    found = [
-        Figure(
-            "cluster_edges_example",
-            "",
-            "Example: H = 1.8 e⁻, read noise 0.33 e⁻",
-            _EXAMPLE_CAPTION,
-            "Density of a PCD with peaks at 0, 1, 2, … electrons and the first four cell edges at "
-            f"{_edges_text(PAPER_EXAMPLE)} e⁻.",
-            example,
-            cells_chart(example),
-        )
-    ]
-    fitted = [pixel for pixel in data.pixels if has_fit(pixel.parameters)]
-    for pixel in fitted[:1]:
-        tables = cell_tables(pixel.parameters, pixel)
-        found.append(
-            Figure(
-                "cluster_edges_pixel",
-                "cells",
-                f"{pixel.place.capitalize()} of this run",
-                _CELLS_CAPTION,
-                f"Histogram and density of {pixel.place}; first cell edges at "
-                f"{_edges_text(pixel.parameters)} DN.",
-                tables,
-                cells_chart(tables),
-            )
-        )
-    return found
+    yield Figure(
+        "cluster_edges_example",
+        "",
+        "Example: H = 1.8 e⁻, read noise 0.33 e⁻",
+        "The example of Hendrickson et al. (2023): density of a PCD with H = 1.8 e⁻ and a read noise of "
+        "0.33 e⁻ (line), and the limits between the most probable electron numbers (dashed).",
+        "Density of a PCD with peaks at 0, 1, 2, … electrons and the first four cell edges at "
+        f"{_edges_text(PAPER_EXAMPLE)} e⁻.",
+        example,
+        cells_chart(example),
+    )
+    pixel = next((pixel for pixel in data.pixels if has_fit(pixel.parameters)), None)
+    if pixel is None:
+        return
+    tables = cell_tables(pixel.parameters, pixel)
+    yield Figure(
+        "cluster_edges_pixel",
+        "cells",
+        f"{pixel.place.capitalize()} of this run",
+        "Histogram of the pixel (gray), its fitted density (line), and the limits between the most probable "
+        "electron numbers (dashed).",
+        f"Histogram and density of {pixel.place}; first cell edges at {_edges_text(pixel.parameters)} DN.",
+        tables,
+        cells_chart(tables),
+    )
 
 
 def _edges_text(parameters: Mapping[str, float]) -> str:
@@ -102,34 +85,32 @@ def _edges_text(parameters: Mapping[str, float]) -> str:
     return ", ".join(short(float(edge), 4) for edge in edges if np.isfinite(edge))
 
 
-def pixel_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def pixel_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the histograms of the shown pixels with their fits."""
     if not data.pixels:
-        return []
+        return
     words = []
     for pixel in data.pixels:
-        names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
-        numbers = ", ".join(_value_text(pixel, name) for name in names)
+        numbers = ", ".join(f"{symbol(name)[1]} {_value_text(pixel, name)}" for name in _TITLE_NAMES)
         state = f" ({pixel.status})" if pixel.status else ""
         words.append(f"{pixel.label} {pixel.place}: {numbers}{state}".strip())
-    return [
-        Figure(
-            "pixel_fits",
-            "pixels",
-            "Histograms of single pixels with their fits",
-            _FITS_CAPTION,
-            "Histograms with fitted densities. " + "; ".join(words) + ".",
-            fit_tables(data.pixels),
-            pixels_chart(data.pixels),
-            PAGE_MM if len(data.pixels) > 1 else COLUMN_MM,
-        )
-    ]
+    yield Figure(
+        "pixel_fits",
+        "pixels",
+        "Histograms of single pixels with their fits",
+        "Gray: share of the frames at each digital number. Black: fitted density. Below: (observed − "
+        "expected) / √expected; gray band: 2 sigma. In a good fit about one line in twenty is outside the "
+        "band, without a pattern. Uncertainties are standard errors of the fit.",
+        "Histograms with fitted densities. " + "; ".join(words) + ".",
+        _fit_tables(data.pixels),
+        pixels_chart(data.pixels),
+        PAGE_MM if len(data.pixels) > 1 else COLUMN_MM,
+    )
 
 
 def _value_text(pixel: PixelFit, name: str) -> str:
-    _, words, unit = symbol(name)
     nan = float("nan")
-    return f"{words} {measured(pixel.parameters.get(name, nan), pixel.stderr.get(name, nan), unit)}"
+    return measured(pixel.parameters.get(name, nan), pixel.stderr.get(name, nan), symbol(name)[2])
 
 
 def cell_tables(parameters: Mapping[str, float], pixel: PixelFit | None = None) -> tuple[DataTable, ...]:
@@ -157,7 +138,7 @@ def cell_tables(parameters: Mapping[str, float], pixel: PixelFit | None = None) 
     return density, between, DataTable(frames, {"dn": "DN"}, "histogram")
 
 
-def fit_tables(pixels: Sequence[PixelFit]) -> tuple[DataTable, DataTable]:
+def _fit_tables(pixels: Sequence[PixelFit]) -> tuple[DataTable, DataTable]:
     """Return the histograms of pixels with what their fits expect, and their parameters."""
     parts = [_pixel_columns(pixel) for pixel in pixels]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -364,13 +345,8 @@ def _title(pixel: PixelFit, letter: str) -> str:
     head = " ".join(part for part in (f"({letter})" if letter else "", plain(cut(pixel.label, 40))) if part)
     lines = [f"{head}: {pixel.place}" if head else pixel.place]
     if has_fit(pixel.parameters):
-        words = []
-        for name in _TITLE_NAMES:
-            sign, _, unit = symbol(name)
-            if name in pixel.parameters:
-                words.append(
-                    f"{sign} = {measured(pixel.parameters[name], pixel.stderr.get(name, float('nan')), unit)}"
-                )
+        known = (name for name in _TITLE_NAMES if name in pixel.parameters)
+        words = [f"{symbol(name)[0]} = {_value_text(pixel, name)}" for name in known]
         lines += ["   ".join(words[i : i + 2]) for i in range(0, len(words), 2)]
     if pixel.status:
         lines += textwrap.wrap(

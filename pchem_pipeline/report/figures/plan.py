@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,6 @@ from pchem_pipeline.report.charts.chart import (
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.stretch import even_edges
 from pchem_pipeline.report.style.wording import power_of_ten
 
 FloatArray = NDArray[np.float64]
@@ -34,34 +33,28 @@ _ENDS, _LEVELS = (0.0, 8.0), range(1, 9)
 #: Ticks of the exposure, e-; points of the picture for one of the grid, along each axis.
 _EXPOSURES, _FINER = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0), 8
 
-_CAPTION = (
-    "Number of frames for the precision in the title (1 sigma error per pixel, Cramer-Rao bound). Dot: "
-    "median pixel of this run; white dots: exposure with the fewest frames at each read noise. Weak peaks "
-    "and many electrons (top right) need more frames than the bound, to rule out a wrong gain."
-)
 
-
-def plan_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def plan_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the figure of the frames needed, where a pixel has a value."""
     plan = data.plan
     if plan is None:
-        return []
+        return
     words = "; ".join(
         f"{target_text(row['target'])}: {frames_text(row['frames'])} frames" for row in plan["rows"]
     )
     table = frames_table(plan["contours"])
-    return [
-        Figure(
-            "frames_needed",
-            "plan",
-            "Frames needed for one sample",
-            _CAPTION,
-            f"Contours of the frames needed over exposure and read noise. For the median pixel, {words}.",
-            (table,),
-            frames_chart(table, plan["mark"]),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "frames_needed",
+        "plan",
+        "Frames needed for one sample",
+        "Number of frames for the precision in the title (1 sigma error per pixel, Cramer-Rao bound). Dot: "
+        "median pixel of this run; white dots: exposure with the fewest frames at each read noise. Weak "
+        "peaks and many electrons (top right) need more frames than the bound, to rule out a wrong gain.",
+        f"Contours of the frames needed over exposure and read noise. For the median pixel, {words}.",
+        (table,),
+        frames_chart(table, plan["mark"]),
+        PAGE_MM,
+    )
 
 
 def frames_table(contours: Mapping[str, Any]) -> DataTable:
@@ -114,7 +107,7 @@ def _stack(x: FloatArray, y: FloatArray, frames: FloatArray, words: str, mark: A
     across, power = np.log10(x), np.log10(np.where(np.isfinite(frames), np.clip(frames, 1.0, None), np.nan))
     fine = _finer(power)
     places, heights = (np.linspace(a[0], a[-1], n) for a, n in ((across, fine.shape[1]), (y, fine.shape[0])))
-    marks: list[Mark] = [Image(fine, even_edges(*_ENDS), _half_steps(across), _half_steps(y))]
+    marks: list[Mark] = [Image(fine, _half_steps(across), _half_steps(y), ends=_ENDS)]
     for level in _LEVELS:
         contour = _crossing(fine, heights, float(level))
         if np.isfinite(contour).any():

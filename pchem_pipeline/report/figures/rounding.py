@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -23,34 +24,27 @@ _LEAST_NOISE = 0.01  # e-
 _NAMES = ("quanta exposure", "conversion gain", "bias", "read noise")
 
 
-_CAPTION = (
-    "Systematic error from rounding to whole DN if the density of the PCD is fitted, in standard errors per "
-    "pixel, at this run's median quanta exposure, median read noise and number of frames (largest over the "
-    "position of the bias between two DN). Above the dotted line (0.05) exact probabilities are fitted, "
-    "unless fit.likelihood is density."
-)
-
-
-def rounding_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def rounding_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the bias by rounding against 1/g."""
     curves = rounding_curves(data)
     if not curves or not data.has_values("conversion_gain"):
-        return []
+        return
     gain = data.maps["conversion_gain"]
     step = 1.0 / data.summary("conversion_gain", with_flagged=True).median
     words = [f"{name} {short(float(np.interp(step, curves['1/g'], curves[name])), 2)}" for name in _NAMES]
     table = DataTable(curves, {"1/g": "DN/e-", **dict.fromkeys(_NAMES, "standard errors")})
-    return [
-        Figure(
-            "rounding",
-            "uncertainty",
-            "Systematic error from rounding to whole DN",
-            _CAPTION,
-            f"At {short(step)} DN per electron, in standard errors per pixel: {', '.join(words)}.",
-            (table,),
-            rounding_chart(table, gain),
-        )
-    ]
+    yield Figure(
+        "rounding",
+        "uncertainty",
+        "Systematic error from rounding to whole DN",
+        "Systematic error from rounding to whole DN if the density of the PCD is fitted, in standard errors "
+        "per pixel, at this run's median quanta exposure, median read noise and number of frames (largest "
+        "over the position of the bias between two DN). Above the dotted line (0.05) exact probabilities "
+        "are fitted, unless fit.likelihood is density.",
+        f"At {short(step)} DN per electron, in standard errors per pixel: {', '.join(words)}.",
+        (table,),
+        _rounding_chart(table, gain),
+    )
 
 
 def rounding_curves(data: ReportData) -> dict[str, NDArray[np.float64]]:
@@ -85,13 +79,8 @@ def rounding_curves(data: ReportData) -> dict[str, NDArray[np.float64]]:
 _HUES = ("blue", "vermilion", "green", "orange")
 
 
-def rounding_chart(table: DataTable, gain: NDArray[Any]) -> Chart:
-    """Return the chart of the bias of the density's estimates against 1/g, with the range of this sensor.
-
-    Args:
-        table: from :func:`rounding_curves`.
-        gain: map of the conversion gain, e-/DN.
-    """
+def _rounding_chart(table: DataTable, gain: NDArray[Any]) -> Chart:
+    """Return the chart of the bias of the density's estimates against 1/g, with the range of this sensor."""
     steps = table["1/g"]
     low, high = (1.0 / float(q) for q in np.quantile(finite(gain), [0.99, 0.01]))
     lines = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -23,39 +23,29 @@ AXES = {
     "light_level": ("light level", "", ("charge_per_level",), "dark_signal"),
 }
 
-_LINE_CAPTION = (
-    "Quanta exposure against {against}, with the median line of the pixels. Below: median residual "
-    "with its standard error."
-)
-_TRANSFER_CAPTION = (
-    "Medians over the pixels. Curve: prediction from the median parameters of the joint fit, not fitted "
-    "to the points."
-)
 
-
-def exposure_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def exposure_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the exposures on their line, where samples lie on one."""
     samples = data.samples
     if samples is None or samples.against not in AXES:
-        return []
+        return
     slope = slope_of(data)
     if slope is None or not samples.on_line:
-        return []
+        return
     words, noun = AXES[samples.against][0], symbol(slope)[1]
-    table = exposure_table(samples)
-    line = (_median(data.maps[slope]), *middle(data.maps[AXES[samples.against][3]])[:2])
-    centre, error, _low, _high = middle(data.maps[slope])
-    return [
-        Figure(
-            "exposures",
-            "exposures",
-            f"{noun.capitalize()} as the slope of H",
-            _LINE_CAPTION.format(against=words),
-            f"Exposures on a line; median {noun} {measured(centre, error, symbol(slope)[2])}.",
-            (table,),
-            exposures_chart(table, line),
-        )
-    ]
+    table = _exposure_table(samples)
+    centre, error = middle(data.maps[slope])[:2]
+    line = (centre, *middle(data.maps[AXES[samples.against][3]])[:2])
+    yield Figure(
+        "exposures",
+        "exposures",
+        f"{noun.capitalize()} as the slope of H",
+        f"Quanta exposure against {words}, with the median line of the pixels. Below: median residual "
+        "with its standard error.",
+        f"Exposures on a line; median {noun} {measured(centre, error, symbol(slope)[2])}.",
+        (table,),
+        _exposures_chart(table, line),
+    )
 
 
 def slope_of(data: ReportData) -> str | None:
@@ -65,33 +55,28 @@ def slope_of(data: ReportData) -> str | None:
     return next((name for name in AXES[data.samples.against][2] if data.has_values(name)), None)
 
 
-def transfer_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def transfer_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return variance against mean of the samples, with the curve of the fit."""
     samples = data.samples
     if samples is None or not data.has_values("conversion_gain"):
-        return []
-    table = transfer_table(samples, data.maps["bias"])
-    fitted = {name: _median(data.maps[name]) for name in ("conversion_gain", "read_noise_dn")}
+        return
+    table = _transfer_table(samples, data.maps["bias"])
+    fitted = {name: middle(data.maps[name])[0] for name in ("conversion_gain", "read_noise_dn")}
     medians = zip(table["sample"], table["variance"], strict=True)
-    return [
-        Figure(
-            "photon_transfer",
-            "photon-transfer",
-            "Variance against mean",
-            _TRANSFER_CAPTION,
-            "Variance against mean above the bias: "
-            + "; ".join(f"{name} {short(float(value))} DN²" for name, value in medians),
-            (table,),
-            transfer_chart(table, fitted),
-        )
-    ]
+    yield Figure(
+        "photon_transfer",
+        "photon-transfer",
+        "Variance against mean",
+        "Medians over the pixels. Curve: prediction from the median parameters of the joint fit, not fitted "
+        "to the points.",
+        "Variance against mean above the bias: "
+        + "; ".join(f"{name} {short(float(value))} DN²" for name, value in medians),
+        (table,),
+        _transfer_chart(table, fitted),
+    )
 
 
-def _median(values: NDArray[Any]) -> float:
-    return float(np.median(finite(values)))
-
-
-def exposure_table(samples: Samples) -> DataTable:
+def _exposure_table(samples: Samples) -> DataTable:
     """Return medians over the pixels of H and of its residuals, of the samples on the line."""
     words, unit, *_ = AXES[samples.against]
     chosen = samples.on_line
@@ -110,13 +95,8 @@ def exposure_table(samples: Samples) -> DataTable:
     return DataTable(columns, dict.fromkeys(list(columns)[2:], "e-") | {words: unit})
 
 
-def transfer_table(samples: Samples, bias: NDArray[Any]) -> DataTable:
-    """Return medians over the pixels of mean above the bias and variance of each sample.
-
-    Args:
-        samples: with their ``mean`` and ``variance``, (sample, y, x).
-        bias: map of mu, DN.
-    """
+def _transfer_table(samples: Samples, bias: NDArray[Any]) -> DataTable:
+    """Return medians over the pixels of mean above the bias (DN) and variance (DN^2) of each sample."""
     mean = np.array([middle(each) for each in samples.arrays["mean"] - bias])
     variance = np.array([middle(each) for each in samples.arrays["variance"]])
     columns: dict[str, Any] = {
@@ -143,15 +123,11 @@ def middle(values: NDArray[Any]) -> tuple[float, float, float, float]:
     return centre, 0.5 * float(ends[1] - ends[0]), low, high
 
 
-def exposures_chart(table: DataTable, line: tuple[float, float, float]) -> Chart:
+def _exposures_chart(table: DataTable, line: tuple[float, float, float]) -> Chart:
     """Return the chart of H against time or light with its line, and the residuals below.
 
     Points are medians over the pixels, bars the 16 to 84 % range between pixels; the error bars of the
     residuals are standard errors of the median.
-
-    Args:
-        table: of :func:`exposure_table`.
-        line: slope, offset and standard error of the offset, e-.
     """
     against = list(table.columns)[1]
     places, exposures, (slope, offset) = table[against].astype(np.float64), table["H"], line[:2]
@@ -186,15 +162,11 @@ def _residuals(places: NDArray[np.float64], table: DataTable) -> Panel:
     return Panel(Axis(label, -most, most), (zero, points))
 
 
-def transfer_chart(table: DataTable, fitted: Mapping[str, float]) -> Chart:
+def _transfer_chart(table: DataTable, fitted: Mapping[str, float]) -> Chart:
     """Return the chart of variance against mean above the bias with the curve of the joint fit.
 
     Photon transfer: ``variance = sigma^2 + (mean - mu) / g`` in DN. Points are medians over the pixels; the
     curve has the median parameters.
-
-    Args:
-        table: of :func:`transfer_table`.
-        fitted: medians of ``conversion_gain`` and ``read_noise_dn``.
     """
     x, y, kinds = (table[name] for name in ("mean above the bias", "variance", "kind"))
     gain, noise = fitted["conversion_gain"], fitted["read_noise_dn"]

@@ -29,19 +29,6 @@ _CLIP = 6.0
 _AT_ONCE = 1 << 21
 _WIDTH = 1.2533  # standard error of a median over that of a mean
 
-_FRAMES = (
-    "Top: mean of all pixels{averaged}; gray: 2 sigma for independent pixels. Below: power spectrum relative "
-    "to independent pixels (1): mean and maximum of neighbouring frequencies."
-)
-_PROFILES = (
-    "Median of the pixels' mean signal over each row and column; gray: median of the sensor ± 2 sigma for "
-    "independent pixels."
-)
-_SPECTRA = (
-    "Top: fixed pattern (means of rows and columns over all frames, hot pixels clipped). Below: noise of "
-    "rows and columns from frame to frame. 1: independent pixels."
-)
-
 
 def stability_figures(sums: StackSums | None) -> list[Figure]:
     """Return means against frame, row and column, and their spectra, where the run has the sums."""
@@ -63,9 +50,15 @@ def _frame_figure(sums: StackSums) -> Figure:
         f"{short(float(power['largest'].max()), 2)} times the expected one."
     )
     return Figure(
-        "frame_means", "stability", "Mean of the frames", _FRAMES.format(averaged=averaged), alt,
-        (means, power), frames_chart(means, power),
-    )  # fmt: skip
+        "frame_means",
+        "stability",
+        "Mean of the frames",
+        f"Top: mean of all pixels{averaged}; gray: 2 sigma for independent pixels. Below: power spectrum "
+        "relative to independent pixels (1): mean and maximum of neighbouring frequencies.",
+        alt,
+        (means, power),
+        _frames_chart(means, power),
+    )
 
 
 def _profile_figure(sums: StackSums) -> Figure | None:
@@ -79,10 +72,15 @@ def _profile_figure(sums: StackSums) -> Figure | None:
         outside = int(((table["mean signal"] < low) | (table["mean signal"] > high)).sum())
         words.append(f"{outside} of {count(low.size, table.part)} outside 2 sigma")
     return Figure(
-        "profiles", "stability", "Profiles of rows and columns", _PROFILES,
+        "profiles",
+        "stability",
+        "Profiles of rows and columns",
+        "Median of the pixels' mean signal over each row and column; gray: median of the sensor ± 2 sigma "
+        "for independent pixels.",
         f"Profiles of the mean signal: {'; '.join(words)}.",
-        tuple(tables), profiles_chart(tables),
-    )  # fmt: skip
+        tuple(tables),
+        _profiles_chart(tables),
+    )
 
 
 def _spectrum_figure(sums: StackSums) -> Figure | None:
@@ -94,10 +92,15 @@ def _spectrum_figure(sums: StackSums) -> Figure | None:
         for table in (*fixed, *temporal)
     ]
     return Figure(
-        "spatial_spectra", "stability", "Spectra of rows and columns", _SPECTRA,
+        "spatial_spectra",
+        "stability",
+        "Spectra of rows and columns",
+        "Top: fixed pattern (means of rows and columns over all frames, hot pixels clipped). Below: noise of "
+        "rows and columns from frame to frame. 1: independent pixels.",
         f"Largest power relative to independent pixels: {', '.join(largest)}.",
-        (*fixed, *temporal), spectra_chart(fixed, temporal),
-    )  # fmt: skip
+        (*fixed, *temporal),
+        _spectra_chart(fixed, temporal),
+    )
 
 
 def frame_table(sums: StackSums) -> DataTable:
@@ -190,60 +193,42 @@ def _spectrum(power: FloatArray, length: int, part: str, unit: str) -> DataTable
     return DataTable({"frequency": frequency, "power": power}, {"frequency": f"1/{unit}"}, part)
 
 
-_CHANCE_LABEL = "chance"
-
-
-def frames_chart(means: DataTable, power: DataTable) -> Chart:
-    """Return the chart of the mean of the frames, and its spectrum below.
-
-    Args:
-        means: of :func:`frame_table`.
-        power: of :func:`power_table`.
-    """
-    x, centre, error = means["frame"], float(means["mean"].mean()), means["error of chance"]
-    band = Band(x, centre - 2 * error, centre + 2 * error, colour="band", label=_CHANCE_LABEL)
-    line = Line(x, means["mean"], width=0.7, label="mean")
+def _frames_chart(means: DataTable, power: DataTable) -> Chart:
+    """Return the chart of the mean of the frames, and its spectrum below."""
+    centre, error = float(means["mean"].mean()), means["error of chance"]
     spectrum = (
         Line(power["frequency"], power["largest"], colour="sky", width=0.6, label="largest"),
         Line(power["frequency"], power["power"], label="mean power"),
         _one(),
     )
-    return Chart(
-        (
-            Stack((Panel(Axis("mean (DN)"), (band, line)),), Axis("frame"), height_mm=44.0),
-            Stack(
-                (Panel(Axis("power / chance", log=True), spectrum),),
-                Axis("frequency (1/frame)", log=True),
-                height_mm=44.0,
-            ),
-        )
-    )
+    panel = Panel(Axis("power / chance", log=True), spectrum)
+    below = Stack((panel,), Axis("frequency (1/frame)", log=True), height_mm=44.0)
+    ends = centre - 2 * error, centre + 2 * error
+    return Chart((_series(means["frame"], means["mean"], ends, "mean", "frame", 0.7), below))
 
 
-def profiles_chart(tables: Sequence[DataTable]) -> Chart:
-    """Return the chart of the profiles of rows and columns.
+def _series(
+    x: FloatArray, y: FloatArray, ends: tuple[FloatArray, FloatArray], what: str, axis: str, width: float
+) -> Stack:
+    """Return a series in DN over the band in which chance leaves it."""
+    band = Band(x, *ends, colour="band", label="chance")
+    panel = Panel(Axis(f"{what} (DN)"), (band, Line(x, y, width=width, label=what)))
+    return Stack((panel,), Axis(axis), height_mm=44.0)
 
-    Args:
-        tables: of :func:`profile_table`.
-    """
+
+def _profiles_chart(tables: Sequence[DataTable]) -> Chart:
+    """Return the chart of the profiles of rows and columns."""
     stacks = []
     for table in tables:
         name = next(iter(table.columns))
-        x = table[name]
-        band = Band(x, table["chance from"], table["chance to"], colour="band", label=_CHANCE_LABEL)
-        line = Line(x, table["mean signal"], width=0.8, label="median")
-        panel = Panel(Axis("median (DN)"), (band, line))
-        stacks.append(Stack((panel,), Axis(f"{table.part} {name} (pixel)"), height_mm=44.0))
+        ends = table["chance from"], table["chance to"]
+        axis = f"{table.part} {name} (pixel)"
+        stacks.append(_series(table[name], table["mean signal"], ends, "median", axis, 0.8))
     return Chart(tuple(stacks))
 
 
-def spectra_chart(fixed: Sequence[DataTable], temporal: Sequence[DataTable]) -> Chart:
-    """Return the chart of spatial spectra of the fixed pattern, and below of the noise of rows and columns.
-
-    Args:
-        fixed: of :func:`pattern_spectra`.
-        temporal: of :func:`line_spectra`.
-    """
+def _spectra_chart(fixed: Sequence[DataTable], temporal: Sequence[DataTable]) -> Chart:
+    """Return the chart of spatial spectra: of the fixed pattern, and below of the noise."""
     stacks = []
     for tables, title in ((fixed, "fixed pattern"), (temporal, "noise")):
         lines = []

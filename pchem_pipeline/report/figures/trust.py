@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,12 +13,10 @@ from pchem_pipeline.report.charts.chart import (
     Axis,
     Bars,
     Chart,
-    Image,
     Level,
     Line,
     Mark,
     Panel,
-    Points,
     Span,
     Stack,
     Steps,
@@ -24,10 +24,9 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.maps import image_stack, is_strip, place_of
+from pchem_pipeline.report.figures.stacks import is_strip, sensor_stack
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.stretch import even_bar, even_edges
 from pchem_pipeline.report.style.wording import count, percent, symbol
 
 FloatArray = NDArray[np.float64]
@@ -43,28 +42,11 @@ _TWO = (1.0, 1.15)
 _UNCERTAIN = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
 _GOODNESS = ("p", "chi2", "dof", "q")
 
-_GOODNESS_CAPTION = (
-    "p-values of the goodness of fit of all pixels (blue): uniform where the model holds (line; gray: 2 "
-    "sigma), with a peak at 0 from pixels that the model does not describe. Map: chi-square as standard "
-    "normal deviate, clipped at −4 and 6; circles: misfits at a false-discovery rate of {rate:g}."
-)
-_LEFT_OUT_CAPTION = (
-    "Samples where the fitted model expects fewer than {floor:g} frames per DN are excluded from the "
-    "likelihood. Left: number of pixels by excluded samples. Right: map; white: none. Without outliers, "
-    "about one pixel in two hundred has an excluded sample."
-)
-_UNCERTAINTY_CAPTION = (
-    "Left: share of each map's variance over the pixels that is noise of the estimates; near 100 % "
-    "(dotted) the map shows only noise: take more frames. Right: predicted density of the ensemble "
-    "(black), its standard error from the errors of the maps (blue), and the sampling noise of the "
-    "data (light blue)."
-)
 
-
-def goodness_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def goodness_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the p-values and the map of the goodness of fit."""
     if not data.misfits or any(f"goodness_{name}" not in data.fit for name in _GOODNESS):
-        return []
+        return
     facts = data.misfits
     rate = float(facts["false_discovery_rate"])
     columns = {name: data.fit[f"goodness_{name}"] for name in _GOODNESS}
@@ -74,65 +56,66 @@ def goodness_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
         f"p-values and misfit of {count(int(facts['tested']), data.noun)}; "
         f"{count(int(facts['misfits']), 'misfit')} at a false-discovery rate of {rate:g}."
     )
-    return [
-        Figure(
-            "goodness",
-            "goodness",
-            "Goodness of fit of all pixels",
-            _GOODNESS_CAPTION.format(rate=rate),
-            text,
-            (table,),
-            goodness_chart(table, rate),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "goodness",
+        "goodness",
+        "Goodness of fit of all pixels",
+        "p-values of the goodness of fit of all pixels (blue): uniform where the model holds (line; gray: 2 "
+        "sigma), with a peak at 0 from pixels that the model does not describe. Map: chi-square as standard "
+        f"normal deviate, clipped at −4 and 6; circles: misfits at a false-discovery rate of {rate:g}.",
+        text,
+        (table,),
+        _goodness_chart(table, rate),
+        PAGE_MM,
+    )
 
 
-def left_out_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def left_out_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return where the tail guard left samples out of the fit."""
     share = data.fit.get("outlier_share")
     if share is None or not data.misfits.get("tail_guard"):
-        return []
+        return
     hit = int((share > 0).sum())
-    return [
-        Figure(
-            "left_out",
-            "goodness",
-            "Samples excluded from the fit",
-            _LEFT_OUT_CAPTION.format(floor=data.misfits["tail_guard"]),
-            f"{count(hit, data.noun)} of {share.size:,} with excluded samples, at most "
-            f"{percent(float(np.max(share, initial=0.0)), 1.0)} of their frames.",
-            (DataTable({"share left out": share}),),
-            left_out_chart(share, data.n_frames),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "left_out",
+        "goodness",
+        "Samples excluded from the fit",
+        f"Samples where the fitted model expects fewer than {data.misfits['tail_guard']:g} frames per DN "
+        "are excluded from the likelihood. Left: number of pixels by excluded samples. Right: map; white: "
+        "none. Without outliers, about one pixel in two hundred has an excluded sample.",
+        f"{count(hit, data.noun)} of {share.size:,} with excluded samples, at most "
+        f"{percent(float(np.max(share, initial=0.0)), 1.0)} of their frames.",
+        (DataTable({"share left out": share}),),
+        left_out_chart(share, data.n_frames),
+        PAGE_MM,
+    )
 
 
-def uncertainty_figures(data: ReportData, _: ReportSettings) -> list[Figure]:
+def uncertainty_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     """Return the part of the maps that is noise, and the error of the predicted ensemble."""
     shares = noise_shares(data, _UNCERTAIN)
     arrays = data.ensemble
     if not shares or "epcd_exact" not in arrays:
-        return []
+        return
     words = ", ".join(f"{symbol(name)[1]} {percent(min(value, 1.0), 1.0)}" for name, value in shares.items())
     maps = DataTable({"map": list(shares), "share of the variance": list(shares.values())}, part="maps")
     names = ("dn", "counts", "epcd_exact", "epcd_stderr")
     columns = {name: arrays[name] for name in names if name in arrays}
     units = {"dn": "DN", "epcd_exact": "1/DN", "epcd_stderr": "1/DN"}
     ensemble = DataTable(columns, units, "ensemble")
-    return [
-        Figure(
-            "uncertainty",
-            "uncertainty",
-            "Noise in the maps and in the prediction",
-            _UNCERTAINTY_CAPTION,
-            f"Share of noise in the variance of the maps: {words}.",
-            (maps, ensemble),
-            uncertainty_chart(maps, ensemble),
-            PAGE_MM,
-        )
-    ]
+    yield Figure(
+        "uncertainty",
+        "uncertainty",
+        "Noise in the maps and in the prediction",
+        "Left: share of each map's variance over the pixels that is noise of the estimates; near 100 % "
+        "(dotted) the map shows only noise: take more frames. Right: predicted density of the ensemble "
+        "(black), its standard error from the errors of the maps (blue), and the sampling noise of the "
+        "data (light blue).",
+        f"Share of noise in the variance of the maps: {words}.",
+        (maps, ensemble),
+        _uncertainty_chart(maps, ensemble),
+        PAGE_MM,
+    )
 
 
 def noise_shares(data: ReportData, names: tuple[str, ...]) -> dict[str, float]:
@@ -155,13 +138,8 @@ def noise_shares(data: ReportData, names: tuple[str, ...]) -> dict[str, float]:
     return found
 
 
-def goodness_chart(table: DataTable, false_discovery_rate: float) -> Chart:
-    """Return the p-values of all pixels against what chance gives, and a map of the goodness of fit.
-
-    Args:
-        table: ``p``, ``q`` and ``misfit``, each (y, x).
-        false_discovery_rate: pixels with a q-value up to it are marked.
-    """
+def _goodness_chart(table: DataTable, false_discovery_rate: float) -> Chart:
+    """Return the p-values of all pixels against what chance gives, and a map of the goodness of fit."""
     deviate, known = table["misfit"], finite(table["p"])
     counts, edges = np.histogram(known, _P_BINS, (0.0, 1.0))
     mean = known.size / _P_BINS
@@ -173,26 +151,10 @@ def goodness_chart(table: DataTable, false_discovery_rate: float) -> Chart:
     )
     high = 1.05 * max(float(counts.max()), mean + 2 * spread)
     left = Stack((Panel(Axis("pixels", 0.0, high), marks),), Axis("p-value of the goodness of fit", 0.0, 1.0))
-    found = np.argwhere(table["q"] <= false_discovery_rate)
-    if is_strip(deviate.shape):
-        values, places = deviate.ravel(), found.max(axis=1)
-        return Chart((left, _channels(values, "misfit (σ)", _ring(places, values[places]))), _TWO)
-    rings = (_ring(found[:, 1], found[:, 0]),) if 0 < len(found) <= _MOST_MARKS else ()
-    image = Image(
-        deviate, even_edges(*_DEVIATES), *place_of(deviate.shape), bar=even_bar(*_DEVIATES, whole=True),
-        unit="misfit (σ)",
-    )  # fmt: skip
-    return Chart((left, image_stack(image, *rings)), _TWO)
-
-
-def _ring(x: NDArray[np.int64], y: NDArray[np.int64]) -> Points:
-    return Points(x, y, size=5.0, face="none", colour="vermilion")
-
-
-def _channels(values: FloatArray, label: str, *others: Mark) -> Stack:
-    """Return a value of each channel of a line."""
-    points = Points(np.arange(values.size), values, size=2.5, label=label, listed=False)
-    return Stack((Panel(Axis(label), (points, *others)),), Axis("channel", whole=True))
+    found = table["q"] <= false_discovery_rate
+    ringed = found if is_strip(found.shape) or found.sum() <= _MOST_MARKS else None
+    right = sensor_stack(deviate, _DEVIATES, "misfit (σ)", ringed=ringed, ring="vermilion", whole=True)
+    return Chart((left, right), _TWO)
 
 
 def left_out_chart(share: FloatArray, n_frames: int | None) -> Chart:
@@ -215,22 +177,14 @@ def left_out_chart(share: FloatArray, n_frames: int | None) -> Chart:
     y = Axis("pixels", 0.0, 1.18 * max(float(counts.max()), 1.0), whole=True)
     note = f"{count(int(hit.size), 'pixel')} of {samples.size:,} with any"
     left = Stack((Panel(y, (Steps(edges, counts, filled=True, colour="bars"),), note=note),), x)
-    if is_strip(samples.shape):
-        return Chart((left, _channels(np.where(lost, samples, 0.0).ravel(), label)), _TWO)
-    image = Image(
-        samples, even_edges(0.0, top), *place_of(samples.shape), scale="from_paper", none="paper",
-        bar=even_bar(0.0, top, whole=bool(n_frames)), unit=label,
-    )  # fmt: skip
-    return Chart((left, image_stack(image)), _TWO)
+    shown = np.where(lost, samples, 0.0) if is_strip(samples.shape) else samples
+    whole = bool(n_frames)
+    right = sensor_stack(shown, (0.0, top), label, scale="from_paper", none="paper", whole=whole)
+    return Chart((left, right), _TWO)
 
 
-def uncertainty_chart(maps: DataTable, ensemble: DataTable) -> Chart:
-    """Return the chart of how much of each map is noise of the estimates, and how sure the prediction is.
-
-    Args:
-        maps: parts of the maps' variance that the errors of the estimates make, by map.
-        ensemble: ``dn``, ``counts``, ``epcd_exact``, and ``epcd_stderr`` where it is known.
-    """
+def _uncertainty_chart(maps: DataTable, ensemble: DataTable) -> Chart:
+    """Return the chart of how much of each map is noise of the estimates, and how sure the prediction is."""
     return Chart((_noise_stack(maps), _error_stack(ensemble)), _TWO)
 
 

@@ -17,7 +17,16 @@ from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
 from pchem_pipeline.report.pages.report_json import json_value
 from pchem_pipeline.report.pages.tables import Table, rmse_unit, rmse_words
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.wording import count, cut, measured, percent, scientific, short, symbol
+from pchem_pipeline.report.style.wording import (
+    count,
+    cut,
+    heading,
+    measured,
+    percent,
+    scientific,
+    short,
+    symbol,
+)
 
 #: Names of the files.
 COMPARE_PAGE, COMPARE_JSON = "compare.html", "compare.json"
@@ -92,8 +101,8 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
     """
     many = len(found.pairs) > _MOST_DRAWN
     maps = {pair.other.label: [] if many else difference_figures(pair) for pair in found.pairs}
-    whole = ensembles_figures([found.runs[0], *found.runs[1:][-_MOST_DRAWN:]])
-    times = history_figures(found.history, found.against)
+    whole = list(ensembles_figures([found.runs[0], *found.runs[1:][-_MOST_DRAWN:]]))
+    times = list(history_figures(found.history, found.against))
     every = [*whole, *times, *(each for figures in maps.values() for each in figures)]
     drawn = (draw or draw_here)(every, _SETTINGS)
 
@@ -250,7 +259,7 @@ def run_table(found: Comparison) -> Table:
     for name in dict.fromkeys(each for run in runs for each in run.summary):
         nan = (float("nan"),) * 3
         cells = [measured(*run.summary.get(name, nan)[:2], symbol(name)[2]) for run in runs]
-        rows.append((f"{symbol(name)[1]} ({symbol(name)[2]}), median", *cells))
+        rows.append((f"{heading(name)}, median", *cells))
     for name in dict.fromkeys(each for run in runs for each in run.rmse):
         cells = [scientific(run.rmse[name]) if name in run.rmse else "not known" for run in runs]
         rows.append((f"RMSE, {rmse_words(name)} ({rmse_unit(name)})", *cells))
@@ -272,12 +281,11 @@ def pair_tables(pair: Pair, tolerance: float) -> list[Table]:
 def _map_table(pair: Pair) -> Table:
     rows = []
     for name, each in pair.maps.items():
-        _, words, unit = symbol(name)
         reason = pair.reasons.get(name)
         verdict = "" if reason is None else "changed" if reason else "within sampling noise"
         rows.append(
             (
-                f"{words} ({unit})",
+                heading(name),
                 measured(each.median, each.median_stderr) if each.median else "0",
                 f"{each.median_z:+.3f}".replace("-", "−"),
                 f"{each.spread_z:.3f}",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from pchem_pipeline.discrepancy.verdict import (
@@ -25,7 +25,7 @@ from pchem_pipeline.report.pages.discrepancy_tables import (
     probability_text,
 )
 from pchem_pipeline.report.pages.pictures import Picture
-from pchem_pipeline.report.pages.summary import Flag, Level
+from pchem_pipeline.report.pages.summary import VERDICT_LEVELS, Flag, Level, gravest_first
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.style.wording import (
     count,
@@ -42,17 +42,6 @@ DISCREPANCY_PAGE = "discrepancy.html"
 _IMMATERIAL = 0.2
 #: Changes below this are none.
 _NOT_MOVED = 0.01
-
-#: Verdict to its level and its name.
-VERDICT_WORDS: dict[str, tuple[Level, str]] = {
-    "named": ("note", "Named"),
-    "named_in_part": ("caution", "Named in part"),
-    "ambiguous": ("caution", "Ambiguous"),
-    "described": ("caution", "Described"),
-    "unexplained": ("serious", "Unexplained"),
-    "consistent": ("good", "Consistent"),
-    "cannot_tell": ("caution", "Cannot tell"),
-}
 
 #: (id, heading, introduction) of the parts of the page.
 PARTS: tuple[tuple[str, str, str], ...] = (
@@ -151,7 +140,7 @@ def discrepancy_view(data: DiscrepancyData, pictures: Sequence[Picture]) -> Disc
         data: verdict and arrays.
         pictures: the figures of the verdict.
     """
-    level, name = verdict_level(data.found)
+    verdict = data.found.verdict
     tables = discrepancy_tables(data)
     parts = []
     first = _signature(data.found)
@@ -173,7 +162,13 @@ def discrepancy_view(data: DiscrepancyData, pictures: Sequence[Picture]) -> Disc
         parts.append(Part(f"discrepancy-part-{id_}", title, intro, empty, shown, rows))
     sentence = typeset(data.found.sentence)
     return DiscrepancyView(
-        level, name, sentence, frames_text(data.found), key_facts(data), remarks(data), parts
+        VERDICT_LEVELS.get(verdict, "note"),
+        verdict.replace("_", " ").capitalize(),
+        sentence,
+        frames_text(data.found),
+        key_facts(data),
+        remarks(data),
+        parts,
     )
 
 
@@ -226,11 +221,6 @@ def _unfitted_text(found: Verdict) -> str:
     spot = next((place for place in seen.places if place.map == "unfitted"), None)
     where = "" if spot is None else f", clustered in {Region.model_validate(spot.region).describe()}"
     return f" Not compared: {count(seen.unfitted, 'pixel')} without a reliable fit{where}."
-
-
-def verdict_level(found: Verdict) -> tuple[Level, str]:
-    """Return severity and name of a verdict."""
-    return VERDICT_WORDS.get(found.verdict, ("note", found.verdict.capitalize()))
 
 
 def key_facts(data: DiscrepancyData) -> list[KeyFact]:
@@ -325,82 +315,76 @@ def _chance_fact(found: Verdict) -> list[KeyFact]:
 
 def remarks(data: DiscrepancyData) -> list[Flag]:
     """Return evidence for and against the verdict, the most severe first."""
+    return gravest_first(_remarks(data))
+
+
+def _remarks(data: DiscrepancyData) -> Iterator[Flag]:
     found = data.found
-    flags: list[Flag] = []
     extended = [step for step in found.steps if step.effect]
     if found.doubt:
         words = "Statistics that depend on the pixels' parameters were not tested, and sizes have no e⁻"
         why = "" if found.doubt in found.sentence else f": {typeset(found.doubt)}"
-        flags.append(Flag("caution", f"{words}{why}."))
+        yield Flag("caution", f"{words}{why}.")
     if extended:
-        flags += _closing(found)
-        flags += [flag for step in extended for flag in _compared(step, data)]
+        yield from _closing(found)
+    for step in extended:
+        yield from _compared(step, data)
     for step in found.steps:
         for rival, measurement in step.separate.items() if step.verdict == "ambiguous" else ():
-            flags.append(Flag("note", f"To distinguish {data.title(rival)}: {measurement}."))
-    if found.unexplained:
-        most = found.unexplained[0]
+            yield Flag("note", f"To distinguish {data.title(rival)}: {measurement}.")
+    for most in found.unexplained[:1]:
         words = most.sentence or most.statistic
-        flags.append(Flag("caution", f"Largest remaining disagreement: {words} ({sigma_text(most.z)})."))
-    flags += [
-        Flag("serious", f"Defect: candidate {name} failed and was not compared: {why}.")
-        for name, why in found.defects.items()
-    ]
+        yield Flag("caution", f"Largest remaining disagreement: {words} ({sigma_text(most.z)}).")
+    for name, why in found.defects.items():
+        yield Flag("serious", f"Defect: candidate {name} failed and was not compared: {why}.")
     if found.untestable:
-        flags.append(
-            Flag("note", f"Not testable with these data: {', '.join(map(data.title, found.untestable))}.")
-        )
-    order = ("serious", "caution", "note", "good")
-    return sorted(flags, key=lambda flag: order.index(flag.level))
+        titles = ", ".join(map(data.title, found.untestable))
+        yield Flag("note", f"Not testable with these data: {titles}.")
 
 
-def _closing(found: Verdict) -> list[Flag]:
+def _closing(found: Verdict) -> Iterator[Flag]:
     """State the remaining gap."""
-    gap, flags = found.gap, []
-    level: Level
-    if math.isfinite(gap.after) and math.isfinite(gap.floor):
-        if gap.within_chance:
-            words = "The gap is within sampling noise before, too: only single statistics show it."
-            flags.append(Flag("note", words))
-        elif gap.after <= gap.floor and gap.standing_out:
-            words = f"A significant discrepancy remains in {families_words(gap.standing_out)}."
-            flags.append(Flag("caution", words))
-        elif gap.after <= gap.floor:
-            flags.append(Flag("good", "The remaining gap is within sampling noise."))
-        else:
-            left = percent(1.0 - gap.closed_fraction, 1.0)
-            words = f"{gap_text(gap.after)} micronats per sample, sampling noise up to {gap_text(gap.floor)}"
-            level = "caution" if found.verdict == "named_in_part" else "note"
-            flags.append(Flag(level, f"{left} of the gap remains: {words}."))
-    return flags
+    gap = found.gap
+    if not (math.isfinite(gap.after) and math.isfinite(gap.floor)):
+        return
+    if gap.within_chance:
+        yield Flag("note", "The gap is within sampling noise before, too: only single statistics show it.")
+    elif gap.after <= gap.floor and gap.standing_out:
+        families = families_words(gap.standing_out)
+        yield Flag("caution", f"A significant discrepancy remains in {families}.")
+    elif gap.after <= gap.floor:
+        yield Flag("good", "The remaining gap is within sampling noise.")
+    else:
+        left = percent(1.0 - gap.closed_fraction, 1.0)
+        words = f"{gap_text(gap.after)} micronats per sample, sampling noise up to {gap_text(gap.floor)}"
+        level: Level = "caution" if found.verdict == "named_in_part" else "note"
+        yield Flag(level, f"{left} of the gap remains: {words}.")
 
 
-def _short(data: DiscrepancyData, tag: str) -> str:
-    """Return the title of an effect without its synonyms."""
-    return data.title(tag).partition(" (")[0]
-
-
-def _compared(step: Step, data: DiscrepancyData) -> list[Flag]:
+def _compared(step: Step, data: DiscrepancyData) -> Iterator[Flag]:
     """State the share of the gap that the next best effect and an unrelated control close instead."""
-    own, flags = step.closed, []
-    name, runner_up, placebo = _short(data, step.effect or ""), step.runner_up, step.placebo
-    if step.within_chance:  # reductions of sampling noise mean nothing
-        if runner_up is None or not runner_up.why:
-            return []
-        rival = f"The next best effect, {_short(data, runner_up.effect)}"
-        return [Flag("note", f"{rival}, is rejected, since {runner_up.why}.")]
-    if not own > 0.0:
-        return []
-    if runner_up is not None:
-        share = percent(step.closed_by(runner_up), 1.0)
-        why = f" and is rejected, since {runner_up.why}" if runner_up.why else ""
-        rival = f"Instead of {name}, {_short(data, runner_up.effect)} (next best effect)"
-        flags.append(Flag("note", f"{rival} closes {share} of the gap{why}."))
+
+    def short_title(tag: str) -> str:
+        return data.title(tag).partition(" (")[0]  # without synonyms
+
+    own, name = step.closed, short_title(step.effect or "")
+    runner_up, placebo = step.runner_up, step.placebo
+    if runner_up is not None and (step.within_chance or own > 0.0):
+        rival, why = short_title(runner_up.effect), f"is rejected, since {runner_up.why}"
+        # reductions of sampling noise mean nothing
+        if not step.within_chance:
+            share = percent(step.closed_by(runner_up), 1.0)
+            words = f"Instead of {name}, {rival} (next best effect) closes {share} of the gap"
+            yield Flag("note", f"{words}{f' and {why}' if runner_up.why else ''}.")
+        elif runner_up.why:
+            yield Flag("note", f"The next best effect, {rival}, {why}.")
+    if step.within_chance or not own > 0.0:
+        return
     if placebo is None:
-        return [*flags, Flag("good", f"No unrelated control instead of {name} closes any of the gap.")]
+        yield Flag("good", f"No unrelated control instead of {name} closes any of the gap.")
+        return
     of_that = min(step.closed_by(placebo) / own, 1.0)
     doubtful = of_that > CONVINCING_PLACEBO
-    end = f": {name} is doubtful" if doubtful else ""
-    text = f"An unrelated control ({_short(data, placebo.effect)}) reduces the gap"
-    words = f"{text} {percent(of_that, 1.0)} as much as {name}{end}."
-    return [*flags, Flag("caution" if doubtful else "good", words)]
+    text = f"An unrelated control ({short_title(placebo.effect)}) reduces the gap"
+    words = f"{text} {percent(of_that, 1.0)} as much as {name}{f': {name} is doubtful' if doubtful else ''}."
+    yield Flag("caution" if doubtful else "good", words)

@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.pages.tables import Table
+from pchem_pipeline.report.pages.tables import Row, Table
+
+_SECTION = "provenance"
 
 
 def provenance_tables(data: ReportData) -> list[Table]:
@@ -38,31 +40,28 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
 
 
 def _run(data: ReportData) -> Table:
-    rows = _flat(data.run)
-    return Table("run", "Run", "Program and settings of this report.", ("item", "value"), tuple(rows))
+    rows = ({"item": item, "value": value} for item, value in _flat(data.run))
+    return Table.of("run", "Run", "Program and settings of this report.", rows, _SECTION)
 
 
 def _stages(data: ReportData) -> Table:
-    rows = []
-    for stage in data.stages:
-        memory = stage.get("peak_memory_bytes")
-        rows.append(
-            (
-                str(stage.get("stage", "")),
-                str(stage.get("state", "")),
-                f"{float(stage['seconds']):.1f} s" if stage.get("seconds") is not None else "",
-                f"{float(stage['cpu_seconds']):.1f} s" if stage.get("cpu_seconds") is not None else "",
-                f"{float(memory) / 2**20:.0f} MiB" if memory else "",
-                str(stage.get("started", "")),
-            )
-        )
-    return Table(
-        "stages",
-        "Stages",
-        "Wall time, CPU time and largest resident memory of a process.",
-        ("stage", "state", "wall", "CPU", "peak memory", "started (UTC)"),
-        tuple(rows),
-    )
+    words = "Wall time, CPU time and largest resident memory of a process."
+    return Table.of("stages", "Stages", words, map(_stage_row, data.stages), _SECTION)
+
+
+def _stage_row(stage: Mapping[str, Any]) -> Row:
+    def seconds(key: str) -> str:
+        return f"{float(stage[key]):.1f} s" if stage.get(key) is not None else ""
+
+    memory = stage.get("peak_memory_bytes")
+    return {
+        "stage": str(stage.get("stage", "")),
+        "state": str(stage.get("state", "")),
+        "wall": seconds("seconds"),
+        "CPU": seconds("cpu_seconds"),
+        "peak memory": f"{float(memory) / 2**20:.0f} MiB" if memory else "",
+        "started (UTC)": str(stage.get("started", "")),
+    }
 
 
 #: Files beyond this number are counted, not listed.
@@ -70,20 +69,19 @@ _MOST_FILES = 200
 
 
 def _inputs(data: ReportData) -> Table:
-    rows = [
-        (
-            str(entry.get("name", "")),
-            size_text(float(entry["size"])) if entry.get("size") is not None else "",
-            str(entry.get("hash", "")),
-        )
-        for entry in data.inputs[:_MOST_FILES]
-    ]
     more = len(data.inputs) - _MOST_FILES
     words = f" The first {_MOST_FILES} of {len(data.inputs):,} files." if more > 0 else ""
-    return Table(
+    return Table.of(
         "inputs",
         "Input files",
         f"Names, sizes and content hashes of the files that were read.{words}",
-        ("file", "size", "hash"),
-        tuple(rows),
+        (
+            {
+                "file": str(entry.get("name", "")),
+                "size": size_text(float(entry["size"])) if entry.get("size") is not None else "",
+                "hash": str(entry.get("hash", "")),
+            }
+            for entry in data.inputs[:_MOST_FILES]
+        ),
+        _SECTION,
     )

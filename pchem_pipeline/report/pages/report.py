@@ -12,6 +12,7 @@ from pchem_pipeline.report.pages.emva import emva_tables
 from pchem_pipeline.report.pages.methods import method_tables
 from pchem_pipeline.report.pages.page import render_page
 from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
+from pchem_pipeline.report.pages.provenance import provenance_tables
 from pchem_pipeline.report.pages.report_json import report_json
 from pchem_pipeline.report.pages.sections import Material, page_sections
 from pchem_pipeline.report.pages.tables import result_tables
@@ -54,7 +55,8 @@ def render_report(
         [Picture(figure, drawn[figure.name]) for figure in each] for each in (shown, others)
     )
     view = None if data.discrepancy is None else discrepancy_view(data.discrepancy, evidence)
-    tables = [*result_tables(data), *method_tables(data), *emva_tables(data)]
+    makers = (result_tables, method_tables, emva_tables, provenance_tables)
+    tables = [table for make in makers for table in make(data)]
     sections = page_sections(Material(data, settings, pictures, tables, view))
     pages = {} if view is None else {DISCREPANCY_PAGE: _discrepancy_page(data, view)}
     numbers, inspector = report_json(data), embedded(data)

@@ -21,7 +21,6 @@ from pchem_pipeline.report.pages.summary import (
     key_numbers,
     pixel_counts,
     sentence,
-    summaries,
 )
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import stored_unit
@@ -79,7 +78,8 @@ def report_json(data: ReportData) -> str:
 
 def _summary(data: ReportData) -> dict[str, Any]:
     found = {}
-    for name, summary in summaries(data).items():
+    for name in (name for name in data.maps if not name.endswith("_stderr")):
+        summary = data.summary(name)
         found[name] = {
             "unit": stored_unit(name),
             "median": summary.median,

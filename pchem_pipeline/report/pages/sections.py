@@ -18,7 +18,6 @@ from pchem_pipeline.report.pages.cite import citation
 from pchem_pipeline.report.pages.discrepancy import DiscrepancyView
 from pchem_pipeline.report.pages.next_steps import next_steps
 from pchem_pipeline.report.pages.pictures import Picture
-from pchem_pipeline.report.pages.provenance import provenance_tables
 from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, pixel_counts, sentence
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.settings import ReportSettings
@@ -215,22 +214,11 @@ def _discrepancy(material: Material) -> Section:
     return Section("discrepancy", "What the model is missing", "discrepancy", content)
 
 
-def _tables(material: Material) -> Section:
-    tables = [table for table in material.tables if table.section == "tables"]
-    nothing = "No pixel has a value."
-    return Section("tables", "Tables", "tables", {"tables": tables, "empty": nothing}, folded=True)
-
-
-def _emva(material: Material) -> Section | None:
-    tables = [table for table in material.tables if table.section == "emva"]
-    content = {"tables": tables, "empty": ""}
-    return Section("emva", "Quantities of EMVA 1288", "tables", content, folded=True) if tables else None
-
-
-def _provenance(material: Material) -> Section:
-    tables = provenance_tables(material.data)
-    content = {"tables": tables, "empty": "Nothing was recorded."}
-    return Section("provenance", "Provenance", "tables", content, folded=True)
+def _tables(id_: str, title: str, empty: str, material: Material) -> Section | None:
+    """Put tables into their section; one without any says why, or is left out."""
+    tables = [table for table in material.tables if table.section == id_]
+    content = {"tables": tables, "empty": empty}
+    return Section(id_, title, "tables", content, folded=True) if tables or empty else None
 
 
 def _cite(material: Material) -> Section:
@@ -251,9 +239,9 @@ PAGE: tuple[Maker, ...] = (
     *(partial(_figures, row, False) for row in OPEN[1:]),
     _discrepancy,
     *(partial(_figures, row, True) for row in FOLDED),
-    _tables,
-    _emva,
+    partial(_tables, "tables", "Tables", "No pixel has a value."),
+    partial(_tables, "emva", "Quantities of EMVA 1288", ""),
     _cite,
-    _provenance,
+    partial(_tables, "provenance", "Provenance", "Nothing was recorded."),
     _configuration,
 )

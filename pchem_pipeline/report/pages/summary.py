@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
@@ -12,7 +12,6 @@ import numpy as np
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.model.checks.map_parts import Parts
 from pchem_pipeline.model.fit.status import FLAGGED, FitStatus, flags_of
-from pchem_pipeline.model.maps.maps import MapSummary
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.pages.criteria import Criterion, criteria
@@ -86,11 +85,6 @@ def pixel_counts(data: ReportData) -> PixelCounts:
     wanted = (status & int(FitStatus.EXCLUDED)) == 0
     failed = (((status & data.failed_mask) != 0) | data.unfitted) & wanted
     return PixelCounts(int(wanted.sum()), int(failed.sum()), int(((status != 0) & ~failed & wanted).sum()))
-
-
-def summaries(data: ReportData) -> dict[str, MapSummary]:
-    """Describe every map by order statistics, flagged pixels left out."""
-    return {name: data.summary(name) for name in data.maps if not name.endswith("_stderr")}
 
 
 def key_numbers(data: ReportData, *, with_flagged: bool = False) -> list[KeyNumber]:
@@ -168,29 +162,33 @@ def _medians(data: ReportData) -> str:
 
 def flags(data: ReportData) -> list[Flag]:
     """Return what speaks for and against the results, the gravest first."""
-    found = [flag for check in CHECKS for flag in check(data)]
+    return gravest_first(dict.fromkeys(flag for check in CHECKS for flag in check(data)))
+
+
+def gravest_first(found: Iterable[Flag]) -> list[Flag]:
+    """Return remarks by their level, the gravest first."""
     order = ("serious", "caution", "note", "good")
     return sorted(found, key=lambda flag: order.index(flag.level))
 
 
-def _levels(data: ReportData) -> list[Flag]:
+def _levels(data: ReportData) -> Iterator[Flag]:
     """Say where the frames are of several exposures: what else is odd follows from that."""
-    found = () if data.quick_look is None else data.quick_look.found
-    return [Flag(check.level, f"{check_sentence(check)}.") for check in found if check.name == "levels"]
+    for check in () if data.quick_look is None else data.quick_look.found:
+        if check.name == "levels":
+            yield Flag(check.level, f"{check_sentence(check)}.")
 
 
-def _failed_pixels(data: ReportData) -> list[Flag]:
+def _failed_pixels(data: ReportData) -> Iterator[Flag]:
     pixels = pixel_counts(data)
     share = pixels.failed / max(pixels.total, 1)
     text = f"{count(pixels.failed, data.noun)} ({percent(pixels.failed, pixels.total)}) without a value"
     if share > data.allowed_failed:
         allowed = percent(data.allowed_failed, 1.0)
-        text = f"{text}; {allowed} allowed{_reasons(data)}."
-        return [Flag("serious", text, "sensor")]
-    if pixels.failed:
-        level: Level = "caution" if share > _CAUTION_SHARE else "note"
-        return [Flag(level, f"{text}{_reasons(data)}.", "sensor")]
-    return [Flag("good", f"Every {data.noun} has a value.", "sensor")]
+        yield Flag("serious", f"{text}; {allowed} allowed{_reasons(data)}.", "sensor")
+    elif pixels.failed:
+        yield Flag("caution" if share > _CAUTION_SHARE else "note", f"{text}{_reasons(data)}.", "sensor")
+    else:
+        yield Flag("good", f"Every {data.noun} has a value.", "sensor")
 
 
 def _reasons(data: ReportData) -> str:
@@ -203,59 +201,45 @@ def _reasons(data: ReportData) -> str:
     return "".join(f"{'; ' if i else '. Reasons: '}{text} ({n:,})" for i, (_, text, n) in enumerate(rows))
 
 
-def _spaced_codes(data: ReportData) -> list[Flag]:
+def _spaced_codes(data: ReportData) -> Iterator[Flag]:
     """Report that only every n-th DN occurs: the samples are not the plain output of an ADC."""
     step = data.code_step
     if step < 2:
-        return []
-    text = (
-        f"Only every {step}th DN occurs"
-        if step > 3
-        else f"Only every {('second', 'third')[step - 2]} DN occurs"
-    )
+        return
+    text = f"Only every {('second', 'third')[step - 2] if step < 4 else f'{step}th'} DN occurs"
     if step & (step - 1):
-        return [Flag("serious", f"{text}: the samples were multiplied after the ADC. Take raw frames.")]
-    shift = step.bit_length() - 1
-    return [Flag("serious", f"{text}: the samples look left-justified. Set input.bit_shift: {shift}.")]
+        yield Flag("serious", f"{text}: the samples were multiplied after the ADC. Take raw frames.")
+    else:
+        shift = step.bit_length() - 1
+        yield Flag("serious", f"{text}: the samples look left-justified. Set input.bit_shift: {shift}.")
 
 
-def _unfitted(data: ReportData) -> list[Flag]:
-    missing = int(data.unfitted.sum())
-    if not missing:
-        return []
-    return [Flag("serious", f"{count(missing, data.noun)} not fitted yet. Continue the run.")]
+def _unfitted(data: ReportData) -> Iterator[Flag]:
+    if missing := int(data.unfitted.sum()):
+        yield Flag("serious", f"{count(missing, data.noun)} not fitted yet. Continue the run.")
 
 
-def _flagged(data: ReportData) -> list[Flag]:
+def _flagged(data: ReportData) -> Iterator[Flag]:
     """Report where many pixels can be off by whole electrons, and what to take."""
     if not data.often_flagged:
-        return []
+        return
     share = percent(int(data.flagged.sum()), pixel_counts(data).fitted)
     cure = "more frames or more exposures" if data.samples is not None else "several exposures (pchem joint)"
+    level: Level = "caution"
     if data.flagged_share("conversion_gain") <= 0.5 * data.flagged_share():
-        return [
-            Flag(
-                "caution",
-                f"{share} of the {data.noun}s with a value are flagged: exposure and bias can be off by "
-                f"whole electrons; gain and read noise are known. Take {cure}.",
-            )
-        ]
-    if not data.mostly_flagged:
-        return [
-            Flag(
-                "caution",
-                f"{share} of the {data.noun}s with a value are flagged and excluded. The others are a biased "
-                "selection: their median read noise is likely too low, by more than its quoted error. "
-                f"Take {cure}.",
-            )
-        ]
-    return [
-        Flag(
-            "serious",
-            f"{share} of the {data.noun}s with a value are flagged: the data do not fix the electron number; "
-            f"gain, bias and read noise can be off by far more than quoted. Take {cure}.",
+        why = ": exposure and bias can be off by whole electrons; gain and read noise are known"
+    elif not data.mostly_flagged:
+        why = (
+            " and excluded. The others are a biased selection: their median read noise is likely too low, by "
+            "more than its quoted error"
         )
-    ]
+    else:
+        level = "serious"
+        why = (
+            ": the data do not fix the electron number; gain, bias and read noise can be off by far more "
+            "than quoted"
+        )
+    yield Flag(level, f"{share} of the {data.noun}s with a value are flagged{why}. Take {cure}.")
 
 
 def _left_out_words(bit: int) -> str:
@@ -265,51 +249,43 @@ def _left_out_words(bit: int) -> str:
     return f" (excluded from medians and tables{which})"
 
 
-def _cautions(data: ReportData) -> list[Flag]:
+def _cautions(data: ReportData) -> Iterator[Flag]:
     status = data.fit.get("fit_status")
     if status is None:
-        return []
+        return
     # what else is odd about a pixel without a value misleads nobody
     kept = status[(status & data.failed_mask) == 0]
-    return [
-        Flag(
-            "caution",
-            f"{percent(n, kept.size)} of the {data.noun}s with a value: {text}{_left_out_words(bit)}.",
-        )
-        for bit, text, n in status_counts(kept, data.status_words)
-        if n > _CAUTION_SHARE * kept.size
-    ]
+    for bit, text, n in status_counts(kept, data.status_words):
+        if n > _CAUTION_SHARE * kept.size:
+            share = f"{percent(n, kept.size)} of the {data.noun}s with a value"
+            yield Flag("caution", f"{share}: {text}{_left_out_words(bit)}.")
 
 
-def _goodness(data: ReportData) -> list[Flag]:
+def _goodness(data: ReportData) -> Iterator[Flag]:
     p = finite(data.fit.get("goodness_p", np.empty(0)))
     if p.size == 0:
-        return []
+        return
     poor = int((p < _POOR_P).sum())
     expected = _POOR_P * p.size
     text = (
         f"{percent(poor, p.size)} of the {data.noun}s fail the goodness-of-fit test (p < {_POOR_P:g}); "
         f"{percent(expected, p.size)} expected"
     )
+    model = f"The model {data.run['model']}" if "model" in data.run else "The PCD"
     if poor > 0.05 * p.size:
-        return [
-            Flag(
-                "serious",
-                f"{text}. {_model(data)} does not describe this sensor: see the residuals of single pixels.",
-            )
-        ]
-    if poor > 2.0 * expected + 5.0 * np.sqrt(expected):
-        return [Flag("caution", f"{text}. {_model(data)} does not describe some pixels.")]
-    return [Flag("good", f"{text}.")]
+        why = "does not describe this sensor: see the residuals of single pixels"
+        yield Flag("serious", f"{text}. {model} {why}.")
+    elif poor > 2.0 * expected + 5.0 * np.sqrt(expected):
+        yield Flag("caution", f"{text}. {model} does not describe some pixels.")
+    else:
+        yield Flag("good", f"{text}.")
 
 
-def _parts(data: ReportData) -> list[Flag]:
+def _parts(data: ReportData) -> Iterator[Flag]:
     """Report a step or two modes of a map, with the medians of the parts."""
-    return [
-        Flag("note" if name == "bias" else "caution", _parts_sentence(name, parts))
-        for name, found in data.parts.items()
-        for parts in found
-    ]
+    for name, found in data.parts.items():
+        for parts in found:
+            yield Flag("note" if name == "bias" else "caution", _parts_sentence(name, parts))
 
 
 def _parts_sentence(name: str, parts: Parts) -> str:
@@ -325,9 +301,8 @@ def _parts_sentence(name: str, parts: Parts) -> str:
     return f"{words.capitalize()} has a step ({places}): the median over the sensor describes no part."
 
 
-def _agreement(data: ReportData) -> list[Flag]:
+def _agreement(data: ReportData) -> Iterator[Flag]:
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
-    found = []
     for name, prefix, words in (("epcd_exact", "", "raw"), ("nuced_exact", "nuced_", "NUCed")):
         floor = f"{prefix}noise_floor"
         if name not in rmse or not rmse.get(floor):
@@ -338,87 +313,70 @@ def _agreement(data: ReportData) -> list[Flag]:
         text = f"The RMSE of the predicted {words} ensemble is {short(ratio, 2)} times the sampling noise"
         text += tested
         if ratio <= _RMSE_GOOD or (p is not None and p >= _POOR_P):
-            found.append(Flag("good", f"{text}: the model describes the data."))
+            yield Flag("good", f"{text}: the model describes the data.")
         elif ratio <= _RMSE_BAD:
-            found.append(Flag("caution", f"{text}: small differences remain."))
+            yield Flag("caution", f"{text}: small differences remain.")
         else:
-            found.append(Flag("serious", f"{text}: the model does not describe the data."))
-    return found
+            yield Flag("serious", f"{text}: the model does not describe the data.")
 
 
-def _discrepancy(data: ReportData) -> list[Flag]:
+#: Verdict of a search to its severity.
+VERDICT_LEVELS: dict[str, Level] = {
+    "named": "note",
+    "named_in_part": "caution",
+    "ambiguous": "caution",
+    "described": "caution",
+    "unexplained": "serious",
+    "consistent": "good",
+    "cannot_tell": "caution",
+}
+
+
+def _discrepancy(data: ReportData) -> Iterator[Flag]:
     """Say what was found to be missing from the model."""
-    if data.discrepancy is None:
-        return []
-    found = data.discrepancy.found
-    levels: dict[str, Level] = {
-        "consistent": "good",
-        "cannot_tell": "caution",
-        "ambiguous": "caution",
-        "described": "caution",
-        "named_in_part": "caution",
-        "unexplained": "serious",
-    }
-    return [Flag(levels.get(found.verdict, "note"), _as_sentence(typeset(found.sentence)))]
+    if data.discrepancy is not None:
+        found = data.discrepancy.found
+        yield Flag(VERDICT_LEVELS.get(found.verdict, "note"), _as_sentence(typeset(found.sentence)))
 
 
-def _quick_look(data: ReportData) -> list[Flag]:
+def _quick_look(data: ReportData) -> Iterator[Flag]:
     """Say what the quick look found, or what it would have found."""
     look = data.quick_look
     if look is None or not look.checks:
-        return []
+        return
     if not look.found:
-        return [Flag("good", nothing_found(look))]
+        yield Flag("good", nothing_found(look))
     known = not look.command or data.discrepancy is not None
     closer = "" if known else f"; to look closer: {look.command}"
-    return [
-        # what the model has already speaks for it
-        Flag(
-            "good" if check.in_model else check.level,
-            f"{check_sentence(check)}{closer if number == 0 else ''}.",
-        )
-        for number, check in enumerate(look.found)
-        if check.name != "levels"
-    ]
+    for number, check in enumerate(look.found):
+        if check.name != "levels":
+            # what the model has already speaks for it
+            level = "good" if check.in_model else check.level
+            yield Flag(level, f"{check_sentence(check)}{'' if number else closer}.")
 
 
-def _conditions(data: ReportData) -> list[Flag]:
-    found = [
-        Flag("note", _as_sentence(data.missing[part]))
-        for part in ("charge_rate", "ensemble")
-        if part in data.missing
-    ]
+def _conditions(data: ReportData) -> Iterator[Flag]:
+    for part in ("charge_rate", "ensemble"):
+        if part in data.missing:
+            yield Flag("note", _as_sentence(data.missing[part]))
     noisy = data.has_values("read_noise_e") and data.summary("read_noise_e").median > _TOO_NOISY
     if data.samples is None and noisy:
-        found.append(
-            Flag(
-                "caution",
-                "Read noise above 0.5 e⁻: one exposure does not suffice. Combine several exposures.",
-            )
-        )
+        words = "Read noise above 0.5 e⁻: one exposure does not suffice. Combine several exposures."
+        yield Flag("caution", words)
     if data.mostly_coarse:
-        found.append(Flag("caution", "Rounding to whole DN biases the estimates: set fit.likelihood: auto."))
+        yield Flag("caution", "Rounding to whole DN biases the estimates: set fit.likelihood: auto.")
     for stage in data.stages:
+        name = stage.get("stage")
         if stage.get("state") not in (None, "complete"):
-            found.append(
-                Flag("serious", f"Stage {stage.get('stage')} is {stage['state']}: the report is incomplete.")
-            )
+            yield Flag("serious", f"Stage {name} is {stage['state']}: the report is incomplete.")
         # why there is no charge rate is said once, with what is missing
-        found += [
-            Flag("note", _as_sentence(f"{stage.get('stage')}: {remark}"))
-            for remark in stage.get("notes", ())
-            if not ("charge_rate" in data.missing and "no charge rate" in remark)
-        ]
-    return list(dict.fromkeys(found))
-
-
-def _model(data: ReportData) -> str:
-    """Return the name of the model that the pixels were fitted with."""
-    return f"The model {data.run['model']}" if "model" in data.run else "The PCD"
+        for remark in stage.get("notes", ()):
+            if not ("charge_rate" in data.missing and "no charge rate" in remark):
+                yield Flag("note", _as_sentence(f"{name}: {remark}"))
 
 
 #: What looks for remarks; a further check is a further row.
-CHECKS: tuple[Callable[[ReportData], list[Flag]], ...] = (
+CHECKS: tuple[Callable[[ReportData], Iterator[Flag]], ...] = (
     _spaced_codes, _levels, _failed_pixels, _unfitted, _flagged, _cautions, _parts, _goodness, _agreement,
     _quick_look, _discrepancy, _conditions,
 )  # fmt: skip

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
 from pchem_pipeline.model.maps.maps import summarise
-from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.data import ReportData, Samples
 from pchem_pipeline.report.figures.ensemble import bias_remark
 from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.figures.plan import frames_text, target_text
@@ -18,16 +19,15 @@ from pchem_pipeline.report.figures.samples import AXES, middle
 from pchem_pipeline.report.figures.trust import noise_shares
 from pchem_pipeline.report.pages.quick_look import check_title
 from pchem_pipeline.report.pages.quick_look import size_text as check_size
-from pchem_pipeline.report.pages.summary import summaries
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import (
     count,
+    heading,
     measured,
     percent,
     scientific,
     short,
     signed,
-    symbol,
     unit_text,
 )
 
@@ -43,6 +43,19 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     section: str = "tables"
 
+    @classmethod
+    def of(
+        cls, id_: str, title: str, caption: str, rows: Iterable[Mapping[str, str]], section: str = "tables"
+    ) -> Table:
+        """Return a table of rows that have each cell by the heading of its column."""
+        known = list(rows)
+        head = tuple(known[0]) if known else ()
+        return cls(id_, title, caption, head, tuple(tuple(row.values()) for row in known), section)
+
+
+#: A row of a table: cells by the heading of their column.
+Row = dict[str, str]
+
 
 def result_tables(data: ReportData) -> list[Table]:
     """Return the tables of results that the data allow."""
@@ -50,30 +63,28 @@ def result_tables(data: ReportData) -> list[Table]:
         _channels, _parameters, _flagged, _against_truth, _rmse, _moments, _electrons, _misfits, _intervals,
         _status, _samples, _plan, _quick_look,
     )  # fmt: skip
-    return [table for make in makers if (table := make(data)).rows]
+    return [table for make in makers if (table := make(data)) is not None and table.rows]
 
 
 def _quick_look(data: ReportData) -> Table:
     look = data.quick_look or QuickLook(())
-    rows = tuple(
-        (
-            check_title(check),
-            ("in the model" if check.in_model else "yes") if check.found else "no",
-            check_size(check) if check.found else "",
-            _limit_text(check),
-            _chance_text(check.p_global),
-            check.where if check.found else "",
-        )
-        for check in look.checks
-    )
     missing = "".join(f" Not tested: {part} ({why})." for part, why in look.missing.items())
-    return Table(
+    return Table.of(
         "quick-look",
         "Quick look",
         "Under the model, samples of different pixels and frames are independent. This is tested for all "
         f"pixels from sums that every run keeps; p-values are corrected for the number of checks.{missing}",
-        ("check", "found", "size", "detection limit", "p-value", "where"),
-        rows,
+        (
+            {
+                "check": check_title(check),
+                "found": ("in the model" if check.in_model else "yes") if check.found else "no",
+                "size": check_size(check) if check.found else "",
+                "detection limit": _limit_text(check),
+                "p-value": _chance_text(check.p_global),
+                "where": check.where if check.found else "",
+            }
+            for check in look.checks
+        ),
         "discrepancy",
     )
 
@@ -89,40 +100,32 @@ def _chance_text(p: float) -> str:
 
 
 def _parameters(data: ReportData) -> Table:
-    rows = []
-    found = summaries(data)
-    for name, summary in ((name, found[name]) for name in _ORDER if data.has_values(name)):
-        _, words, unit = symbol(name)
-        error = data.pixel_error(name)
-        values = [short(summary.percentiles[p], 4) for p in data.percentiles]
-        rows.append(
-            (
-                f"{words} ({unit})",
-                measured(summary.median, summary.median_stderr),
-                short(summary.robust_sd),
-                "not known" if error is None else short(error, 2),
-                *values,
-                f"{summary.n_low + summary.n_high:,}",
-                f"{summary.n_valid:,}",
-            )
-        )
-    return Table(
+    return Table.of(
         "parameters",
         "Parameters",
         f"Median over the {data.noun}s with its standard error, robust standard deviation between "
         f"{data.noun}s (1.4826 MAD), median 1 sigma error per {data.noun}, percentiles, and outliers beyond "
         f"{data.outlier_sigmas:g} robust standard deviations.{_left_out(data)}",
-        (
-            "parameter",
-            "median",
-            "spread",
-            f"error per {data.noun}",
-            *(f"{p:g} %" for p in data.percentiles),
-            "outliers",
-            "pixels",
-        ),
-        tuple(rows),
+        (_parameter_row(data, name) for name in _known(data)),
     )
+
+
+def _known(data: ReportData) -> list[str]:
+    """Return the maps that have values, in the order of the tables."""
+    return [name for name in _ORDER if data.has_values(name)]
+
+
+def _parameter_row(data: ReportData, name: str) -> Row:
+    summary, error = data.summary(name), data.pixel_error(name)
+    return {
+        "parameter": heading(name),
+        "median": measured(summary.median, summary.median_stderr),
+        "spread": short(summary.robust_sd),
+        f"error per {data.noun}": "not known" if error is None else short(error, 2),
+        **{f"{p:g} %": short(summary.percentiles[p], 4) for p in data.percentiles},
+        "outliers": f"{summary.n_low + summary.n_high:,}",
+        "pixels": f"{summary.n_valid:,}",
+    }
 
 
 def _left_out(data: ReportData) -> str:
@@ -133,23 +136,25 @@ def _left_out(data: ReportData) -> str:
 def _flagged(data: ReportData) -> Table:
     """Return what flagged pixels read; their errors are no errors and are not shown."""
     rows = []
-    for name in _ORDER if data.any_flagged else ():
-        if not data.has_values(name):
-            continue
+    for name in _known(data) if data.any_flagged else ():
         flagged = data.flagged_in(name)
         if not flagged.any():
             continue
         summary = summarise(data.maps[name][flagged], percentiles=(5.0, 95.0))
-        _, words, unit = symbol(name)
-        numbers = (summary.median, *summary.percentiles.values(), summary.minimum, summary.maximum)
-        rows.append((f"{words} ({unit})", *(short(number, 4) for number in numbers), f"{summary.n_valid:,}"))
-    return Table(
+        numbers = {
+            "median": summary.median,
+            **{f"{p:g} %": value for p, value in summary.percentiles.items()},
+            "smallest": summary.minimum,
+            "largest": summary.maximum,
+        }
+        cells = {head: short(number, 4) for head, number in numbers.items()}
+        rows.append({"parameter": heading(name), **cells, f"{data.noun}s": f"{summary.n_valid:,}"})
+    return Table.of(
         "flagged",
         f"Flagged {data.noun}s",
         "The data do not fix these values: they can be off by an electron or more, far beyond their standard "
         "errors. Excluded from the other tables.",
-        ("parameter", "median", "5 %", "95 %", "smallest", "largest", f"{data.noun}s"),
-        tuple(rows),
+        rows,
     )
 
 
@@ -157,28 +162,25 @@ def _flagged(data: ReportData) -> Table:
 _MOST_CHANNELS = 100
 
 
-def _channels(data: ReportData) -> Table:
-    names = [name for name in _ORDER if data.has_values(name)]
-    rows = []
-    if data.shape[0] == 1 and data.shape[1] <= _MOST_CHANNELS:
-        status = np.ravel(data.fit.get("fit_status", np.zeros(data.shape, dtype=np.uint16)))
-        for x in range(data.shape[1]):
-            label = data.channel_names[x] if x < len(data.channel_names) else ""
-            values = []
-            for name in names:
-                stderr = data.maps.get(f"{name}_stderr")
-                error = float(stderr[0, x]) if stderr is not None else float("nan")
-                values.append(measured(float(data.maps[name][0, x]), error))
-            words = "; ".join(text for bit, text in data.status_words.items() if int(status[x]) & bit)
-            rows.append((f"{x} {label}".strip(), *values, words or "good fit"))
-    head = tuple(f"{symbol(name)[1]} ({symbol(name)[2]})" for name in names)
-    return Table(
-        "channels",
-        "Channels",
-        "Estimates with their standard errors.",
-        ("channel", *head, "fit status"),
-        tuple(rows),
-    )
+def _channels(data: ReportData) -> Table | None:
+    if data.shape[0] > 1 or data.shape[1] > _MOST_CHANNELS:
+        return None
+    rows = (_channel_row(data, x) for x in range(data.shape[1]))
+    return Table.of("channels", "Channels", "Estimates with their standard errors.", rows)
+
+
+def _channel_row(data: ReportData, x: int) -> Row:
+    status = np.ravel(data.fit.get("fit_status", np.zeros(data.shape, dtype=np.uint16)))
+    label = data.channel_names[x] if x < len(data.channel_names) else ""
+    missing = np.full(data.shape, np.nan)
+    values = {
+        heading(name): measured(
+            float(data.maps[name][0, x]), float(data.maps.get(f"{name}_stderr", missing)[0, x])
+        )
+        for name in _known(data)
+    }
+    words = "; ".join(text for bit, text in data.status_words.items() if int(status[x]) & bit)
+    return {"channel": f"{x} {label}".strip(), **values, "fit status": words or "good fit"}
 
 
 _ORDER = (
@@ -197,7 +199,16 @@ _ORDER = (
 
 
 def _against_truth(data: ReportData) -> Table:
-    rows = []
+    return Table.of(
+        "truth",
+        "Estimates against the truth",
+        "Simulated data only. Pull: (estimate − truth) / standard error; mean 0 and standard deviation 1 if "
+        f"estimates are unbiased and errors correct.{_left_out(data)}",
+        _truth_rows(data),
+    )
+
+
+def _truth_rows(data: ReportData) -> Iterator[Row]:
     for name, truth in data.truth.items():
         if name not in data.maps:
             continue
@@ -207,25 +218,15 @@ def _against_truth(data: ReportData) -> Table:
         if known.size == 0:
             continue
         pull = finite(error / data.maps[f"{name}_stderr"]) if f"{name}_stderr" in data.maps else np.empty(0)
-        _, words, unit = symbol(name)
-        rows.append(
-            (
-                f"{words} ({unit})",
-                short(float(np.median(truth[np.isfinite(error)])), 4),
-                short(float(np.median(finite(estimate))), 4),
-                short(float(np.sqrt(np.mean(known**2)))),
-                measured(float(pull.mean()), float(1 / np.sqrt(pull.size))) if pull.size else "not known",
-                measured(float(pull.std()), float(1 / np.sqrt(2 * pull.size))) if pull.size else "not known",
-            )
-        )
-    return Table(
-        "truth",
-        "Estimates against the truth",
-        "Simulated data only. Pull: (estimate − truth) / standard error; mean 0 and standard deviation 1 if "
-        f"estimates are unbiased and errors correct.{_left_out(data)}",
-        ("parameter", "true median", "estimated median", "RMSE", "mean pull", "sd of pulls"),
-        tuple(rows),
-    )
+        n = pull.size
+        yield {
+            "parameter": heading(name),
+            "true median": short(float(np.median(truth[np.isfinite(error)])), 4),
+            "estimated median": short(float(np.median(finite(estimate))), 4),
+            "RMSE": short(float(np.sqrt(np.mean(known**2)))),
+            "mean pull": measured(float(pull.mean()), float(1 / np.sqrt(n))) if n else "not known",
+            "sd of pulls": measured(float(pull.std()), float(1 / np.sqrt(2 * n))) if n else "not known",
+        }
 
 
 _RMSE_ROWS = (
@@ -256,73 +257,65 @@ def _rmse(data: ReportData) -> Table:
     for name, words, floor_name in _RMSE_ROWS:
         if rmse.get(name) is None:
             continue
-        floor = rmse.get(floor_name)
-        unit = rmse_unit(name)
+        floor, unit = rmse.get(floor_name), rmse_unit(name)
         rows.append(
-            (
-                words,
-                f"{scientific(rmse[name], 3)} {unit}",
-                f"{scientific(floor, 3)} {unit}" if floor else "not known",
-                short(rmse[name] / floor) if floor else "not known",
-            )
+            {
+                "prediction": words,
+                "RMSE": f"{scientific(rmse[name], 3)} {unit}",
+                "sampling noise": f"{scientific(floor, 3)} {unit}" if floor else "not known",
+                "ratio": short(rmse[name] / floor) if floor else "not known",
+            }
         )
-    return Table(
+    return Table.of(
         "rmse",
         "Ensemble prediction against data",
         "Root mean square difference of densities, and its expectation from sampling noise alone.",
-        ("prediction", "RMSE", "sampling noise", "ratio"),
-        tuple(rows),
-        section="ensemble",
+        rows,
+        "ensemble",
     )
 
 
 def _moments(data: ReportData) -> Table:
-    rows = []
-    for row in data.moments:
-        unit = unit_text(str(row.get("unit", "")))
-        observed, error = row.get("observed"), row.get("stderr")
-        predicted = float(row["predicted"])
-        if observed is None:
-            expected, seen, difference = short(predicted), "", ""
-        elif error:
-            # to the digits of the data that it is compared with
-            expected = measured(predicted, float(error)).partition(" ±")[0]
-            seen = measured(float(observed), float(error))
-            difference = signed((float(observed) - predicted) / float(error))
-        else:
-            expected, seen, difference = short(predicted, 5), short(float(observed), 5), ""
-        rows.append(
-            (
-                f"{row['quantity']} ({unit})" if unit else str(row["quantity"]),
-                expected,
-                seen,
-                difference,
-            )
-        )
-    return Table(
+    remark = bias_remark(data)
+    bias = f" Variance of the bias:{remark}" if remark else ""
+    return Table.of(
         "moments",
         "Moments of the ensemble",
         "From the parameter maps (Hendrickson et al. 2023, Appendix A) and from the data with their "
-        f"standard error.{_of_bias(data)}",
-        ("moment", "from the maps", "from the data", "difference / standard error"),
-        tuple(rows),
-        section="ensemble",
+        f"standard error.{bias}",
+        map(_moment_row, data.moments),
+        "ensemble",
     )
 
 
-def _of_bias(data: ReportData) -> str:
-    remark = bias_remark(data)
-    return f" Variance of the bias:{remark}" if remark else ""
+def _moment_row(row: Mapping[str, Any]) -> Row:
+    unit = unit_text(str(row.get("unit", "")))
+    observed, error = row.get("observed"), row.get("stderr")
+    predicted = float(row["predicted"])
+    expected, seen, difference = short(predicted, 3 if observed is None else 5), "", ""
+    if observed is not None and error:
+        # to the digits of the data that it is compared with
+        expected = measured(predicted, float(error)).partition(" ±")[0]
+        seen = measured(float(observed), float(error))
+        difference = signed((float(observed) - predicted) / float(error))
+    elif observed is not None:
+        seen = short(float(observed), 5)
+    return {
+        "moment": f"{row['quantity']} ({unit})" if unit else str(row["quantity"]),
+        "from the maps": expected,
+        "from the data": seen,
+        "difference / standard error": difference,
+    }
 
 
 #: Larger electron numbers are in ``report.json`` only.
 _MOST_NUMBERS = 24
 
 
-def _electrons(data: ReportData) -> Table:
+def _electrons(data: ReportData) -> Table | None:
     arrays, facts = data.ensemble, data.ensemble_facts
     if "electron_mass" not in arrays:
-        return Table("electron-table", "", "", (), ())
+        return None
     k = np.asarray(arrays["k"])
     mass, pmf = np.asarray(arrays["electron_mass"]), np.asarray(arrays["electron_pmf"])
     expected = np.asarray(arrays["electron_pmf_map"]) if "electron_pmf_map" in arrays else None
@@ -330,15 +323,6 @@ def _electrons(data: ReportData) -> Table:
     last = int(seen[-1]) if seen.size else 0
     samples = float(np.sum(arrays["electron_counts"])) if "electron_counts" in arrays else 0.0
     errors = np.sqrt(mass * (1.0 - mass) / samples) if samples else np.full(mass.shape, np.nan)
-    rows = [
-        (
-            str(int(k[i])),
-            measured(float(mass[i]), float(errors[i])) if samples else f"{mass[i]:.5f}",
-            f"{pmf[i]:.5f}",
-            f"{expected[i]:.5f}" if expected is not None else "",
-        )
-        for i in range(min(last + 1, _MOST_NUMBERS))
-    ]
     words = ""
     if facts.get("error_rate") is not None:
         rate, error = 100.0 * float(facts["error_rate"]), 100.0 * float(facts.get("error_rate_stderr") or 0.0)
@@ -346,152 +330,167 @@ def _electrons(data: ReportData) -> Table:
     if facts.get("expected_error_rate") is not None:
         expected_errors = percent(float(facts["expected_error_rate"]), 1.0)
         words += f" Expected from the fitted parameters: {expected_errors}."
-    return Table(
+    return Table.of(
         "electron-table",
         "Electron numbers",
         f"Share of each estimated electron number, and its prediction.{words}",
-        ("k", "estimated", "predicted p(k)", "expected share"),
-        tuple(rows),
-        section="electrons",
+        (
+            {
+                "k": str(int(k[i])),
+                "estimated": measured(float(mass[i]), float(errors[i])) if samples else f"{mass[i]:.5f}",
+                "predicted p(k)": f"{pmf[i]:.5f}",
+                "expected share": f"{expected[i]:.5f}" if expected is not None else "",
+            }
+            for i in range(min(last + 1, _MOST_NUMBERS))
+        ),
+        "electrons",
     )
 
 
-def _misfits(data: ReportData) -> Table:
+def _misfits(data: ReportData) -> Table | None:
     facts = data.misfits
-    rows = [
-        (
-            f"channel {row['x']}" if data.shape[0] == 1 else f"y = {row['y']}, x = {row['x']}",
-            f"{row['chi2']:.1f}",
-            f"{row['dof']:.1f}".removesuffix(".0"),
-            scientific(float(row["p"])),
-            scientific(float(row["q"])),
-            "yes" if float(row["q"]) <= float(facts["false_discovery_rate"]) else "no",
-        )
-        for row in facts.get("worst", ())
-    ]
-    if not rows:
-        return Table("misfits", "", "", (), ())
-    return Table(
+    if not facts.get("worst"):
+        return None
+    return Table.of(
         "misfits",
         f"Worst {data.noun}s",
         f"{int(facts['misfits']):,} of {int(facts['tested']):,} tested {data.noun}s disagree with the model "
         f"at a false-discovery rate of {facts['false_discovery_rate']:g} (Benjamini and Hochberg 1995). "
         f"{count(int(facts['pixels_with_outliers']), data.noun)} with excluded samples, at most "
         f"{percent(float(facts['largest_outlier_share']), 1.0)} of their frames.",
-        (data.noun, "χ²", "degrees of freedom", "p", "q", "misfit"),
-        tuple(rows),
-        section="goodness",
+        (
+            {
+                data.noun: f"channel {row['x']}" if data.shape[0] == 1 else f"y = {row['y']}, x = {row['x']}",
+                "χ²": f"{row['chi2']:.1f}",
+                "degrees of freedom": f"{row['dof']:.1f}".removesuffix(".0"),
+                "p": scientific(float(row["p"])),
+                "q": scientific(float(row["q"])),
+                "misfit": "yes" if float(row["q"]) <= float(facts["false_discovery_rate"]) else "no",
+            }
+            for row in facts["worst"]
+        ),
+        "goodness",
     )
 
 
 def _intervals(data: ReportData) -> Table:
-    rows = []
-    shares = noise_shares(data, _ORDER)
-    for name in (name for name in _ORDER if data.has_values(name)):
-        _, words, unit = symbol(name)
-        error = data.pixel_error(name, with_flagged=True)
-        if error is None:
-            continue
-        ends = ["", ""]
-        if name in data.intervals:
-            values, errors = data.maps[name], data.maps[f"{name}_stderr"]
-            low, high = data.intervals[name]
-            ends = [short(float(np.nanmedian(part / errors)), 3) for part in (values - low, high - values)]
-        rows.append(
-            (
-                f"{words} ({unit})",
-                short(error, 3),
-                percent(error, abs(data.summary(name, with_flagged=True).median)),
-                percent(min(shares[name], 1.0), 1.0) if name in shares else "not known",
-                *(ends if data.intervals else ()),
-            )
-        )
-    profile = ("profile: below", "profile: above") if data.intervals else ()
-    head = ("quantity", f"error per {data.noun}", "relative error", "noise in the map", *profile)
     words = (
         f" Profile: distance of the ends of the {100 * data.interval_level:g} % profile-likelihood interval "
         "from the estimate, in standard errors."
     )
-    return Table(
+    return Table.of(
         "uncertainties",
         "Uncertainties",
         f"Median 1 sigma error per {data.noun}, and its share of the map's variance."
         + (words if data.intervals else ""),
-        head,
-        tuple(rows),
-        section="uncertainty",
+        _interval_rows(data),
+        "uncertainty",
     )
 
 
-def _status(data: ReportData) -> Table:
+def _interval_rows(data: ReportData) -> Iterator[Row]:
+    shares = noise_shares(data, _ORDER)
+    for name in _known(data):
+        error = data.pixel_error(name, with_flagged=True)
+        if error is None:
+            continue
+        row = {
+            "quantity": heading(name),
+            f"error per {data.noun}": short(error, 3),
+            "relative error": percent(error, abs(data.summary(name, with_flagged=True).median)),
+            "noise in the map": percent(min(shares[name], 1.0), 1.0) if name in shares else "not known",
+        }
+        if data.intervals:
+            ends = ["", ""]
+            if name in data.intervals:
+                values, errors = data.maps[name], data.maps[f"{name}_stderr"]
+                low, high = data.intervals[name]
+                ends = [short(float(np.nanmedian(part / errors))) for part in (values - low, high - values)]
+            row |= dict(zip(("profile: below", "profile: above"), ends, strict=True))
+        yield row
+
+
+def _status(data: ReportData) -> Table | None:
     status = data.fit.get("fit_status")
     if status is None:
-        return Table("failures", "", "", (), ())
-    total = status.size
+        return None
     unfitted = int(data.unfitted.sum())
     good = int((status == 0).sum()) - int((data.unfitted & (status == 0)).sum())
-    rows: list[tuple[str, ...]] = [("good fit", f"{good:,}", percent(good, total), f"{good:,}")]
+    rows = [("good fit", good, f"{good:,}")]
     if unfitted:
-        rows.append(("not fitted yet", f"{unfitted:,}", percent(unfitted, total), "none"))
+        rows.append(("not fitted yet", unfitted, "none"))
     kept = status[(status & data.failed_mask) == 0]
     for bit, text, n in status_counts(status, data.status_words):
         usable = int(((kept & bit) != 0).sum())
-        rows.append((text, f"{n:,}", percent(n, total), f"{usable:,}, with caution" if usable else "none"))
-    return Table(
+        rows.append((text, n, f"{usable:,}, with caution" if usable else "none"))
+    return Table.of(
         "failures",
         "Fit status by reason",
         "A pixel with several reasons counts for each.",
-        ("reason", "pixels", "share", "with a value"),
-        tuple(rows),
-        section="status",
+        (
+            {"reason": reason, "pixels": f"{n:,}", "share": percent(n, status.size), "with a value": usable}
+            for reason, n, usable in rows
+        ),
+        "status",
     )
 
 
-def _samples(data: ReportData) -> Table:
+def _samples(data: ReportData) -> Table | None:
     if data.samples is None:
-        return Table("samples", "", "", (), ())
-    found = data.samples
-    words, unit, *_ = AXES.get(found.against, ("exposure", ""))
-    rows = []
-    for i, sample in enumerate(found.samples):
-        centre, error, *_ = middle(found.arrays["quanta_exposure"][i])
-        exposure = "0 (bias)" if sample.kind == "bias" else measured(centre, error)
-        residual = share = "–"
-        if sample.x is not None and len(found.on_line) > 2 and "linearity_residual" in found.arrays:
-            rest, rest_error, *_ = middle(found.arrays["linearity_residual"][i])
-            residual = measured(rest, rest_error)
-            if centre > 0:
-                share = f"{100.0 * rest / centre:+.2f} %".replace("-", "−")
-        x = "–" if sample.x is None else f"{sample.x:g}"
-        rows.append((sample.name, x, f"{sample.n_frames:,}", exposure, residual, share))
-    p = finite(found.arrays.get("linearity_p", np.empty(0)))
+        return None
+    p = finite(data.samples.arrays.get("linearity_p", np.empty(0)))
     off = percent(int((p < 0.01).sum()), p.size)
     remark = f" {off} of the {data.noun}s are off the line (p < 0.01; 1 % expected)." if p.size else ""
-    head = f"{words} ({unit})" if unit else words
-    return Table(
+    return Table.of(
         "samples",
         "Samples",
         f"Medians over the {data.noun}s, with their standard errors.{remark}",
-        ("sample", head, "frames", "H (e⁻)", "residual (e⁻)", "residual / H"),
-        tuple(rows),
-        section="exposures",
+        (_sample_row(data.samples, i) for i in range(len(data.samples.samples))),
+        "exposures",
     )
 
 
-def _plan(data: ReportData) -> Table:
+def _sample_row(found: Samples, i: int) -> Row:
+    words, unit, *_ = AXES.get(found.against, ("exposure", ""))
+    sample = found.samples[i]
+    centre, error, *_ = middle(found.arrays["quanta_exposure"][i])
+    residual = share = "–"
+    if sample.x is not None and len(found.on_line) > 2 and "linearity_residual" in found.arrays:
+        rest, rest_error, *_ = middle(found.arrays["linearity_residual"][i])
+        residual = measured(rest, rest_error)
+        if centre > 0:
+            share = f"{100.0 * rest / centre:+.2f} %".replace("-", "−")
+    return {
+        "sample": sample.name,
+        f"{words} ({unit})" if unit else words: "–" if sample.x is None else f"{sample.x:g}",
+        "frames": f"{sample.n_frames:,}",
+        "H (e⁻)": "0 (bias)" if sample.kind == "bias" else measured(centre, error),
+        "residual (e⁻)": residual,
+        "residual / H": share,
+    }
+
+
+def _plan(data: ReportData) -> Table | None:
     plan = data.plan
     if plan is None:
-        return Table("plan-table", "", "", (), ())
+        return None
     rows = []
     for row in plan["rows"]:
         reached = plan["reached"].get(row["name"])
         unit, scale = ("e⁻", 1.0) if row["name"] == "bias" else ("%", 100.0)
-        now = "" if reached is None else f"{short(scale * reached, 2)} {unit}"
-        rows.append((target_text(row["target"]), frames_text(row["frames"]), now))
+        rows.append(
+            {
+                "precision": target_text(row["target"]),
+                "frames needed": frames_text(row["frames"]),
+                "this run's": "" if reached is None else f"{short(scale * reached, 2)} {unit}",
+            }
+        )
     exposure, noise = plan["mark"]
-    caption = (
+    return Table.of(
+        "plan-table",
+        "Frames for a precision",
         f"Cramer-Rao bound for the median pixel (H = {short(exposure)} e⁻, read noise {short(noise)} e⁻). "
-        "Best exposure, other sensors, several samples, check by simulation: pchem plan."
+        "Best exposure, other sensors, several samples, check by simulation: pchem plan.",
+        rows,
+        "plan",
     )
-    head = ("precision", "frames needed", "this run's")
-    return Table("plan-table", "Frames for a precision", caption, head, tuple(rows), section="plan")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 import numpy as np
@@ -46,41 +45,7 @@ def map_colours(known: Ordered, stretch: Literal["beta", "linear"] = "beta") -> 
     high = high if high > low else low + 1.0
     signs = ["≤ ", "", "", "", "≥ "]
     texts = [sign + text for sign, text in zip(signs, _labels(low + _LEVELS * (high - low)), strict=True)]
-    return even_edges(low, high), tuple(zip(_LEVELS.tolist(), texts, strict=True))
-
-
-def even_edges(low: float, high: float) -> FloatArray:
-    """Return the values between colours in equal steps from a low to a high value."""
-    return np.linspace(low, high, SHADES + 1)[1:-1]
-
-
-def even_bar(low: float, high: float, *, whole: bool = False) -> Bar:
-    """Return places and texts of a bar of colours in equal steps: round numbers."""
-    found = ticks_between(low, high, 5, whole=whole)
-    return tuple(((place - low) / (high - low), text) for place, text in found)
-
-
-def ticks_between(low: float, high: float, most: int, *, whole: bool = False) -> list[tuple[float, str]]:
-    """Return multiples of 1, 2 or 5 times a power of ten."""
-    rough = (high - low) / most
-    power = math.floor(math.log10(rough))
-    steps = [m * 10.0**power for m in (1, 2, 5, 10)]
-    step = next(each for each in steps if each >= rough * (1 - 1e-9))
-    if not _has_two(low, high, step):  # a single tick tells no scale
-        step = next((each for each in reversed(steps) if _has_two(low, high, each)), step)
-    if whole and step < 1.0:
-        step, power = 1.0, 0
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    decimals = max(0, -math.floor(math.log10(step) + 1e-9))
-    places = [round(i * step, decimals + 2) for i in range(first, last + 1)]
-    if decimals > 5 or max(map(abs, places), default=0.0) >= 1e6:
-        return [(place, short(place, 2)) for place in places]
-    return [(place, f"{place:,.{decimals}f}".replace("-", "−")) for place in places]
-
-
-def _has_two(low: float, high: float, step: float) -> bool:
-    """Tell whether at least two multiples of a step lie between two ends."""
-    return math.floor(high / step + 1e-9) > math.ceil(low / step - 1e-9)
+    return np.linspace(low, high, SHADES + 1)[1:-1], tuple(zip(_LEVELS.tolist(), texts, strict=True))
 
 
 def _labels(physical: FloatArray) -> list[str]:

@@ -93,6 +93,12 @@ def symbol(name: str) -> tuple[str, str, str]:
     return math_symbol, words, unit_text(unit)
 
 
+def heading(name: str) -> str:
+    """Return the words of a map with its unit, e.g. ``bias (DN)``."""
+    _, words, unit = symbol(name)
+    return f"{words} ({unit})"
+
+
 def stored_unit(name: str) -> str:
     """Return the unit of a map as the store writes it."""
     return _SYMBOLS[name][2]

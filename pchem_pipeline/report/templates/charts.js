@@ -7,7 +7,7 @@
   const { colours, charts } = JSON.parse(source.textContent);
   const dark = matchMedia("(prefers-color-scheme: dark)");
   let palette = colours[dark.matches ? "dark" : "light"];
-  const colourOf = (name) => palette[name] ?? name;
+  const colourOf = (name = "blue") => palette[name] ?? name;
 
   const PX_MM = 4.6, LOWEST = 72, TICKS = 26, NAME = 18, BELOW = TICKS + NAME, ABOVE = 8, LEFT = 66, RIGHT = 14, POINT = 4 / 3, SIDE_BY_SIDE = 560;
   const DASHES = { "--": [5, 3], ":": [1.5, 2.5], "-.": [6, 3, 1.5, 3], "-...": [7, 2, 1.5, 2, 1.5, 2], "..": [1.5, 1.5] };

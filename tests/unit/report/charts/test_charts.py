@@ -15,8 +15,8 @@ from helpers.report_material import report_data
 
 from pchem_pipeline.report.charts.chart import (
     COLUMN_MM,
-    NO_COLOUR,
     PAGE_MM,
+    SHADES,
     Axis,
     Band,
     Bars,
@@ -31,9 +31,8 @@ from pchem_pipeline.report.charts.chart import (
     Steps,
     Sticks,
     Words,
+    extremes,
     fewer_steps,
-    some_points,
-    thinned,
     x_window,
     y_window,
 )
@@ -46,7 +45,6 @@ from pchem_pipeline.report.inspector.inspector import json_for_html
 from pchem_pipeline.report.pages.pictures import draw_figure
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.palette import DIVERGING, LIGHT, MAP_COLOURS, shades
-from pchem_pipeline.report.style.stretch import even_edges, ticks_between
 from pchem_pipeline.report.style.style import Look
 from pchem_pipeline.report.style.wording import symbol, without_formulas
 
@@ -153,7 +151,7 @@ def map_chart(values: np.ndarray, *, square: bool = True, **more: object) -> Cha
     """A map of values from 0 to 1 at rows 10, 11, ... and columns 20, 21, ..."""
     rows, columns = values.shape
     x, y = (19.5, 19.5 + columns), (9.5, 9.5 + rows)
-    image = Image(values, even_edges(0.0, 1.0), x, y, **more)  # type: ignore[arg-type]
+    image = Image(values, x, y, **more)  # type: ignore[arg-type]
     panel = Panel(Axis("y", *y, whole=True, down=True), (image,), square=square)
     return Chart((Stack((panel,), Axis("x", *x, whole=True)),))
 
@@ -166,7 +164,7 @@ def test_a_map_has_the_colours_of_its_scale() -> None:
         drawn = shown.to_rgba(shown.get_array(), bytes=True)[..., :3].astype(int)
         assert drawn.shape == (6, 9, 3)
         assert tuple(drawn[2, 4]) == tuple(bytes.fromhex(LIGHT.no_value[1:]))
-        level = np.floor(values * NO_COLOUR) / (NO_COLOUR - 1)
+        level = np.floor(values * SHADES) / (SHADES - 1)
         expected = 255.0 * mpl.colormaps[name](level)[..., :3]
         known = np.isfinite(values)
         assert np.abs(drawn[known] - expected[known]).max() <= 3
@@ -181,7 +179,7 @@ def test_a_map_lies_where_its_axes_say() -> None:
     assert axes.get_aspect() == 1.0
     # upwards, the first row is the lowest
     upwards = np.linspace(0.0, 1.0, 5)[:, None].repeat(3, axis=1)
-    panel = Panel(Axis("y", 0.0, 5.0), (Image(upwards, even_edges(0.0, 1.0), (0.0, 3.0), (0.0, 5.0)),))
+    panel = Panel(Axis("y", 0.0, 5.0), (Image(upwards, (0.0, 3.0), (0.0, 5.0)),))
     chart = Chart((Stack((panel,), Axis("x", 0.0, 3.0)),))
     axes = draw_chart(Look(), chart).axes[0]
     assert axes.get_ylim() == (0.0, 5.0)
@@ -231,18 +229,19 @@ def test_long_curves_keep_their_extremes_and_gaps() -> None:
     x, y = np.arange(100_000.0), rng.standard_normal(100_000)
     y[70_123], y[20_001] = 50.0, -40.0
     y[30_000:40_000] = np.nan
-    few_x, few_y = thinned(x, y, 500)
-    assert few_x.size == few_y.size == 1000
-    assert (np.nanmax(few_y), np.nanmin(few_y)) == (50.0, -40.0)
-    assert np.isnan(few_y[(few_x > 30_200) & (few_x < 39_800)]).all()
-    assert np.all(np.diff(few_x) >= 0)
-    assert thinned(x[:900], y[:900], 500)[1] is not few_y
-    np.testing.assert_array_equal(thinned(x[:900], y[:900], 500)[1], y[:900])
-    points = some_points(Points(x, y, error=np.ones((2, y.size))), 4000)
-    assert 2000 <= points.y.size <= 4000
-    assert points.error is not None
-    assert points.error.shape == (2, points.y.size)
-    assert {50.0, -40.0} <= set(points.y.tolist())
+    kept = extremes(x, y, 500)
+    assert kept.size == 1000
+    assert {70_123, 20_001} <= set(kept.tolist())
+    assert np.isnan(y[kept[(kept > 30_200) & (kept < 39_800)]]).all()
+    assert np.all(np.diff(kept) >= 0)
+    np.testing.assert_array_equal(extremes(x[:900], y[:900], 500), np.arange(900))
+    points = Points(x, y, error=np.ones((2, y.size)))
+    [few] = page_chart(Chart((Stack((Panel(Axis("y"), (points,)),), Axis("x")),)))["stacks"][0]["panels"][0][
+        "marks"
+    ]
+    assert 2000 <= len(few["y"]) <= 4000
+    assert len(few["error"][1]) == len(few["y"])
+    assert {50.0, -40.0} <= set(few["y"])
     edges, steps = fewer_steps(np.append(x, 100_000.0), np.abs(y), 3000)
     assert edges.size == steps.size + 1 <= 3001
     assert (edges[0], edges[-1], np.nanmax(steps)) == (0.0, 100_000.0, 50.0)
@@ -251,11 +250,6 @@ def test_long_curves_keep_their_extremes_and_gaps() -> None:
 def test_numbers_have_the_digits_of_a_screen() -> None:
     assert rounded(np.array([123.4567891, np.nan, -0.0]), (123.0, 124.0)) == [123.45679, None, 0.0]
     assert rounded(np.array([1.23456789e-7, np.inf]), (1e-9, 1.0), log=True) == [1.2346e-7, None]
-
-
-@pytest.mark.parametrize(("end", "most"), [(9.0, 3), (0.9, 2), (4.9, 1)])
-def test_a_scale_has_more_than_one_tick(end: float, most: int) -> None:
-    assert len(ticks_between(-end, end, most)) > 1
 
 
 def test_a_title_wider_than_its_place_is_broken_and_the_panels_beside_it_stay_level() -> None:

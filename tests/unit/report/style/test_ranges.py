@@ -5,7 +5,7 @@ import pytest
 
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.style.ranges import histogram_edges, robust_range
-from pchem_pipeline.report.style.stretch import even_bar, map_colours
+from pchem_pipeline.report.style.stretch import map_colours
 
 
 def test_hot_pixels_do_not_stretch_the_axis_and_are_counted() -> None:
@@ -96,7 +96,3 @@ def test_nothing_to_stretch_and_one_value() -> None:
 def test_labels_tell_close_values_apart() -> None:
     _, bar = map_colours(Ordered.of(np.linspace(100.001, 100.009, 99)))
     assert len({text for _, text in bar}) == 5
-
-
-def test_a_bar_in_equal_steps_has_round_numbers() -> None:
-    assert even_bar(-4.0, 4.0, whole=True) == ((0.0, "−4"), (0.25, "−2"), (0.5, "0"), (0.75, "2"), (1.0, "4"))
