@@ -40,6 +40,7 @@ _FEWEST_CODES = 5
 _EXCLUDED = 5.0  # standard errors
 #: Nats below which a rival an electron away counts in the moments, and the distance that holds it, e-.
 _RIVAL_GAP, _RIVAL_REACH = 10.0, 1.5
+_CUT_SHARE = 2e-3  # of the samples outside of the window, from which exposure and bias are no more known
 _LOOSE = 0.1  # relative standard error of the gain beyond which several samples do not determine it
 #: Bits about the data, whatever the fit, and those for which a fit with the cells may still find an answer.
 _OF_DATA = FitStatus.ADC_LIMIT | FitStatus.OUTSIDE_WINDOW
@@ -232,9 +233,8 @@ class _Batch:
         )
         self.n, self.n_samples = counts.shape[0], len(samples)
         self.settings, self.adc_limits = settings, adc_limits
-        if adc_limits is not None and self._reaches_adc(slice(None), beyond=1).any():
-            self.adc_limits = None  # they were seen in some frames only, and are none
         self.outside, self.by_cells = np.zeros(self.n, np.bool_) | (outside > 0), np.zeros(self.n, np.bool_)
+        self.cut = np.zeros(self.n, np.bool_) | (outside > _CUT_SHARE * counts.sum(axis=1))
 
     # -- the two fits
 
@@ -440,8 +440,12 @@ class _Batch:
         )
 
     def neutral(self) -> list[SampleLaw]:
-        """Return the law of the PCD between the limits of the ADC."""
+        """Return the law of the PCD between the limits of the ADC, but in pixels with samples beyond them."""
+        low: FloatArray | int | None
+        high: FloatArray | int | None
         low, high = self.adc_limits or (None, None)
+        if self.adc_limits is not None and (none := self._reaches_adc(slice(None), beyond=1)).any():
+            low, high = (np.where(none, np.nan, limit) for limit in self.adc_limits)
         return [SampleLaw(clip_low=low, clip_high=high)] * self.n_samples
 
     def _at_limits(self, laws: Sequence[SampleLaw]) -> NDArray[np.bool_]:
@@ -511,13 +515,14 @@ class _Batch:
         status = words[:, tile_numba.STATUS].copy()
         status[probability < self.settings.goodness_limit] |= FitStatus.POOR_FIT
         status[self.outside[some]] |= FitStatus.OUTSIDE_WINDOW
+        status[self.cut[some]] |= FitStatus.BIAS_AMBIGUOUS
         if n > 1:
             with np.errstate(invalid="ignore"):
                 loose = np.sqrt(covariance[:, n, n]) > _LOOSE * parameters[:, n]
             status[loose] |= FitStatus.NOT_INFORMATIVE
         if self.adc_limits is not None:
             status[self._reaches_adc(some)] |= FitStatus.ADC_LIMIT
-        status = with_rivals_named(status, dark=bool(np.any(self.given.dark)))
+        status = with_rivals_named(status, dark=bool(np.any(self.given.dark)), several=n > 1)
         failed = (status & int(FAILED)) != 0
         parameters[failed] = np.nan
         covariance[failed] = np.nan

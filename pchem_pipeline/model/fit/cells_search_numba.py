@@ -19,6 +19,7 @@ from pchem_pipeline.model.fit.search_numba import (
     FIT_NOT_CONVERGED,
     GAP,
     LOG_LIKELIHOOD,
+    NEAR_TWO,
     SATELLITE_WEIGHT,
     SUSPICIOUS,
     Found,
@@ -92,7 +93,7 @@ _UNRESOLVED = 0.45
 _CUT_SHARE = 0.005  # of a sample at a limit, beyond which the starts of the whole sample mislead
 _CUT_EXPOSURES = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.8, 1.2, 1.8, 2.5, 3.3, 4.2, 5.3, 6.8, 9.0)  # e-
 _CUT_NOISE_E, _CUT_RATIO = 0.28, 1.2
-_NEAR_TWO, _CLIMBED = 0.06, 2  # e-/DN from 0.5: combs of whole numbers with aliases; of 2 DN, climbed from
+_CLIMBED = 2  # combs of 2 DN, from the likeliest starts
 _STEPS, _AROUND = 3, 3  # biases per electron, and to either side
 
 
@@ -241,7 +242,7 @@ def _flat_at_two(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) ->
     scratch, top, covariance = tools.scratch, -math.inf, np.empty((best.size, best.size))
     at, held, trial = scratch.evaluations[AT_BEST], scratch.flags[HELD], scratch.small[HERE]
     find_held(best, at, scratch.flags[FIXED], tools.limits, held)
-    if abs(1.0 / best[1 + STEP] - 0.5) > _NEAR_TWO or not invert_arrow(at, best, held, covariance):
+    if abs(1.0 / best[1 + STEP] - 0.5) > NEAR_TWO or not invert_arrow(at, best, held, covariance):
         return False
     combs_of_step(pixel, tools.evaluate, 2.0, scratch)
     scratch.flags[FIXED, 1 + STEP] = True
@@ -280,7 +281,7 @@ def _start_anew(
     if lost or (limits.scan and (astray or few)):
         found = _climb_few(pixel, tools, best, found)
     if limits.scan and n == 1 and best[place] < ALIASED_STEP:
-        if abs(1.0 / best[place] - 0.5) > _NEAR_TWO:
+        if abs(1.0 / best[place] - 0.5) > NEAR_TWO:
             used = alias_of_step(pixel, tools.evaluate, best, tools.scratch)
             near: Found = _climb_kept(pixel, tools, best, plus(found, used))
             return near

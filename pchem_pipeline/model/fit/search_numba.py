@@ -77,6 +77,7 @@ _LOCKED_NOISE = 0.15  # DN: below it each electron number has one code, and many
 _FEWEST_CODES = 7.0  # of which the four parameters leave two free shares
 _COARSE_NOISE = 0.6  # DN: below it, or below so many DN per electron, rounding is more than additive noise
 _COARSE_STEP = 2.5
+NEAR_TWO = 0.06  # e-/DN from 0.5: combs of whole numbers with aliases
 _SAME_COMB = 1e-3  # nats: two maxima of one comb, farther apart in height than climbs to one of them
 
 SMALLEST_EXPECTATION = 5.0
@@ -459,6 +460,8 @@ def judge(
         status |= EXPOSURE_AT_BOUND
     if not limits.cells and (sigma < _COARSE_NOISE or a < _COARSE_STEP):
         status |= COARSE_STEPS
+    if n > 1 and limits.cells and sigma < _COARSE_NOISE and abs(1.0 / a - 0.5) < NEAR_TWO:
+        status |= GAIN_AMBIGUOUS  # combs with the same codes are looked for in single samples only
     if n == 1:
         if limits.cells and (sigma < _LOCKED_NOISE or pixel.facts[0, OCCUPIED] < _FEWEST_CODES):
             status |= GAIN_AMBIGUOUS
@@ -564,7 +567,9 @@ def _climb_start(
     same = known and same_place(best, trial, cells)
     least = found.loglik + _SAME_COMB if same else found.loglik
     if outcome != CONVERGED or loglik <= least:
-        runner_up = found.runner_up if same else max(found.runner_up, loglik)
+        # where a climb did not arrive, a higher value is none of the likelihood
+        no_rival = same or (outcome != CONVERGED and loglik > found.loglik)
+        runner_up = found.runner_up if no_rival else max(found.runner_up, loglik)
         return Found(found.loglik, runner_up, used, found.degenerate)
     runner_up = found.runner_up if same else max(found.runner_up, found.loglik)
     copy(trial, best)
@@ -654,7 +659,7 @@ def search_density(
         if clear and attempt == 0:
             _keep_highest(tools.scratch.small[HEIGHTS])
         found = _climb_starts(pixel, tools, clear, plus(found, count), trial, best, out)
-        if n == 1 and attempt == 0 and best[n + STEP] > 0.0:
+        if (n > 1 or attempt == 0) and best[n + STEP] > 0.0:
             count = longer_steps(
                 pixel, tools.evaluate, np.bool_(False), best, found.loglik - CLEAR_GAP, tools.scratch
             )

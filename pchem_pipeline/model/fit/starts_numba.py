@@ -441,14 +441,24 @@ def longer_steps(
     there. Starts below ``least`` are left out.
     """
     histogram, heights, used = histogram_of(pixel, np.int64(0)), scratch.small[HEIGHTS], 0
+    trial = scratch.small[HERE]
     _no_starts(heights)
-    a = best[1 + STEP]
-    if not histogram.variance < _SPARSE * a * a or _holds_one(histogram, best):
+    n = pixel.facts.shape[0]
+    a = best[n + STEP]
+    if n == 1 and (not histogram.variance < _SPARSE * a * a or _holds_one(histogram, best)):
         return used
     for multiple in (1.3, 1.6, 2.0, 2.5, 3.0, 4.0, 5.0):
-        if multiple * a < histogram.n_bins:
+        if n == 1 and multiple * a < histogram.n_bins:
             lobe = ecf_at(histogram, 1.0 / (multiple * a))
             used += _keep_lobe(pixel, evaluate, cells, multiple * a, lobe, scratch)
+        elif n > 1:  # the same means, bias and read noise
+            copy(best, trial)
+            trial[n + STEP] *= multiple
+            least_variance = min_log_variance(trial[n + STEP], cells)
+            trial[n + LOG_VARIANCE] = max(trial[n + LOG_VARIANCE], least_variance)
+            for j in range(n):
+                trial[j] -= math.log(multiple)
+            used += keep_start(pixel, evaluate, cells, scratch)
     for i in range(N_KEPT):
         if heights[i] < least:
             heights[i] = -math.inf

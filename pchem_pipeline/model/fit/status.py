@@ -69,17 +69,20 @@ def flags_of(name: str) -> FitStatus:
     return FLAGGED if name in COUNTS_ELECTRONS else FLAGGED & ~of_bias
 
 
-def with_rivals_named(words: NDArray[np.int64], *, dark: bool) -> NDArray[np.int64]:
+def with_rivals_named(words: NDArray[np.int64], *, dark: bool, several: bool = False) -> NDArray[np.int64]:
     """Return status words that say of ambiguous pixels whether their rival differs in bias, gain or both.
 
     The search says so of one sample. Where bias frames hold the bias, the rival differs in gain alone.
+    Several samples have a gain of small error, and a rival's differs by many of these.
 
     Args:
         words: of the fit, shape (n,).
         dark: whether bias frames are among the samples.
+        several: whether there are several.
     """
     ambiguous = (words & FitStatus.BIAS_AMBIGUOUS) != 0
-    return np.where(ambiguous & dark, words ^ AMBIGUOUS, words)
+    named = words ^ AMBIGUOUS if dark else words | AMBIGUOUS if several else words
+    return np.where(ambiguous, named, words)
 
 
 def moves_gain(exposure: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -5,7 +5,7 @@ import pytest
 from helpers.plain_law import joint_mass
 
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus
+from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus, flags_of
 
 
 def samples(rng, exposure, step, noise, frames, bias, pixels):
@@ -53,6 +53,25 @@ def test_dark_and_clean_pixels_have_the_right_gain(exposure, noise, frames, step
     # n electrons give the step to s / sqrt(n); a share exp(-N H) of few of them is no fault
     few = 0.2 + 5.0 * noise / np.sqrt(exposure * frames)
     assert (np.abs(ratio - 1.0) > min(few, 0.6)).sum() == 0
+
+
+@pytest.mark.parametrize(
+    ("step", "noise", "exposures", "least"),
+    [(26.0, 0.065, (0.015, 0.02), 0.9), (11.0, 0.07, (0.01, 0.02), 0.8), (10.0, 0.45, (12.0, 16.0), 0.0)],
+)
+def test_several_dark_or_blurred_exposures_have_the_right_gain_or_say_so(step, noise, exposures, least):
+    """Half the step in half of the pixels, nats below the truth; gains of bright ones off by 100 errors."""
+    rng = np.random.default_rng(9)
+    dn = [samples(rng, exposure, step, noise, 900, 100.3, 80) for exposure in exposures]
+    counts = [
+        np.stack([np.bincount(row - each.min(), minlength=np.ptp(each) + 1) for row in each]) for each in dn
+    ]
+    found = fit_histograms(counts, [np.full(len(each), each.min()) for each in dn])
+    gain = (found.fit_status & int(FAILED | flags_of("conversion_gain"))) == 0
+    pulls = (found.conversion_gain * step - 1.0) / (step * np.sqrt(found.covariance[:, 2, 2]))
+    assert gain.mean() >= least
+    assert (np.abs(pulls[gain]) < 5.0).all()
+    assert np.nanmin(found.likelihood_gap) >= 0.0
 
 
 @pytest.mark.parametrize(
