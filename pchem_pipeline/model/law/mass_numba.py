@@ -37,6 +37,7 @@ FloatArray = NDArray[np.float64]
 
 
 _LEAST_VARIANCE = 1e-6  # DN^2
+_MOST_EXPOSURE = 1e6  # e-: each electron number costs, and cumulants may ask for 1e13 of them
 _FAR = 1e-9  # mass of an occupied code below which the tails are looked at
 # mass of a cell that tells nothing: a difference of two tails that are alike, whose slopes are left over
 _LEAST_TOLD = 1e-15
@@ -60,8 +61,8 @@ def _at(room: Pixel, centre: int) -> Pixel:
 
 @kernel
 def known_theta(parameters: FloatArray, centre: int, weight: float, theta: FloatArray) -> bool:
-    """Fill a sample's own theta from (H, g, mu, sigma); False unless they are known."""
-    if not math.isfinite(parameters.sum()):
+    """Fill a sample's own theta from (H, g, mu, sigma); False unless they are known, and H is one of pixels."""
+    if not (math.isfinite(parameters.sum()) and parameters[0] < _MOST_EXPOSURE):
         return False
     theta[0] = math.log(parameters[0])
     theta[1] = 1.0 / parameters[1]

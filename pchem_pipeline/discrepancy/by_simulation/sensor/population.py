@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.by_simulation.sensor.population_numba import solve_parabolas
 from pchem_pipeline.model.arithmetic.robust import robust_sd
+from pchem_pipeline.model.fit.climb_numba import MAX_LOG_EXPOSURE
 from pchem_pipeline.model.fit.shared import to_parameters, to_theta
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
@@ -421,7 +422,7 @@ def _at_least(scatter: FloatArray) -> FloatArray:
 def _inside(theta: FloatArray) -> FloatArray:
     """Return theta with some exposure and some read noise."""
     found = theta.copy()
-    found[..., 0] = np.maximum(found[..., 0], _LOWEST_LOG_EXPOSURE)
+    found[..., 0] = np.clip(found[..., 0], _LOWEST_LOG_EXPOSURE, MAX_LOG_EXPOSURE)
     found[..., 3] = np.maximum(found[..., 3], _LOWEST_LOG_VARIANCE)
     return found
 

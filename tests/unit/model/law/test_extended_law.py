@@ -34,6 +34,19 @@ def test_mass_is_the_docstring_term_by_term(name: str) -> None:
         np.testing.assert_allclose(row[close], expected[close], rtol=1e-11)
 
 
+def test_an_exposure_beyond_all_pixels_is_not_known() -> None:
+    """The search went on for an hour, electron number by electron number, and heard no signal."""
+    maps = [
+        np.array([2.0, 6.5e13]),
+        np.array([1 / 12, 4e5]),
+        np.array([100.0, -1.6e8]),
+        np.array([3.0, 30.0]),
+    ]
+    counts = np.full((2, 40), 5, np.uint32)
+    value, _, _ = sample_parabolas(SampleLaw(), maps, counts, np.array([90, 90]))
+    assert np.isfinite(value).tolist() == [True, False]
+
+
 def test_parts_that_differ_from_pixel_to_pixel_are_those_of_their_pixel() -> None:
     laws = [LAWS["levels"], SampleLaw().with_variance(e2=0.04, dn2=0.2), LAWS["skew"]]
     laws[1] = laws[1].with_added_exposure([[0.0, 0.8]], [[0.6, 0.4]])
