@@ -61,7 +61,7 @@ def _at(room: Pixel, centre: int) -> Pixel:
 
 @kernel
 def known_theta(parameters: FloatArray, centre: int, weight: float, theta: FloatArray) -> bool:
-    """Fill a sample's own theta from (H, g, mu, sigma); False unless they are known, and H is one of pixels."""
+    """Fill a sample's own theta from (H, g, mu, sigma); False unless known, and H that of a pixel."""
     if not (math.isfinite(parameters.sum()) and parameters[0] < _MOST_EXPOSURE):
         return False
     theta[0] = math.log(parameters[0])
