@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.by_simulation.sensor.population_numba import solve_parabolas
 from pchem_pipeline.model.arithmetic.robust import robust_sd
-from pchem_pipeline.model.fit.climb_numba import MAX_LOG_EXPOSURE
+from pchem_pipeline.model.fit.climb_numba import LEAST_STEP, MAX_LOG_EXPOSURE
 from pchem_pipeline.model.fit.shared import to_parameters, to_theta
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
@@ -468,7 +468,7 @@ def _centres_of(k: FloatArray) -> FloatArray:
     """
     k2, k3, k4 = np.maximum(k, [1e-3, 1e-3, 1e-6]).T
     # from no read noise at all to much
-    least = k3 / k2
+    least = np.maximum(k3 / k2, LEAST_STEP)  # samples that are cut off have no skewness of electrons
     by_four = np.log(np.clip(k4 / k3, least, _MOST_NOISE * least))
     step = least.copy()
     for _ in range(_ITERATIONS):
