@@ -97,7 +97,7 @@ def test_a_folder_of_files_is_one_pattern_wherever_the_store_is(tmp_path, monkey
     store.records.write(StageRecord("ingest", 1, "f", {}, finished=True))
     with pytest.raises(ConfigError, match=r"input\.files .* in the file, .* here") as refused:
         find_or_start(files, Path("new/run.zarr"), {})
-    assert len(str(refused.value)) < 400
+    assert len(str(refused.value)) < 700  # twice the path of the test
 
 
 def test_an_edited_yaml_is_never_replaced(tmp_path, file):
