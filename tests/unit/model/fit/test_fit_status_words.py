@@ -156,6 +156,8 @@ def test_outside_the_window() -> None:
         assert word(result) == FitStatus.OUTSIDE_WINDOW
         assert np.isfinite(result.bias[0])
     samples = int(pixel.counts.sum())
+    cut = fit_histograms(pixel.counts, pixel.origin, over=np.array([samples // 100]))
+    assert word(cut) & FitStatus.BIAS_AMBIGUOUS  # so many are missed in the mean
     for outside, expected in ((samples, FitStatus.OUTSIDE_WINDOW), (samples + 1, FitStatus.NO_DATA)):
         result = fit_histograms(pixel.counts, pixel.origin, np.array([outside - 5]), np.array([5]))
         assert word(result) & expected
