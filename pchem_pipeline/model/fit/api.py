@@ -40,7 +40,7 @@ _FEWEST_CODES = 5
 _EXCLUDED = 5.0  # standard errors
 #: Nats below which a rival an electron away counts in the moments, and the distance that holds it, e-.
 _RIVAL_GAP, _RIVAL_REACH = 10.0, 1.5
-_CUT_SHARE = 2e-3  # of the samples outside of the window, from which exposure and bias are no more known
+_LOST_SHARE = 2e-3  # of the samples, outside of the window, from which exposure and bias are not known
 _LOOSE = 0.1  # relative standard error of the gain beyond which several samples do not determine it
 #: Bits about the data, whatever the fit, and those for which a fit with the cells may still find an answer.
 _OF_DATA = FitStatus.ADC_LIMIT | FitStatus.OUTSIDE_WINDOW
@@ -234,7 +234,7 @@ class _Batch:
         self.n, self.n_samples = counts.shape[0], len(samples)
         self.settings, self.adc_limits = settings, adc_limits
         self.outside, self.by_cells = np.zeros(self.n, np.bool_) | (outside > 0), np.zeros(self.n, np.bool_)
-        self.cut = np.zeros(self.n, np.bool_) | (outside > _CUT_SHARE * counts.sum(axis=1))
+        self.truncated = np.zeros(self.n, np.bool_) | (outside > _LOST_SHARE * counts.sum(axis=1))
 
     # -- the two fits
 
@@ -515,7 +515,7 @@ class _Batch:
         status = words[:, tile_numba.STATUS].copy()
         status[probability < self.settings.goodness_limit] |= FitStatus.POOR_FIT
         status[self.outside[some]] |= FitStatus.OUTSIDE_WINDOW
-        status[self.cut[some]] |= FitStatus.BIAS_AMBIGUOUS
+        status[self.truncated[some]] |= FitStatus.BIAS_AMBIGUOUS
         if n > 1:
             with np.errstate(invalid="ignore"):
                 loose = np.sqrt(covariance[:, n, n]) > _LOOSE * parameters[:, n]

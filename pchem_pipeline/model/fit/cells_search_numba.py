@@ -93,7 +93,6 @@ _UNRESOLVED = 0.45
 _CUT_SHARE = 0.005  # of a sample at a limit, beyond which the starts of the whole sample mislead
 _CUT_EXPOSURES = (0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.8, 1.2, 1.8, 2.5, 3.3, 4.2, 5.3, 6.8, 9.0)  # e-
 _CUT_NOISE_E, _CUT_RATIO = 0.28, 1.2
-_CLIMBED = 2  # combs of 2 DN, from the likeliest starts
 _STEPS, _AROUND = 3, 3  # biases per electron, and to either side
 
 
@@ -246,7 +245,7 @@ def _flat_at_two(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) ->
         return False
     combs_of_step(pixel, tools.evaluate, 2.0, scratch)
     scratch.flags[FIXED, 1 + STEP] = True
-    for _ in range(_CLIMBED):
+    for _ in range(2):  # the likeliest
         if next_start(scratch, trial):
             top = max(top, climb_on(pixel, tools, from_start(), trial, trial)[1])
     scratch.flags[FIXED, 1 + STEP] = False
