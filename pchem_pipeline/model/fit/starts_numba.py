@@ -445,7 +445,10 @@ def longer_steps(
     _no_starts(heights)
     n = pixel.facts.shape[0]
     a = best[n + STEP]
-    if n == 1 and (not histogram.variance < _SPARSE * a * a or _holds_one(histogram, best)):
+    for j in range(n):
+        if not pixel.facts[j, VARIANCE] < _SPARSE * a * a:
+            return used
+    if n == 1 and _holds_one(histogram, best):
         return used
     for multiple in (1.3, 1.6, 2.0, 2.5, 3.0, 4.0, 5.0):
         if n == 1 and multiple * a < histogram.n_bins:
