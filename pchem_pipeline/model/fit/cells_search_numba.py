@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
-from pchem_pipeline.model.errors.algebra_numba import invert_arrow
-from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, LEAST_STEP, find_held, same_place
+from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, LEAST_STEP, same_place
 from pchem_pipeline.model.fit.satellites_numba import search_satellites
 from pchem_pipeline.model.fit.search_numba import (
     AMPLITUDE,
@@ -29,6 +28,7 @@ from pchem_pipeline.model.fit.search_numba import (
     climb_neighbours,
     climb_on,
     examine,
+    fall_and_parabola,
     from_start,
     judge,
     loglik_without_gain,
@@ -37,6 +37,7 @@ from pchem_pipeline.model.fit.search_numba import (
     rival_moves_gain,
     score_of,
     settled,
+    surely_seen,
 )
 from pchem_pipeline.model.fit.starts_numba import (
     add_line_starts,
@@ -49,7 +50,6 @@ from pchem_pipeline.model.fit.starts_numba import (
 from pchem_pipeline.model.law.pixel_numba import (
     ADDED_EXPOSURE,
     ADDED_WEIGHT,
-    AT_BEST,
     BIAS,
     BOTTOM,
     CUMULATIVE,
@@ -59,7 +59,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     FIRST,
     FIXED,
     HEIGHTS,
-    HELD,
     HERE,
     LOG_VARIANCE,
     N_BINS,
@@ -161,13 +160,15 @@ def _better(pixel: Pixel, tools: Tools, trial: FloatArray, best: FloatArray, fou
 
 @kernel(borrows=True)
 def _share_at_limits(pixel: Pixel) -> float:
-    """Return the share of a single sample in the codes that hold what lies beyond the limits."""
-    facts, found = pixel.facts[0], 0.0
-    for i in range(int(facts[N_BINS])):
-        if i <= facts[BOTTOM] or i + 1 >= facts[TOP]:
-            found += pixel.bins[0, WEIGHT, i]
-    share: float = found / facts[N_FRAMES]
-    return share
+    """Return the largest share of a sample in the codes that hold what lies beyond the limits."""
+    largest = 0.0
+    for j in range(pixel.facts.shape[0]):
+        facts, found = pixel.facts[j], 0.0
+        for i in range(int(facts[N_BINS])):
+            if i <= facts[BOTTOM] or i + 1 >= facts[TOP]:
+                found += pixel.bins[j, WEIGHT, i]
+        largest = max(largest, found / facts[N_FRAMES])
+    return largest
 
 
 @kernel(borrows=True)
@@ -234,23 +235,15 @@ def _climb_known(pixel: Pixel, tools: Tools, near: FloatArray, best: FloatArray)
 
 @kernel
 def _flat_at_two(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -> bool:
-    """Tell whether the log-likelihood falls towards 2 DN per electron by less than half of its parabola.
+    """Tell whether the log-likelihood of a single sample is flat towards 2 DN per electron.
 
     Whole numbers do not tell 1/a from 1 - 1/a: it has no slope at 2 DN, and near it no standard error.
     """
-    scratch, top, covariance = tools.scratch, -math.inf, np.empty((best.size, best.size))
-    at, held, trial = scratch.evaluations[AT_BEST], scratch.flags[HELD], scratch.small[HERE]
-    find_held(best, at, scratch.flags[FIXED], tools.limits, held)
-    if abs(1.0 / best[1 + STEP] - 0.5) > NEAR_TWO or not invert_arrow(at, best, held, covariance):
+    if abs(1.0 / best[1 + STEP] - 0.5) > NEAR_TWO:
         return False
-    combs_of_step(pixel, tools.evaluate, 2.0, scratch)
-    scratch.flags[FIXED, 1 + STEP] = True
-    for _ in range(2):  # the likeliest
-        if next_start(scratch, trial):
-            top = max(top, climb_on(pixel, tools, from_start(), trial, trial)[1])
-    scratch.flags[FIXED, 1 + STEP] = False
-    parabola = 0.5 * (best[1 + STEP] - 2.0) ** 2 / covariance[1 + STEP, 1 + STEP]
-    return bool(loglik - top < CLEAR_GAP and 2.0 * (loglik - top) < parabola)
+    combs_of_step(pixel, tools.evaluate, 2.0, tools.scratch)
+    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, np.int64(1 + STEP))
+    return bool(fall < CLEAR_GAP and 2.0 * fall < parabola)
 
 
 @kernel(inline=True)
@@ -279,11 +272,12 @@ def _start_anew(
     lost = known and not best[place] > 0.0
     if lost or (limits.scan and (astray or few)):
         found = _climb_few(pixel, tools, best, found)
-    if limits.scan and n == 1 and best[place] < ALIASED_STEP:
-        if abs(1.0 / best[place] - 0.5) > NEAR_TWO:
-            used = alias_of_step(pixel, tools.evaluate, best, tools.scratch)
-            near: Found = _climb_kept(pixel, tools, best, plus(found, used))
-            return near
+    if not (limits.scan and best[place] < ALIASED_STEP):
+        return found
+    if abs(1.0 / best[place] - 0.5) > NEAR_TWO:
+        used = alias_of_step(pixel, tools.evaluate, best, tools.scratch)
+        found = _climb_kept(pixel, tools, best, plus(found, used))
+    elif n == 1:
         for nearer in (1.0, 3.0):
             a = 1.0 / (0.5 - (1.0 / best[place] - 0.5) / nearer)
             used = combs_of_step(pixel, tools.evaluate, a, tools.scratch)
@@ -336,7 +330,8 @@ def search_cells(
     tools.scratch.flags[FIXED, n + SATELLITE] = True
     out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
     found = Found(-math.inf, -math.inf, 0, np.bool_(False))
-    cut = n == 1 and not limits.warm and _share_at_limits(pixel) > _CUT_SHARE
+    at_limits = not limits.warm and _share_at_limits(pixel) > _CUT_SHARE
+    cut = n == 1 and at_limits
     if known:
         found = _climb_known(pixel, tools, task.near, best)
     if best[n + STEP] > 0.0:
@@ -370,6 +365,10 @@ def search_cells(
     above_null = math.inf if known else found.loglik - null
     of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.loglik - bias_gap)
     of_gain = of_gain or (n == 1 and limits.scan and _flat_at_two(pixel, tools, best, found.loglik))
-    of_gain = of_gain or (cut and bias_gap < limits.gap)
+    # of several samples, combs that the limits leave open are not looked for
+    unsure = not surely_seen(pixel, best) or best[n + STEP] < FEW_STEP
+    if n == 1:
+        unsure = bias_gap < limits.gap
+    of_gain = of_gain or (at_limits and unsure)
     word = judge(pixel, limits, best, above_null, blurred, bias_gap, of_gain)
     return word, found.used, int(out[DEGREES])

@@ -10,14 +10,22 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
+from pchem_pipeline.model.errors.algebra_numba import invert_arrow
 from pchem_pipeline.model.fit.climb_numba import (
     CONVERGED,
     DEGENERATE,
     Goal,
     Limits,
+    find_held,
     same_place,
 )
-from pchem_pipeline.model.fit.starts_numba import N_ATTEMPTS, fill_starts, longer_steps
+from pchem_pipeline.model.fit.starts_numba import (
+    N_ATTEMPTS,
+    fill_starts,
+    keep_start,
+    longer_steps,
+    no_starts,
+)
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.density_numba import LOG_2PI
@@ -29,7 +37,9 @@ from pchem_pipeline.model.law.pixel_numba import (
     EXPECTATIONS,
     EXPECTED,
     FIRST,
+    FIXED,
     HEIGHTS,
+    HELD,
     HERE,
     KEPT_STARTS,
     LOG_VARIANCE,
@@ -68,7 +78,7 @@ _SURE_THRESHOLDS = 4.0  # ... and, so many times the gap that counts as ambiguou
 _FINE_STEP = 5.0  # DN per electron: below it climbs from a neighbour also meet combs that fit whole numbers
 _CLEAR_LOBE = 3.0  # standard errors: a side lobe of the characteristic function that settles the gain
 _SURE_LOBE = 5.0  # the same where the model does not fit: other starts have only helped below 3
-_MOST_MOVES = 40
+_MOST_MOVES, _MOST_STEPS = 40, 16.0
 _LEAST_BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains apart
 _BLURRED2, _LEAST_SKEWNESS = 0.64, 0.02  # e-^2: read noise without peaks; a skewness of H = 2500 e-
 _SAME_GAIN, _SAME_RIVAL = 0.03, 0.1  # relative; nats
@@ -159,32 +169,65 @@ def goal_beside(first: bool, loglik: float, runner_up: float) -> Goal:
 
 
 @kernel(inline=True)
-def _neighbour(which: int, pixel: Pixel, theta: FloatArray, out: FloatArray) -> bool:
-    """Fill ``out`` with a neighbour of ``theta``: one electron more or (odd ``which``) fewer.
-
-    The first two move the bias: all H_j +- 1, mu -+ 1/g. The others keep it and move
-        the gain, so
-    that the brightest sample alone has an electron more or less: the combs agree at the bias and there.
-    """
-    n = pixel.facts.shape[0]
-    direction = -1.0 if which % 2 else 1.0
-    copy(theta, out)
-    most = 0.0
+def surely_seen(pixel: Pixel, best: FloatArray) -> bool:
+    """Tell whether peaks of contrast ``2 r``, ``r = exp(-2 pi^2 s_e^2)``, bring so many nats, ``N r^2``."""
+    n, frames = pixel.facts.shape[0], 0.0
     for j in range(n):
         if pixel.facts[j, DARK] == 0.0:
+            frames += pixel.facts[j, N_FRAMES]
+    noise2 = math.exp(best[n + LOG_VARIANCE]) / best[n + STEP] ** 2
+    return bool(frames * math.exp(-4.0 * math.pi**2 * noise2) > _SURELY_SEEN)
+
+
+@kernel(inline=True)
+def _most_electrons(pixel: Pixel, theta: FloatArray) -> float:
+    """Return the largest exposure of a pixel's samples, e-."""
+    most = 0.0
+    for j in range(pixel.facts.shape[0]):
+        if pixel.facts[j, DARK] == 0.0:
             most = max(most, math.exp(theta[j]))
-    if not most + direction > 0.03:
+    return most
+
+
+@kernel(inline=True)
+def _count_neighbours(pixel: Pixel, cells: bool, theta: FloatArray) -> int:
+    """Return how many neighbours a maximum has: of its bias two, the others differ in their gains.
+
+    One sample tells neighbouring gains apart but for few DN per electron. Of several, the variance leaves
+    ``sqrt(2 / N)`` of the gain open, which is so many electrons of the brightest; three times that is tried.
+    """
+    n = pixel.facts.shape[0]
+    if n == 1:
+        return 4 if cells and not theta[n + STEP] > FEW_STEP else 2
+    frames = pixel.facts[0, N_FRAMES]
+    for j in range(n):
+        frames = min(frames, pixel.facts[j, N_FRAMES])
+    reach = 3.0 * math.sqrt(2.0 / frames) * _most_electrons(pixel, theta)
+    return 4 + 2 * int(min(reach, _MOST_STEPS))
+
+
+@kernel(inline=True)
+def _neighbour(which: int, pixel: Pixel, theta: FloatArray, out: FloatArray) -> bool:
+    """Fill ``out`` with a neighbour of ``theta``: electrons more or (odd ``which``) fewer.
+
+    The first two move the bias: all H_j +- 1, mu -+ 1/g. The others keep it and move the gain, so that the
+    brightest sample alone has 1, 2, ... electrons more or less: the combs agree at the bias and there.
+    """
+    n, most = pixel.facts.shape[0], _most_electrons(pixel, theta)
+    change = max(float(which // 2), 1.0) * (-1.0 if which % 2 else 1.0)
+    copy(theta, out)
+    if not most + change > 0.03:
         return False
     if which < 2:
         for j in range(n):
-            out[j] = math.log(max(math.exp(theta[j]) + direction, 0.01))
-        out[n + BIAS] -= direction * theta[n + STEP]
+            out[j] = math.log(max(math.exp(theta[j]) + change, 0.01))
+        out[n + BIAS] -= change * theta[n + STEP]
         return True
-    factor = (most + direction) / most
+    factor = (most + change) / most
     for j in range(n):
         out[j] += math.log(factor)
     out[n + STEP] /= factor
-    return most > _LEAST_BRIGHT
+    return bool(most > _LEAST_BRIGHT)
 
 
 @kernel(borrows=True)
@@ -203,11 +246,8 @@ def climb_neighbours(
         Log-likelihood of the best, that of the best other one (-inf without one), evaluations.
     """
     trial, runner_up = tools.scratch.small[OTHER], -math.inf
-    # combs of few DN per electron, too, differ in their gains
-    n = pixel.facts.shape[0]
-    n_neighbours = 2 if n == 1 and (not tools.limits.cells or best[n + STEP] > FEW_STEP) else 4
     came_from, used, moves, which = -1, 0, 0, int(np.int64(0))
-    while which < n_neighbours:
+    while which < _count_neighbours(pixel, tools.limits.cells, best):
         if which == came_from or not _neighbour(which, pixel, best, trial):
             which += 1
             continue
@@ -226,7 +266,7 @@ def climb_neighbours(
             best_loglik = loglik
             came_from = which ^ 1
             moves += 1
-            which -= which % 2
+            which = 0  # the new one has neighbours of both kinds
         else:
             runner_up = max(runner_up, loglik)
             which += 1
@@ -460,7 +500,7 @@ def judge(
         status |= EXPOSURE_AT_BOUND
     if not limits.cells and (sigma < _COARSE_NOISE or a < _COARSE_STEP):
         status |= COARSE_STEPS
-    if n > 1 and limits.cells and sigma < _COARSE_NOISE and abs(1.0 / a - 0.5) < NEAR_TWO:
+    if n > 1 and limits.cells and sigma < _COARSE_NOISE and 1.0 / a > 0.5 - NEAR_TWO:
         status |= GAIN_AMBIGUOUS  # combs with the same codes are looked for in single samples only
     if n == 1:
         if limits.cells and (sigma < _LOCKED_NOISE or pixel.facts[0, OCCUPIED] < _FEWEST_CODES):
@@ -496,19 +536,6 @@ def rival_moves_gain(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
 
 
 @kernel(inline=True)
-def above_blurred(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -> float:
-    """Return by how many nats a maximum is above the likelihood without peaks; infinite where that is sure.
-
-    Peaks of contrast ``2 r``, ``r = exp(-2 pi^2 s_e^2)``, bring ``N r^2`` nats.
-    """
-    facts, noise2 = pixel.facts[0], math.exp(best[1 + LOG_VARIANCE]) / best[1 + STEP] ** 2
-    if pixel.facts.shape[0] > 1 or facts[N_FRAMES] * math.exp(-4.0 * math.pi**2 * noise2) > _SURELY_SEEN:
-        return math.inf
-    above: float = loglik - loglik_without_ripple(pixel, tools.evaluate, tools.limits.cells, tools.scratch)
-    return above
-
-
-@kernel(inline=True)
 def next_start(scratch: Scratch, theta: FloatArray) -> bool:
     """Take the highest of the starts; False where none is left."""
     heights, which = scratch.small[HEIGHTS], 0
@@ -520,6 +547,69 @@ def next_start(scratch: Scratch, theta: FloatArray) -> bool:
     heights[which] = -math.inf
     copy(scratch.small[KEPT_STARTS + which], theta)
     return True
+
+
+@kernel
+def fall_and_parabola(
+    pixel: Pixel, tools: Tools, best: FloatArray, loglik: float, which: int
+) -> tuple[float, float]:
+    """Return by how many nats the log-likelihood falls to other values of a parameter, and by its error.
+
+    Args:
+        pixel: its samples.
+        tools: of the search; its scratch holds starts, of which the two highest are climbed from, and the
+            evaluation at the maximum.
+        best: the maximum.
+        loglik: its log-likelihood.
+        which: place of the parameter in theta that stays where the starts have it.
+
+    Returns:
+        The fall, infinite where nothing is to be known; what the standard error would have it be.
+    """
+    scratch, top, covariance = tools.scratch, -math.inf, np.empty((best.size, best.size))
+    at, held, trial, change = scratch.evaluations[AT_BEST], scratch.flags[HELD], scratch.small[HERE], 0.0
+    find_held(best, at, scratch.flags[FIXED], tools.limits, held)
+    if not invert_arrow(at, best, held, covariance):
+        return math.inf, 0.0
+    scratch.flags[FIXED, which] = True
+    for _ in range(2):
+        if next_start(scratch, trial):
+            change = trial[which] - best[which]
+            top = max(top, climb_on(pixel, tools, from_start(), trial, trial)[1])
+    scratch.flags[FIXED, which] = False
+    return loglik - top, 0.5 * change**2 / covariance[which, which]
+
+
+@kernel
+def ripple_by_chance(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -> bool:
+    """Tell whether the standard errors of several samples rest on peaks that may be seen by chance.
+
+    They then exclude read noises that the likelihood does not. One without peaks, 0.8 e-, has the same
+    variances with a bias and exposures that are off by the difference of the squares, e-.
+    """
+    n, trial = pixel.facts.shape[0], tools.scratch.small[HERE]
+    more = _BLURRED2 - math.exp(best[n + LOG_VARIANCE]) / best[n + STEP] ** 2
+    if more < 0.0:
+        return False
+    copy(best, trial)
+    for j in range(n):
+        trial[j] = math.log(math.exp(best[j]) + more)
+    trial[n + BIAS] -= more * best[n + STEP]
+    trial[n + LOG_VARIANCE] = math.log(_BLURRED2 * best[n + STEP] ** 2)
+    no_starts(tools.scratch.small[HEIGHTS])
+    keep_start(pixel, tools.evaluate, tools.limits.cells, tools.scratch)
+    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, np.int64(n + LOG_VARIANCE))
+    least = tools.limits.gap
+    return bool(fall < 2.0 * least and parabola > 2.0 * max(fall, least))
+
+
+@kernel(inline=True)
+def above_blurred(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -> float:
+    """Return the nats that a maximum is above the likelihood without peaks; infinite where that is sure."""
+    if pixel.facts.shape[0] > 1 or surely_seen(pixel, best):
+        return math.inf
+    above: float = loglik - loglik_without_ripple(pixel, tools.evaluate, tools.limits.cells, tools.scratch)
+    return above
 
 
 @kernel(borrows=True)
@@ -660,9 +750,8 @@ def search_density(
             _keep_highest(tools.scratch.small[HEIGHTS])
         found = _climb_starts(pixel, tools, clear, plus(found, count), trial, best, out)
         if (n > 1 or attempt == 0) and best[n + STEP] > 0.0:
-            count = longer_steps(
-                pixel, tools.evaluate, np.bool_(False), best, found.loglik - CLEAR_GAP, tools.scratch
-            )
+            poor, least = score_of(out) > SUSPICIOUS, found.loglik - CLEAR_GAP
+            count = longer_steps(pixel, tools.evaluate, poor, best, least, tools.scratch)
             found = _climb_starts(pixel, tools, clear, plus(found, count), trial, best, out)
         if found.loglik > before and not settled(pixel, best, clear, found.loglik - null, out)[1]:
             break

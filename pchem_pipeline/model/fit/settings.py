@@ -70,7 +70,8 @@ class FitSettings(Section):
     )
     errors: Literal["information", "sandwich"] = Field(
         default="information",
-        description="information: standard errors from the observed information, correct if the model holds. "
+        description="information: standard errors from the observed information, of several exposures with "
+        "unresolved peaks from the expected one; correct if the model holds. "
         "sandwich: robust standard errors, correct also if it does not hold",
     )
     intervals: Literal["normal", "profile"] = Field(

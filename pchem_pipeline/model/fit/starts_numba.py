@@ -341,7 +341,7 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
     ``3 / sqrt(N)``.
     """
     histogram, work, used = histogram_of(pixel, np.int64(0)), scratch.rows, 0
-    _no_starts(scratch.small[HEIGHTS])
+    no_starts(scratch.small[HEIGHTS])
     first, sd = work.shape[1] - SCANNED, math.sqrt(histogram.variance)
     highest = min(_SCAN_END / sd, 1.0 / (LEAST_STEP if cells else MIN_STEP))
     end, frequency = first, 1.0 / (histogram.n_bins + 1.0)
@@ -369,10 +369,25 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
 
 
 @kernel(inline=True)
-def _no_starts(heights: NDArray[np.float64]) -> None:
+def no_starts(heights: NDArray[np.float64]) -> None:
     """Forget all starts."""
     for i in range(N_KEPT):
         heights[i] = -math.inf
+
+
+@kernel(borrows=True)
+def _keep_rescaled(
+    pixel: Pixel, evaluate: Any, cells: bool, best: NDArray[np.float64], factor: float, scratch: Scratch
+) -> int:
+    """Put a maximum among the starts with a longer step and the same means, bias and read noise in DN."""
+    n, trial = pixel.facts.shape[0], scratch.small[HERE]
+    copy(best, trial)
+    trial[n + STEP] *= factor
+    trial[n + LOG_VARIANCE] = max(trial[n + LOG_VARIANCE], min_log_variance(trial[n + STEP], cells))
+    for j in range(n):
+        trial[j] -= math.log(factor)
+    used: int = keep_start(pixel, evaluate, cells, scratch)
+    return used
 
 
 @kernel(borrows=True)
@@ -382,10 +397,14 @@ def alias_of_step(pixel: Pixel, evaluate: Any, best: NDArray[np.float64], scratc
     Returns:
         Evaluations.
     """
-    _no_starts(scratch.small[HEIGHTS])
-    a = 1.0 / (1.0 - 1.0 / best[1 + STEP])
+    no_starts(scratch.small[HEIGHTS])
+    n, cells = pixel.facts.shape[0], np.bool_(True)
+    a = 1.0 / (1.0 - 1.0 / best[n + STEP])
+    if n > 1:
+        rescaled: int = _keep_rescaled(pixel, evaluate, cells, best, a / best[n + STEP], scratch)
+        return rescaled
     lobe = ecf_at(histogram_of(pixel, np.int64(0)), 1.0 / a)
-    used: int = _keep_lobe(pixel, evaluate, np.bool_(True), a, lobe, scratch)
+    used: int = _keep_lobe(pixel, evaluate, cells, a, lobe, scratch)
     return used
 
 
@@ -400,7 +419,7 @@ def combs_of_step(pixel: Pixel, evaluate: Any, a: float, scratch: Scratch) -> in
         Evaluations.
     """
     histogram, trial, used = histogram_of(pixel, np.int64(0)), scratch.small[HERE], 0
-    _no_starts(scratch.small[HEIGHTS])
+    no_starts(scratch.small[HEIGHTS])
     trial[1 + STEP], trial[1 + SATELLITE] = a, 0.0
     for noise in _FEW_NOISES:
         middle = (histogram.variance - QUANTISATION_VARIANCE) / (a * a) - noise * noise
@@ -432,21 +451,22 @@ def _holds_one(histogram: Histogram, theta: NDArray[np.float64]) -> bool:
 
 @kernel(borrows=True)
 def longer_steps(
-    pixel: Pixel, evaluate: Any, cells: bool, best: NDArray[np.float64], least: float, scratch: Scratch
+    pixel: Pixel, evaluate: Any, poor: bool, best: NDArray[np.float64], least: float, scratch: Scratch
 ) -> int:
     """Put combs of longer steps than a maximum's among the starts; return the evaluations.
 
     Where H and read noise are low, the sample is one peak and some electrons apart, and the comb of half the
     step fits them with no sample at each second peak; none are needed where the peak of one electron is
-    there. Starts below ``least`` are left out.
+    there. Several samples that fit poorly may have such a comb at any exposure. Starts below ``least`` are
+    left out.
     """
+    cells = np.bool_(False)
     histogram, heights, used = histogram_of(pixel, np.int64(0)), scratch.small[HEIGHTS], 0
-    trial = scratch.small[HERE]
-    _no_starts(heights)
+    no_starts(heights)
     n = pixel.facts.shape[0]
     a = best[n + STEP]
     for j in range(n):
-        if not pixel.facts[j, VARIANCE] < _SPARSE * a * a:
+        if not (pixel.facts[j, VARIANCE] < _SPARSE * a * a or (n > 1 and poor)):
             return used
     if n == 1 and _holds_one(histogram, best):
         return used
@@ -454,14 +474,8 @@ def longer_steps(
         if n == 1 and multiple * a < histogram.n_bins:
             lobe = ecf_at(histogram, 1.0 / (multiple * a))
             used += _keep_lobe(pixel, evaluate, cells, multiple * a, lobe, scratch)
-        elif n > 1:  # the same means, bias and read noise
-            copy(best, trial)
-            trial[n + STEP] *= multiple
-            least_variance = min_log_variance(trial[n + STEP], cells)
-            trial[n + LOG_VARIANCE] = max(trial[n + LOG_VARIANCE], least_variance)
-            for j in range(n):
-                trial[j] -= math.log(multiple)
-            used += keep_start(pixel, evaluate, cells, scratch)
+        elif n > 1:
+            used += _keep_rescaled(pixel, evaluate, cells, best, multiple, scratch)
     for i in range(N_KEPT):
         if heights[i] < least:
             heights[i] = -math.inf
@@ -636,7 +650,7 @@ def fill_starts(
     """
     n_samples, any_clear, used = pixel.facts.shape[0], False, 0
     trial, heights = scratch.small[HERE], scratch.small[HEIGHTS]
-    _no_starts(heights)
+    no_starts(heights)
     if n_samples == 1:
         if attempt > 0:
             return False, scan_steps(pixel, evaluate, np.bool_(False), scratch)

@@ -81,7 +81,8 @@ def with_rivals_named(words: NDArray[np.int64], *, dark: bool, several: bool = F
         several: whether there are several.
     """
     ambiguous = (words & FitStatus.BIAS_AMBIGUOUS) != 0
-    named = words ^ AMBIGUOUS if dark else words | AMBIGUOUS if several else words
+    named = words | AMBIGUOUS if dark or several else words
+    named = named & ~int(FitStatus.BIAS_AMBIGUOUS) if dark else named
     return np.where(ambiguous, named, words)
 
 

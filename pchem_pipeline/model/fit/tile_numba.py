@@ -15,10 +15,14 @@ from pchem_pipeline.model.errors.information_numba import fill_squared_scores
 from pchem_pipeline.model.fit.climb_numba import Limits, min_log_variance
 from pchem_pipeline.model.fit.search_numba import (
     FIT_NOT_CONVERGED,
+    GAIN_AMBIGUOUS,
+    LOG_LIKELIHOOD,
     NO_DATA,
     TOO_FEW_BINS,
     Task,
     Tools,
+    ripple_by_chance,
+    surely_seen,
 )
 from pchem_pipeline.model.fit.starts_numba import start_regression
 from pchem_pipeline.model.law.cells_numba import Law, resolve
@@ -26,21 +30,29 @@ from pchem_pipeline.model.law.pixel_numba import (
     AT_BEST,
     BIAS,
     CENTRE,
+    DAMPING,
     DARK,
+    DERIVATIVES,
+    EXPECTED,
     FIRST,
     FIXED,
     HERE,
+    INFORMATION,
     LOG_VARIANCE,
     MEAN,
     N_BINS,
+    N_BLOCK,
     N_FRAMES,
     N_SHARED,
     OCCUPIED,
     SATELLITE,
+    SCORE,
     STEP,
     VARIANCE,
+    WEIGHT,
     Pixel,
     Scratch,
+    copy,
     histogram_of,
     load,
     make_pixel,
@@ -192,6 +204,28 @@ def _write(
     return regular
 
 
+@kernel(inline=True)
+def _expect_information(
+    pixel: Pixel, theta: FloatArray, limits: Limits, evaluate: Any, scratch: Scratch
+) -> None:
+    """Put the expected information in `AT_BEST`: the squared scores of the counts that are expected.
+
+    The observed information also holds what looks like peaks by chance, which makes it several times larger
+    where peaks are not resolved. Single samples have a flag for that.
+    """
+    at = scratch.evaluations[AT_BEST]
+    for j in range(pixel.facts.shape[0]):
+        copy(pixel.bins[j, EXPECTED], pixel.bins[j, WEIGHT])
+    if limits.cells:
+        evaluate(pixel, theta, DERIVATIVES, scratch, at)
+    else:
+        fill_squared_scores(pixel, theta, at)
+    for j in range(pixel.facts.shape[0]):
+        copy(at[j, SCORE] * 0.0, at[j, SCORE])
+        for row in range(N_BLOCK):
+            copy(at[j, DAMPING + row], at[j, INFORMATION + row])
+
+
 @kernel
 def make_room(given: Histograms, law: Law) -> Pixel:
     """Return room for the histograms of a pixel."""
@@ -279,6 +313,11 @@ def fit_tile(
         words[EVALUATIONS] += used
         if best[n + STEP] > 0.0:
             parameters, covariance = answers.parameters[index], answers.covariance[index]
+            if n > 1 and not surely_seen(pixel, best):
+                if ripple_by_chance(pixel, tools, best, out[LOG_LIKELIHOOD]):
+                    status |= GAIN_AMBIGUOUS
+                if not limits.sandwich:
+                    _expect_information(pixel, best, limits, evaluate, scratch)
             if not _write(pixel, best, limits, scratch, parameters, covariance):
                 status |= FIT_NOT_CONVERGED
         words[STATUS] = status

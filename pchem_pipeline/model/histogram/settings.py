@@ -24,7 +24,7 @@ class HistogramSettings(Section):
         description="frames read at a time; the first of them set the number of bins",
     )
     max_bins: int = Field(
-        default=16384,
+        default=65536,
         ge=32,
         le=65536,
         multiple_of=16,
