@@ -20,6 +20,7 @@ from pchem_pipeline.model.fit.search_numba import (
     LOG_LIKELIHOOD,
     NEAR_TWO,
     SATELLITE_WEIGHT,
+    SURELY_SEEN,
     SUSPICIOUS,
     Found,
     Task,
@@ -32,12 +33,12 @@ from pchem_pipeline.model.fit.search_numba import (
     from_start,
     judge,
     loglik_without_gain,
+    nats_of_peaks,
     next_start,
     plus,
     rival_moves_gain,
     score_of,
     settled,
-    surely_seen,
 )
 from pchem_pipeline.model.fit.starts_numba import (
     add_line_starts,
@@ -366,7 +367,7 @@ def search_cells(
     of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.loglik - bias_gap)
     of_gain = of_gain or (n == 1 and limits.scan and _flat_at_two(pixel, tools, best, found.loglik))
     # of several samples, combs that the limits leave open are not looked for
-    unsure = not surely_seen(pixel, best) or best[n + STEP] < FEW_STEP
+    unsure = nats_of_peaks(pixel, best) < SURELY_SEEN or best[n + STEP] < FEW_STEP
     if n == 1:
         unsure = bias_gap < limits.gap
     of_gain = of_gain or (at_limits and unsure)

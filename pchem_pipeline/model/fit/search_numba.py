@@ -82,7 +82,8 @@ _MOST_MOVES, _MOST_STEPS = 40, 16.0
 _LEAST_BRIGHT = 3.0  # e-: a dimmer brightest sample does not tell neighbouring gains apart
 _BLURRED2, _LEAST_SKEWNESS = 0.64, 0.02  # e-^2: read noise without peaks; a skewness of H = 2500 e-
 _SAME_GAIN, _SAME_RIVAL = 0.03, 0.1  # relative; nats
-_SURELY_SEEN = 40.0  # nats: where so much is expected of the peaks alone, they are no chance
+SURELY_SEEN = 40.0  # nats: where so much is expected of the peaks alone, they are no chance ...
+_UNSEEN = 0.1  # ... and where so little, no error rests on them
 _LOCKED_NOISE = 0.15  # DN: below it each electron number has one code, and many combs have these codes
 _FEWEST_CODES = 7.0  # of which the four parameters leave two free shares
 _COARSE_NOISE = 0.6  # DN: below it, or below so many DN per electron, rounding is more than additive noise
@@ -169,14 +170,14 @@ def goal_beside(first: bool, loglik: float, runner_up: float) -> Goal:
 
 
 @kernel(inline=True)
-def surely_seen(pixel: Pixel, best: FloatArray) -> bool:
-    """Tell whether peaks of contrast ``2 r``, ``r = exp(-2 pi^2 s_e^2)``, bring so many nats, ``N r^2``."""
+def nats_of_peaks(pixel: Pixel, best: FloatArray) -> float:
+    """Return the nats that peaks of contrast ``2 r``, ``r = exp(-2 pi^2 s_e^2)``, bring: ``N r^2``."""
     n, frames = pixel.facts.shape[0], 0.0
     for j in range(n):
         if pixel.facts[j, DARK] == 0.0:
             frames += pixel.facts[j, N_FRAMES]
     noise2 = math.exp(best[n + LOG_VARIANCE]) / best[n + STEP] ** 2
-    return bool(frames * math.exp(-4.0 * math.pi**2 * noise2) > _SURELY_SEEN)
+    return frames * math.exp(-4.0 * math.pi**2 * noise2)
 
 
 @kernel(inline=True)
@@ -589,7 +590,7 @@ def ripple_by_chance(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
     """
     n, trial = pixel.facts.shape[0], tools.scratch.small[HERE]
     more = _BLURRED2 - math.exp(best[n + LOG_VARIANCE]) / best[n + STEP] ** 2
-    if more < 0.0:
+    if more < 0.0 or nats_of_peaks(pixel, best) < _UNSEEN:
         return False
     copy(best, trial)
     for j in range(n):
@@ -606,7 +607,7 @@ def ripple_by_chance(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
 @kernel(inline=True)
 def above_blurred(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -> float:
     """Return the nats that a maximum is above the likelihood without peaks; infinite where that is sure."""
-    if pixel.facts.shape[0] > 1 or surely_seen(pixel, best):
+    if pixel.facts.shape[0] > 1 or nats_of_peaks(pixel, best) > SURELY_SEEN:
         return math.inf
     above: float = loglik - loglik_without_ripple(pixel, tools.evaluate, tools.limits.cells, tools.scratch)
     return above

@@ -18,11 +18,12 @@ from pchem_pipeline.model.fit.search_numba import (
     GAIN_AMBIGUOUS,
     LOG_LIKELIHOOD,
     NO_DATA,
+    SURELY_SEEN,
     TOO_FEW_BINS,
     Task,
     Tools,
+    nats_of_peaks,
     ripple_by_chance,
-    surely_seen,
 )
 from pchem_pipeline.model.fit.starts_numba import start_regression
 from pchem_pipeline.model.law.cells_numba import Law, resolve
@@ -313,7 +314,7 @@ def fit_tile(
         words[EVALUATIONS] += used
         if best[n + STEP] > 0.0:
             parameters, covariance = answers.parameters[index], answers.covariance[index]
-            if n > 1 and not surely_seen(pixel, best):
+            if n > 1 and nats_of_peaks(pixel, best) < SURELY_SEEN:
                 if ripple_by_chance(pixel, tools, best, out[LOG_LIKELIHOOD]):
                     status |= GAIN_AMBIGUOUS
                 if not limits.sandwich:
