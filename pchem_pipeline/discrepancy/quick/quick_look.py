@@ -34,12 +34,7 @@ from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
-from pchem_pipeline.model.histogram.odd_frames import (
-    FAR_CHANCE,
-    chance_of_copies,
-    frame_words,
-    odd_words,
-)
+from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, chance_of_copies, frame_words, odd_words
 from pchem_pipeline.model.histogram.spectrum import SEEN_MIDWAY
 from pchem_pipeline.model.maps.ordered import median_of
 
@@ -139,9 +134,9 @@ def _wave(sums: StackSums, others: Sequence[Check]) -> list[Check]:
     sure = (math.sqrt(2.0 * math.log(cells)) + 3.0) / math.sqrt(frames)
     p = look_elsewhere(float(special.gammaincc(frames, frames * line["ratio"])), cells)
     limit = line["unit"] * math.sqrt(sure / SEEN_MIDWAY)
-    # what pixels share more in a part of the sensor has all frequencies
+    # what pixels share more in a part of the sensor has all frequencies; runs of earlier versions lack p
     shared = any(check.p < SIGNIFICANCE for check in others if check.name in _SHARED)
-    in_lines = 1.0 if shared else look_elsewhere(line["line_p"], line["line_looks"])
+    in_lines = 1.0 if shared else look_elsewhere(line.get("line_p", 1.0), line.get("line_looks", 1.0))
     of, how = "", "; pchem discrepancy finds its frequency"
     if in_lines < p and p > SIGNIFICANCE:  # lines show a wave across the frame, too
         of, how = "line_", ""

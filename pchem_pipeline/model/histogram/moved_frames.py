@@ -8,16 +8,16 @@ is ``sum d^2``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.histogram.odd_frames import FAR, FEWEST_FRAMES
+from pchem_pipeline.model.histogram.spectrum import MOST_SAMPLES
 
-_FloatArray = NDArray[np.float32]
+_FloatArray = NDArray[np.floating[Any]]
 
 #: Standard deviations beyond which a difference or a deviation of a single pixel does not count any more.
 _CLIP = 3.0
@@ -26,72 +26,56 @@ _STEPS, _KINDS = ((0, 1), (0, -1), (1, 0), (-1, 0)), ("moved_x", "moved_y")
 
 
 class MovedFrames:
-    """Compares the frames that come in with the pattern of the first of them."""
+    """Compares the frames that come in with the pattern of the first of them.
+
+    Attributes:
+        found: numbers of the frames that look moved, by kind.
+    """
 
     def __init__(self, found: Mapping[str, Sequence[int]] | None = None, n_frames: int = 0) -> None:
         """Begin with no frames, or behind so many of which some were found."""
-        self._pattern: _Pattern | None = None
-        self._n = n_frames
+        self._n, self._known = n_frames, False
         self.found = {kind: list((found or {}).get(kind, ())) for kind in _KINDS}
 
-    def learn(self, mean: NDArray[np.float64], sd: NDArray[np.float64], n_frames: int) -> None:
+    def learn(self, mean: _FloatArray, sd: _FloatArray, n_frames: int) -> None:
         """Take mean and standard deviation of each pixel over some frames, (y, x), DN, as the pattern."""
         if n_frames < FEWEST_FRAMES:
             return
-        weight = np.divide(1.0, sd, where=sd > 0, out=np.zeros(sd.shape))
+        (ny, nx), weight = mean.shape, np.divide(1.0, sd, where=sd > 0, out=np.zeros(sd.shape))
         shown = np.pad(mean, 1, constant_values=np.nan)
-        ny, nx = mean.shape
         neighbours = np.stack([shown[1 - dy :, 1 - dx :][:ny, :nx] for dy, dx in _STEPS], axis=-1)
         scaled = ((neighbours - mean[..., None]) * weight[..., None]).reshape(-1, len(_STEPS))
         clipped = np.nan_to_num(np.clip(scaled, -_CLIP, _CLIP))
         # what an offset of the frame, other light (as the variances are) or another gain do is no movement
         modes = np.stack([weight, sd, mean * weight], axis=-1).reshape(-1, 3)
         differences = clipped - modes @ np.linalg.lstsq(modes, clipped, rcond=None)[0]
-        self._pattern = _Pattern(
-            mean.ravel().astype(np.float32),
-            weight.ravel().astype(np.float32),
-            differences.astype(np.float32),
-            (differences**2).sum(axis=0),
-            np.count_nonzero(clipped, axis=0) / n_frames,
+        self._squares = (differences**2).sum(axis=0)
+        self._bias = np.count_nonzero(clipped, axis=0) / n_frames  # the error of the mean is in u and in d
+        self._mean, self._weight, self._differences = (
+            each.astype(np.float32) for each in (mean.ravel(), weight.ravel(), differences)
         )
+        self._known = True
 
     def add(self, frames: NDArray[np.unsignedinteger[Any]]) -> None:
         """Compare the next frames, (frame, y, x), of the same rows each."""
-        if self._pattern is None:
-            self.learn(frames.mean(axis=0), frames.std(axis=0), len(frames))
-        if self._pattern is not None:
-            for t, kind in self._pattern.moved(frames.reshape(len(frames), -1)):
-                self.found[kind].append(self._n + t)
-        self._n += len(frames)
+        step = max(FEWEST_FRAMES, MOST_SAMPLES // max(frames[0].size, 1))
+        for part in (frames[t : t + step] for t in range(0, len(frames), step)):
+            if not self._known:
+                mean, sd = part.mean(axis=0, dtype=np.float32), part.std(axis=0, dtype=np.float32)
+                self.learn(mean, sd, len(part))
+            if self._known:
+                self._compare(part.reshape(len(part), -1))
+            self._n += len(part)
 
-
-@dataclass(frozen=True)
-class _Pattern:
-    """The pattern of the sensor.
-
-    Attributes:
-        mean: of each pixel, DN, (p,).
-        weight: one over its standard deviation along time, 1/DN; 0 of a pixel that never changes.
-        differences: ``d`` of each pixel and step, (p, step).
-        squares: their sums of squares, (step,).
-        bias: by which ``sum(u d)`` is too large, as the error of the mean is in both, (step,).
-    """
-
-    mean: _FloatArray
-    weight: _FloatArray
-    differences: _FloatArray
-    squares: NDArray[np.float64]
-    bias: NDArray[np.float64]
-
-    def moved(self, frames: NDArray[np.unsignedinteger[Any]]) -> Iterator[tuple[int, str]]:
-        """Yield the number and kind of each frame, (frame, p), that fits better if it has moved."""
+    def _compare(self, frames: NDArray[np.unsignedinteger[Any]]) -> None:
+        """Add the frames, (frame, pixel), that fit better if they have moved."""
         u = frames.astype(np.float32)
-        u -= self.mean
-        u *= self.weight
+        u -= self._mean
+        u *= self._weight
         np.clip(u, -_CLIP, _CLIP, out=u)
-        products = u @ self.differences - self.bias
-        noise = np.maximum(np.einsum("tp,tp->t", u, u) / max(np.count_nonzero(self.weight), 1), 1.0)
-        better = products - 0.5 * self.squares
-        certain = products > FAR * np.sqrt(noise[:, None] * self.squares)
-        for t in np.flatnonzero((certain & (better > 0)).any(axis=1)).tolist():
-            yield t, _KINDS[int(np.where(certain[t], better[t], 0.0).argmax()) // 2]
+        products = u @ self._differences - self._bias
+        noise = np.maximum(np.einsum("tp,tp->t", u, u) / max(np.count_nonzero(self._weight), 1), 1.0)
+        better = products - 0.5 * self._squares
+        better[products <= FAR * np.sqrt(noise[:, None] * self._squares)] = 0.0
+        for t in np.flatnonzero((better > 0).any(axis=1)).tolist():
+            self.found[_KINDS[int(better[t].argmax()) // 2]].append(self._n + t)
