@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.histogram.odd_frames import FAR, FEWEST_FRAMES
 from pchem_pipeline.model.histogram.spectrum import MOST_SAMPLES
 
-_FloatArray = NDArray[np.floating[Any]]
+_FloatArray = NDArray[np.float64]
 
 #: Standard deviations beyond which a difference or a deviation of a single pixel does not count any more.
 _CLIP = 3.0
@@ -61,8 +61,7 @@ class MovedFrames:
         step = max(FEWEST_FRAMES, MOST_SAMPLES // max(frames[0].size, 1))
         for part in (frames[t : t + step] for t in range(0, len(frames), step)):
             if not self._known:
-                mean, sd = part.mean(axis=0, dtype=np.float32), part.std(axis=0, dtype=np.float32)
-                self.learn(mean, sd, len(part))
+                self.learn(part.mean(axis=0), part.std(axis=0), len(part))
             if self._known:
                 self._compare(part.reshape(len(part), -1))
             self._n += len(part)
