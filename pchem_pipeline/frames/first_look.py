@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.settings import InputSettings
 
 _FRAMES, _PLACES, _ROWS, _SAMPLES = 48, 4, 16, 100_000  # that are looked at
-_FEWEST, _FEWEST_CODES, _FEWEST_STEPS = 8, 8, 500
+_FEWEST, _FEWEST_STEPS = 8, 500
 _FEWEST_AT_LIMIT, _LARGEST_SPAN = 20, 1 << 20  # samples; codes
 _CLEARLY = 4.0  # times the common variance of the one is that of the other
 _ERRORS = 3.0
@@ -97,7 +97,7 @@ def _check_byte_order(values: NDArray[Any], where: str, order: str | None) -> No
 
 def _unused_bits(values: NDArray[Any]) -> int:
     """Return how many of the lowest bits no sample uses; 0 where there are too few codes to tell."""
-    if np.unique(values).size < _FEWEST_CODES:
+    if np.unique(values).size < _FEWEST:
         return 0
     used = int(np.bitwise_or.reduce(values, axis=None))
     return (used & -used).bit_length() - 1
@@ -111,13 +111,13 @@ def limits_seen(first: int, samples: NDArray[Any], pixels: tuple[int, int]) -> t
         samples: how many there are of each code from the lowest to the highest.
         pixels: how many have samples of the lowest, and of the highest code.
     """
-    last, few = first + samples.size - 1, _FEWEST_CODES + 1
+    last, few = first + samples.size - 1, _FEWEST + 1
     found: list[int | None] = []
     for code, n, (at, *beside) in (
         (first, pixels[0], samples[:few].tolist()),
         (last, pixels[1], samples[::-1][:few].tolist()),
     ):
-        several = n >= _FEWEST and len(beside) == _FEWEST_CODES and min(beside) > 0
+        several = n >= _FEWEST and len(beside) == _FEWEST and min(beside) > 0
         found.append(code if several and at > _CLEARLY * max(beside) + _FEWEST_AT_LIMIT else None)
     return found[0], found[1]
 

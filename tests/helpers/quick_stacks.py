@@ -11,7 +11,8 @@ from pchem_pipeline.discrepancy.quick.codes import CodeSample
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.histogram.count import histogram_frames
-from pchem_pipeline.model.histogram.odd_frames import left_out, odd_frames
+from pchem_pipeline.model.histogram.moved_frames import MovedFrames
+from pchem_pipeline.model.histogram.odd_frames import frame_scores, left_out, odd_frames
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,
@@ -47,7 +48,11 @@ def sums_of(frames: Array, block: int = 256) -> StackSums:
     mean, variance = frame_statistics(lines.row_sum, lines.row_sum_square, frames.shape[2])
     _, digest = np.unique(frames.reshape(len(frames), -1), axis=0, return_inverse=True)
     level = np.median(lines.row_sum - np.median(lines.row_sum, axis=0), axis=1) / frames.shape[2]
-    odd = odd_frames(level, variance, digest.ravel(), frames[0].size)
+    scores = frame_scores(lines.row_sum, lines.row_sum_square, frames.shape[2])
+    moved = MovedFrames()
+    for part in np.array_split(frames[:, :ROW_GROUP], -(-len(frames) // 256)):
+        moved.add(part)
+    odd = odd_frames(level, variance, digest.ravel(), frames[0].size, scores=scores, moved=moved.found)
     numbers = np.setdiff1d(np.arange(len(frames)), left_out(odd, len(frames)))
     frames = frames[numbers]
     n, ny, nx = frames.shape

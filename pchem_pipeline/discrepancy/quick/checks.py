@@ -77,8 +77,9 @@ _WORDS: dict[str, tuple[str, str, str]] = {
                "input.frame_range) and fit them jointly (pchem joint)"),
     "odd_frames": ("1", "outlying frames", "included in the fit; leave them out {}"),
     "empty_frames": ("1", "empty frames", "left out"),
-    "repeated_frames": ("1", "repeated frames",
-                        "standard errors are too small, since fewer frames are independent"),
+    "repeated_frames": ("1", "repeated frames", "left out, as exact copies of earlier frames; check the "
+                        "camera's link"),
+    "moved_frames": ("1", "moved frames", "included in the fit; leave them out {}"),
     "frame_noise": ("DN", "frame noise", f"{_IN_NOISE} frame"),
     "row_noise": ("DN", "row noise", f"{_IN_NOISE} row"),
     "column_noise": ("DN", "column noise", f"{_IN_NOISE} column"),
@@ -93,8 +94,7 @@ _WORDS: dict[str, tuple[str, str, str]] = {
                          "exposure and read noise are averages over these levels; check for a moved sensor, "
                          "a drift, or blinking pixels"),
     "local_drift": ("DN", "drift of a part of the sensor", "adds to the read noise there"),
-    "wave": ("DN", "pickup in readout order",
-             "adds to the read noise; pchem discrepancy finds its frequency"),
+    "wave": ("DN", "pickup or periodic noise", "adds to the read noise{}"),
     "codes": ("LSB", "unequal code widths (DNL)",
               "the histograms of all pixels deviate from the model at the same DN"),
     "top_code": ("1", "saturation",
@@ -215,6 +215,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "bottom_limit": (1e-4, 1.0),
     "odd_frames": (0.0, 0.01),
     "empty_frames": (0.01, 0.1),
+    "moved_frames": (0.0, 0.01),
 }
 
 

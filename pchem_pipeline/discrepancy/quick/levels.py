@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
-from pchem_pipeline.model.histogram.odd_frames import frame_words
+from pchem_pipeline.model.histogram.odd_frames import FEWEST_FRAMES, frame_words
 
 FloatArray = NDArray[np.float64]
 
-#: Of 16 frames, evenly spread, chance leaves such a gap in one of 400 runs; of 32 in none of 4,000.
-_FEWEST_FRAMES = 32
 #: Frames of a level, at least, and as a share of all.
 _FEWEST_OF_LEVEL, _LEAST_SHARE = 4, 0.01
 #: Gap between two levels, in standard deviations within them. The halves of a normal or a uniform
@@ -54,7 +52,7 @@ def _parted(
 ) -> tuple[list[NDArray[np.int64]], float]:
     """Return the frames of each level, and how probable the growth of the variance between any two is."""
     levels, p = [frames], 1.0
-    if frames.size < _FEWEST_FRAMES:
+    if frames.size < FEWEST_FRAMES:  # of 16, chance leaves such a gap in one of 400 runs
         return levels, p
     fewest = max(_FEWEST_OF_LEVEL, int(np.ceil(_LEAST_SHARE * frames.size)))
     while len(levels) < _MOST_LEVELS:

@@ -34,7 +34,7 @@ from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
-from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, frame_words, odd_words
+from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, chance_of_copies, frame_words, odd_words
 from pchem_pipeline.model.histogram.spectrum import SEEN_MIDWAY
 from pchem_pipeline.model.maps.ordered import median_of
 
@@ -48,8 +48,6 @@ _LOUD = 4.0
 #: Standard deviations beyond which single pixels and lines do not count any more: a few tracks of particles
 #: or blinking pixels are no property of the sensor.
 _CLIP = 5.0
-#: Squares of frame means beyond this multiple of their expectation count as that much.
-_LARGEST_SQUARE = 25.0
 #: Standard deviations from which on a check fails for sure (19 of 20), with a dozen checks.
 _SURE = 5.4
 _FEWEST_LINES = 4
@@ -79,7 +77,8 @@ def quick_look(
     gain, noise = (median_of(values, ~usable) for values in (maps.conversion_gain, maps.read_noise_dn))
     if sums is not None and sums.freedom > 0:
         checks.append(levels_check(sums.all_means, sums.all_variances, gain, sums.odd.get("empty", ())))
-        checks += [*_odd_frames(sums), *_stack_checks(sums, maps), *_wave(sums)]
+        stack = _stack_checks(sums, maps)
+        checks += [*_odd_frames(sums), *stack, *_wave(sums, stack)]
     if codes is not None:
         checks += code_checks(codes)
     samples = 0 if sums is None else sums.n_frames * int(np.prod(sums.shape))
@@ -101,39 +100,51 @@ _NEEDS = {
 
 
 def _odd_frames(sums: StackSums) -> list[Check]:
-    """Return whether frames are far from the others, empty or copies: all other checks are of the rest."""
-    n, odd, variance = sums.all_means.size, sums.odd, sums.rows.variance
+    """Return whether frames are far, moved, empty or copies: all other checks are of the rest."""
+    n, odd = sums.all_means.size, sums.odd
     if not odd:
         return []
-    # rows have the same sum by chance with the density of the difference at 0, in any pair of frames
-    alike = float(np.log(np.minimum(1.0, 0.5 / np.sqrt(np.pi * np.maximum(variance, 0.1)))).sum())
-    equal, far = math.exp(max(alike + 2.0 * math.log(n), -700.0)), odd["far"]
+    equal, far = chance_of_copies(sums.rows.variance, n), odd["far"]
     first = far.size > 0 and int(far[-1]) == far.size - 1
     how = f"with --frames {far.size}: (input.frame_range)" if first else "by input.frame_range"
-    return [
-        check_of(
-            name, min(p, 1.0) if frames.size else 1.0, frames.size / n, limit=1.0 / n, where=where, how=how
-        )
-        for name, frames, p, where in (
-            ("odd_frames", far, n * FAR_CHANCE, odd_words({"far": far}, sums.all_means)),
-            ("empty_frames", odd["empty"], n * FAR_CHANCE, frame_words(odd["empty"])),
-            ("repeated_frames", odd["copied"], equal, frame_words(odd["copied"])),
-        )
-    ]
+    checks = []
+    for name, kinds, p in (
+        ("odd_frames", ("far",), n * FAR_CHANCE),
+        ("empty_frames", ("empty",), n * FAR_CHANCE),
+        ("repeated_frames", ("copied",), equal),
+        ("moved_frames", ("moved_x", "moved_y"), n * FAR_CHANCE),
+    ):
+        some = {kind: odd[kind] for kind in kinds if kind in odd}
+        number = sum(frames.size for frames in some.values())
+        where = odd_words(some, sums.all_means, sums.all_variances)
+        if name in ("empty_frames", "repeated_frames"):  # the title says how they are odd
+            where = frame_words(odd[kinds[0]])
+        p = min(p, 1.0) if number else 1.0
+        checks.append(check_of(name, p, number / n, limit=1.0 / n, where=where, how=how))
+    return checks
 
 
-def _wave(sums: StackSums) -> list[Check]:
-    """Return whether one wave runs across the samples of the frames as they are read."""
+def _wave(sums: StackSums, others: Sequence[Check]) -> list[Check]:
+    """Return whether noise has a frequency within frames: a wave across the frame, or one in each line."""
     line = sums.spectrum
     if not line:
         return []
     frames, cells = line["frames"], line["cells"]
-    cycles = (f"{line[f'cycles_per_{of}']:+.3g} cycles per {of}" for of in ("column", "row"))
     # of so many means of exponential numbers the largest
     sure = (math.sqrt(2.0 * math.log(cells)) + 3.0) / math.sqrt(frames)
     p = look_elsewhere(float(special.gammaincc(frames, frames * line["ratio"])), cells)
-    limit, where = line["unit"] * math.sqrt(sure / SEEN_MIDWAY), ", ".join(cycles)
-    return [check_of("wave", p, line["size"], limit=limit, where=where)]
+    limit = line["unit"] * math.sqrt(sure / SEEN_MIDWAY)
+    # what pixels share more in a part of the sensor has all frequencies; runs of earlier versions lack p
+    shared = any(check.p < SIGNIFICANCE for check in others if check.name in _SHARED)
+    in_lines = 1.0 if shared else look_elsewhere(line.get("line_p", 1.0), line.get("line_looks", 1.0))
+    of, how = "", "; pchem discrepancy finds its frequency"
+    if in_lines < p and p > SIGNIFICANCE:  # lines show a wave across the frame, too
+        of, how = "line_", ""
+    axes = [name for name in ("column", "row") if f"{of}cycles_per_{name}" in line]
+    where = ", ".join(f"{line[f'{of}cycles_per_{name}']:+.3g} cycles per {name}" for name in axes)
+    where += f", new in each {'row' if axes == ['column'] else 'column'}" if of else ""
+    p = look_elsewhere(min(p, in_lines), 2.0)
+    return [check_of("wave", p, line[f"{of}size"], limit=limit, where=where, how=how)]
 
 
 @dataclass(frozen=True)
@@ -189,6 +200,7 @@ _MAP_OF = {
     "lag": "lag",
     "drift": "spread",
 }
+_SHARED = ("frame_noise", "row_noise", "column_noise")
 #: Checks of which a part of the sensor alone may fail.
 _LOCAL = ("neighbours_x", "neighbours_y", "lag")
 
@@ -293,7 +305,7 @@ def _frame_covariance(sums: StackSums) -> tuple[_Estimate, _Estimate]:
     scale = float(variance.sum())
     # a few frames with a track of a particle do not count in full
     typical = max(1.0, float(np.median(total**2)) / (0.455 * scale))
-    products = np.minimum(products, _LARGEST_SQUARE * typical * scale)
+    products = np.minimum(products, _CLIP**2 * typical * scale)
     freedom = sums.freedom
     value = float(products.sum()) / freedom
     chance = math.sqrt(2.0 / freedom * (scale**2 - float((variance**2).sum())))

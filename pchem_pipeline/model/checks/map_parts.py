@@ -1,9 +1,8 @@
-"""Parts of a sensor that differ: steps of a map along its columns or rows, and values with two modes."""
+"""Parts of a sensor that differ: steps of a map along its columns and rows, and values with two modes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from scipy.special import bdtr, stdtr
@@ -20,18 +19,19 @@ _PIXELS, _VALUES = 512, 1 << 18
 _SHARE = 0.05
 
 
+Box = tuple[int, int, int, int]
+
+
 @dataclass(frozen=True)
 class Parts:
     """Parts of a map that differ.
 
     Attributes:
-        axis: ``columns`` or ``rows`` for steps; ``modes`` for values with two modes.
-        edges: first line of each part and the end of the last; of modes the value that divides them.
-        medians: of each part, in the unit of the map.
+        boxes: first row, end, first column and end of each part; empty for values with two modes.
+        medians: of each part, or mode, in the unit of the map.
     """
 
-    axis: str
-    edges: tuple[float, ...]
+    boxes: tuple[Box, ...]
     medians: tuple[float, ...]
 
 
@@ -39,56 +39,78 @@ def map_parts(values: FloatArray) -> list[Parts]:
     """Find steps of a map along its columns and rows; without any, two modes of its values.
 
     A step is a jump of the medians of lines against a common slope, by at least the robust standard deviation
-    of the pixels within the parts: a smaller one hardly matters to a median over the sensor.
+    of the pixels within the parts: a smaller one hardly matters to a median over the sensor. The map is
+    divided at the most significant one, and each part likewise.
 
     Args:
         values: the map, NaN where it has no value, shape (ny, nx).
     """
-    found = []
-    for axis, across in (("columns", values), ("rows", values.T)):
-        edges = _steps(across)
-        if len(edges) > 2:
-            medians = (_median(across[:, a:b]) for a, b in pairwise(edges))
-            found.append(Parts(axis, tuple(edges), tuple(medians)))
-    return found or _two_modes(values)
+    # of each line, all of it and both halves are looked at
+    boxes = _divided(values, (0, values.shape[0], 0, values.shape[1]), _ALARM / (3.0 * sum(values.shape)))
+    boxes.sort()
+    if len(boxes) == 1:
+        return _two_modes(values)
+    medians = (_median(values[y0:y1, x0:x1]) for y0, y1, x0, x1 in boxes)
+    return [Parts(tuple(boxes), tuple(medians))]
+
+
+def _divided(values: FloatArray, box: Box, limit: float) -> list[Box]:
+    """Divide a part of the map at its steps, as long as these have a p-value of at most ``limit``."""
+    y0, y1, x0, x1 = box
+    part = values[y0:y1, x0:x1]
+    (p, x), (p_row, y) = _step(part), _step(part.T)
+    if min(p, p_row) > limit:
+        return [box]
+    halves = ((y0, y1, x0, x0 + x), (y0, y1, x0 + x, x1))
+    if p_row < p:
+        halves = ((y0, y0 + y, x0, x1), (y0 + y, y1, x0, x1))
+    return [each for half in halves for each in _divided(values, half, limit)]
 
 
 def _median(values: FloatArray) -> float:
     return float(np.median(values[np.isfinite(values)]))
 
 
-def _steps(values: FloatArray) -> list[int]:
-    """Return the first column of each part, and the end of the last."""
+def _step(values: FloatArray) -> tuple[float, int]:
+    """Return the p-value of the most significant step along the columns, and its place.
+
+    Lines are looked at as a whole and in halves: where steps cross, those of the halves may cancel.
+    """
+    middle = len(values) // 2
+    return min(_step_of(part) for part in (values, values[:middle], values[middle:]))
+
+
+def _step_of(values: FloatArray) -> tuple[float, int]:
+    if not len(values):
+        return 1.0, -1
     some = np.unique(np.linspace(0, len(values) - 1, min(len(values), _PIXELS)).astype(np.int64))
     chosen = values[some]
     full = np.isfinite(chosen).sum(axis=0) >= _FEWEST
     columns = np.flatnonzero(full)
     if columns.size < 2 * _FEWEST:
-        return []
+        return 1.0, -1
     lines = np.nanmedian(chosen[:, full], axis=0)
     spread = 1.4826 * float(np.nanmedian(np.abs(chosen[:, full] - lines)))
-    limit, edges = _ALARM / (4.0 * lines.size), [0, lines.size]
-    while True:
-        p, at = min((_best_step(lines[a:b], a, spread) for a, b in pairwise(edges)))
-        if p > limit:
-            return [0, *(int(columns[i]) for i in edges[1:-1]), values.shape[1]]
-        edges = sorted([*edges, at])
+    p, at = _best_step(lines, spread)
+    return p, int(columns[at])
 
 
-def _best_step(lines: FloatArray, first: int, spread: float) -> tuple[float, int]:
+def _best_step(lines: FloatArray, spread: float) -> tuple[float, int]:
     """Return the p-value of the most significant step that is larger than a spread, and its place."""
-    best = 1.0, -1
-    for at in range(_FEWEST, lines.size - _FEWEST + 1):
-        half = min(_MOST, at, lines.size - at)
+    best, places = (1.0, -1), np.arange(_FEWEST, lines.size - _FEWEST + 1)
+    halves = np.minimum(np.minimum(places, lines.size - places), _MOST)
+    for half in np.unique(halves).tolist():
         x = np.arange(2 * half) - (half - 0.5)
         design = np.stack([np.ones(2 * half), x, np.sign(x)], axis=1)
         inverse = np.linalg.inv(design.T @ design)
-        near = lines[at - half : at + half]
-        fitted = inverse @ design.T @ near
+        at = places[halves == half]
+        near = np.lib.stride_tricks.sliding_window_view(lines, 2 * half)[at - half]
+        fitted = near @ design @ inverse
         freedom = 2 * half - 3
-        error = np.sqrt(inverse[2, 2] * np.sum((near - design @ fitted) ** 2) / freedom)
-        if abs(2.0 * fitted[2]) > max(spread, 1e-12 * float(np.abs(near).max())):
-            best = min(best, (2.0 * float(stdtr(freedom, -abs(fitted[2]) / max(error, 1e-300))), first + at))
+        error = np.sqrt(inverse[2, 2] * ((near - fitted @ design.T) ** 2).sum(axis=1) / freedom)
+        p = 2.0 * stdtr(freedom, -np.abs(fitted[:, 2]) / np.maximum(error, 1e-300))
+        p[np.abs(2.0 * fitted[:, 2]) <= np.maximum(spread, 1e-12 * np.abs(near).max(axis=1))] = 1.0
+        best = min(best, (float(p.min()), int(at[p.argmin()])))
     return best
 
 
@@ -112,4 +134,4 @@ def _two_modes(values: FloatArray) -> list[Parts]:
     ]
     fewest = min(counts[0], counts[2])
     p = float(bdtr(counts[1], counts[1] + fewest, 0.5)) if fewest else 1.0
-    return [Parts("modes", (middle,), medians)] if n * p < _ALARM else []
+    return [Parts((), medians)] if n * p < _ALARM else []

@@ -1,20 +1,22 @@
 """The spectrum of the samples of a frame over rows and columns: what is picked up while they are read.
 
 Noise that runs on from sample to sample, with as much from row to row, is one wave across the frame, whatever
-the gap between rows. The samples of each pixel are standardised; without such noise the mean power over T
-frames is 1 at every frequency, with a standard deviation of 1/sqrt(T) (Fisher 1929).
+the gap between rows. Where each row, or column, has a phase of its own, the power averaged over the lines of
+a frame shows it. The samples of each pixel are standardised; without such noise the mean power over T frames
+is 1 at every frequency, with a standard deviation of 1/sqrt(T) (Fisher 1929).
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import fft, ndimage, special
 
 #: Samples that are looked at, of the first frames, and rows and columns that a spectrum needs.
-_MOST_SAMPLES, _FEWEST_LINES = 1 << 22, 8
+MOST_SAMPLES, _FEWEST_LINES = 1 << 22, 8
 #: Factor by which zeros lengthen either axis of a frame: the step between frequencies is so much smaller.
 _PADDED = 2
 #: Frequencies on either side, along rows or columns, whose median is the noise of the one in their middle.
@@ -30,25 +32,35 @@ class FrameSpectrum:
         """Begin with no frames of some rows and columns."""
         self._shape = _PADDED * shape[0], _PADDED * shape[1]
         self._power = np.zeros((max(self._shape[0] - 1, 0), self._shape[1] // 2))
-        self._left = _MOST_SAMPLES // max(shape[0] * shape[1], 1) if min(shape) >= _FEWEST_LINES else 0
+        self.most = MOST_SAMPLES // max(shape[0] * shape[1], 1) if min(shape) >= _FEWEST_LINES else 0
         self._n, self._pixels, self._sd = 0, 0, 0.0
+        self._lines = [np.zeros((2, length // 2)) for length in shape]
 
     def add(self, frames: NDArray[np.unsignedinteger[Any]]) -> None:
         """Add frames, (frame, y, x), until enough have come."""
-        frames = frames[: self._left]
+        frames = frames[: self.most - self._n]
         if len(frames) < 2:
             return
         u = frames.astype(np.float32)
         u -= u.mean(axis=0)
-        variance = np.mean(u * u, axis=0)
-        weight = np.divide(1.0, variance, where=variance > 0, out=np.zeros_like(variance))  # none is a frame
-        u -= (u * weight).sum(axis=(1, 2), keepdims=True) / max(float(weight.sum()), 1e-30)
         sd = np.sqrt(np.mean(u * u, axis=0))
-        u /= np.where(sd > 0, sd, 1.0)
+        weight = np.divide(1.0, sd, where=sd > 0, out=np.zeros_like(sd))  # none is a frame
+        u *= weight
+        # an offset of a frame, and other light, which moves pixels as their variances are, are no waves
+        q = np.linalg.qr(np.stack([weight, sd], axis=-1).reshape(-1, 2))[0]
+        flat = u.reshape(len(u), -1)
+        flat -= (flat @ q) @ q.T
+        rest = np.sqrt(np.mean(u * u, axis=0))
+        u /= np.where(rest > 0, rest, 1.0)
+        sd *= rest
         for frame in u:
             wave = fft.rfft2(frame, self._shape)[1:, 1:]
             self._power += wave.real**2 + wave.imag**2
-        self._left -= len(frames)
+        for axis, lines in enumerate(self._lines):
+            spectra = fft.rfft(u, axis=axis + 1).swapaxes(1, axis + 1)[:, 1:]
+            power = sum(np.einsum("tkl,tkl->tk", part, part) for part in (spectra.real, spectra.imag))
+            power /= max(np.count_nonzero(sd), 1)
+            lines += power.sum(axis=0), (power**2).sum(axis=0)
         self._n += len(frames)
         self._pixels, self._sd = int(np.count_nonzero(sd)), float(np.median(sd))
 
@@ -83,4 +95,33 @@ class FrameSpectrum:
             "unit": unit,
             "cycles_per_row": ((y + 1) / rows + 0.5) % 1.0 - 0.5,
             "cycles_per_column": (x + 1) / columns,
+            **self._of_lines(),
         }
+
+    def _of_lines(self) -> dict[str, float]:
+        """Return the frequency along rows, or columns, that stands out most if each line has its own phase.
+
+        A mean over frames is compared with its standard error (Student's test). Noise that all pixels of the
+        other lines share raises all frequencies alike, and a correlation of neighbours with the cosine of a
+        frequency: neither is looked for here.
+        """
+        looks = float(sum(lines.shape[1] for lines in self._lines))
+        best = {"line_p": math.inf}
+        for name, length, lines in zip(("row", "column"), self._shape, self._lines, strict=True):
+            length //= _PADDED
+            mean = lines[0] / self._n
+            error = np.sqrt(np.maximum(lines[1] / self._n - mean**2, 1e-300) / (self._n - 1.0))
+            cycles = np.arange(1, mean.size + 1) / length
+            smooth = np.stack([np.ones(mean.size), np.cos(2.0 * np.pi * cycles)], axis=1) / error[:, None]
+            q = np.linalg.qr(smooth)[0]
+            scaled = mean / error
+            rest = scaled - q @ (q.T @ scaled)
+            z = rest / np.sqrt(np.maximum(1.0 - (q**2).sum(axis=1), 1e-6))
+            at = int(z.argmax())
+            p = float(special.stdtr(self._n - 1.0, -z[at]))
+            if p < best["line_p"]:
+                near = np.maximum((rest * error)[max(at - 1, 0) : at + 2], 0.0)
+                real = 1.0 if 2 * (at + 1) == length else 2.0
+                size = self._sd * (real * float(near.sum()) / length) ** 0.5
+                best = {"line_p": p, "line_size": size, f"line_cycles_per_{name}": float(cycles[at])}
+        return {**best, "line_looks": looks}

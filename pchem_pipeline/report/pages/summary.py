@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -291,14 +290,19 @@ def _parts(data: ReportData) -> Iterator[Flag]:
 def _parts_sentence(name: str, parts: Parts) -> str:
     _, words, unit = symbol(name)
     medians = [f"{short(median, 4)} {unit}" for median in parts.medians]
-    if parts.axis == "modes":
+    if not parts.boxes:
         return (
             f"{words.capitalize()} has two modes, {medians[0]} and {medians[1]}: "
             "the median over the sensor describes neither."
         )
-    ends = zip(pairwise(parts.edges), medians, strict=True)
-    places = ", ".join(f"{parts.axis} {a:g} to {b - 1:g}: {median}" for (a, b), median in ends)
-    return f"{words.capitalize()} has a step ({places}): the median over the sensor describes no part."
+    lines = [{box[at : at + 2] for box in parts.boxes} for at in (0, 2)]
+    places = []
+    for box, median in zip(parts.boxes, medians, strict=True):
+        ends = zip(("rows", "columns"), (box[:2], box[2:]), lines, strict=True)
+        place = " and ".join(f"{name} {a} to {b - 1}" for name, (a, b), all_of in ends if len(all_of) > 1)
+        places.append(f"{place}: {median}")
+    listed = ", ".join(places)
+    return f"{words.capitalize()} has a step ({listed}): the median over the sensor describes no part."
 
 
 def _agreement(data: ReportData) -> Iterator[Flag]:

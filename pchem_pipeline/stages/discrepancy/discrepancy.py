@@ -202,7 +202,7 @@ def _surveyed(
         tell("scanning all pixels and frames")
         seen = _survey(context, source, settings)
         if seen.left_out:
-            context.note(f"excluded, empty or outlying: {frame_words(np.array(seen.left_out))}")
+            context.note(f"excluded, empty, outlying or moved: {frame_words(np.array(seen.left_out))}")
         most, few = settings, fewer_samples(source, settings, roi, seen) if not before else settings
         if few != settings:
             context.note(

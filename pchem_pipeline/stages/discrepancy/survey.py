@@ -78,7 +78,7 @@ class Survey:
     Attributes:
         places: the most significant place of each map (next_x, score.C2, pairs.row.readout) that has one.
         shares: of the run's samples, by what was looked at; what is absent was not.
-        left_out: frames that are empty or far from the others: nothing is said of them.
+        left_out: frames that are empty, far from the others or moved: nothing is said of them.
     """
 
     places: Mapping[str, Suspect] = field(default_factory=dict)

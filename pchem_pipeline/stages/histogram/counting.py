@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms
+from pchem_pipeline.model.histogram.moved_frames import MovedFrames
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,
@@ -170,9 +171,12 @@ class _BandCounter:
         self._histograms = HistogramAccumulator(shape, job.bins, job.shape[0])
         self._summaries: SummaryAccumulator | None = None
         self._spectrum: FrameSpectrum | None = None
+        self._moved: MovedFrames | None = None
         if self._settings.summaries:
             self._summaries = SummaryAccumulator(shape, self._settings.block_length(job.shape[0]))
-            self._spectrum = FrameSpectrum((min(shape[0], ROW_GROUP), shape[1])) if y0 == 0 else None
+            if y0 == 0:
+                self._spectrum = FrameSpectrum((min(shape[0], ROW_GROUP), shape[1]))
+                self._moved = MovedFrames()
 
     def resume(self, n_frames: int) -> None:
         """Go on behind the frames that the run has counted, see `StackCounter.resume`."""
@@ -186,6 +190,15 @@ class _BandCounter:
         length = self._settings.block_length(n_frames)
         self._summaries = SummaryAccumulator.resumed(state, n_frames, length)
         blocks = n_frames // length
+        if self._rows.start == 0:
+            known = opened.attributes("summary")
+            self._moved = MovedFrames(known.get("moved_frames"), n_frames)
+            kept = length - sum(t < length for t in known.get("left_out", []))
+            if blocks and kept > 0:
+                part = (0, slice(min(self._shape[1], ROW_GROUP)), slice(None))
+                total, square = (opened.read(f"summary/block_sum{of}", part) for of in ("", "_square"))
+                mean = total / kept
+                self._moved.learn(mean, np.sqrt(np.maximum(square / kept - mean**2, 0.0)), kept)
         self._done = {name: blocks if name.startswith("block") else n_frames for name in _ALONG_TIME}
 
     def add(self, frames: NDArray[Any]) -> None:
@@ -202,6 +215,8 @@ class _BandCounter:
                 self._along(name).add(part)
         if self._spectrum is not None:
             self._spectrum.add(frames[:, :ROW_GROUP])
+        if self._moved is not None:
+            self._moved.add(frames[:, :ROW_GROUP])
 
     def finish(self) -> None:
         """Write all that was not written on the way."""
@@ -224,6 +239,8 @@ class _BandCounter:
                 opened.write(f"histogram/{name}", (self._rows, slice(x, x + step)), values[:, x : x + step])
         if self._spectrum is not None:
             opened.set_attributes("summary", {"spectrum": self._spectrum.line()})
+        if self._moved is not None:
+            opened.set_attributes("summary", {"moved_frames": self._moved.found})
 
     def _add_sums(self, sums: BlockSums) -> None:
         for name, part in vars(sums).items():

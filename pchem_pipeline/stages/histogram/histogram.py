@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ import numpy as np
 from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.count import RowHistograms, choose_bins, most_bins, pixels_by_range
-from pchem_pipeline.model.histogram.odd_frames import odd_frames
+from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, chance_of_copies, frame_scores, odd_frames
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, frame_statistics
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
@@ -150,22 +151,33 @@ def _write_frame_statistics(context: StageContext, shape: tuple[int, int, int]) 
     n_frames, ny, nx = shape
     mean, variance, level = np.empty((3, n_frames))
     weights = np.random.default_rng(1).integers(1 << 62, size=(2, ny))
-    digest, usual = np.empty(n_frames, np.int64), None
-    step = row_frames(ny)
-    for t in range(0, n_frames, step):
-        part = slice(t, min(t + step, n_frames))
+    digest, usual, scores, chance = np.empty(n_frames, np.int64), None, [], 1.0
+    # parts of about the same length: a frame is ranked among those of its part
+    ends = np.linspace(0, n_frames, -(-n_frames // row_frames(ny)) + 1).astype(int).tolist()
+    for part in (slice(*each) for each in pairwise(ends)):
         sums, squares = (
             context.store.read(f"summary/{name}", (part, slice(None)))
             for name in ("row_sum", "row_sum_square")
         )
         mean[part], variance[part] = frame_statistics(sums, squares, nx)
-        usual = np.median(sums, axis=0) if usual is None else usual
+        if usual is None:
+            usual, chance = np.median(sums, axis=0), chance_of_copies(sums.var(axis=0), n_frames)
         # of most rows: the track of a particle moves the mean, too
         level[part] = np.median(sums - usual, axis=1) / nx
         digest[part] = sums @ weights[0] + squares @ weights[1]
+        scores.append(frame_scores(sums, squares, nx))
     context.store.write_array("summary/frame_mean", mean)
     context.store.write_array("summary/frame_variance", variance)
-    leave_out_odd_frames(context, odd_frames(level, variance, digest, ny * nx), mean)
+    odd = odd_frames(
+        level,
+        variance,
+        digest,
+        ny * nx,
+        scores=np.concatenate(scores, axis=1),
+        copies=chance < n_frames * FAR_CHANCE,
+        moved=context.store.attributes("summary").get("moved_frames", {}),
+    )
+    leave_out_odd_frames(context, odd, mean, variance)
 
 
 # -- ready-made histograms ----------------------------------------------------------------------

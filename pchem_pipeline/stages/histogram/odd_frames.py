@@ -1,16 +1,19 @@
-"""Odd frames are left out of the sums over frames, and empty ones of the histograms, once all are counted.
+"""Odd frames are left out of the sums over frames, empty ones and copies of the histograms, too.
 
-A link that drops frames says nothing of the pixels.
+All frames are counted before. A link that drops or repeats frames says nothing of the pixels.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pchem_pipeline.frames.stream import FrameStream
+from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.odd_frames import KINDS, FloatArray, IntArray, left_out, odd_words
+from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, SummaryAccumulator
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.stages.histogram.arrays import COVARIANCES, MAPS, with_block_length
@@ -19,6 +22,7 @@ from pchem_pipeline.store.tiles import equal_rows
 if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.store.run_store import RunStore
+    from pchem_pipeline.store.tiles import Tile
 
 _AT_ONCE = 32  # frames
 
@@ -31,41 +35,49 @@ def odd_frames_of(store: RunStore) -> tuple[dict[str, IntArray], IntArray]:
     return kinds, np.array(known.get("left_out", []), np.int64)
 
 
-def leave_out_odd_frames(context: StageContext, odd: dict[str, IntArray], mean: FloatArray) -> None:
+def leave_out_odd_frames(
+    context: StageContext, odd: dict[str, IntArray], mean: FloatArray, variance: FloatArray
+) -> None:
     """Leave odd frames out; the result is the same where that was done in part before.
 
     Args:
         context: of the stage, whose bands are all done.
         odd: frames by kind.
         mean: of each frame over its pixels, DN, (frame,).
+        variance: likewise, DN^2.
 
     Raises:
         InputError: frames cannot be read again.
         StoreError: the store refuses.
     """
     out, (_, before) = left_out(odd, mean.size), odd_frames_of(context.store)
-    if odd["empty"].size:
-        _leave_out_of_histograms(context, odd["empty"], mean)
-        context.note(f"{odd_words({'empty': odd['empty']}, mean)}: not counted")
+    useless = {kind: odd[kind] for kind in ("empty", "copied")}
+    gone = np.union1d(*useless.values())
+    if gone.size:
+        _leave_out_of_histograms(context, gone)
+        context.note(f"{odd_words(useless, mean, variance)}: not counted")
     changed = np.union1d(out, before)
     if changed.size:
         _leave_out_of_sums(context, changed, out)
+        _leave_out_of_spectrum(context, out)
     numbers = {kind: frames.tolist() for kind, frames in odd.items()}
     context.store.set_attributes("summary", {"odd_frames": numbers, "left_out": out.tolist()})
 
 
-def _leave_out_of_histograms(context: StageContext, frames: IntArray, mean: FloatArray) -> None:
-    """Take samples of empty frames out of all histograms, those that are there still: the newest."""
-    store, names = context.store, [f"histogram/{name}" for name in ("counts", *MAPS)]
+def _leave_out_of_histograms(context: StageContext, frames: IntArray) -> None:
+    """Take samples of frames out of all histograms, those that are there still: the newest."""
+    store, source = context.store, open_source(context)
+    names = [f"histogram/{name}" for name in ("counts", *MAPS)]
+    newer = dict(zip(frames.tolist(), range(frames.size)[::-1], strict=True))
     for tile in context.tiles():
         held = [store.read(name, tile.region) for name in names]
         counts, origin, under, over, low, high = (values.astype(np.int64) for values in held)
         last = origin + counts.shape[2] - 1
         there = counts.sum(axis=2) + under + over - (context.sensor.n_frames - frames.size)
-        for number, dn in enumerate(mean[frames[::-1]].astype(np.int64)):
-            some = there > number
+        for t, dn in _samples(source, tile, newer):
+            some = there > newer[t]
             inside = some & (dn >= origin) & (dn <= last)
-            counts[inside, dn - origin[inside]] -= 1
+            counts[inside, (dn - origin)[inside]] -= 1
             under -= some & (dn < origin)
             over -= some & (dn > last)
         filled = counts > 0
@@ -73,6 +85,27 @@ def _leave_out_of_histograms(context: StageContext, frames: IntArray, mean: Floa
         high = np.where(over == 0, last - filled[:, :, ::-1].argmax(axis=2), high)
         for name, old, new in zip(names, held, (counts, origin, under, over, low, high), strict=True):
             store.write(name, tile.region, new.astype(old.dtype))
+
+
+def _samples(source: FrameSource, tile: Tile, frames: Iterable[int]) -> Iterator[tuple[int, IntArray]]:
+    """Yield the samples of a tile, (y, x), of each of some frames, which are read by blocks."""
+    for block, some in groupby(frames, lambda t: t // _AT_ONCE):
+        t0, t1 = block * _AT_ONCE, min((block + 1) * _AT_ONCE, source.shape[0])
+        held = np.empty((t1 - t0, tile.y1 - tile.y0, source.shape[2]), source.dtype)
+        source.read_into(held, t0, t1, tile.y0, tile.y1)
+        for t in some:
+            yield t, held[t - t0, :, tile.x0 : tile.x1].astype(np.int64)
+
+
+def _leave_out_of_spectrum(context: StageContext, out: IntArray) -> None:
+    """Compute the spectrum of the first frames without those that are left out."""
+    source, rows = open_source(context), (0, min(context.sensor.shape[0], ROW_GROUP))
+    spectrum = FrameSpectrum((rows[1], source.shape[2]))
+    frames, step = (0, min(spectrum.most, source.shape[0])), context.config.histogram.window_frames
+    with FrameStream(source, [rows], step, frames=frames) as stream:
+        for start, (part,) in stream:
+            spectrum.add(part[~np.isin(np.arange(start, start + len(part)), out)])
+    context.store.set_attributes("summary", {"spectrum": spectrum.line()})
 
 
 def _leave_out_of_sums(context: StageContext, changed: IntArray, out: IntArray) -> None:

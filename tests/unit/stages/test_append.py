@@ -106,6 +106,22 @@ def test_odd_frames_among_old_and_new_ones_are_in_no_sum(tmp_path, frames):
         assert (counts == 697).all()
 
 
+def test_moved_frames_are_found_among_old_and_new_ones(tmp_path, frames):
+    moved = frames.copy()
+    moved[[30, 290, 500, 699]] = np.roll(moved[[30, 290, 500, 699]], 1, axis=2)
+    write(tmp_path, moved[:301], [])
+    run = target(tmp_path, "run.zarr")
+    run_stages(run, ["ingest", "histogram"], QUIET)
+    np.save(tmp_path / "f1.npy", moved[301:])
+    append_frames(run, QUIET)
+    assert RunStore.open(tmp_path / "run.zarr").attributes("summary")["odd_frames"]["moved_x"] == [
+        30,
+        290,
+        500,
+        699,
+    ]
+
+
 def test_old_frames_are_not_read(tmp_path, frames, monkeypatch):
     from pchem_pipeline.frames import sequence
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar, Literal
@@ -23,6 +24,7 @@ from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.spectrum import SEEN_MIDWAY, FrameSpectrum
@@ -77,7 +79,7 @@ def clean() -> QuickLook:
 def test_a_clean_stack_passes_all_checks(clean: QuickLook) -> None:
     assert clean.found == ()
     assert {check.level for check in clean.checks} == {"good"}
-    assert len(clean.checks) == 19
+    assert len(clean.checks) == 20
     assert clean.samples == np.prod(SHAPE)
 
 
@@ -318,6 +320,94 @@ def test_repeated_and_single_frames_are_told_by_their_numbers() -> None:
     assert re.fullmatch(r"frame 77 is (2|3|4)(\.\d)? DN above the others", found["odd_frames"].where)
     assert {check.name for check in found.values() if check.found} == {"repeated_frames", "odd_frames"}
     assert found["odd_frames"].level == "caution"
+
+
+@pytest.mark.parametrize("shape", [(400, 32, 32), (700, 64, 24), (300, 48, 70)])
+@pytest.mark.parametrize("gain", [0.05, 0.125])
+@pytest.mark.parametrize("kind", ["half lost", "half dark", "noisy", "shifted", "shifted down"])
+def test_frames_that_differ_are_told_by_their_numbers_and_nothing_else(
+    shape: tuple[int, int, int], gain: float, kind: str
+) -> None:
+    """Rows that a link has lost, samples of fourfold read noise, pixels that are one column or row away."""
+    rng = np.random.default_rng(hash_of(kind, *shape))
+    noise = READ_NOISE * np.ones((shape[0], 1, 1))
+    # four frames that are half dark may be of another exposure
+    odd = np.sort(rng.choice(shape[0], 3 if kind == "half dark" else 6, replace=False))
+    noise[odd] *= 4.0 if kind == "noisy" else 1.0
+    bias = 200.0 + 0.6 / gain * rng.standard_normal(shape[1:])
+    electrons = rng.poisson(EXPOSURE, shape) + noise * rng.standard_normal(shape)
+    dark = bias + READ_NOISE / gain * rng.standard_normal(shape)
+    frames = electrons / gain + bias
+    lower = np.s_[odd, shape[1] // 2 :]
+    if kind.startswith("half"):
+        frames[lower] = 0.0 if kind == "half lost" else dark[lower]
+    if kind.startswith("shifted"):
+        frames[odd] = np.roll(frames[odd], 1, axis=1 if kind == "shifted down" else 2)
+    look = quick_look(sums_of(np.rint(frames).astype(np.uint16)), maps_of(shape[1:]))
+    (check,) = look.found
+    assert check.size == pytest.approx(odd.size / shape[0])
+    says, name = {
+        "half lost": ("DN below the others", "odd_frames"),
+        "half dark": ("DN below the others", "odd_frames"),
+        "noisy": ("DN rms more noise than the others", "odd_frames"),
+        "shifted": ("look moved by one column", "moved_frames"),
+        "shifted down": ("look moved by one row", "moved_frames"),
+    }[kind]
+    assert check.name == name
+    assert says in check.where
+    assert all(f" {t}" in check.where for t in odd[:2])
+
+
+def hash_of(*values: Any) -> int:
+    return zlib.crc32(repr(values).encode())
+
+
+def test_frames_look_moved_only_where_the_pattern_tells() -> None:
+    rng = np.random.default_rng(23)
+    frames = rng.normal(200.0, 10.0, (300, 32, 32)) + 0.3 * rng.standard_normal((32, 32))
+    frames[::40] = np.roll(frames[::40], 1, axis=1)
+    look = quick_look(sums_of(np.rint(frames).astype(np.uint16)), maps_of((32, 32)))
+    assert look.found == ()
+
+
+def test_every_second_frame_a_copy_is_told_and_nothing_else() -> None:
+    for seed, shape in enumerate([(800, 32, 32), (400, 16, 24)]):
+        frames = stack(np.random.default_rng(seed), shape)
+        frames[1::2] = frames[::2]
+        (check,) = looked(frames).found
+        assert (check.name, check.size) == ("repeated_frames", 0.5)
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize(("shape", "gain"), [((600, 32, 32), 0.125), ((400, 64, 40), 0.05)])
+def test_noise_with_a_phase_of_its_own_in_each_line_is_found(
+    axis: int, shape: tuple[int, int, int], gain: float
+) -> None:
+    """Signs + + - - along a row: no covariance of neighbours, and none of the same column of other rows."""
+    rng = np.random.default_rng(19)
+    phase = rng.integers(0, 4, [n if i != axis else 1 for i, n in enumerate(shape)])
+    place = np.arange(shape[axis]).reshape([-1 if i == axis else 1 for i in range(3)])
+    size = 0.4 * READ_NOISE / gain
+    electrons = rng.poisson(EXPOSURE, shape) + READ_NOISE * rng.standard_normal(shape)
+    frames = 200.0 + electrons / gain + size * np.array([1.0, 1.0, -1.0, -1.0])[(place + phase) % 4]
+    (check,) = quick_look(sums_of(np.rint(frames).astype(np.uint16)), maps_of(shape[1:])).found
+    assert check.name == "wave"
+    assert check.size == pytest.approx(size, rel=0.1)
+    along, line = ("column", "row") if axis == 2 else ("row", "column")
+    assert check.where == f"+0.25 cycles per {along}, new in each {line}"
+
+
+def test_chance_alarms_as_often_as_stated() -> None:
+    """Of 120 stacks of several sizes none has odd or moved frames, and p of noise in lines is uniform."""
+    rng, p = np.random.default_rng(29), []
+    shapes = [(200, 16, 24), (150, 32, 32), (120, 64, 16), (300, 17, 40)]
+    for number in range(120):
+        exposure, read_noise = float(np.exp(rng.uniform(-4.0, 3.0))), float(rng.uniform(0.15, 0.8))
+        sums = sums_of(stack(rng, shapes[number % 4], exposure=exposure, read_noise=read_noise))
+        assert not any(frames.size for frames in sums.odd.values()), number
+        p.append(look_elsewhere(sums.spectrum["line_p"], sums.spectrum["line_looks"]))
+    for level in (0.05, 0.3):
+        assert np.mean(np.array(p) < level) < level + 4.0 * np.sqrt(level * (1.0 - level) / len(p))
 
 
 @pytest.mark.parametrize("size", [0.05, 0.15])

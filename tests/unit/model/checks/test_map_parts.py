@@ -16,24 +16,37 @@ def test_two_taps_are_found_along_columns_and_rows() -> None:
     values = taps(np.random.default_rng(1))
     values[::7, 3] = np.nan
     (found,) = map_parts(values)
-    assert (found.axis, found.edges) == ("columns", (0, 32, 64))
+    assert found.boxes == ((0, 48, 0, 32), (0, 48, 32, 64))
     assert found.medians == pytest.approx((0.100, 0.115), rel=4 * 1.25 * 0.02 / np.sqrt(48 * 32))
     (turned,) = map_parts(values.T)
-    assert (turned.axis, turned.edges, turned.medians) == ("rows", found.edges, found.medians)
+    assert turned.boxes == ((0, 32, 0, 48), (32, 64, 0, 48))
+    assert turned.medians == found.medians
 
 
 def test_three_parts_on_a_slope() -> None:
     rng, x = np.random.default_rng(2), np.arange(90)
     level = 100.0 + 0.05 * x + 12.0 * ((x >= 20) & (x < 60))
     (found,) = map_parts(level + rng.standard_normal((40, 90)))
-    assert found.edges == (0, 20, 60, 90)
+    assert found.boxes == ((0, 40, 0, 20), (0, 40, 20, 60), (0, 40, 60, 90))
+
+
+@pytest.mark.parametrize(
+    "gains", [[[1.0, 1.1], [1.15, 0.92]], [[1.0, 1.1], [1.1, 1.0]], [[1.0, 1.1, 1.2], [0.8, 0.9, 1.3]]]
+)
+def test_parts_that_differ_along_rows_and_columns(gains: list[list[float]]) -> None:
+    """Also where the steps of both halves cancel in the medians of whole lines."""
+    ny, nx = 24 * len(gains), 30 * len(gains[0])
+    level = np.kron(gains, np.ones((24, 30)))
+    (found,) = map_parts(level * (1 + 0.02 * np.random.default_rng(5).standard_normal((ny, nx))))
+    assert found.boxes == tuple((y, y + 24, x, x + 30) for y in range(0, ny, 24) for x in range(0, nx, 30))
+    assert found.medians == pytest.approx(np.ravel(gains), abs=5 * 1.25 * 0.026 / np.sqrt(24 * 30))
 
 
 def test_alternating_columns_are_two_modes() -> None:
     rng = np.random.default_rng(3)
     values = np.where(np.arange(64) % 2, 0.115, 0.100) * (1 + 0.02 * rng.standard_normal((48, 64)))
     (found,) = map_parts(values)
-    assert found.axis == "modes"
+    assert found.boxes == ()
     assert found.medians == pytest.approx((0.100, 0.115), rel=0.005)
 
 

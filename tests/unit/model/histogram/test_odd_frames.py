@@ -31,13 +31,16 @@ def test_odd_frames_are_found_and_chance_makes_none():
         "empty": list(range(700, 850)),
         "copied": [300],
         "far": [0, 1, 2, 3, 4, 600],
+        "moved_x": [],
+        "moved_y": [],
     }
-    assert odd_words(found, level) == (
+    assert odd_words(found, level, variance) == (
         "frames 700 to 849 are empty; frame 300 is equal to an earlier frame; "
         "frames 0 to 4 are 30 DN above the others; frame 600 is 60 DN below the others"
     )
     assert left_out(found, N).size == 157
-    assert left_out({**found, "copied": np.arange(100, 200)}, N).size == 156  # a property of the camera
+    assert left_out({**found, "copied": np.arange(100, 200)}, N).size == 256
+    assert left_out({**found, "moved_x": np.arange(100, 200)}, N).size == 157  # the sensor has moved
 
 
 def test_what_many_frames_do_or_a_drift_or_few_pixels_is_not_odd():

@@ -293,6 +293,31 @@ def test_odd_frames_are_in_no_sums_and_empty_ones_in_no_histogram(tmp_path, fram
     assert any("frames 130 to 132 are empty" in note for note in context.notes)
 
 
+def test_copies_are_in_no_histogram_and_odd_frames_in_no_spectrum(tmp_path, frames):
+    doubled = np.repeat(frames[:100], 2, axis=0)
+    doubled[40:44, NY // 2 :] = 0
+    single = np.delete(doubled[::2], [20, 21], 0)
+    found, expected = (
+        make_context(tmp_path / str(len(each)), each, tile=32, window_frames=256)
+        for each in (doubled, single)
+    )
+    for context in (found, expected):
+        assert execute("histogram", context).state == "complete"
+    odd = found.store.attributes("summary")["odd_frames"]
+    assert (odd["copied"], odd["far"]) == (list(range(1, 200, 2)), [40, 42])
+    one, other = (context.store.attributes("summary")["spectrum"] for context in (found, expected))
+    assert one == pytest.approx(other, rel=1e-4)
+    counted = sum(found.store.read(f"histogram/{name}") for name in ("under", "over"))
+    assert (found.store.read("histogram/counts").sum(axis=2) + counted == 100).all()
+    np.testing.assert_array_equal(found.store.read("histogram/maximum"), doubled[::2].max(axis=0))
+
+
+def test_frames_that_are_all_equal_are_no_copies(tmp_path):
+    context = make_context(tmp_path, np.full((64, 16, 16), 7, np.uint16))
+    assert execute("histogram", context).state == "complete"
+    assert (context.store.read("histogram/counts").sum(axis=2) == 64).all()
+
+
 def test_a_sensor_that_is_often_at_one_level_has_no_empty_frames(tmp_path):
     """Four quiet pixels: all at 100 DN in a third of the frames, as their histograms say."""
     frames = 100 + (np.random.default_rng(4).random((400, 2, 2)) < 0.25).astype(np.uint16)
