@@ -1,25 +1,25 @@
 """How two runs differ: value by value, and map by map in units of the standard errors.
 
 Whether a difference of two measurements is chance is judged by order statistics, which a few odd pixels do
-not move; all limits are five standard errors (false alarm 6e-7 each).
+not move, with limits of five standard errors (false alarm 6e-7 each), and pixel by pixel at a false-discovery
+rate over all maps.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erfc
 
+from pchem_pipeline.model.checks.multiple_testing import false_discovery
 from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.maps import summarise
 
 #: Standard errors beyond which a statistic of all pixels counts as changed.
 LIMIT = 5.0
-#: Standard errors beyond which a single pixel counts as changed.
-FAR = 5.0
-#: Share of pixels that may lie beyond: errors of fits have longer tails than the normal law.
-_TAIL = 1e-4
 #: By how much the standard errors of the fits themselves may be wrong.
 _TRUST = 0.1
 
@@ -91,8 +91,11 @@ class MapDifference:
         median_z: median of ``z`` over the pixels that count.
         spread_z: robust standard deviation of ``z`` over them; 1 where chance alone acts.
         n_counted: pixels that count: good fits in both.
-        n_far: pixels beyond ``FAR`` among them.
         largest_z: largest absolute value of ``z`` among them.
+        changed: those among them whose value changed, (ny, nx); see :func:`compare_maps`.
+        n_changed: their number.
+        p_value: probability that chance alone makes a map with a pixel like them, all maps and pixels that
+            were looked at allowed for.
     """
 
     difference: FloatArray
@@ -105,33 +108,67 @@ class MapDifference:
     median_z: float
     spread_z: float
     n_counted: int
-    n_far: int
     largest_z: float
+    changed: NDArray[np.bool_]
+    n_changed: int
+    p_value: float
+
+
+ValuesAndErrors = tuple[FloatArray, FloatArray]
 
 
 def compare_maps(
-    one: tuple[FloatArray, FloatArray],
-    other: tuple[FloatArray, FloatArray],
+    one: Mapping[str, ValuesAndErrors],
+    other: Mapping[str, ValuesAndErrors],
     good: NDArray[np.bool_],
     *,
     same_data: bool,
-) -> MapDifference:
-    """Compare a map of two runs.
+    rate: float = 0.01,
+) -> dict[str, MapDifference]:
+    """Compare the maps of two runs.
+
+    A pixel changed where its ``z`` is significant at a false-discovery rate (Benjamini and Hochberg 1995)
+    among all pixels of all maps together. Where nothing changed, a pixel is found with at most that
+    probability: standard errors a tenth too small, and the tails of fits, are allowed for.
 
     Args:
-        one: values and standard errors, each (ny, nx); NaN where there is no value.
-        other: the same of the other run.
+        one: values and standard errors, each (ny, nx), by the name of the map; NaN where there is no value.
+        other: the same of the other run, under the same names.
         good: pixels with a good fit in both, (ny, nx).
         same_data: both are fits of the same frames: the errors are then not independent, and the unit is the
             standard error of one fit, ``sqrt((s1^2 + s2^2) / 2)``; else it is ``sqrt(s1^2 + s2^2)``.
+        rate: share of the changed pixels that may be due to chance.
     """
-    difference = other[0] - one[0]
+    if not one:
+        return {}
+    scores = [_score(one[name], other[name], same_data=same_data) for name in one]
+    probability = erfc(np.abs(scores) / ((1.0 + _TRUST) * np.sqrt(2.0)))
+    q = false_discovery(np.where(good, probability, np.nan))
+    return {
+        name: _difference(one[name], other[name], z, good, each, rate)
+        for name, z, each in zip(one, scores, q, strict=True)
+    }
+
+
+def _score(one: ValuesAndErrors, other: ValuesAndErrors, *, same_data: bool) -> FloatArray:
     with np.errstate(invalid="ignore", divide="ignore"):
         unit = np.sqrt((one[1] ** 2 + other[1] ** 2) / (2.0 if same_data else 1.0))
-        z = np.where(unit > 0, difference / unit, np.nan)
+        return np.where(unit > 0, (other[0] - one[0]) / unit, np.nan)
+
+
+def _difference(
+    one: ValuesAndErrors,
+    other: ValuesAndErrors,
+    z: FloatArray,
+    good: NDArray[np.bool_],
+    q: FloatArray,
+    rate: float,
+) -> MapDifference:
+    difference = other[0] - one[0]
     known_one, known_other = np.isfinite(one[0]), np.isfinite(other[0])
     counted = z[good & np.isfinite(z)]
     whole, core = summarise(difference), summarise(counted)
+    changed = q <= rate
     return MapDifference(
         difference=difference,
         z=z,
@@ -143,8 +180,10 @@ def compare_maps(
         median_z=core.median,
         spread_z=core.robust_sd,
         n_counted=counted.size,
-        n_far=int((np.abs(counted) > FAR).sum()),
         largest_z=float(np.max(np.abs(counted), initial=0.0)),
+        changed=changed,
+        n_changed=int(changed.sum()),
+        p_value=float(np.min(q, initial=1.0, where=np.isfinite(q))),
     )
 
 
@@ -155,7 +194,7 @@ class Reasons:
     Attributes:
         shifted: the median of ``z`` is not 0.
         spread: ``z`` scatters more than its standard errors allow.
-        pixels: too many single pixels lie far off.
+        pixels: single pixels changed.
     """
 
     shifted: bool
@@ -172,8 +211,7 @@ def reasons_of_change(found: MapDifference) -> Reasons:
 
     Under the null ``z`` is N(0, 1): its median has standard error ``sqrt(pi / 2 n)``, its robust standard
     deviation ``1.166 / sqrt(n)`` (Maronna et al., *Robust Statistics*, 2019, Sec. 2.5), to which a tenth is
-    added since the standard errors are estimates; of n pixels, 1e-4 n and five standard deviations of the
-    count may lie beyond five standard errors.
+    added since the standard errors are estimates.
 
     Args:
         found: of two runs on different frames.
@@ -181,9 +219,8 @@ def reasons_of_change(found: MapDifference) -> Reasons:
     n = found.n_counted
     if n < 2:
         return Reasons(False, False, False)
-    allowed = _TAIL * n
     return Reasons(
         shifted=bool(abs(found.median_z) > LIMIT * np.sqrt(np.pi / (2.0 * n))),
         spread=bool(found.spread_z > 1.0 + _TRUST + LIMIT * 1.166 / np.sqrt(n)),
-        pixels=bool(found.n_far > allowed + LIMIT * np.sqrt(max(allowed, 1.0))),
+        pixels=found.n_changed > 0,
     )

@@ -20,6 +20,7 @@ from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import (
     count,
     measured,
+    p_value_text,
     percent,
     scientific,
     short,
@@ -309,7 +310,7 @@ def _agreement(data: ReportData) -> Iterator[Flag]:
             continue
         ratio = rmse[name] / rmse[floor]
         p = (data.ensemble_facts.get(f"{prefix}chi_square") or {}).get("p")
-        tested = "" if p is None else f" (chi-square: p {'< 0.001' if p < _POOR_P else f'= {short(p, 2)}'})"
+        tested = "" if p is None else f" (chi-square: {p_value_text(p)})"
         text = f"The RMSE of the predicted {words} ensemble is {short(ratio, 2)} times the sampling noise"
         text += tested
         if ratio <= _RMSE_GOOD or (p is not None and p >= _POOR_P):
