@@ -11,7 +11,7 @@ from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.config.load import setting_of, states
 from pchem_pipeline.run.declaration import Stage, imported
 from pchem_pipeline.run.model_versions import model_of_content, model_versions
-from pchem_pipeline.store.files import digest_of_file
+from pchem_pipeline.store.files import digest_of
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.run_store import DESCRIPTION
 
@@ -114,7 +114,7 @@ def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) 
 
 
 def changed_file(record: StageRecord, store: RunStore) -> str:
-    """Return a file of a stage's result that is missing or not as it was written; empty: none.
+    """Return a file or array of a stage's result that is missing or not as it was written; empty: none.
 
     Raises:
         StoreError: the description of a group is damaged.
@@ -123,7 +123,7 @@ def changed_file(record: StageRecord, store: RunStore) -> str:
         if not store.has(group):
             return f"{group}/{DESCRIPTION}"
     for name, digest in record.files.items():
-        if digest != digest_of_file(store.path / name):
+        if digest != digest_of(store.path / name):
             return name
     return ""
 
