@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
 
 _TILE = "run.tile"
+_NEWS = {f"input.{name}": f"new result of pchem {name}" for name in ("discrepancy", "methods")}
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,7 @@ def _input_changes(old: Any, new: Any, models: Mapping[Any, int]) -> list[str]:
     before, after = (models.get(facts.get("model"), "unknown") for facts in (old, new))
     words = [] if old.get("model") == new.get("model") else [f"model {before} -> {after}"]
     changes = _changes("input", {**old, "model": None}, {**new, "model": None})
-    return words + [f"{key} {was} -> {now}" for key, was, now in changes]
+    return words + [_NEWS.get(key, f"{key} {was} -> {now}") for key, was, now in changes]
 
 
 def _changes(key: str, old: Any, new: Any) -> list[tuple[str, Any, Any]]:
