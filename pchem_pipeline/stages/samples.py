@@ -72,7 +72,7 @@ def sample_targets(config: RunConfig, base_dir: Path) -> list[Target]:
         place = str(target.store.resolve())
         if place in seen:
             raise ConfigError(
-                f"input.samples: {sample.run} is the run {seen[place]} again; list each run once"
+                f"input.samples: {sample.run} is the run of {seen[place]} again; list each run once"
             )
         seen[place] = str(sample.run)
         targets.append(target)

@@ -101,8 +101,8 @@ def test_going_back_to_an_older_model_and_forth_gives_the_same_bits(searched, tm
     other = Shell(tmp_path / "copy", shell.environment)
     shutil.copytree(shell.folder, other.folder)
     status = [" ".join(line.split()) for line in other.ok("status", "run.yaml").stdout.splitlines()]
-    assert "fit complete model 2" in status
-    assert "discrepancy complete model 1" in status
+    assert "fit complete (with model 2)" in status
+    assert "discrepancy complete (searched from model 1)" in status
     listed = other.ok("model", "run.yaml").stdout.splitlines()
     assert listed[1].split() == ["1", "config", "discrepancy", "plain", "model"]
     assert listed[2].startswith("* 2 ")

@@ -267,7 +267,7 @@ def test_a_search_looks_at_all_samples_and_the_fit_takes_what_it_names(joint, ke
         (
             [("dark_1s.zarr", ""), ("dark_1s.yaml", "")],
             {},
-            "input.samples: dark_1s.yaml is the run dark_1s.zarr again",
+            "input.samples: dark_1s.yaml is the run of dark_1s.zarr again",
         ),
         (
             [("dark_2s.zarr", ""), ("dark_1s.zarr", "")],
