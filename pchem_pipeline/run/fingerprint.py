@@ -13,6 +13,7 @@ from pchem_pipeline.run.declaration import Stage, imported
 from pchem_pipeline.run.model_versions import model_of_content, model_versions
 from pchem_pipeline.store.files import digest_of
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
+from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import DESCRIPTION
 
 if TYPE_CHECKING:
@@ -123,7 +124,10 @@ def changed_file(record: StageRecord, store: RunStore) -> str:
     for group in sorted({name.partition("/")[0] for name in record.files if name.endswith(DESCRIPTION)}):
         if not store.has(group):
             return f"{group}/{DESCRIPTION}"
+    remote = isinstance(store.path, RemotePath)
     for name, digest in record.files.items():
+        if remote and "." not in name:
+            continue  # an array, of whose chunks each would be a request
         if digest != digest_of(store.path / name):
             return name
     return ""

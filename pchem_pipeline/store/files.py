@@ -240,7 +240,7 @@ def digest_of(path: Path) -> str | None:
     in a file their sizes and the checksum of these): chunks that are exchanged, cut or missing are found
     without reading them.
     """
-    if path.is_dir():
+    if not isinstance(path, RemotePath) and path.is_dir():
         chunks = sorted(each for each in (path / "c").rglob("*") if each.is_file())
         return hashlib.sha256(b"".join(_mark_of(each, path) for each in chunks)).hexdigest()
     try:
