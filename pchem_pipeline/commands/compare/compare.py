@@ -22,6 +22,7 @@ from pchem_pipeline.commands.compare.history import (
 from pchem_pipeline.commands.compare.settings import settings_that_differ, versions_that_differ
 from pchem_pipeline.commands.figures import warn_if_old
 from pchem_pipeline.model.checks.run_differences import compare_maps, reasons_of_change
+from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD, NO_VALUE
 from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, RunFacts
 from pchem_pipeline.report.pages.compare import (
@@ -190,12 +191,9 @@ def _pair(first: _Side, second: _Side, tolerance: float, rate: float, reporter: 
         grades = before.quality.ravel(), now.quality.ravel()
         transitions = np.histogram2d(*grades, bins=np.arange(4) - 0.5)[0].astype(int).tolist()
         good = (before.quality == GOOD) & (now.quality == GOOD)
-        names = [name for name in MAPS if one_store.has(f"maps/{name}") and other_store.has(f"maps/{name}")]
-        left, right = (
-            {name: (store.read(f"maps/{name}"), store.read(f"maps/{name}_stderr")) for name in names}
-            for store in (one_store, other_store)
-        )
-        maps = compare_maps(left, right, good, same_data=same_data, rate=rate)
+        in_both = (name for name in MAPS if one_store.has(f"maps/{name}") and other_store.has(f"maps/{name}"))
+        read = ((name, _value(one_store, name), _value(other_store, name)) for name in in_both)
+        maps = compare_maps(read, good, same_data=same_data, rate=rate)
     arrays = compare_arrays(one_store, other_store, tolerance, reporter) if same_data else []
     reasons = {} if same_data else {name: reasons_of_change(found) for name, found in maps.items()}
     words = _words(one, other, arrays, maps, reasons)
@@ -208,6 +206,11 @@ def _pair(first: _Side, second: _Side, tolerance: float, rate: float, reporter: 
         versions_that_differ(one_store, other_store),
         bool(words), words,
     )  # fmt: skip
+
+
+def _value(store: RunStore, name: str) -> tuple[FloatArray, FloatArray]:
+    """Return a map and its standard errors."""
+    return store.read(f"maps/{name}"), store.read(f"maps/{name}_stderr")
 
 
 def _words(

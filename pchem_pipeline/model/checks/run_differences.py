@@ -7,8 +7,9 @@ rate over all maps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,17 +110,16 @@ class MapDifference:
     spread_z: float
     n_counted: int
     largest_z: float
-    changed: NDArray[np.bool_]
-    n_changed: int
-    p_value: float
+    changed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), np.bool_))
+    n_changed: int = 0
+    p_value: float = 1.0
 
 
 ValuesAndErrors = tuple[FloatArray, FloatArray]
 
 
 def compare_maps(
-    one: Mapping[str, ValuesAndErrors],
-    other: Mapping[str, ValuesAndErrors],
+    maps: Iterable[tuple[str, ValuesAndErrors, ValuesAndErrors]],
     good: NDArray[np.bool_],
     *,
     same_data: bool,
@@ -132,43 +132,46 @@ def compare_maps(
     probability: standard errors a tenth too small, and the tails of fits, are allowed for.
 
     Args:
-        one: values and standard errors, each (ny, nx), by the name of the map; NaN where there is no value.
-        other: the same of the other run, under the same names.
+        maps: name of each, and its values and standard errors in either run, (ny, nx); NaN: no value.
         good: pixels with a good fit in both, (ny, nx).
         same_data: both are fits of the same frames: the errors are then not independent, and the unit is the
             standard error of one fit, ``sqrt((s1^2 + s2^2) / 2)``; else it is ``sqrt(s1^2 + s2^2)``.
         rate: share of the changed pixels that may be due to chance.
     """
-    if not one:
-        return {}
-    scores = [_score(one[name], other[name], same_data=same_data) for name in one]
-    probability = erfc(np.abs(scores) / ((1.0 + _TRUST) * np.sqrt(2.0)))
-    q = false_discovery(np.where(good, probability, np.nan))
+    found = {name: _difference(one, other, good, same_data=same_data) for name, one, other in maps}
+    tested = sum(each.n_counted for each in found.values())
+    places, likely = [], []
+    for each in found.values():
+        probability = np.where(good, erfc(np.abs(each.z) / ((1.0 + _TRUST) * np.sqrt(2.0))), np.nan)
+        places.append(np.nonzero(probability <= rate))  # the others are not significant in any company
+        likely.append(probability[places[-1]])
+    few = np.concatenate([*likely, np.empty(0)])
+    ends = np.cumsum([each.size for each in likely])
+    each_q = np.split(false_discovery(few * (tested / max(few.size, 1))), ends)
     return {
-        name: _difference(one[name], other[name], z, good, each, rate)
-        for name, z, each in zip(one, scores, q, strict=True)
+        name: _with_changed(each, place, q, rate)
+        for (name, each), place, q in zip(found.items(), places, each_q, strict=False)
     }
 
 
-def _score(one: ValuesAndErrors, other: ValuesAndErrors, *, same_data: bool) -> FloatArray:
-    with np.errstate(invalid="ignore", divide="ignore"):
-        unit = np.sqrt((one[1] ** 2 + other[1] ** 2) / (2.0 if same_data else 1.0))
-        return np.where(unit > 0, (other[0] - one[0]) / unit, np.nan)
+def _with_changed(found: MapDifference, place: Any, q: FloatArray, rate: float) -> MapDifference:
+    changed = np.zeros(found.z.shape, np.bool_)
+    changed[place] = q <= rate
+    return replace(
+        found, changed=changed, n_changed=int(changed.sum()), p_value=float(np.min(q, initial=1.0))
+    )
 
 
 def _difference(
-    one: ValuesAndErrors,
-    other: ValuesAndErrors,
-    z: FloatArray,
-    good: NDArray[np.bool_],
-    q: FloatArray,
-    rate: float,
+    one: ValuesAndErrors, other: ValuesAndErrors, good: NDArray[np.bool_], *, same_data: bool
 ) -> MapDifference:
     difference = other[0] - one[0]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unit = np.sqrt((one[1] ** 2 + other[1] ** 2) / (2.0 if same_data else 1.0))
+        z = np.where(unit > 0, difference / unit, np.nan)
     known_one, known_other = np.isfinite(one[0]), np.isfinite(other[0])
     counted = z[good & np.isfinite(z)]
     whole, core = summarise(difference), summarise(counted)
-    changed = q <= rate
     return MapDifference(
         difference=difference,
         z=z,
@@ -181,9 +184,6 @@ def _difference(
         spread_z=core.robust_sd,
         n_counted=counted.size,
         largest_z=float(np.max(np.abs(counted), initial=0.0)),
-        changed=changed,
-        n_changed=int(changed.sum()),
-        p_value=float(np.min(q, initial=1.0, where=np.isfinite(q))),
     )
 
 

@@ -56,7 +56,7 @@ def test_blocks_add_up() -> None:
 
 def compared(one: tuple, other: tuple, good: np.ndarray, *, same_data: bool) -> MapDifference:
     """The difference of one map."""
-    return compare_maps({"bias": one}, {"bias": other}, good, same_data=same_data)["bias"]
+    return compare_maps([("bias", one, other)], good, same_data=same_data)["bias"]
 
 
 def two_captures(seed: int, *, shift: float = 0.0, scatter: float = 1.0) -> tuple:
@@ -109,10 +109,10 @@ def test_ten_pixels_of_five_errors_are_a_change() -> None:
     one = {name: (rng.standard_normal((24, 24)), error) for name in "abcdef"}
     other = {name: (rng.standard_normal((24, 24)), error) for name in "abcdef"}
     good = np.ones((24, 24), bool)
-    same = compare_maps(one, other, good, same_data=False)
+    same = compare_maps([(name, one[name], other[name]) for name in one], good, same_data=False)
     assert not any(found.n_changed or reasons_of_change(found) for found in same.values())
     other["b"][0].flat[:160:16] += 6.0 * np.sqrt(2.0)
-    found = compare_maps(one, other, good, same_data=False)
+    found = compare_maps([(name, one[name], other[name]) for name in one], good, same_data=False)
     assert reasons_of_change(found["b"]).pixels
     assert 7 <= found["b"].n_changed <= 11
     assert not any(reasons_of_change(found[name]) for name in "acdef")

@@ -20,8 +20,8 @@ def difference(shape: tuple[int, int], size: float, *, same_data: bool = False):
     one, error = rng.normal(10, 1, shape), np.full(shape, 0.1)
     other = one + size * 0.1 * rng.standard_normal(shape)
     one[0, 0] = np.nan
-    maps = ({"bias": (values, error)} for values in (one, other))
-    return compare_maps(*maps, np.ones(shape, bool), same_data=same_data)["bias"]
+    maps = [("bias", (one, error), (other, error))]
+    return compare_maps(maps, np.ones(shape, bool), same_data=same_data)["bias"]
 
 
 def drawn(found: MapDifference, *, same_data: bool) -> Drawing:
