@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.progress import ProgressMode
 
 _BLOCK_BYTES = 64 << 20
+_WAYS_OUT = "omit these arguments to continue with the settings in the file, or give another store"
 
 
 def characterise(
@@ -148,7 +149,7 @@ def _target(place: Path, given: Mapping[str, Any], settings: Mapping[str, Mappin
     content["input"] = {**known, **content.get("input", {})}
     config = make_config(content, "characterise")
     if path.exists():
-        config = settings_there(path, content, "run")
+        config = settings_there(path, content, _WAYS_OUT)
     else:
         place.parent.mkdir(parents=True, exist_ok=True)
         write_config(path, dump_config(config))

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.commands.model import adopt_verdict
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, read_verdict
+from pchem_pipeline.report.pages.summary import KEY_MAPS
+from pchem_pipeline.report.style.wording import measured, symbol
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target
@@ -40,6 +42,7 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
     run_stages(target, [*counted, "discrepancy"], command)
     if command.options.dry_run:
         return ""
+    words, before = "", _medians(target)
     if add:
         target, words = adopt_verdict(target)
         if words:
@@ -52,7 +55,32 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
     found = read_verdict(target.store)
     if found is None:
         raise StoreError(f"{target.store / VERDICT_FILE} is missing; run pchem discrepancy again")
-    return f"{verdict_text(found)}\n\n{target.store / VERDICT_FILE}"
+    changed = _changed_medians(before, _medians(target)) if words else []
+    return "\n".join([verdict_text(found), *changed, "", str(target.store / VERDICT_FILE)])
+
+
+def _medians(target: Target) -> dict[str, tuple[float, float]]:
+    """Return median and standard error of the maps of a run; none where it has no maps."""
+    summary = target.stored().attributes("maps").get("summary", {})
+    found = {
+        name: (summary[name]["median"], summary[name]["median_stderr"])
+        for name in KEY_MAPS
+        if name in summary
+    }
+    return {name: pair for name, pair in found.items() if None not in pair}
+
+
+def _changed_medians(
+    before: dict[str, tuple[float, float]], after: dict[str, tuple[float, float]]
+) -> list[str]:
+    """Say what the medians were and are, a line each."""
+    both = [(symbol(name)[1:], before[name], after[name]) for name in before if name in after]
+    wide = max((len(words) for (words, _), *_ in both), default=0)
+    lines = [
+        f"  median {words:<{wide}}  {measured(*old)} → {measured(*new, unit)}"
+        for (words, unit), old, new in both
+    ]
+    return ["", "fitted with the new model:", *lines] if lines else []
 
 
 def _of_histograms(target: Target) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.commands.first_screen import run_to_first_screen
-from pchem_pipeline.commands.new_run import settings_of, settings_there
+from pchem_pipeline.commands.new_run import settings_of, settings_there, ways_out
 from pchem_pipeline.config.load import dump_config, make_config, write_config
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.runner.session import Command
@@ -60,7 +60,7 @@ def find_joint(
         find_run(each)
     is_new = write and not path.exists()
     if path.exists():
-        config = settings_there(path, content, "joint")
+        config = settings_there(path, content, ways_out("joint", path))
     if is_new:
         write_config(path, dump_config(config))
     return Target(config, path.parent, place, path), is_new

@@ -82,7 +82,7 @@ def list_models(target: Target) -> list[ListedModel]:
 
 def model_lines(models: Sequence[ListedModel]) -> list[str]:
     """Return a table of the versions of a model."""
-    rows = [("model", "source", "gap closed", "results", "effects")]
+    rows = [("model", "source", "explained", "results", "effects")]
     for each in models:
         version = each.version
         closed = "" if version.closed_fraction is None else f"{100 * version.closed_fraction:.1f} %"
@@ -101,7 +101,7 @@ def _words(version: ModelVersion) -> str:
     except ConfigError:
         return ", ".join(str(effect.get("tag")) for effect in version.model["effects"])
     aside = [f"without {len(version.settings.set_aside_e)} intervals"] if version.settings.set_aside_e else []
-    return " + ".join(["PCD", *map(_effect_words, effects), *aside])
+    return " + ".join(["plain model", *map(_effect_words, effects), *aside])
 
 
 def _effect_words(effect: Effect) -> str:

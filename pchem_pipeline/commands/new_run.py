@@ -101,7 +101,7 @@ def find_or_start(
     }
     config = make_config(stated, "the command line")
     if path.exists() and not _came_to_nothing(place, path):
-        config = settings_there(path, stated, "run")
+        config = settings_there(path, stated, ways_out("run", path))
     target = Target(config, path.parent, place, path)
     text = unwritten(target)
     if write and text is not None:
@@ -133,13 +133,13 @@ def settings_of(store: Path) -> Path:
     return Path(name).resolve() if isinstance(store, RemotePath) else store.with_name(name)
 
 
-def settings_there(path: Path, stated: Mapping[str, Any], command: str) -> RunConfig:
+def settings_there(path: Path, stated: Mapping[str, Any], ways: str) -> RunConfig:
     """Return the settings of a YAML file, which must agree with those that are stated; others are its own.
 
     Args:
         path: the YAML file.
         stated: sections with the settings that the command line or the caller states.
-        command: the command that takes the YAML.
+        ways: what to do where they disagree.
 
     Raises:
         ConfigError: the YAML is wrong, or says otherwise; in one line what differs, and the ways out.
@@ -154,9 +154,14 @@ def settings_there(path: Path, stated: Mapping[str, Any], command: str) -> RunCo
         for each in differ[:_SHOWN]
     ]
     more = [f"{len(differ) - _SHOWN} more"] if len(differ) > _SHOWN else []
-    raise ConfigError(
-        f"{path} exists with other settings ({'; '.join([*shown, *more])}); continue with these: pchem "
-        f"{command} {quoted(path)}; or edit the file, or start another run with --store NAME.zarr"
+    raise ConfigError(f"{path} exists with other settings ({'; '.join([*shown, *more])}); {ways}")
+
+
+def ways_out(command: str, path: Path) -> str:
+    """Say what to do where a command line contradicts the YAML of its run."""
+    return (
+        f"continue with these: pchem {command} {quoted(path)}; or edit the file, or start another run with "
+        "--store NAME.zarr"
     )
 
 

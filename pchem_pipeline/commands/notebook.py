@@ -170,7 +170,7 @@ class Run:
             )
         for record in filter(None, map(self._store.records.known, STAGES)):
             for file in record.files:
-                if file.startswith(f"{name}/") and not (self.path / file).exists():
+                if file.startswith(f"{name}/") and "." in file and not (self.path / file).exists():
                     raise StoreError(f"{self.path / file} is missing; {self._store.cure(name)}")
         found = lazy_dataset(self._store, name)
         for axis, length in zip(("y", "x"), self.shape, strict=True):

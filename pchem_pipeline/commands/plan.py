@@ -74,8 +74,8 @@ def make_plan(request: PlanRequest) -> str:
         ConfigError: a number is missing or wrong, or no number of frames reaches a target.
         StoreError: the run has no maps, or a file cannot be written.
     """
-    known = _median_pixel(request.run) if request.run is not None else {}
-    noise = known.get("read_noise_e") if request.read_noise_e is None else request.read_noise_e
+    known, effects = _median_pixel(request.run) if request.run is not None else ({}, "")
+    noise = known.get("noise_e") if request.read_noise_e is None else request.read_noise_e
     if noise is None:
         raise ConfigError("--read-noise is missing: give it in e-, quantisation included, or give a run")
     if not request.targets and request.frames is None:
@@ -93,6 +93,8 @@ def make_plan(request: PlanRequest) -> str:
         if request.samples is None
         else (_several(request, targets, point))
     )
+    if effects:
+        lines += ["", _effects_line(effects, known, noise)]
     if request.figure is not None:
         _draw(request.figure, targets or [Target("conversion_gain", 1.0, "%")], content, gain)
         lines += ["", str(request.figure)]
@@ -102,9 +104,16 @@ def make_plan(request: PlanRequest) -> str:
     return "\n".join(lines)
 
 
-def _median_pixel(run: Path) -> dict[str, float]:
-    """Return the medians of a run's maps."""
+def _median_pixel(run: Path) -> tuple[dict[str, float], str]:
+    """Return the medians of a run's maps, and the effects of its model.
+
+    ``noise_e`` is the noise of a sample at a given electron number: the read noise and what the effects add.
+    """
+    from pchem_pipeline.commands.apply.characterisation import read_calibration
+    from pchem_pipeline.effects.framework.compose import effect_words
+    from pchem_pipeline.run.model_versions import model_of
     from pchem_pipeline.run.target import find_run, with_maps
+    from pchem_pipeline.use.electrons import read_stderr
 
     store = with_maps(find_run(run).stored())
     summary = store.attributes("maps")["summary"]
@@ -114,7 +123,21 @@ def _median_pixel(run: Path) -> dict[str, float]:
         raise StoreError(
             f"{store.path}: every pixel is flagged or has no value; give --read-noise and --exposure"
         )
-    return {name: float(value) for name, value in found.items()}
+    found["noise_e"] = found["read_noise_e"]
+    version, effects = model_of(store, "fit"), ""
+    if version is not None and version.effects:
+        effects = ", ".join(map(effect_words, version.effects))
+        found["noise_e"] = max(np.nanmedian(read_stderr(read_calibration(store))), found["read_noise_e"])
+    return {name: float(value) for name, value in found.items()}, effects
+
+
+def _effects_line(effects: str, known: dict[str, float], noise: float) -> str:
+    """Say what of the effects of a run's model is in a plan, and which way the rest errs."""
+    if noise == known["noise_e"] > 1.01 * known["read_noise_e"]:
+        part = f"noise {noise:.3g} e- instead of {known['read_noise_e']:.3g} e-; what else they change"
+    else:
+        part = "what they change"
+    return f"effects in the model of the run ({effects}): {part} is left out, so more frames may be needed"
 
 
 def _one(
@@ -230,7 +253,7 @@ def _check_line(result: Verification) -> str:
     for check in result.checks:
         unit, scale = ("e-", 1.0) if check.target.name == "bias" else ("%", 100.0)
         parts.append(
-            f"{check.target.name} {scale * check.rmse:.3g} +- {scale * check.rmse_stderr:.1g} {unit}, "
+            f"{check.target.name} {scale * check.rmse:.3g} ± {scale * check.rmse_stderr:.1g} {unit}, "
             f"{'reached' if check.reached else 'not reached'}"
         )
     caution = f", {result.n_flagged} flagged" if result.n_flagged else ""

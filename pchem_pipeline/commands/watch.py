@@ -36,7 +36,7 @@ def rows(states: Sequence[StageState], progress: Mapping[str, Any] | None) -> li
         if progress is not None and state.stage == running:
             words = pace_words(progress)
         elif state.model is not None:
-            words += f"  model {state.model}"
+            words += f"  ({'searched from' if state.stage == 'discrepancy' else 'with'} model {state.model})"
         lines.append(f"{state.stage:<11} {words}")
     if progress is not None and running not in {state.stage for state in states}:
         lines.append(f"{'':<11} {pace_words({**progress, 'stage': f': {label}' if label else ''})}")

@@ -118,7 +118,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
     """
     data, present = by.prepared, by.model
     first, z, significance = data.first, data.z, data.settings.significance
-    tell("measuring the gap of the model")
+    tell("measuring how far model and data disagree")
     before = by.gap(first)
     places = locate(data.evidence, first, z.both, significance)
     null, limit = first, ""
@@ -129,7 +129,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
         except EffortSpentError as spent:
             limit = spent.words()
         still = disagrees(null, z, significance, by.tolerance())
-    tell("measuring the remaining gap")
+    tell("measuring the remaining disagreement")
     added = by.close(before, null, still)
     if not disagreed and before.at_floor and not any(each.named for each in added.additions):
         # data that agree with the model are not made doubtful by what they do not confirm

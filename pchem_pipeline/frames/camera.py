@@ -33,24 +33,36 @@ FACT_NAMES = (
     *(*_NAMES, *_SERIALS, *_TEMPERATURES, *_TIMES, *_DURATIONS, *_DEPTHS, *_DURATIONS_IN),
     *(name + suffix for name in (*_DURATIONS, *_TEMPERATURES) for suffix in _UNIT_SUFFIXES),
 )
-#: seconds -> words for the unit; those of three letters and more (and ms) also count within a sentence
+#: share by which two statements of one time may differ, printed with few digits
+_ROUNDING = 0.01
+#: seconds -> words for the unit; plurals, long ones and ms also count within a sentence
 _UNITS = {
     1.0: "s sec secs second seconds",
     1e-3: "ms msec msecs millisec millisecs millisecond milliseconds",
     1e-6: "us usec usecs microsec microsecs microsecond microseconds",
     1e-9: "ns nsec nsecs nanosec nanosecond nanoseconds",
     60.0: "min mins minute minutes",
+    3600.0: "h hr hrs hour hours",
+    1e3: "ks ksec ksecs kilosec kilosecond kiloseconds",
 }
 _SECONDS = {word: scale for scale, words in _UNITS.items() for word in words.split()}
 _IN_SENTENCES = "|".join(
-    word for word in _SECONDS if word == "ms" or (len(word) > 2 and word not in ("min", "second"))
+    word for word in _SECONDS if word == "ms" or (len(word) > 2 and word not in ("min", "second", "hour"))
 )
 #: where a comment states a unit: in brackets, after "in" (no article), at the end after a comma, or in full
 _STATED = re.compile(
     rf"[\[(]\s*([a-z]+)\.?\s*[\])]|\bin\s+(?:units\s+of\s+)?(?!an?\b|th)([a-z]+)|[,:/]\s*({'|'.join(_SECONDS)})\.?\s*$|\b({_IN_SENTENCES})\b",
     re.IGNORECASE,
 )
-_SCALED = re.compile(rf"\d\s*({'|'.join(_SECONDS)})\b|\b({'|'.join(_SECONDS)})\s*[/*x]\s*\d", re.IGNORECASE)
+_UNIT = rf"({'|'.join(_SECONDS)})\b"
+#: where it states a multiple of a unit, a fraction, a rate, or counts of a clock
+_SCALED = re.compile(
+    rf"\d\s*/?\s*{_UNIT}|\b{_UNIT}\s*[/*x]\s*\d|\bper\s+{_UNIT}|\b(ticks?|cycles?)\b"
+    rf"|(th|half|quarter)s?[\s-]+(of\s+)?(an?\s+)?{_UNIT}",
+    re.IGNORECASE,
+)
+_NAMED_SECONDS = re.compile(r"[a-z]+sec(?:ond)?s?\b", re.IGNORECASE)
+_CELSIUS = re.compile(r"(°|º|deg(rees?)?)?[ ._]*(c(el\w*|entigrade)?)?")
 _NUMBER_AND_UNIT = re.compile(r"([-+.\d]+(?:e[-+]?\d+)?)\s*(.*)", re.IGNORECASE)
 
 
@@ -119,14 +131,17 @@ def celsius(value: Any, unit: Any = "C") -> float | None:
 
     Args:
         value: the number.
-        unit: kelvin if it is ``K`` or begins with ``kelvin``.
+        unit: kelvin if it is ``K`` or begins with ``kelvin``; degrees Celsius, or none that is known.
     """
     try:
         number = float(value)
     except (TypeError, ValueError):
         return None
     name = (text_of(unit) or "C").strip("[]()").lower()
-    number -= _ZERO_CELSIUS if name == "k" or name.startswith("kelvin") else 0.0
+    if name == "k" or name.startswith("kelvin"):
+        number -= _ZERO_CELSIUS
+    elif not _CELSIUS.fullmatch(name):
+        return None
     return number if math.isfinite(number) and -_ZERO_CELSIUS <= number <= 150.0 else None
 
 
@@ -166,9 +181,10 @@ def duration_of(name: str, value: Any, *units: Any, comment: str = "") -> Durati
         return None
     stated = [each for each in map(text_of, (unit, *units)) if each]
     scales = {scale for text in stated for scale in _scales(text) or {None}} | _scales(comment)
-    words = f"{name} = {seconds:g}" + (f" ({'; '.join(filter(None, [*stated, comment]))})" if scales else "")
+    unit_words = "; ".join(filter(None, [*stated, comment])) if scales else "no unit stated, s assumed"
+    words = f"{name} = {seconds:g} ({unit_words})"
     if not scales:
-        return Duration(seconds, f"{words}, no unit stated, s assumed")
+        return Duration(seconds, words)
     scale = scales.pop() if len(scales) == 1 else None
     if scale is not None and not SHORTEST <= seconds * scale <= LONGEST:
         return None
@@ -178,21 +194,29 @@ def duration_of(name: str, value: Any, *units: Any, comment: str = "") -> Durati
 def _scales(text: str) -> set[float | None]:
     """Return the units that a word or comment states, in s; None stands for one that is not known."""
     text = re.sub("[\u00b5\u03bc]", "u", text)
-    text = re.sub(r"\b(milli|micro|nano|[mun])[-_ ](?=s)", r"\1", text, flags=re.IGNORECASE).replace("_", " ")
+    prefix = r"\b(mega|kilo|deca|deci|centi|milli|micro|nano|pico|[kmunp])[-_ ](?=s)"
+    text = re.sub(prefix, r"\1", text, flags=re.IGNORECASE).replace("_", " ")
     if text.lower() in _SECONDS:
         return {_SECONDS[text.lower()]}
-    if _SCALED.search(text):
-        return {None}  # such as "in units of 10 us"
+    if _SCALED.search(text) or not {each.lower() for each in _NAMED_SECONDS.findall(text)} <= _SECONDS.keys():
+        return {None}  # such as "in units of 10 us" or "deciseconds"
     found = {
         _SECONDS.get(word.lower()) for match in _STATED.finditer(text) for word in match.groups() if word
     }
     return found - {None} or found
 
 
-def first_duration(found: Iterable[Duration | None]) -> Duration | None:
-    """Return the first duration that is known; else the first one, whose words say why it is not."""
+def agreed_duration(found: Iterable[Duration | None]) -> Duration | None:
+    """Return the first duration that is known; unknown where there is none, or another contradicts it."""
     there = [each for each in found if each is not None]
-    return next((each for each in there if each.seconds is not None), there[0] if there else None)
+    known = [(each.seconds, each.words) for each in there if each.seconds is not None]
+    if not known:
+        return there[0] if there else None
+    seconds, words = known[0]
+    for other, other_words in known[1:]:
+        if abs(other - seconds) > _ROUNDING * seconds:
+            return Duration(None, f"{words}, but {other_words}")
+    return Duration(seconds, words)
 
 
 def bits_of(value: Any) -> int | None:
@@ -234,7 +258,7 @@ def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] | None 
         first_of(seconds_of(values.get(name)) for name in _TIMES),
     )
     return StatedFacts(
-        camera, first_duration(durations), first_of(bits_of(values.get(name)) for name in _DEPTHS)
+        camera, agreed_duration(durations), first_of(bits_of(values.get(name)) for name in _DEPTHS)
     )
 
 

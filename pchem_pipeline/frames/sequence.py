@@ -227,7 +227,7 @@ def _time_words(first: FrameReader, taken: float | None) -> str:
     if not first.time_words:
         return ""
     if taken is None:
-        words = "unknown integration time; give --integration-time SECONDS"
+        words = "unknown integration time; set input.integration_time (--integration-time SECONDS)"
     else:
         words = f"integration time {taken:g} s"
     return f"{words}: {first.paths[0].name} states {first.time_words}"

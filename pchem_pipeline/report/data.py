@@ -136,11 +136,13 @@ class Samples:
         against: what their exposures are drawn against: integration_time, light_level or none.
         arrays: ``quanta_exposure``, ``mean``, ``variance``, ``linearity_residual``, (sample, y, x);
             ``linearity_p`` (y, x); any may lack.
+        shown: place of the one whose H the maps and the first screen show.
     """
 
     samples: tuple[Sample, ...]
     against: str
     arrays: Mapping[str, NDArray[Any]]
+    shown: int = 0
 
     @property
     def on_line(self) -> list[int]:

@@ -11,8 +11,9 @@ from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.config.load import setting_of, states
 from pchem_pipeline.run.declaration import Stage, imported
 from pchem_pipeline.run.model_versions import model_of_content, model_versions
-from pchem_pipeline.store.files import digest_of_file
+from pchem_pipeline.store.files import digest_of
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
+from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import DESCRIPTION
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
 
 _TILE = "run.tile"
+_NEWS = {f"input.{name}": f"new result of pchem {name}" for name in ("discrepancy", "methods")}
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,7 @@ def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) 
 
 
 def changed_file(record: StageRecord, store: RunStore) -> str:
-    """Return a file of a stage's result that is missing or not as it was written; empty: none.
+    """Return a file or array of a stage's result that is missing or not as it was written; empty: none.
 
     Raises:
         StoreError: the description of a group is damaged.
@@ -122,8 +124,11 @@ def changed_file(record: StageRecord, store: RunStore) -> str:
     for group in sorted({name.partition("/")[0] for name in record.files if name.endswith(DESCRIPTION)}):
         if not store.has(group):
             return f"{group}/{DESCRIPTION}"
+    remote = isinstance(store.path, RemotePath)
     for name, digest in record.files.items():
-        if digest != digest_of_file(store.path / name):
+        if remote and "." not in name:
+            continue  # an array, of whose chunks each would be a request
+        if digest != digest_of(store.path / name):
             return name
     return ""
 
@@ -200,7 +205,7 @@ def _input_changes(old: Any, new: Any, models: Mapping[Any, int]) -> list[str]:
     before, after = (models.get(facts.get("model"), "unknown") for facts in (old, new))
     words = [] if old.get("model") == new.get("model") else [f"model {before} -> {after}"]
     changes = _changes("input", {**old, "model": None}, {**new, "model": None})
-    return words + [f"{key} {was} -> {now}" for key, was, now in changes]
+    return words + [_NEWS.get(key, f"{key} {was} -> {now}") for key, was, now in changes]
 
 
 def _changes(key: str, old: Any, new: Any) -> list[tuple[str, Any, Any]]:

@@ -15,7 +15,7 @@ from pchem_pipeline.run.declaration import Stage, imported
 from pchem_pipeline.run.fingerprint import StageState, changed_file, fingerprint_content, rests_on, status
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.table import STAGES
-from pchem_pipeline.store.files import digest_of_file
+from pchem_pipeline.store.files import digest_of
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import DESCRIPTION
@@ -80,6 +80,11 @@ def _perform(
     old = records.known(stage.name)
     # a stage that was stopped before its first unit may lack arrays
     resumes = before.state in ("partial", "complete") and old is not None and old.keys > 0
+    if (
+        before.state == "stale" and not restart and old is not None
+    ):  # chosen tiles mend chunks, and keep the rest
+        same = fingerprint_of(content) == old.fingerprint
+        resumes = same and not changed_file(old, context.store).endswith(DESCRIPTION)
     if resumes and context.options.force and restart:
         resumes = False
     context.stage, context.failed, context.notes, context.n_keys = stage.name, {}, [], 0
@@ -155,13 +160,13 @@ def _finish(
 
 
 def written_files(stage: Stage, folder: Path) -> dict[str, str]:
-    """Return the files beside arrays that a stage wrote and the descriptions of its arrays, with digests."""
+    """Return the files beside arrays that a stage wrote, its arrays and their descriptions, with digests."""
     places = [folder / name for name in stage.files]
     if not isinstance(folder, RemotePath):  # where each would be a request
         for name in stage.writes:
-            below = DESCRIPTION if "/" in name else f"*/{DESCRIPTION}"
-            places += (folder / name).glob(below)
-    found = {place.relative_to(folder).as_posix(): digest_of_file(place) for place in places}
+            for description in (folder / name).glob(DESCRIPTION if "/" in name else f"*/{DESCRIPTION}"):
+                places += [description, description.parent]
+    found = {place.relative_to(folder).as_posix(): digest_of(place) for place in places}
     return {name: digest for name, digest in found.items() if digest is not None}
 
 

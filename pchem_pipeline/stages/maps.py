@@ -35,6 +35,8 @@ _RESIDUALS = ("linearity_residual", "linearity_residual_stderr", "linearity_chi2
 _SUMMARISED = (*PARAMETERS, "read_noise_e", "analog_read_noise_e")
 #: of the arrays of a tile that are read and made
 _PIXEL_BYTES = 80 * 8
+#: Why there is no charge rate.
+NO_TIME = "unknown integration time: no charge rate. Set input.integration_time (--integration-time), s"
 #: Relative; times are written with few digits.
 _SAME_TIME = 1e-3
 #: Where the width of the law alone tells the number of electrons, and the window cuts it, H has no error.
@@ -45,8 +47,7 @@ def _tell_time(context: StageContext) -> None:
     """Say where the integration time is not known, or is not what the files say."""
     time, stated = context.integration_time, context.sensor.integration_time
     if time is None:
-        where = "" if context.config_path is None else f" in {context.config_path.name}"
-        context.note(f"unknown integration time: no charge rate. Set input.integration_time{where} (s)")
+        context.note(NO_TIME)
     elif stated is not None and abs(time - stated) > _SAME_TIME * stated:
         context.note(f"integration time {time:g} s from input.integration_time; the files state {stated:g} s")
 

@@ -66,16 +66,15 @@ def sample_targets(config: RunConfig, base_dir: Path) -> list[Target]:
     Raises:
         ConfigError: two samples are one run, or a run cannot be found.
     """
-    targets, seen = [], dict[str, int]()
-    for i, sample in enumerate(config.input.samples):
+    targets, seen = [], dict[str, str]()
+    for sample in config.input.samples:
         target = find_run(base_dir / sample.run)
         place = str(target.store.resolve())
         if place in seen:
             raise ConfigError(
-                f"input.samples.{i}.run: {sample.run} is the run of input.samples.{seen[place]} again; "
-                "list each run once"
+                f"input.samples: {sample.run} is the run of {seen[place]} again; list each run once"
             )
-        seen[place] = i
+        seen[place] = str(sample.run)
         targets.append(target)
     return targets
 
@@ -91,7 +90,7 @@ def open_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
     for i, target in enumerate(sample_targets(config, base_dir)):
         store = RunStore.open(target.store)
         record = store.records.read("histogram")
-        where = f"input.samples.{i} ({config.input.samples[i].run})"
+        where = f"sample {config.input.samples[i].run}"
         if record is None or not store.has("histogram/counts"):
             raise StoreError(
                 f"{where}: {store.path} has no histograms; run: pchem histogram {quoted(store.path)}"
@@ -157,7 +156,7 @@ def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> NDArray
         return None
     found = np.full(len(samples), np.nan)
     for i, (given, sample) in enumerate(zip(settings.samples, samples, strict=True)):
-        where = f"input.samples.{i} ({given.run})"
+        where = f"sample {given.run}"
         if given.bias:
             continue
         if settings.against == "light_level":
@@ -188,8 +187,8 @@ def _check_increasing(settings: InputSettings, samples: Sequence[OpenSample]) ->
     for last, i in itertools.pairwise(exposed):
         if x[i] <= x[last]:
             raise ConfigError(
-                f"{samples[i].where}: {what} {x[i]:g} is not above {x[last]:g} (input.samples.{last}); list "
-                f"the samples in increasing order of {what}"
+                f"{samples[i].where}: {what} {x[i]:g} is not above {x[last]:g} of {samples[last].where}; "
+                f"list the samples in increasing order of {what}"
             )
     if len(exposed) < 2:
         raise ConfigError(

@@ -41,6 +41,9 @@ _CURES_OF_A_PLACE = {
     ),
 }
 
+#: of a file of chunks that enter its digest: the checksum of one chunk, or what a shard lists
+_LAST_BYTES = 4096
+
 _ERRNO = re.compile(r"errno = (\d+)")
 
 
@@ -230,12 +233,27 @@ def read_json(path: Path, cure: str = "delete it and run the stage again") -> An
         raise StoreError(f"{path} is damaged ({error}); {cure}") from error
 
 
-def digest_of_file(path: Path) -> str | None:
-    """Return the SHA-256 of a file or an object, None where there is none."""
+def digest_of(path: Path) -> str | None:
+    """Return the SHA-256 of a file or an object, or of the chunks of an array; None where there is none.
+
+    Of a chunk enter its place, its size and its last bytes, which are the checksum of its codecs (of several
+    in a file their sizes and the checksum of these): chunks that are exchanged, cut or missing are found
+    without reading them.
+    """
+    if not isinstance(path, RemotePath) and path.is_dir():
+        chunks = sorted(each for each in (path / "c").rglob("*") if each.is_file())
+        return hashlib.sha256(b"".join(_mark_of(each, path) for each in chunks)).hexdigest()
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except FileNotFoundError:
         return None
+
+
+def _mark_of(chunk: Path, array: Path) -> bytes:
+    with chunk.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - _LAST_BYTES, 0))
+        return f"{chunk.relative_to(array).as_posix()} {size} ".encode() + file.read()
 
 
 # -- records of a run: JSON with a digest of itself ------------------------------------------------

@@ -338,6 +338,39 @@ def test_one_frame_is_as_often_right_as_it_says_though_a_bias_may_be_an_electron
     assert summary["quanta_exposure"]["n_left_out"] > 0.8 * N
 
 
+def stated_and_right(output, electrons, at):
+    """The mean probability that was stated for some samples, and the share of them that is right."""
+    found = opened(output).load()
+    good = at & np.isfinite(found.number_probability.values)
+    assert good.sum() > 0.98 * at.sum()
+    return (
+        float(found.number_probability.values[good].mean()),
+        float((found.electron_number.values == electrons)[good].mean()),
+    )
+
+
+def test_a_number_at_the_limit_of_the_adc_is_as_often_right_as_it_says(tmp_path, monkeypatch, capsys):
+    """The limit is seen in the frames alone; a sample there is any electron number from some on."""
+    monkeypatch.chdir(tmp_path)
+    lab = Lab(tmp_path, {}, capsys)
+    rng = np.random.default_rng(64)
+    camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.2, 0.3))
+    tifffile.imwrite(tmp_path / "dark.tif", camera.frames(rng, 2.0, 2000)[1])
+    lab.ok("run", "dark.tif", "--store", "run.zarr", "--integration-time", "1", "--until", "maps", "--quiet")
+    electrons, dn = camera.frames(rng, 2.0, 300)
+    for limit in (125, 145):
+        frames = np.minimum(dn, limit).astype(np.uint16)
+        tifffile.imwrite(tmp_path / f"{limit}.tif", frames)
+        lab.ok("apply", "run.zarr", f"{limit}.tif", "--output", f"{limit}.zarr")
+        for at in (frames == limit, frames < limit):
+            stated, right = stated_and_right(tmp_path / f"{limit}.zarr", electrons, at)
+            assert abs(right - stated) < 4 * np.sqrt(0.25 / at.sum()) + 0.003
+        # two neighbouring numbers alone would be right in less
+        assert stated_and_right(tmp_path / f"{limit}.zarr", electrons, frames == limit)[0] < 0.8
+        exposure = opened(tmp_path / f"{limit}.zarr").exposure.values
+        assert abs(np.nanmedian(exposure) - 2.0) < 0.03
+
+
 ROW_NOISE = 2.5  # DN: 0.24 e-, as much as the read noise
 
 
@@ -375,7 +408,7 @@ def test_row_noise_of_the_model_is_taken_from_the_frames(striped, tmp_path, monk
     errors = [(each.electrons.values - electrons)[:, good] for each in (found, kept)]
     scatter = [(each - each.mean(axis=0)).std() for each in errors]
     assert scatter[0] < 0.8 * scatter[1]
-    numbers = re.findall(r"(0\.\d+) \+- (0\.\d+) e-", said)
+    numbers = re.findall(r"(0\.\d+) ± (0\.\d+) e-", said)
     for (noise, error), spread in zip(numbers, scatter[::-1], strict=True):
         assert abs(float(noise) - spread) < 5.0 * float(error)
         assert float(error) < 0.1 * spread
@@ -389,6 +422,18 @@ def test_row_noise_of_the_model_is_taken_from_the_frames(striped, tmp_path, monk
     assert (found.noise_after < found.noise_before).values[good].mean() > 0.9
     assert "row_offset" in found
     assert "row_offset" not in kept
+
+
+def test_a_sample_at_the_limit_less_its_offset_is_censored(striped, tmp_path, monkeypatch, capsys):
+    """Without the offset of its row each has a limit of its own."""
+    monkeypatch.chdir(tmp_path)
+    lab = Lab(tmp_path, {}, capsys)
+    frames = np.minimum(tifffile.imread(striped / "night.tif"), 118)
+    tifffile.imwrite("limited.tif", frames)
+    lab.ok("apply", striped / "run.zarr", "limited.tif", "--output", "out.zarr")
+    stated, right = stated_and_right(tmp_path / "out.zarr", np.load(striped / "electrons.npy"), frames == 118)
+    assert abs(right - stated) < 0.05
+    assert stated < 0.8
 
 
 def test_a_twin_is_the_camera_that_was_measured(lab, night):

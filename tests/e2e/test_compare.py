@@ -136,9 +136,9 @@ def test_another_capture_agrees_until_it_is_warmer(shell, copies, finished):
     shutil.copytree(finished, shell.folder / "warm <b>.zarr")
     warm = RunStore.open(shell.folder / "warm <b>.zarr", writable=True)
     other_capture(warm, exposure=1.2, seed=2)
-    assert "Differs from A (a.zarr): C; no difference in B." in here(
-        shell, "a.zarr", "b.zarr", "warm <b>.zarr"
-    )
+    sentence = here(shell, "a.zarr", "b.zarr", "warm <b>.zarr")
+    assert sentence.startswith("Differs from A (a.zarr): C (Quanta exposure: median changed by ")
+    assert sentence.partition(" See ")[0].endswith("; no difference in B.")
     same, moved = numbers(shell)["comparisons"]
     assert not same["changed"]
     assert moved["maps"]["charge_rate"]["reasons"]["shifted"]
@@ -192,6 +192,8 @@ def test_the_history_of_a_camera(shell, copies, finished):
     found = int(rows[2]["bias_moved"])
     assert 38 <= found <= 40 + 12  # 40 moved; at most one in twenty of those found by chance, and its scatter
     assert found < 0.2 * n
+    sentence = f"Bias: {found} pixels changed, p < 0.001 over all pixels and maps."
+    assert sentence in numbers(shell, "history")["comparisons"][1]["what"]  # one count in both
     assert int(rows[2]["pixels_good"]) == int((third.read("maps/quality") == 0).sum())
     summary = third.attributes("maps")["summary"]["conversion_gain"]
     assert float(rows[2]["conversion_gain_median"]) == pytest.approx(summary["median"])

@@ -101,18 +101,18 @@ def test_going_back_to_an_older_model_and_forth_gives_the_same_bits(searched, tm
     other = Shell(tmp_path / "copy", shell.environment)
     shutil.copytree(shell.folder, other.folder)
     status = [" ".join(line.split()) for line in other.ok("status", "run.yaml").stdout.splitlines()]
-    assert "fit complete model 2" in status
-    assert "discrepancy complete model 1" in status
+    assert "fit complete (with model 2)" in status
+    assert "discrepancy complete (searched from model 1)" in status
     listed = other.ok("model", "run.yaml").stdout.splitlines()
-    assert listed[1].split() == ["1", "config", "discrepancy", "PCD"]
+    assert listed[1].split() == ["1", "config", "discrepancy", "plain", "model"]
     assert listed[2].startswith("* 2 ")
-    assert "PCD + row_noise 1.2" in listed[2]
+    assert "plain model + row_noise 1.2" in listed[2]
     beside = other.folder / "run.effects.yaml"
     after, text = read(other, "fit/read_noise_dn"), beside.read_text()
     words = other.ok("model", "run.yaml", "--use", "1").stdout
     assert "stale: fit; to update: pchem run" in words
     assert not beside.exists()
-    assert "fit         stale - model 2 -> 1  model 2" in other.ok("status", "run.yaml").stdout
+    assert "fit         stale - model 2 -> 1  (with model 2)" in other.ok("status", "run.yaml").stdout
     other.ok("run", "run.yaml", "--until", "fit")
     assert np.array_equal(read(other, "fit/read_noise_dn"), before, equal_nan=True)
     # a search that is up to date is asked for what it named, and nothing is searched again

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
+from pchem_pipeline.commands.plan import PlanRequest, make_plan
 from pchem_pipeline.commands.view import RunView
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
@@ -106,6 +108,17 @@ def test_bias_is_cut_at_least_five_times_where_it_was_significant(both) -> None:
         assert abs(after[name]) < abs(was) / 5, name
     for name, now in after.items():
         assert abs(now) < 5, name
+
+
+def test_a_plan_has_the_noise_of_the_effects(both) -> None:
+    """As many frames as the run has give the error of the gain that its fit has."""
+    path, _ = both
+    store = RunStore.open(path.parent / "run.zarr")
+    error = np.median(store.read("maps/conversion_gain_stderr") / store.read("maps/conversion_gain"))
+    words = make_plan(PlanRequest(path.parent / "run.zarr", frames=3000))
+    planned = float(re.search(r"conversion_gain +([\d.]+) %", words)[1])
+    assert planned == pytest.approx(100 * error, rel=0.1)
+    assert "effects in the model of the run (signal_dependent_noise, row_noise, nonlinearity): noise" in words
 
 
 def test_ensemble_is_predicted_with_the_extended_law(both) -> None:

@@ -80,9 +80,9 @@ def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, fi
     shutil.copytree(finished, shell.folder / "run.zarr")
     (shell.folder / "run.yaml").write_text(RUN.replace("4.87", "5"))
     rows = dict(line.split(maxsplit=1) for line in shell.ok("status", "run.yaml").stdout.splitlines())
-    assert rows["maps"] == "stale - input.integration_time 4.87 -> 5.0  model 1"
-    assert rows["ensemble"] == "complete  model 1"  # it reads no maps
-    assert rows["report"] == "stale - maps is stale  model 1"
+    assert rows["maps"] == "stale - input.integration_time 4.87 -> 5.0  (with model 1)"
+    assert rows["ensemble"] == "complete  (with model 1)"  # it reads no maps
+    assert rows["report"] == "stale - maps is stale  (with model 1)"
     export = shell.ok("export", "run.yaml", "--format", "csv")
     assert export.last.startswith("warning: maps: stale - input.integration_time")
     (shell.folder / "run.yaml").write_text(RUN + "fit: {gap_threshold: 6}\n")
@@ -90,7 +90,7 @@ def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, fi
     result = shell.ok("status", "run.yaml")
     rows = dict(line.split(maxsplit=1) for line in result.stdout.splitlines())
     assert rows["histogram"] == "complete"
-    assert rows["fit"] == "stale - fit.gap_threshold 5.0 -> 6.0  model 1"
+    assert rows["fit"] == "stale - fit.gap_threshold 5.0 -> 6.0  (with model 1)"
     assert rows["report"].startswith("stale")
     dry = shell.ok("run", "run.yaml", "--dry-run")
     assert "fit: stale - fit.gap_threshold 5.0 -> 6.0 -> would run" in dry.stderr
@@ -99,7 +99,7 @@ def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, fi
     same = [stage for stage in STAGES if before[stage] == after[stage]]
     assert same == ["ingest", "histogram", "report"]
     rows = dict(line.split(maxsplit=1) for line in shell.ok("status", "run.yaml").stdout.splitlines())
-    assert rows["ensemble"] == "complete  model 1"
+    assert rows["ensemble"] == "complete  (with model 1)"
     assert rows["report"].startswith("stale")
 
 
@@ -173,7 +173,7 @@ def test_export_and_electrons(shell, frames, finished):
     electrons = RunStore.open(shell.folder / "run.zarr").read("electrons/electron_number")
     assert electrons.shape == (1200, 20, 28)
     assert 1 < electrons.mean() < 4
-    assert shell.ok("status", "run.zarr").stdout.splitlines()[-1] == "electrons   complete  model 1"
+    assert shell.ok("status", "run.zarr").stdout.splitlines()[-1] == "electrons   complete  (with model 1)"
     assert "electrons: complete -> nothing to do" in shell.ok("electrons", "run.zarr", "--dry-run").stderr
 
 

@@ -143,6 +143,32 @@ def test_any_file_is_damaged(finished, tmp_path, step):
         check(folder, f"{victim} {kind}", expected, FORCED[i % len(FORCED)])
 
 
+@pytest.mark.parametrize(
+    ("array", "reader"),
+    [("histogram/counts", "fit"), ("fit/bias", "maps"), ("maps/read_noise_e", "report")],
+)
+def test_chunks_that_are_exchanged_or_cut_are_found(finished, tmp_path, array, reader):
+    """Each has the right checksum, in the wrong place."""
+    expected = numbers(finished / "run.zarr")
+    group = array.partition("/")[0]
+    for kind in ("exchanged", "cut"):
+        folder = tmp_path / kind
+        shutil.copytree(finished, folder)
+        files = (folder / "run.zarr" / array / "c").rglob("*")
+        one, other, *_ = sorted(each for each in files if each.is_file())
+        content = one.read_bytes()
+        one.write_bytes(other.read_bytes() if kind == "exchanged" else content[:-9])
+        if kind == "exchanged":
+            other.write_bytes(content)
+        states = {each.stage: each for each in run_status(find_run(folder / "run.yaml"))}
+        words = f"{array} is missing or has changed"
+        assert (states[group].state, states[group].why) == ("stale", words)
+        refused = asked(lambda place=folder: run(place / "run.yaml", [reader], force=True))
+        assert f"{words}; " in refused
+        run(folder / "run.yaml")
+        same(numbers(folder / "run.zarr"), expected)
+
+
 def test_without_the_model_of_the_fit_nothing_is_expected_of_a_pixel(finished, tmp_path):
     """It was expected of the plain PCD, without a word."""
     folder = tmp_path / "run"

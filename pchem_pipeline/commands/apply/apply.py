@@ -24,7 +24,7 @@ from pchem_pipeline.commands.apply.characterisation import (
 from pchem_pipeline.commands.apply.files import write_files
 from pchem_pipeline.commands.apply.finish import finish_maps
 from pchem_pipeline.commands.apply.settings import ApplySettings, Job, Piece
-from pchem_pipeline.commands.apply.source import check_camera, check_level, open_like_run, top_code
+from pchem_pipeline.commands.apply.source import check_camera, check_level, limits_of, open_like_run
 from pchem_pipeline.commands.apply.tasks import (
     N_SUMS,
     convert_piece,
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 #: Name of the work in the records of the output.
 STAGE = "apply"
-_VERSION = 3
+_VERSION = 4
 _PRODUCT = "calibrated frames"
 _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
 _SEGMENT_SAMPLES = 1 << 27
@@ -150,9 +150,9 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
     digest = check_run(run)
     sensor = SensorInfo.read(run)
     frames = open_like_run(target, sensor, files, wanted.dataset)
-    top = top_code(frames, sensor)
+    limits = limits_of(frames, sensor)
     modes = _modes(run, wanted, sensor.shape)
-    calibration = read_calibration(run, top=top, removed=modes.removed)
+    calibration = read_calibration(run, limits=limits or (None, None), removed=modes.removed)
     remarks = check_camera(frames, sensor) + check_level(frames, calibration)
     if modes.left and wanted.remove:
         remarks.append(
@@ -175,7 +175,7 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         wanted.kinds,
         wanted.prior,
         prior_map,
-        top=top,
+        limits=limits,
         modes=modes,
         depth=_chunks(frames.shape)[0],
         expected=numbers and overlap > 0,
@@ -376,8 +376,7 @@ def _with_moments(context: StageContext, job: Job, made: _Made) -> tuple[Job, _M
     rows = _chunks(job.source.shape)[1]
     lengths = {"row": 3, "column": 3, "side": 2, "quantity": 4}
     _create(context, job, "applied_parts/covariance", "applied_parts/rivals", lengths=lengths)
-    ends = None if job.top is None else (0, job.top)
-    task = functools.partial(moments_piece, job=job, settings=context.config.fit, adc_limits=ends)
+    task = functools.partial(moments_piece, job=job, settings=context.config.fit)
     pieces = [Piece("errors", *band, 0, 1) for band in equal_rows(ny, rows)]
     context.run_units(pieces, task, unit_name="band", by_tiles=False)
     if context.failed:
@@ -419,7 +418,8 @@ def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
     lift = int(np.ceil(max(float(each["largest"]) for each in found))) + 1 if found else 0
     # codes are cut to parts of a DN: their own rounding is part of what is not known
     variance = np.tensordot(left, parts, 1) + QUANTISATION_VARIANCE / _PARTS**2
-    return replace(job, parts=_PARTS, lift=lift, offset_variance=variance)
+    reached = (any(each["reached"][0] for each in found), any(each["reached"][1] for each in found))
+    return replace(job, parts=_PARTS, lift=lift, offset_variance=variance, reached=reached)
 
 
 def _counted(context: StageContext, job: Job, made: _Made) -> Job:

@@ -49,7 +49,7 @@ def read_calibration(
     *,
     removed: Sequence[str] = (),
     extra_variance: FloatArray | None = None,
-    top: int | None = None,
+    limits: tuple[int | None, int | None] = (None, None),
 ) -> Calibration:
     """Return the calibration of some rows.
 
@@ -58,17 +58,15 @@ def read_calibration(
         rows: of the sensor.
         removed: tags of effects that the frames no longer have.
         extra_variance: of what took them away, DN^2, of these rows (y, x); None: none.
-        top: largest code of the ADC, DN: codes there and at 0 are limits; None: not known.
+        limits: first and last code of the samples, DN; None: not known.
     """
     region = (rows, slice(None))
     maps = [store.read(f"fit/{name}", region) for name in PARAMETERS]
     stderr = np.stack([store.read(f"fit/{name}_stderr", region) for name in PARAMETERS])
     covariance = covariance_of(stderr, store.read("fit/correlation", region))
-    law = FittedModel.read(store, region).law(maps, without=removed)
+    law = FittedModel.read(store, region).law(maps, without=removed).with_clip(*limits)
     if extra_variance is not None:
         law = law.with_variance(dn2=extra_variance.ravel())
-    if top is not None:
-        law = law.with_clip(0, top)
     satellites = fitted_satellites(store, region)
     exposure, gain, bias, sigma = maps
     words = store.read("fit/fit_status", region)
@@ -106,7 +104,6 @@ def write_moments(
     output: RunStore,
     rows: slice,
     settings: FitSettings,
-    adc_limits: tuple[int, int] | None,
 ) -> None:
     """Write the errors of g, mu and sigma of some rows, of doubtful pixels by their likelihood.
 
@@ -115,7 +112,7 @@ def write_moments(
     """
     from pchem_pipeline.model.fit.api import likelihood_moments  # the fit is much to load
 
-    region = (rows, slice(None))
+    region, sensor = (rows, slice(None)), SensorInfo.read(run)
     calibration = read_calibration(run, rows)
     names = [*PARAMETERS, "likelihood_gap", "outlier_share"]
     maps = np.stack([run.read(f"fit/{name}", region).ravel() for name in names], axis=-1)
@@ -124,7 +121,7 @@ def write_moments(
     covariance = calibration.covariance.reshape(-1, 3, 3).copy()
     rivals = np.zeros((len(maps), 2, 4))
     apart = chosen[~moves_gain(maps[chosen, 0], maps[chosen, 1] * maps[chosen, 3])]
-    m, share = electron_shifts(maps[apart, 0], maps[apart, 4], SensorInfo.read(run).n_frames)
+    m, share = electron_shifts(maps[apart, 0], maps[apart, 4], sensor.n_frames)
     off = 1.0 - share[:, m == 0]
     shift = np.sqrt(share @ m[:, None] ** 2 / np.maximum(off, 1e-300)) / maps[apart, 1:2]
     rivals[apart, :, 0] = 0.5 * off
@@ -141,7 +138,7 @@ def write_moments(
             law=None if calibration.law.neutral else calibration.law.of(some),
             satellites=calibration.own_satellites[some],
             settings=settings,
-            adc_limits=adc_limits,
+            adc_limits=sensor.adc_limits,
         )
         known = np.isfinite(found.covariance).all(axis=(1, 2))
         covariance[some[known]] = found.covariance[known, 1:, 1:]

@@ -33,7 +33,7 @@ def finish_maps(output: RunStore, job: Job, calibration: Calibration, reporter: 
         assert sums is not None
         _write_errors(output, calibration, sums, n)
     if sums is not None:
-        raised |= _flags_of_sums(calibration, sums, n, job.top)
+        raised |= _flags_of_sums(calibration, sums, n, job.limits)
     if job.counts:
         ends = output.read("applied_parts/range")
         raised["outside_histogram"] = (ends[1] - ends[0]) >= job.bins
@@ -111,16 +111,16 @@ def _noise_words(excess: NDArray[np.float64], expected: NDArray[np.float64]) -> 
     if not mean > 0.0:
         return "not known (the samples scatter less than their mean allows: frames of another sensor?)"
     error = float(np.sqrt(np.sum((weight * (excess[known] - mean)) ** 2)) / weight.sum())
-    return f"{np.sqrt(mean):.3f} +- {error / (2.0 * np.sqrt(mean)):.3f} e-"
+    return f"{np.sqrt(mean):.3f} ± {error / (2.0 * np.sqrt(mean)):.3f} e-"
 
 
 def _flags_of_sums(
-    calibration: Calibration, sums: NDArray[np.float64], n: int, top: int | None
+    calibration: Calibration, sums: NDArray[np.float64], n: int, limits: tuple[int, int] | None
 ) -> dict[str, Any]:
     mean = sums[0] / n
     error = np.sqrt(calibration.noise_variance_dn2 / n + calibration.covariance[..., 1, 1])
     with np.errstate(invalid="ignore"):
         found = {"below_bias": mean - calibration.bias < -_BELOW * error}
-    if top is not None:
-        found["at_adc_limit"] = (sums[4] <= 0) | (sums[5] >= top)
+    if limits is not None:
+        found["at_adc_limit"] = (sums[4] <= limits[0]) | (sums[5] >= limits[1])
     return found

@@ -93,13 +93,14 @@ class Job:
         prior: as in `ApplySettings`; a file stands as its map in ``prior_map``.
         prior_map: exposure of each pixel (y, x), e-.
         pool: what the exposures of these frames have in common, where they are the prior.
-        top: largest code of the ADC, DN; None: not known.
+        limits: first and last code of the ADC, DN; None: not known.
         modes: offsets that are taken from the frames; none: the frames as they come.
         scene: exposure to expect while the offsets are found (y, x), e-.
         offset_variance: variance of the offsets' estimates, DN^2, (y, x); None without offsets.
         moments: whether the errors of the calibration are in the output, by `write_moments`.
         parts: codes in a DN.
-        lift: DN by which codes are raised so that none is negative.
+        lift: DN by which codes are raised so that none is negative; no offset is larger.
+        reached: whether samples lie at the first and at the last code of the ADC.
         bins: of the histograms.
         window: frames of a block while counting.
         depth: frames of a chunk.
@@ -114,13 +115,14 @@ class Job:
     prior: str = "frames"
     prior_map: Any = None
     pool: ExposurePool | None = None
-    top: int | None = None
+    limits: tuple[int, int] | None = None
     modes: CommonModes = field(default_factory=CommonModes)
     scene: Any = None
     offset_variance: Any = None
     moments: bool = False
     parts: int = 1
     lift: int = 0
+    reached: tuple[bool, bool] = (True, True)
     bins: int = 0
     window: int = 256
     depth: int = 1
@@ -131,6 +133,18 @@ class Job:
     def removed(self) -> tuple[str, ...]:
         """Tags of the effects whose offsets are taken from the frames."""
         return self.modes.removed
+
+    @property
+    def cut(self) -> tuple[int | None, int | None]:
+        """Codes at and beyond which samples are censored, DN; None: there are none.
+
+        Less its offset a sample at a limit of the ADC may be anywhere within the largest offset from it.
+        """
+        low, high = self.limits or (None, None)
+        return (
+            None if low is None or not self.reached[0] else low + self.lift,
+            None if high is None or not self.reached[1] else high - self.lift,
+        )
 
     @property
     def counts(self) -> bool:

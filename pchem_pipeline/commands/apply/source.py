@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.frames.first_look import first_look
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.samples import sample_targets
@@ -54,6 +56,7 @@ def open_like_run(
     if settings.roi is not None:
         settings = _with_region(settings, list(settings.roi), sensor, target.store.name)
     frames = open_frames(settings, Path.cwd(), check_duplicates=False, least=1)
+    first_look(frames, settings)
     name = frames.paths[0]
     if frames.shape[1:] != sensor.shape:
         raise InputError(
@@ -104,10 +107,11 @@ def _by(shape: tuple[int, ...]) -> str:
     return " x ".join(str(each) for each in shape)
 
 
-def top_code(frames: FrameSequence, sensor: SensorInfo) -> int | None:
-    """Return the largest code of the ADC, DN, or that at which samples pile up; None: not known."""
-    depth, seen = frames.bit_depth or sensor.bit_depth, frames.seen_limits[1] or sensor.seen_limits[1]
-    return seen if depth is None or seen else 2**depth - 1
+def limits_of(frames: FrameSequence, sensor: SensorInfo) -> tuple[int, int] | None:
+    """Return first and last code of the ADC, DN, or those at which samples pile up; None: not known."""
+    (low, high), (run_low, run_high) = frames.seen_limits, sensor.seen_limits
+    depth = frames.bit_depth or sensor.bit_depth
+    return replace(sensor, bit_depth=depth, seen_limits=(low or run_low, high or run_high)).adc_limits
 
 
 def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:

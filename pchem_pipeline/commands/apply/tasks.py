@@ -5,7 +5,7 @@ What loads compiled loops is imported where it is needed: electrons are done wit
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from pchem_pipeline.use.common_modes import Offsets, estimate_offsets
 from pchem_pipeline.use.electrons import add_up, electrons, read_stderr, whole_parts, with_its_errors
 
 if TYPE_CHECKING:
-    from pchem_pipeline.model.electrons.electrons import NumberTables
+    from pchem_pipeline.model.electrons.electrons import KnownPixels, Numbers, NumberTables
     from pchem_pipeline.model.histogram.count import RowHistograms
 
 #: Sums of a pixel over frames: x, x^2, the same without offsets, smallest and largest x.
@@ -41,10 +41,10 @@ def offsets_of(output: RunStore, job: Job, t0: int, t1: int, rows: slice) -> NDA
     return found.of_samples(job.modes, rows)
 
 
-def _calibration(job: Job, rows: slice) -> Calibration:
+def _calibration(job: Job, rows: slice, limits: tuple[int | None, int | None]) -> Calibration:
     run = RunStore.open(job.run)
     extra = None if job.offset_variance is None else job.offset_variance[rows]
-    found = read_calibration(run, rows, removed=job.removed, extra_variance=extra, top=job.top)
+    found = read_calibration(run, rows, removed=job.removed, extra_variance=extra, limits=limits)
     return with_moments(found, open_store(job.output), rows) if job.moments else found
 
 
@@ -56,12 +56,10 @@ def _codes(frames: NDArray[Any], job: Job, offsets: NDArray[np.float32]) -> NDAr
 # -- errors of the calibration ---------------------------------------------------------------------
 
 
-def moments_piece(
-    piece: Piece, *, job: Job, settings: FitSettings, adc_limits: tuple[int, int] | None
-) -> dict[str, Any]:
+def moments_piece(piece: Piece, *, job: Job, settings: FitSettings) -> dict[str, Any]:
     """Write the errors of the calibration of some rows."""
     rows = slice(piece.y0, piece.y1)
-    write_moments(RunStore.open(job.run), open_store(job.output), rows, settings, adc_limits)
+    write_moments(RunStore.open(job.run), open_store(job.output), rows, settings)
     return {}
 
 
@@ -71,8 +69,10 @@ def moments_piece(
 def offsets_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
     """Find and write the offsets of some frames; the summary tells how well they are known."""
     output = open_store(job.output)
-    calibration = _calibration(job, _WHOLE)
+    calibration = _calibration(job, _WHOLE, job.cut)
     left, largest = np.zeros(len(job.modes.parts)), 0.0
+    ends, known = [0, np.iinfo(np.int64).max] if job.limits is None else list(job.limits), calibration.usable
+    reached = [False, False]
     with FrameStream(job.source, [(piece.y0, piece.y1)], job.depth, frames=(piece.t0, piece.t1)) as stream:
         for start, (frames,) in stream:
             found = estimate_offsets(frames, job.scene, calibration, job.modes)
@@ -81,9 +81,11 @@ def offsets_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
             output.write("applied/column_offset", region, found.columns.astype(np.float32))
             if len(job.modes.waves):
                 output.write("applied/wave_offset", region, found.waves.astype(np.float32))
+            reached[0] |= bool((frames.min(axis=0) <= ends[0])[known].any())
+            reached[1] |= bool((frames.max(axis=0) >= ends[1])[known].any())
             left += found.left.sum(axis=0)
             largest = max(largest, float(abs(found.of_samples(job.modes)).max()))
-    return {"left": left.tolist(), "largest": largest}
+    return {"left": left.tolist(), "largest": largest, "reached": reached}
 
 
 # -- histograms and exposure -----------------------------------------------------------------------
@@ -97,16 +99,23 @@ def count_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
     rows = slice(piece.y0, piece.y1)
     shape = (piece.y1 - piece.y0, job.source.shape[2])
     accumulator = HistogramAccumulator(shape, job.bins, piece.t1)
+    ends = np.stack([np.full(shape, np.iinfo(np.int64).max), np.full(shape, np.iinfo(np.int64).min)])
     with FrameStream(job.source, [(piece.y0, piece.y1)], job.window) as stream:
         for start, (frames,) in stream:
             offsets = offsets_of(output, job, start, start + len(frames), rows)
-            accumulator.add(_codes(frames, job, offsets))
+            codes = _codes(frames, job, offsets)
+            np.minimum(ends[0], codes.min(axis=0), out=ends[0])
+            np.maximum(ends[1], codes.max(axis=0), out=ends[1])
+            if job.removed:
+                for end, cut in zip(job.cut, (np.maximum, np.minimum), strict=True):
+                    if end is not None:
+                        cut(codes, np.uint32((end + job.lift) * job.parts), out=codes)
+            accumulator.add(codes)
     found = accumulator.finish()
-    ends = np.stack([found.minimum, found.maximum]).astype(np.int64)
     output.write("applied_parts/range", (_WHOLE, rows, _WHOLE), ends)
     if not job.estimates:
         return {}
-    _write_exposure(output, found, _calibration(job, rows), job, rows)
+    _write_exposure(output, found, _calibration(job, rows, job.cut), job, rows)
     return {"outside": int(((found.under > 0) | (found.over > 0)).sum())}
 
 
@@ -117,12 +126,22 @@ def _write_exposure(
     from pchem_pipeline.use.exposure import estimate_exposure, mean_signal
 
     origin = found.origin.astype(np.int64) - job.lift * job.parts
+    low, high = job.cut
+    censored = np.zeros(origin.shape, np.bool_)
+    if low is not None:
+        censored |= found.minimum <= (low + job.lift) * job.parts
+    if high is not None:
+        censored |= found.maximum >= (high + job.lift) * job.parts
+    wanted = "exposure" in job.kinds
+    if wanted or censored.any():
+        maps = estimate_exposure(found.counts, origin, calibration, job.parts)
     if job.learns_prior:
         signal = mean_signal(found.counts, origin, calibration, job.parts)
+        if censored.any():  # the mean of samples that are cut off is no signal
+            signal = np.where(censored, maps.exposure, signal)
         output.write("applied_parts/prior", (rows, _WHOLE), signal)
-    if "exposure" not in job.kinds:
+    if not wanted:
         return
-    maps = estimate_exposure(found.counts, origin, calibration, job.parts)
     values = {
         "exposure": maps.exposure,
         "exposure_stderr": maps.stderr,
@@ -140,7 +159,8 @@ def convert_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
     """Write electrons and electron numbers of a piece, and the sums over its frames."""
     output = open_store(job.output)
     rows = slice(piece.y0, piece.y1)
-    calibration = _calibration(job, rows)
+    # without offsets each sample has limits of its own
+    calibration = _calibration(job, rows, (None, None) if job.removed else job.cut)
     tables = _tables(output, job, calibration, rows) if "numbers" in job.kinds else None
     sums = np.zeros((N_SUMS, *calibration.shape))
     sums[4] = np.inf
@@ -154,14 +174,69 @@ def convert_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
             if electron_frames:
                 output.write("applied/electrons", region, electrons(frames, calibration, offsets, room))
             if tables is not None:
-                _write_numbers(output, tables, _codes(frames, job, offsets), job, region)
+                found = tables.numbers(frames, _codes(frames, job, offsets), job)
+                output.write("applied/electron_number", region, found.number)
+                output.write("applied/number_probability", region, found.probability)
+                if job.expected:
+                    output.write("applied/expected_number", region, found.expected)
     output.write(
         "applied_parts/sums", (slice(piece.number, piece.number + 1), _WHOLE, rows, _WHOLE), sums[None]
     )
     return {}
 
 
-def _tables(output: RunStore, job: Job, calibration: Calibration, rows: slice) -> NumberTables:
+@dataclass(frozen=True)
+class _Tables:
+    """Electron numbers of the codes of some rows.
+
+    Attributes:
+        known: the pixels.
+        prior: exposure that is expected, e-, (y, x); None: none.
+        right_bias: probability that the bias is right, (y, x): one that is an electron off makes nearly all
+            numbers wrong.
+        tables: of the codes that occur.
+    """
+
+    known: KnownPixels
+    prior: Any
+    right_bias: Any
+    tables: NumberTables
+
+    def numbers(self, frames: NDArray[Any], codes: NDArray[Any], job: Job) -> Numbers:
+        """Return the numbers of samples (frame, y, x), given with their codes.
+
+        Of samples at a limit of the ADC all that is known is that they lie there or beyond; less its offset
+        each has a limit of its own.
+        """
+        found = self.tables.convert(codes, lift=job.lift * job.parts, expected=job.expected)
+        if job.removed and job.limits is not None:
+            high = frames >= job.limits[1]
+            at = (frames <= job.limits[0]) | high
+            for t in np.flatnonzero(at.any(axis=(1, 2))).tolist():
+                self._censored(found, t, codes[t][at[t]], np.flatnonzero(at[t]), high[t][at[t]], job)
+        return found
+
+    def _censored(
+        self, found: Numbers, t: int, codes: NDArray[Any], at: NDArray[Any], high: NDArray[Any], job: Job
+    ) -> None:
+        """Put in the numbers of the samples at the limits of frame t, in pixels ``at``."""
+        from pchem_pipeline.model.electrons.electrons import number_tables
+
+        code = codes.astype(np.int64) - job.lift * job.parts
+        limit = np.floor(code / job.parts + 0.5)
+        pixels = self.known.of(at)
+        low_end, high_end = np.where(high, np.nan, limit), np.where(high, limit, np.nan)
+        pixels = replace(pixels, law=replace(pixels.law, clip_low=low_end, clip_high=high_end))
+        prior = None if self.prior is None else self.prior.ravel()[at]
+        one = number_tables(code, code, prior, pixels, dtype=job.number_type, parts=job.parts, detailed=True)
+        for kind in ("number", "expected"):
+            if (values := getattr(found, kind)).size:
+                values[t].reshape(-1)[at] = getattr(one, kind)
+        with np.errstate(invalid="ignore"):
+            found.probability[t].reshape(-1)[at] = one.right / one.mass * self.right_bias.ravel()[at]
+
+
+def _tables(output: RunStore, job: Job, calibration: Calibration, rows: slice) -> _Tables:
     """Return the electron numbers of the codes of some rows."""
     from pchem_pipeline.model.electrons.electrons import number_tables
 
@@ -183,16 +258,5 @@ def _tables(output: RunStore, job: Job, calibration: Calibration, rows: slice) -
     found = number_tables(
         ends[0], ends[1], prior, known, dtype=job.number_type, parts=job.parts, detailed=True
     )
-    # a bias that is an electron off makes nearly all numbers wrong
     share = np.repeat(calibration.right_bias.ravel(), np.diff(found.start))
-    return replace(found, right=found.right * share)
-
-
-def _write_numbers(
-    output: RunStore, tables: NumberTables, codes: NDArray[Any], job: Job, region: tuple[slice, ...]
-) -> None:
-    found = tables.convert(codes, lift=job.lift * job.parts, expected=job.expected)
-    output.write("applied/electron_number", region, found.number)
-    output.write("applied/number_probability", region, found.probability)
-    if job.expected:
-        output.write("applied/expected_number", region, found.expected)
+    return _Tables(known, prior, calibration.right_bias, replace(found, right=found.right * share))

@@ -21,7 +21,8 @@ from pchem_pipeline.commands.compare.history import (
 )
 from pchem_pipeline.commands.compare.settings import settings_that_differ, versions_that_differ
 from pchem_pipeline.commands.figures import warn_if_old
-from pchem_pipeline.model.checks.run_differences import LIMIT, compare_maps, reasons_of_change
+from pchem_pipeline.model.checks.run_differences import compare_maps, reasons_of_change
+from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD, NO_VALUE
 from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, RunFacts
 from pchem_pipeline.report.pages.compare import (
@@ -30,7 +31,7 @@ from pchem_pipeline.report.pages.compare import (
     render_comparison,
     sentence_of,
 )
-from pchem_pipeline.report.style.wording import count, measured, short, signed, symbol
+from pchem_pipeline.report.style.wording import count, measured, p_value_text, short, signed, symbol
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target, find_run, with_maps
@@ -111,6 +112,8 @@ def comparison_of(
         raise ConfigError("compare: give two runs or more")
     if not 0 <= tolerance < 1:
         raise ConfigError(f"--tolerance {tolerance:g}: give a relative difference from 0 to below 1")
+    if not 0.0 < history.rate < 1.0:
+        raise ConfigError(f"--fdr {history.rate:g}: give a rate between 0 and 1, such as 0.01")
     targets = [find_run(path) for path in paths]
     stores = [with_maps(target.stored()) for target in targets]
     for target, store in zip(targets, stores, strict=True):
@@ -122,7 +125,7 @@ def comparison_of(
     ]
     runs = list(map(_facts, _letters(len(names)), names, stores, states))
     sides = list(zip(runs, targets, stores, states, strict=True))
-    pairs = [_pair(sides[0], side, tolerance, reporter) for side in sides[1:]]
+    pairs = [_pair(sides[0], side, tolerance, history.rate, reporter) for side in sides[1:]]
     rows = history_rows(runs, stores, pairs, history, states)
     return Comparison(runs, pairs, tolerance, rows, history.axis, history.rate)
 
@@ -179,7 +182,7 @@ def _data_digest(store: RunStore, sensor: SensorInfo) -> str:
     return f"{sensor.identity.get('digest', '')} {taken} {sensor.n_frames} {sensor.shape}"
 
 
-def _pair(first: _Side, second: _Side, tolerance: float, reporter: Reporter) -> Pair:
+def _pair(first: _Side, second: _Side, tolerance: float, rate: float, reporter: Reporter) -> Pair:
     (one, one_target, one_store, before), (other, other_target, other_store, now) = first, second
     same_data = one.digest == other.digest
     maps: dict[str, Any] = {}
@@ -188,13 +191,9 @@ def _pair(first: _Side, second: _Side, tolerance: float, reporter: Reporter) -> 
         grades = before.quality.ravel(), now.quality.ravel()
         transitions = np.histogram2d(*grades, bins=np.arange(4) - 0.5)[0].astype(int).tolist()
         good = (before.quality == GOOD) & (now.quality == GOOD)
-        for name in MAPS:
-            if one_store.has(f"maps/{name}") and other_store.has(f"maps/{name}"):
-                both = [
-                    (store.read(f"maps/{name}"), store.read(f"maps/{name}_stderr"))
-                    for store in (one_store, other_store)
-                ]
-                maps[name] = compare_maps(both[0], both[1], good, same_data=same_data)
+        in_both = (name for name in MAPS if one_store.has(f"maps/{name}") and other_store.has(f"maps/{name}"))
+        read = ((name, _value(one_store, name), _value(other_store, name)) for name in in_both)
+        maps = compare_maps(read, good, same_data=same_data, rate=rate)
     arrays = compare_arrays(one_store, other_store, tolerance, reporter) if same_data else []
     reasons = {} if same_data else {name: reasons_of_change(found) for name, found in maps.items()}
     words = _words(one, other, arrays, maps, reasons)
@@ -207,6 +206,11 @@ def _pair(first: _Side, second: _Side, tolerance: float, reporter: Reporter) -> 
         versions_that_differ(one_store, other_store),
         bool(words), words,
     )  # fmt: skip
+
+
+def _value(store: RunStore, name: str) -> tuple[FloatArray, FloatArray]:
+    """Return a map and its standard errors."""
+    return store.read(f"maps/{name}"), store.read(f"maps/{name}_stderr")
 
 
 def _words(
@@ -228,7 +232,10 @@ def _words(
         if why.spread:
             text.append(f"scatter {short(maps[name].spread_z, 2)} sigma")
         if why.pixels:
-            text.append(f"{count(maps[name].n_far, 'pixel')} changed by more than {LIMIT:g} sigma")
+            text.append(
+                f"{count(maps[name].n_changed, 'pixel')} changed, {p_value_text(maps[name].p_value)} "
+                "over all pixels and maps"
+            )
         if text:
             sign = f"{symbol(name)[1]}{' (DN)' if name == 'read_noise_dn' else ''}"
             found.append(f"{sign[0].upper()}{sign[1:]}: {', '.join(text)}.")

@@ -12,12 +12,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erfc
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.frames.camera import CameraFacts
-from pchem_pipeline.model.checks.multiple_testing import false_discovery
-from pchem_pipeline.model.checks.run_differences import LIMIT, MapDifference
+from pchem_pipeline.model.checks.run_differences import LIMIT
 from pchem_pipeline.model.fit.status import FitStatus, flags_of
 from pchem_pipeline.model.maps.maps import GOOD, hot_pixels
 from pchem_pipeline.report.comparison import Against, HistoryRow, Pair, RunFacts
@@ -66,22 +64,20 @@ def history_rows(
         runs: the runs.
         stores: of them.
         pairs: the first with each of the others.
-        wanted: labels, what they are drawn against, and the false-discovery rate.
+        wanted: labels, and what they are drawn against.
         states: of the pixels of each run.
 
     Raises:
         ConfigError: there are labels, but not one for each run; or the frames of a run state no
             temperature, which is asked for.
     """
-    labels, against, rate = wanted.labels, wanted.axis, wanted.rate
+    labels, against = wanted.labels, wanted.axis
     if labels and len(labels) != len(runs):
         raise ConfigError(
             f"--label: {len(labels)} labels for {len(runs)} runs; give one per run, in the same order"
         )
     if not labels and against == "label":
         raise ConfigError("--against label: no labels; give --label once per run")
-    if not 0.0 < rate < 1.0:
-        raise ConfigError(f"--fdr {rate:g}: give a rate between 0 and 1, such as 0.01")
     cameras = [SensorInfo.read(store).camera for store in stores]
     silent = [run.name for run, camera in zip(runs, cameras, strict=True) if camera.temperature is None]
     if against == "temperature" and silent:
@@ -91,7 +87,7 @@ def history_rows(
         )
     rows = []
     for i, (run, store) in enumerate(zip(runs, stores, strict=True)):
-        moved, any_moved, compared = _moved(pairs[i - 1], states[0], states[i], rate) if i else ({}, 0, 0)
+        moved, any_moved, compared = _moved(pairs[i - 1], states[0], states[i]) if i else ({}, 0, 0)
         date, temperature = _date(store, cameras[i]), cameras[i].temperature
         warmth = "" if temperature is None else f"{temperature:.4g} °C"
         label = labels[i] if labels else warmth if against == "temperature" else date
@@ -182,27 +178,13 @@ def _effects(store: RunStore) -> tuple[str, ...]:
     return () if version is None else tuple(effect.tag for effect in version.effects)
 
 
-def _moved(pair: Pair, one: PixelStates, other: PixelStates, rate: float) -> tuple[dict[str, int], int, int]:
+def _moved(pair: Pair, one: PixelStates, other: PixelStates) -> tuple[dict[str, int], int, int]:
     """Return the pixels whose parameters moved: of each map, of any, and how many were compared."""
     if pair.same_data or not pair.maps:
         return {}, 0, 0
     good = (one.quality == GOOD) & (other.quality == GOOD)
-    found = {name: moved_pixels(each, good, rate) for name, each in pair.maps.items()}
-    any_moved = np.logical_or.reduce(list(found.values()))
-    return {name: int(each.sum()) for name, each in found.items()}, int(any_moved.sum()), int(good.sum())
-
-
-def moved_pixels(each: MapDifference, good: NDArray[np.bool_], rate: float) -> NDArray[np.bool_]:
-    """Return where a map moved beyond its errors, at a false-discovery rate (Benjamini and Hochberg 1995).
-
-    Args:
-        each: the difference of two maps.
-        good: pixels with a good fit in both.
-        rate: among the pixels returned, the share that moved by chance alone is at most this.
-    """
-    probability = np.where(good, erfc(np.abs(each.z) / np.sqrt(2.0)), np.nan)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(false_discovery(probability) <= rate)
+    any_moved = np.logical_or.reduce([each.changed for each in pair.maps.values()])
+    return {name: each.n_changed for name, each in pair.maps.items()}, int(any_moved.sum()), int(good.sum())
 
 
 def history_csv(rows: Sequence[HistoryRow]) -> str:

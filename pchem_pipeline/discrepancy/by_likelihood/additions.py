@@ -194,7 +194,7 @@ class AddedSets:
             except ValueError:
                 continue
             gap = self.gaps.value(self.sets.problem(fitted.members), fitted.fit, chance)
-            why = f"it predicts unseen samples worse, by {-behind:.3g} +- {error:.2g}"
+            why = f"it predicts unseen samples worse, by {-behind:.3g} ± {error:.2g}"
             if other.tag in named.equals:
                 why = "it predicts unseen samples as well: these histograms do not decide"
             found.append(Rival(effect=other.tag, gap_after=gap, behind=behind, why=why))

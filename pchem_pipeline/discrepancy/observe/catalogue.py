@@ -76,29 +76,29 @@ _OF_A_SCORE = """
 #: All others: channel, name, and the meaning of a large positive [or negative] value. Those of ``both`` are
 #: one for each of the charge and the readout, whose name and subject take the places of ``{}`` and ``{of}``.
 _OTHERS = """
-digital shape.goodness.mean histograms [deviate from the PCD|are closer to the PCD than sampling noise] (mean
-        over pixels)
-digital shape.goodness.chi histograms deviate from the PCD, differently in each pixel
-digital shape.goodness.cnt histograms deviate strongly from the PCD in a few pixels
-readout shape.peaks.mean the peaks of the histograms [deviate from the PCD|are closer to the PCD than sampling
-        noise] (mean over pixels)
-readout shape.peaks.chi the peaks of the histograms deviate from the PCD, differently in each pixel
-readout shape.peaks.cnt the peaks of the histograms deviate strongly from the PCD in a few pixels
-digital code.rough counts deviate from the PCD from code to code
-digital code.alternating counts of adjacent codes deviate from the PCD with [opposite signs|the same sign]
-digital code.smooth counts deviate from the PCD smoothly along DN
-digital code.period2 counts deviate from the PCD with a period of 2 DN
-digital code.period4 counts deviate from the PCD with a period of 4 DN
-digital code.period8 counts deviate from the PCD with a period of 8 DN
-digital code.period16 counts deviate from the PCD with a period of 16 DN
+digital shape.goodness.mean histograms [deviate from the model|are closer to the model than sampling noise]
+        (mean over pixels)
+digital shape.goodness.chi histograms deviate from the model, differently in each pixel
+digital shape.goodness.cnt histograms deviate strongly from the model in a few pixels
+readout shape.peaks.mean the peaks of the histograms [deviate from the model|are closer to the model than
+        sampling noise] (mean over pixels)
+readout shape.peaks.chi the peaks of the histograms deviate from the model, differently in each pixel
+readout shape.peaks.cnt the peaks of the histograms deviate strongly from the model in a few pixels
+digital code.rough counts deviate from the model from code to code
+digital code.alternating counts of adjacent codes deviate from the model with [opposite signs|the same sign]
+digital code.smooth counts deviate from the model smoothly along DN
+digital code.period2 counts deviate from the model with a period of 2 DN
+digital code.period4 counts deviate from the model with a period of 4 DN
+digital code.period8 counts deviate from the model with a period of 8 DN
+digital code.period16 counts deviate from the model with a period of 16 DN
 digital code.largest the count of one code is an outlier
 digital code.top samples pile up at the highest code (saturation)
 digital code.bottom samples pile up at the lowest code (clipping)
-readout tail.low.count too [many samples below the range|few samples at the low end] of the PCD
-readout tail.low.pixels too many pixels with samples below the range of the PCD
-charge  tail.high.count too [many samples above the range|few samples at the high end] of the PCD
-charge  tail.high.pixels too many pixels with samples above the range of the PCD
-charge  tail.high.clusters samples above the range of the PCD are adjacent in a frame
+readout tail.low.count too [many samples below the range|few samples at the low end] of the model
+readout tail.low.pixels too many pixels with samples below the range of the model
+charge  tail.high.count too [many samples above the range|few samples at the high end] of the model
+charge  tail.high.pixels too many pixels with samples above the range of the model
+charge  tail.high.clusters samples above the range of the model are adjacent in a frame
 both    time.lag1.{}.mean {of} of successive frames are [correlated|anticorrelated] (mean over pixels)
 both    time.lag2.{}.mean {of} of frames two apart are [correlated|anticorrelated] (mean over pixels)
 both    time.lag3.{}.mean {of} of frames three apart are [correlated|anticorrelated] (mean over pixels)

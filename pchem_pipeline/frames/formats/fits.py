@@ -24,11 +24,12 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
     TIME_UNIT,
     CameraFacts,
+    Duration,
     StatedFacts,
+    agreed_duration,
     bits_of,
     celsius,
     duration_of,
-    first_duration,
     first_of,
     seconds_of,
     text_of,
@@ -41,7 +42,9 @@ from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
-_TIME_KEYWORDS = ("EXPTIME", "EXPOSURE", "TELAPSE", "INTTIME", "ITIME", "XPOSURE")
+_TIME_KEYWORDS = ("EXPTIME", "EXPOSURE", "INTTIME", "ITIME")
+#: of these the first counts where the others are absent: with dead time, or without it
+_TOTAL_TIME_KEYWORDS = ("TELAPSE", "XPOSURE")
 _DEPTH_KEYWORDS = ("BITDEPTH", "ADCBITS")
 _CAMERA_KEYWORDS = ("CAMERA", "DETNAM", "DETECTOR", "INSTRUME")
 _SERIAL_KEYWORDS = ("SERIALNO", "SERNO", "SERIAL", "CAMSERNO", "DETSERNO")
@@ -104,14 +107,16 @@ class FitsReader(ContiguousReader):
         """Take each fact from the last header that has it."""
         last = [*reversed(headers)]
         units = [str(header[name]) for header in last for name in header if TIME_UNIT.fullmatch(name)][:1]
-        times = (
-            duration_of(name, header[name], *units, comment=str(header.comments[name]))
-            for header in last
-            for name in _TIME_KEYWORDS
-            if name in header
+
+        def time_of(name: str) -> Duration | None:
+            header = next((each for each in last if name in each), None)  # the image's own before the primary
+            return header and duration_of(name, header[name], *units, comment=str(header.comments[name]))
+
+        duration = agreed_duration(map(time_of, _TIME_KEYWORDS)) or first_of(
+            map(time_of, _TOTAL_TIME_KEYWORDS)
         )
         depths = (bits_of(header.get(name)) for header in last for name in _DEPTH_KEYWORDS)
-        self.take_facts(StatedFacts(_camera(last), first_duration(times), first_of(depths)))
+        self.take_facts(StatedFacts(_camera(last), duration, first_of(depths)))
 
     def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         """See `ContiguousReader.decode_into`."""
@@ -210,11 +215,11 @@ def _camera(headers: Sequence[Any]) -> CameraFacts:
     clock, _ = _keyword(headers, ("TIME-OBS",))
     if isinstance(taken, str) and "T" not in taken and isinstance(clock, str):
         taken = f"{taken}T{clock}"
-    kelvin = re.search(r"\[K\]|kelvin", unit, re.IGNORECASE)
+    stated = re.search(r"[\[(][KF][\])]|kelvin|fahrenheit", unit, re.IGNORECASE)
     return CameraFacts(
         text_of(_keyword(headers, _CAMERA_KEYWORDS)[0]),
         text_of(_keyword(headers, _SERIAL_KEYWORDS)[0]),
-        celsius(hot, "K" if kelvin else "C"),
+        celsius(hot, stated[0] if stated else "C"),
         seconds_of(taken),
     )
 

@@ -15,11 +15,11 @@ from pchem_pipeline.frames.camera import (
     CameraFacts,
     Duration,
     StatedFacts,
+    agreed_duration,
     bits_of,
     celsius,
     duration_of,
     facts_from_names,
-    first_duration,
     first_of,
     seconds_of,
     text_of,
@@ -155,7 +155,7 @@ def stated_facts(file: Any, page: Any) -> StatedFacts:
     depths = (_ome_depth(_ome(file)), own.bit_depth, _odd_depth(page.bitspersample))
     names = [each.name for each in fields(CameraFacts)]
     camera = CameraFacts(*(first_of(getattr(each, name) for each in cameras) for name in names))
-    return StatedFacts(camera, first_duration(times), first_of(depths))
+    return StatedFacts(camera, agreed_duration(times), first_of(depths))
 
 
 def _ome_time(text: str) -> Duration | None:

@@ -1,25 +1,26 @@
 """How two runs differ: value by value, and map by map in units of the standard errors.
 
 Whether a difference of two measurements is chance is judged by order statistics, which a few odd pixels do
-not move; all limits are five standard errors (false alarm 6e-7 each).
+not move, with limits of five standard errors (false alarm 6e-7 each), and pixel by pixel at a false-discovery
+rate over all maps.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erfc
 
+from pchem_pipeline.model.checks.multiple_testing import false_discovery
 from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.maps import summarise
 
 #: Standard errors beyond which a statistic of all pixels counts as changed.
 LIMIT = 5.0
-#: Standard errors beyond which a single pixel counts as changed.
-FAR = 5.0
-#: Share of pixels that may lie beyond: errors of fits have longer tails than the normal law.
-_TAIL = 1e-4
 #: By how much the standard errors of the fits themselves may be wrong.
 _TRUST = 0.1
 
@@ -91,8 +92,11 @@ class MapDifference:
         median_z: median of ``z`` over the pixels that count.
         spread_z: robust standard deviation of ``z`` over them; 1 where chance alone acts.
         n_counted: pixels that count: good fits in both.
-        n_far: pixels beyond ``FAR`` among them.
         largest_z: largest absolute value of ``z`` among them.
+        changed: those among them whose value changed, (ny, nx); see :func:`compare_maps`.
+        n_changed: their number.
+        p_value: probability that chance alone makes a map with a pixel like them, all maps and pixels that
+            were looked at allowed for.
     """
 
     difference: FloatArray
@@ -105,26 +109,62 @@ class MapDifference:
     median_z: float
     spread_z: float
     n_counted: int
-    n_far: int
     largest_z: float
+    changed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), np.bool_))
+    n_changed: int = 0
+    p_value: float = 1.0
+
+
+ValuesAndErrors = tuple[FloatArray, FloatArray]
 
 
 def compare_maps(
-    one: tuple[FloatArray, FloatArray],
-    other: tuple[FloatArray, FloatArray],
+    maps: Iterable[tuple[str, ValuesAndErrors, ValuesAndErrors]],
     good: NDArray[np.bool_],
     *,
     same_data: bool,
-) -> MapDifference:
-    """Compare a map of two runs.
+    rate: float = 0.01,
+) -> dict[str, MapDifference]:
+    """Compare the maps of two runs.
+
+    A pixel changed where its ``z`` is significant at a false-discovery rate (Benjamini and Hochberg 1995)
+    among all pixels of all maps together. Where nothing changed, a pixel is found with at most that
+    probability: standard errors a tenth too small, and the tails of fits, are allowed for.
 
     Args:
-        one: values and standard errors, each (ny, nx); NaN where there is no value.
-        other: the same of the other run.
+        maps: name of each, and its values and standard errors in either run, (ny, nx); NaN: no value.
         good: pixels with a good fit in both, (ny, nx).
         same_data: both are fits of the same frames: the errors are then not independent, and the unit is the
             standard error of one fit, ``sqrt((s1^2 + s2^2) / 2)``; else it is ``sqrt(s1^2 + s2^2)``.
+        rate: share of the changed pixels that may be due to chance.
     """
+    found = {name: _difference(one, other, good, same_data=same_data) for name, one, other in maps}
+    tested = sum(each.n_counted for each in found.values())
+    places, likely = [], []
+    for each in found.values():
+        probability = np.where(good, erfc(np.abs(each.z) / ((1.0 + _TRUST) * np.sqrt(2.0))), np.nan)
+        places.append(np.nonzero(probability <= rate))  # the others are not significant in any company
+        likely.append(probability[places[-1]])
+    few = np.concatenate([*likely, np.empty(0)])
+    ends = np.cumsum([each.size for each in likely])
+    each_q = np.split(false_discovery(few * (tested / max(few.size, 1))), ends)
+    return {
+        name: _with_changed(each, place, q, rate)
+        for (name, each), place, q in zip(found.items(), places, each_q, strict=False)
+    }
+
+
+def _with_changed(found: MapDifference, place: Any, q: FloatArray, rate: float) -> MapDifference:
+    changed = np.zeros(found.z.shape, np.bool_)
+    changed[place] = q <= rate
+    return replace(
+        found, changed=changed, n_changed=int(changed.sum()), p_value=float(np.min(q, initial=1.0))
+    )
+
+
+def _difference(
+    one: ValuesAndErrors, other: ValuesAndErrors, good: NDArray[np.bool_], *, same_data: bool
+) -> MapDifference:
     difference = other[0] - one[0]
     with np.errstate(invalid="ignore", divide="ignore"):
         unit = np.sqrt((one[1] ** 2 + other[1] ** 2) / (2.0 if same_data else 1.0))
@@ -143,7 +183,6 @@ def compare_maps(
         median_z=core.median,
         spread_z=core.robust_sd,
         n_counted=counted.size,
-        n_far=int((np.abs(counted) > FAR).sum()),
         largest_z=float(np.max(np.abs(counted), initial=0.0)),
     )
 
@@ -155,7 +194,7 @@ class Reasons:
     Attributes:
         shifted: the median of ``z`` is not 0.
         spread: ``z`` scatters more than its standard errors allow.
-        pixels: too many single pixels lie far off.
+        pixels: single pixels changed.
     """
 
     shifted: bool
@@ -172,8 +211,7 @@ def reasons_of_change(found: MapDifference) -> Reasons:
 
     Under the null ``z`` is N(0, 1): its median has standard error ``sqrt(pi / 2 n)``, its robust standard
     deviation ``1.166 / sqrt(n)`` (Maronna et al., *Robust Statistics*, 2019, Sec. 2.5), to which a tenth is
-    added since the standard errors are estimates; of n pixels, 1e-4 n and five standard deviations of the
-    count may lie beyond five standard errors.
+    added since the standard errors are estimates.
 
     Args:
         found: of two runs on different frames.
@@ -181,9 +219,8 @@ def reasons_of_change(found: MapDifference) -> Reasons:
     n = found.n_counted
     if n < 2:
         return Reasons(False, False, False)
-    allowed = _TAIL * n
     return Reasons(
         shifted=bool(abs(found.median_z) > LIMIT * np.sqrt(np.pi / (2.0 * n))),
         spread=bool(found.spread_z > 1.0 + _TRUST + LIMIT * 1.166 / np.sqrt(n)),
-        pixels=bool(found.n_far > allowed + LIMIT * np.sqrt(max(allowed, 1.0))),
+        pixels=found.n_changed > 0,
     )

@@ -43,6 +43,12 @@ class KnownPixels:
     law: SampleLaw
     satellites: tuple[ArrayLike, ArrayLike] | None = None
 
+    def of(self, pixels: NDArray[np.intp]) -> KnownPixels:
+        """Return some of the pixels, by their places in C order."""
+        own = self.satellites
+        some = None if own is None else (np.asarray(own[0])[pixels], np.asarray(own[1])[pixels])
+        return KnownPixels(list(columns_of(self.parameters)[pixels].T), self.law.of(pixels), some)
+
     @property
     def exposure(self) -> FloatArray:
         """H, e-, shape (n,); NaN where there are no usable parameters."""

@@ -76,7 +76,7 @@ class FitSettings(Section):
     )
     intervals: Literal["normal", "profile"] = Field(
         default="normal",
-        description="normal: estimate +- standard error. profile: also profile-likelihood intervals, for low "
+        description="normal: estimate ± standard error. profile: also profile-likelihood intervals, for low "
         "quanta exposure or read noise above 0.45 e- (about 0.1 ms per pixel)",
     )
     interval_level: float = Field(

@@ -111,14 +111,14 @@ MEANINGS: dict[FitStatus, str] = {
     FitStatus.NOT_CONVERGED: "the fit did not converge",
     FitStatus.GAIN_NOT_IDENTIFIED: "one Gaussian fits as well: the data do not fix the conversion gain",
     FitStatus.EXPOSURE_AT_BOUND: "quanta exposure at its lower bound: no electrons",
-    FitStatus.BIAS_AMBIGUOUS: "bias ambiguous by one electron or more",
+    FitStatus.BIAS_AMBIGUOUS: "bias may be off by one electron (1/g in DN) or more, and H by as many",
     FitStatus.GAIN_AMBIGUOUS: "gain ambiguous: another gain is nearly as likely",
     FitStatus.NOT_INFORMATIVE: "read noise too high for one sample; take several exposures",
     FitStatus.ADC_LIMIT: "samples at the limits of the ADC",
     FitStatus.OUTSIDE_WINDOW: "frames outside the histogram window excluded",
     FitStatus.POOR_FIT: "poor goodness of fit: the model does not describe the pixel",
     FitStatus.COARSE_STEPS: "DN too coarse (sigma < 0.6 DN or g > 0.4 e-/DN): rounding biases the estimates",
-    FitStatus.BIAS_UNSURE: "bias not certain: off by one electron is as likely in such pixels",
+    FitStatus.BIAS_UNSURE: "bias not certain: in such pixels often off by one electron (1/g in DN)",
     FitStatus.WEAKLY_IDENTIFIED: "too few frames for this sensor's read noise: bias not certain, standard "
     "errors approximate",
     FitStatus.EXCLUDED: "excluded by input.mask or the camera's marker",
@@ -135,7 +135,7 @@ def describe(word: int) -> str:
         >>> describe(0)
         'good fit'
         >>> describe(32)
-        'bias ambiguous by one electron or more'
+        'bias may be off by one electron (1/g in DN) or more, and H by as many'
     """
     sentences = [meaning for bit, meaning in MEANINGS.items() if word & bit]
     return "; ".join(sentences) if sentences else "good fit"

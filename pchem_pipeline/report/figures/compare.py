@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.checks.run_differences import FAR, MapDifference
+from pchem_pipeline.model.checks.run_differences import LIMIT, MapDifference
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
     Axis,
@@ -62,7 +62,7 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
     alt = (
         f"Map and histogram of the difference in {label}: median "
         f"{measured(each.median, each.median_stderr, unit)} ({signed(each.median_z)} sigma of one pixel); "
-        f"scatter {short(each.spread_z, 2)} sigma; {count(each.n_far, 'good pixel')} beyond {FAR:g} sigma."
+        f"scatter {short(each.spread_z, 2)} sigma; {count(each.n_changed, 'good pixel')} changed."
     )
     caption = (
         "Line: N(0, 1), expected from sampling noise alone."
@@ -77,7 +77,7 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
         f"{pair.other.label} − {pair.one.label}, in standard errors of each pixel. {caption}",
         alt,
         (DataTable({"difference": each.z}, {"difference": "standard errors"}),),
-        difference_chart(each.z, each.n_far, title, same_data=pair.same_data),
+        difference_chart(each.z, each.n_changed, title, same_data=pair.same_data),
     )
 
 
@@ -120,12 +120,12 @@ def ensemble_tables(runs: Sequence[RunFacts]) -> tuple[DataTable, ...]:
     return tuple(tables)
 
 
-def difference_chart(z: FloatArray, n_far: int, title: str, *, same_data: bool) -> Chart:
+def difference_chart(z: FloatArray, n_changed: int, title: str, *, same_data: bool) -> Chart:
     """Return the difference of a map of two runs in standard errors, and its histogram beside chance.
 
     Args:
         z: the difference in standard errors, (y, x).
-        n_far: good pixels that moved far.
+        n_changed: good pixels that changed.
         title: what is subtracted from what.
         same_data: both are fits of the same frames, for which N(0, 1) is not what chance gives.
     """
@@ -134,8 +134,8 @@ def difference_chart(z: FloatArray, n_far: int, title: str, *, same_data: bool) 
     unit, label = _unit(limit)
     end = limit / unit
     top = sensor_stack(z / unit, (-end, end), label, scale=DIVERGING, title=plain(title))
-    edge = limit if same_data else max(limit, FAR)
-    note = f"{count(n_far, 'good pixel')} beyond ±{FAR:g}"
+    edge = limit if same_data else max(limit, LIMIT)
+    note = f"{count(n_changed, 'good pixel')} changed"
     pulls = pull_stack(known / unit, edge / unit, f"difference ({label})", note, normal=not same_data)
     return Chart((top, pulls))
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pchem_pipeline.model.checks.run_differences import FAR
 from pchem_pipeline.report.comparison import ArrayRow, Comparison, HistoryRow, Pair, Setting
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures
 from pchem_pipeline.report.figures.figure import Figure
@@ -58,7 +57,7 @@ def sentence_of(found: Comparison) -> str:
     """Return what came out, in one sentence or one for each pair."""
     if len(found.pairs) == 1:
         return _pair_sentence(found.pairs[0], found.tolerance)
-    changed = [pair.other.label for pair in found.pairs if pair.changed]
+    changed = [f"{pair.other.label} ({_first_change(pair)})" for pair in found.pairs if pair.changed]
     if not changed:
         return f"None of the {len(found.pairs)} runs differs from {found.runs[0].title}."
     same = [pair.other.label for pair in found.pairs if not pair.changed]
@@ -66,10 +65,14 @@ def sentence_of(found: Comparison) -> str:
     return f"Differs from {found.runs[0].title}: {', '.join(changed)}{rest}."
 
 
+def _first_change(pair: Pair) -> str:
+    more = "" if len(pair.changes) == 1 else f", and {len(pair.changes) - 1} more"
+    return f"{pair.changes[0].rstrip('.')}{more}"
+
+
 def _pair_sentence(pair: Pair, tolerance: float) -> str:
     if pair.changed:
-        more = "" if len(pair.changes) == 1 else f" (and {len(pair.changes) - 1} more)"
-        first = f"{pair.other.title} differs from {pair.one.title}: {pair.changes[0].rstrip('.')}{more}."
+        first = f"{pair.other.title} differs from {pair.one.title}: {_first_change(pair)}."
         return f"{first}{_largest_text(pair)}"
     if not pair.same_data:
         return (
@@ -172,7 +175,7 @@ _MEDIAN = ("median", "median_stderr", "robust_sd")
 
 
 def _pair_numbers(pair: Pair) -> dict[str, Any]:
-    skipped = ("difference", "z")
+    skipped = ("difference", "z", "changed")
     return {
         "reference": pair.one.label,
         "run": pair.other.label,
@@ -209,8 +212,8 @@ def history_table(found: Comparison) -> Table:
         moved = {symbol(name)[1]: n for name, n in row.moved.items() if n}
         rows.append(
             (
-                row.date[:16].replace("T", " ") if row.label == row.date else row.label,
-                "" if row.label == row.date else row.date[:10],
+                row.run.label if row.label == row.date else row.label,
+                row.date[:16].replace("T", " "),
                 "" if row.temperature is None else f"{row.temperature:.4g}",
                 row.run.title,
                 f"{row.run.pixels[0]:,}",
@@ -225,7 +228,8 @@ def history_table(found: Comparison) -> Table:
         "history-runs",
         "Run by run",
         "Changed: pixels with a good fit in both runs whose value differs significantly from the first run "
-        f"(false-discovery rate {found.rate:g}). All medians: history.csv, one line per run.",
+        f"(false-discovery rate {found.rate:g} over all pixels and maps). All medians: history.csv, one line "
+        "per run.",
         ("label", "date", "°C", "run", "good pixels", "hot", "flags", "effects", "changed", "in"),
         tuple(rows),
     )
@@ -289,7 +293,7 @@ def _map_table(pair: Pair) -> Table:
                 measured(each.median, each.median_stderr) if each.median else "0",
                 f"{each.median_z:+.3f}".replace("-", "−"),
                 f"{each.spread_z:.3f}",
-                f"{each.n_far:,} of {each.n_counted:,}",
+                f"{each.n_changed:,} of {each.n_counted:,}",
                 short(each.largest_z),
                 verdict,
             )
@@ -304,7 +308,7 @@ def _map_table(pair: Pair) -> Table:
         f"maps-{pair.other.label}",
         "Differences of the maps",
         f"{pair.other.label} − {pair.one.label}, pixels with a good fit in both runs. {unit_words}",
-        ("map", "median", "median (σ)", "scatter (σ)", f"beyond ±{FAR:g} σ", "largest (σ)", ""),
+        ("map", "median", "median (σ)", "scatter (σ)", "pixels changed", "largest (σ)", ""),
         tuple(rows),
     )
 

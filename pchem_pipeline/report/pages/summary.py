@@ -19,6 +19,7 @@ from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import (
     count,
     measured,
+    p_value_text,
     percent,
     scientific,
     short,
@@ -28,7 +29,7 @@ from pchem_pipeline.report.style.wording import (
 
 Level = Literal["good", "note", "caution", "serious"]
 
-_KEY_MAPS = ("read_noise_e", "conversion_gain", *CHARGE_RATES, "quanta_exposure", "bias")
+KEY_MAPS = ("read_noise_e", "conversion_gain", *CHARGE_RATES, "quanta_exposure", "bias")
 
 #: Ratio of an RMSE to that of sampling noise alone up to which a significant difference is small, and from
 #: which it is large.
@@ -98,10 +99,12 @@ def key_numbers(data: ReportData, *, with_flagged: bool = False) -> list[KeyNumb
         return []
     found = []
     which = f" of unflagged {data.noun}s" if data.often_flagged and not with_flagged else ""
-    for name in _KEY_MAPS:
+    for name in KEY_MAPS:
         if not (data.has_values(name) if with_flagged else data.has_median(name)):
             continue
         _, words, unit = symbol(name)
+        if name == "quanta_exposure" and data.samples is not None:
+            words += f" in {data.samples.samples[data.samples.shown].name}"
         summary = data.summary(name, with_flagged=with_flagged)
         low, high = summary.percentiles[5.0], summary.percentiles[95.0]
         error = data.pixel_error(name, with_flagged=with_flagged)
@@ -313,7 +316,7 @@ def _agreement(data: ReportData) -> Iterator[Flag]:
             continue
         ratio = rmse[name] / rmse[floor]
         p = (data.ensemble_facts.get(f"{prefix}chi_square") or {}).get("p")
-        tested = "" if p is None else f" (chi-square: p {'< 0.001' if p < _POOR_P else f'= {short(p, 2)}'})"
+        tested = "" if p is None else f" (chi-square: {p_value_text(p)})"
         text = f"The RMSE of the predicted {words} ensemble is {short(ratio, 2)} times the sampling noise"
         text += tested
         if ratio <= _RMSE_GOOD or (p is not None and p >= _POOR_P):
@@ -417,7 +420,7 @@ def answers(data: ReportData, remarks: list[Flag] | None = None) -> tuple[Answer
         remarks: of :func:`flags`; None: they are made.
     """
     sensor, belief = _sensor(data), _belief(data, flags(data) if remarks is None else remarks)
-    if belief.level == "serious" and sensor.level == "good":
+    if belief.level == "serious" and sensor.level != "serious":
         text = f"{sensor.text.rstrip('.')}, but the results are not reliable."
         sensor = replace(sensor, level="caution", word="Unknown", text=text)
     return sensor, belief

@@ -175,6 +175,11 @@ def count(number: int, noun: str) -> str:
     return f"{number:,} {noun}{plural}"
 
 
+def p_value_text(p: float) -> str:
+    """Return ``p < 0.001`` or ``p = 0.034``."""
+    return "p < 0.001" if p < 1e-3 else f"p = {short(p, 2)}"
+
+
 def percent(part: float, whole: float) -> str:
     """Return a share as ``12 %``, ``0.4 %`` or ``< 0.01 %``; ``0 %`` only for none."""
     if whole <= 0:

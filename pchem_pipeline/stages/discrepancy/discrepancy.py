@@ -26,6 +26,7 @@ from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy, Elsewhere
+from pchem_pipeline.effects.adc.clipping import Clipping
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.model.histogram.odd_frames import frame_words
@@ -87,7 +88,7 @@ def _run_frames(
     verdict = found.verdict.on_sensor(source.shape[1:], window.rows, window.columns, window.pixel)
     verdict = seen.told(verdict, window.share(source.shape)).costing(search.work)
     found = replace(found, verdict=verdict if elsewhere is None else verdict.checked(elsewhere))
-    _write(context, found)
+    _write(context, found, before)
     write_added_exposure(context.store, _STAGE, found.added, found.model, window.rows, window.columns)
 
 
@@ -121,7 +122,7 @@ class _Search:
             window.numbers,
             settings,
             **self._taken(window),
-            model=self.before,
+            model=(*self.before, *_limits(self.context, self.before)),
             mapper=_Mapper(self.context, prefix),
             tell=self.tell,
         )
@@ -233,13 +234,22 @@ def _start(context: StageContext) -> tuple[tuple[Effect, ...], tuple[int, ...] |
     return (context.model if model is None else model).effects, tuple(roi) or None
 
 
+def _limits(context: StageContext, model: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Return as an effect the codes at which samples pile up: the fit has them without a model."""
+    low, high = context.sensor.seen_limits
+    if (low is None and high is None) or any(effect.tag == "clipping" for effect in model):
+        return ()
+    return (Clipping(low=low, high=high),)
+
+
 def _run_histograms(context: StageContext, before: Sequence[Effect], tell: Callable[[str], None]) -> None:
     """Do the same with ready-made histograms, or with those of several samples together, in one unit."""
     samples = _samples(context) if context.sensor.samples else [_histograms(context.store)]
+    model = (*before, *_limits(context, before))
     found = find_in_histograms(
-        samples, context.config.discrepancy, width=context.sensor.nx, model=before, tell=tell
+        samples, context.config.discrepancy, width=context.sensor.nx, model=model, tell=tell
     )
-    _write(context, found)
+    _write(context, found, before)
     context.run_units([WHOLE], nothing_left, by_tiles=False)
 
 
@@ -317,7 +327,7 @@ def _simulate(unit: Named[Replicate]) -> dict[str, float]:
     return unit.content()
 
 
-def _write(context: StageContext, found: Discrepancy) -> None:
+def _write(context: StageContext, found: Discrepancy, before: Sequence[Effect]) -> None:
     context.begin()
     names, z_before, z_after = found.statistics
     arrays = evidence_arrays(
@@ -331,6 +341,9 @@ def _write(context: StageContext, found: Discrepancy) -> None:
     )
     for name, array in arrays.items():
         context.store.write_array(f"{_STAGE}/{name}", array)
-    context.store.write_file(VERDICT_FILE, found.verdict.to_json().encode())
+    limits = _limits(context, before)
+    kept = tuple(each.model_dump(mode="json") for each in found.model if each not in limits)
+    verdict = found.verdict.model_copy(update={"model_effects": kept})
+    context.store.write_file(VERDICT_FILE, verdict.to_json().encode())
     for tag, reason in found.verdict.defects.items():
         context.note(f"effect {tag} failed and was not compared: {reason}")

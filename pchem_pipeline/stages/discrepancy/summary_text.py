@@ -19,17 +19,16 @@ from pchem_pipeline.discrepancy.verdict import (
     sigma_text,
 )
 from pchem_pipeline.model.histogram.odd_frames import frame_words
-from pchem_pipeline.report.style.wording import fitted_or_chosen
+from pchem_pipeline.report.style.wording import fitted_or_chosen, typeset
 
 _WIDTH = 100
 #: Longer lists end with a count.
 _MOST_PLACES, _MOST_CANDIDATES, _MOST_LEFT = 3, 5, 4
 _LEAD = "where: "
 _DEFECT = "DEFECT: candidate {} failed and was not compared: {}"
-_PLAIN = str.maketrans({"−": "-", "→": "->", "⁻": "-", "±": "+-", "…": "...", "\u00a0": " "})
 # no line break between a number and its unit
 _HELD = "\u00a0"
-_BEFORE_UNIT = re.compile(r"(?<=\d) (?=%|DN|e-|sigma\b|nats)")
+_BEFORE_UNIT = re.compile(r"(?<=\d) (?=%|DN|e⁻|sigma\b|nats)")
 
 
 def verdict_text(found: Verdict) -> str:
@@ -64,7 +63,7 @@ def verdict_text(found: Verdict) -> str:
 
 def _wrapped(text: str, indent: str = "  ") -> list[str]:
     # line breaks in a plug-in's message would break the columns
-    words = _BEFORE_UNIT.sub(_HELD, " ".join(text.translate(_PLAIN).split()))
+    words = _BEFORE_UNIT.sub(_HELD, typeset(" ".join(text.split())))
     lines = textwrap.wrap(words, _WIDTH - 7, subsequent_indent=indent, break_long_words=True) or [""]
     return [line.replace(_HELD, " ") for line in lines]
 
@@ -108,7 +107,7 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
         lines.append(f"{title:<28}{'score':>10}{'stderr':>9}{'probability':>13}")
         for each in step.candidates[:_MOST_CANDIDATES]:
             row = f"  {each.effect:<26}{_number(each.score):>10}{_number(each.stderr):>9}"
-            lines.append(f"{row}{_number(each.probability, 3):>13}".translate(_PLAIN)[:_WIDTH])
+            lines.append(f"{row}{_number(each.probability, 3):>13}"[:_WIDTH])
         more = len(step.candidates) - _MOST_CANDIDATES
         lines += [f"  and {more} more"] if more > 0 else []
     # parameters are those of a single candidate
@@ -144,15 +143,15 @@ def _gap(found: Verdict) -> list[str]:
     gap = found.gap
     if not math.isfinite(gap.before):
         return []
-    words = f"gap: {micronats(gap.before)}"
+    words = f"disagreement: {micronats(gap.before)}"
     if found.steps and math.isfinite(gap.after):
-        words += f" -> {micronats(gap.after)}"
-    words += f" micronats per sample (floor {micronats(gap.floor)}"
+        words += f" → {micronats(gap.after)}"
+    words += f" ×10⁻⁶ of log-likelihood per sample (sampling noise makes up to {micronats(gap.floor)}"
     if found.steps and gap.within_chance:
-        words += ": within sampling noise before and after"
+        words += ": no more before and after"
     elif found.steps and math.isfinite(gap.closed_fraction):
         nearest = " by the closest effect" if found.verdict == "unexplained" else ""
-        words += f", {share_text(gap.closed_fraction)} closed{nearest}"
+        words += f"; {share_text(gap.closed_fraction)} explained{nearest}"
     words += ")"
     for step in found.steps:
         if step.within_chance or not step.effect:

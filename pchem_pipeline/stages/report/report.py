@@ -28,6 +28,7 @@ from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.report.style.wording import short_name
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy.result import verdict_data
+from pchem_pipeline.stages.maps import NO_TIME
 from pchem_pipeline.stages.quick_look import read_sums, run_quick_look
 from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_workers
 from pchem_pipeline.stages.report.inspector import deciding_parameters, inspector_data, read_maps
@@ -305,7 +306,7 @@ def _samples(run: StoredRun, config: RunConfig) -> Samples | None:
         Sample(each.name, "bias" if each.bias else "exposed", place, each.n_frames)
         for each, place in zip(found, places, strict=True)
     ]
-    return Samples(tuple(samples), config.input.against, run.samples)
+    return Samples(tuple(samples), config.input.against, run.samples, run.sensor.shown)
 
 
 def _run_facts(run: StoredRun, config: RunConfig) -> dict[str, Any]:
@@ -362,9 +363,7 @@ def _missing(run: StoredRun, maps: Mapping[str, NDArray[Any]]) -> dict[str, str]
     found: dict[str, str] = {}
     if not set(CHARGE_RATES) & maps.keys():
         found["charge_rate"] = (
-            "no charge rate: input.against is not integration_time"
-            if run.sensor.samples
-            else "unknown integration time: no charge rate. Set input.integration_time (s)"
+            "no charge rate: input.against is not integration_time" if run.sensor.samples else NO_TIME
         )
     if not any(np.isfinite(values).any() for values in maps.values()):
         found["maps"] = "no pixel has a value"

@@ -22,7 +22,7 @@ DONE, PART = StageState("ingest", "complete"), StageState("fit", "partial", "", 
 
 
 def test_rows_tell_rate_and_remaining_time() -> None:
-    assert rows([DONE, PART], None) == ["ingest      complete", "fit         partial 8 of 64  model 2"]
+    assert rows([DONE, PART], None) == ["ingest      complete", "fit         partial 8 of 64  (with model 2)"]
     assert rows([DONE, PART], PACE)[1] == "fit         running 8 of 64 tiles, 2/s, 28 s left"
     both = {**PACE, "stage": "ingest and histogram", "unit": "MiB"}
     assert rows([PART], both)[1].strip() == "running (ingest and histogram) 8 of 64 MiB, 2/s, 28 s left"

@@ -158,6 +158,10 @@ def test_files_of_two_cameras_are_no_stack(tmp_path: Path) -> None:
         ("-10", "°C", -10.0),
         (300, "K", 26.85),
         (300, "C", None),
+        (-20, "deg_C", -20.0),
+        (-20, "degrees Celsius", -20.0),
+        (77, "F", None),
+        (77, "mK", None),
         (float("nan"), "C", None),
         ("warm", "C", None),
     ],
@@ -236,6 +240,20 @@ def test_hostile_texts_become_one_short_line() -> None:
         (100, "[lines] exposure time", None),
         (100, "[s] exposure time in ms", None),
         (100, "exposure in units of 10 us", None),
+        (100, "exposure in tenths of seconds", None),
+        (100, "exposure time, tenths of a second", None),
+        (100, "exposure time (tenths of a second)", None),
+        (100, "tenths of a second", None),
+        (100, "exposure of half seconds", None),
+        (100, "exposure time, deci-seconds", None),
+        (100, "exposure time, deciseconds", None),
+        (100, "exposure time, ticks", None),
+        (100, "1/s", None),
+        (100, "frames per second", None),
+        (2, "exposure time, kiloseconds", 2000.0),
+        (2, "kilo-seconds", 2000.0),
+        (2, "ks", 2000.0),
+        (2, "exposure time (hours)", 7200.0),
     ],
 )
 def test_durations(value: Any, unit: Any, seconds: float | None) -> None:
@@ -270,6 +288,29 @@ def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path: Path) ->
             assert stack.integration_time == (None if right is None else pytest.approx(right)), name
             assert name in stack.time_words
             assert "--integration-time" not in stack.time_words or right is None
+
+
+def test_statements_that_contradict_each_other_leave_the_time_unknown(tmp_path: Path) -> None:
+    cards = {
+        "apart": ({"EXPTIME": (0.1, "[s]"), "EXPOSURE": (0.2, "[s]")}, None),
+        "alike": ({"EXPTIME": (0.0333, "[s]"), "EXPOSURE": (33.3333, "[ms]")}, 0.0333),
+        "total": ({"EXPTIME": (0.1, "[s]"), "TELAPSE": (12.0, "[s]")}, 0.1),
+        "alone": ({"TELAPSE": (12.0, "[s]")}, 12.0),
+    }
+    for name, (header, seconds) in cards.items():
+        image = fits.PrimaryHDU(STACK)
+        image.header.update(header)
+        image.writeto(tmp_path / f"{name}.fits")
+        with opened(tmp_path / f"{name}.fits") as stack:
+            assert stack.integration_time == seconds
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["frames"], file["exposure_ms"], file["integration_time"] = STACK, 100, 0.2
+    both_of = {"apart.fits": "EXPTIME = 0.1 ([s]), but EXPOSURE = 0.2 ([s])", "a.h5": "0.2 (s), but"}
+    for name, both in both_of.items():
+        with opened(tmp_path / name) as stack:
+            assert stack.integration_time is None
+            assert both in stack.time_words
+            assert "set input.integration_time (--integration-time SECONDS)" in stack.time_words
 
 
 @pytest.mark.parametrize(

@@ -202,7 +202,7 @@ def test_status_tells_the_model_that_each_result_rests_on(run: Path) -> None:
     assert states(path)["fit"] == ("complete", 2)
     assert states(path)["maps"] == ("stale - fit was run again", 1)
     shown = CliRunner().invoke(app.app, ["status", str(path)], catch_exceptions=False).stdout
-    assert "fit         complete  model 2" in shown.splitlines()
+    assert "fit         complete  (with model 2)" in shown.splitlines()
     shown = CliRunner().invoke(app.app, ["status", str(path), "--json"], catch_exceptions=False).stdout
     assert [stage["model"] for stage in json.loads(shown)["stages"]][3:5] == [2, 1]
 
@@ -212,7 +212,7 @@ def test_a_verdict_is_put_in_force_and_taken_back(run: Path) -> None:
     verdict(run, ROW)
     target, words = adopt_verdict(find_run(run))
     beside = run.with_name("run.effects.yaml")
-    held = f"model 2 is now in use: PCD + row_noise 1.2 DN (in {beside})"
+    held = f"model 2 is now in use: plain model + row_noise 1.2 DN (in {beside})"
     assert words == f"{held}; to go back: pchem model {run} --use 1"
     assert run.read_text(encoding="utf-8") == text
     shown = CliRunner().invoke(app.app, ["fit", str(run)], catch_exceptions=False).stderr
@@ -226,8 +226,8 @@ def test_a_verdict_is_put_in_force_and_taken_back(run: Path) -> None:
     assert not np.array_equal(before["fit/read_noise_dn"], after["fit/read_noise_dn"])
     lines = model_lines(list_models(find_run(run)))
     assert [" ".join(line.split()) for line in lines[1:]] == [
-        "1 config discrepancy PCD",
-        "* 2 verdict on 1 90.0 % fit, maps PCD + row_noise 1.2 DN",
+        "1 config discrepancy plain model",
+        "* 2 verdict on 1 90.0 % fit, maps plain model + row_noise 1.2 DN",
     ]
     words = use_model(find_run(run), 1)
     assert "stale: fit, maps; to update: pchem run" in words

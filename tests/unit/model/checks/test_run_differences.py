@@ -7,6 +7,7 @@ import pytest
 
 from pchem_pipeline.model.checks.run_differences import (
     BlockDifference,
+    MapDifference,
     compare_blocks,
     compare_maps,
     reasons_of_change,
@@ -53,6 +54,11 @@ def test_blocks_add_up() -> None:
     assert 0 < whole.n_beyond == int((a != b).sum())
 
 
+def compared(one: tuple, other: tuple, good: np.ndarray, *, same_data: bool) -> MapDifference:
+    """The difference of one map."""
+    return compare_maps([("bias", one, other)], good, same_data=same_data)["bias"]
+
+
 def two_captures(seed: int, *, shift: float = 0.0, scatter: float = 1.0) -> tuple:
     """Two measurements of one map, shift in standard errors of a difference."""
     rng = np.random.default_rng(seed)
@@ -63,14 +69,14 @@ def two_captures(seed: int, *, shift: float = 0.0, scatter: float = 1.0) -> tupl
 
 
 def test_two_captures_of_the_same_sensor_agree() -> None:
-    found = compare_maps(*two_captures(2), GOOD, same_data=False)
+    found = compared(*two_captures(2), GOOD, same_data=False)
     assert abs(found.median_z) < 5 * np.sqrt(np.pi / (2 * N))
     assert abs(found.spread_z - 1) < 5 * 1.166 / np.sqrt(N)
     assert not reasons_of_change(found)
 
 
 def test_a_shift_of_a_tenth_of_an_error_is_seen() -> None:
-    found = compare_maps(*two_captures(3, shift=0.3), GOOD, same_data=False)
+    found = compared(*two_captures(3, shift=0.3), GOOD, same_data=False)
     # 0.3 errors are 24 standard errors of the median of 10,000 pixels: the test can fail
     assert found.median_z / np.sqrt(np.pi / (2 * N)) > 20
     reasons = reasons_of_change(found)
@@ -79,34 +85,52 @@ def test_a_shift_of_a_tenth_of_an_error_is_seen() -> None:
 
 
 def test_pixels_that_scatter_or_jump_are_seen() -> None:
-    reasons = reasons_of_change(compare_maps(*two_captures(4, scatter=2.5), GOOD, same_data=False))
+    reasons = reasons_of_change(compared(*two_captures(4, scatter=2.5), GOOD, same_data=False))
     assert reasons.spread
     one, other = two_captures(5)
     jumped = other[0].copy()
     jumped[:2, :30] += 50 * other[1][:2, :30]
-    found = compare_maps(one, (jumped, other[1]), GOOD, same_data=False)
-    assert found.n_far == 60
+    found = compared(one, (jumped, other[1]), GOOD, same_data=False)
+    assert 60 <= found.n_changed <= 62
+    assert found.changed[:2, :30].all()
+    assert found.p_value < 1e-9
     reasons = reasons_of_change(found)
     assert (reasons.shifted, reasons.spread, reasons.pixels) == (False, False, True)
     # pixels without a good fit do not count
     bad = GOOD.copy()
     bad[:2, :30] = False
-    assert not reasons_of_change(compare_maps(one, (jumped, other[1]), bad, same_data=False))
+    assert not reasons_of_change(compared(one, (jumped, other[1]), bad, same_data=False))
+
+
+def test_ten_pixels_of_five_errors_are_a_change() -> None:
+    """Fewer pixels than a count beyond five errors would need, in a sensor of 24 x 24."""
+    rng = np.random.default_rng(7)
+    error = np.ones((24, 24))
+    one = {name: (rng.standard_normal((24, 24)), error) for name in "abcdef"}
+    other = {name: (rng.standard_normal((24, 24)), error) for name in "abcdef"}
+    good = np.ones((24, 24), bool)
+    same = compare_maps([(name, one[name], other[name]) for name in one], good, same_data=False)
+    assert not any(found.n_changed or reasons_of_change(found) for found in same.values())
+    other["b"][0].flat[:160:16] += 6.0 * np.sqrt(2.0)
+    found = compare_maps([(name, one[name], other[name]) for name in one], good, same_data=False)
+    assert reasons_of_change(found["b"]).pixels
+    assert 7 <= found["b"].n_changed <= 11
+    assert not any(reasons_of_change(found[name]) for name in "acdef")
 
 
 def test_missing_values_are_counted_and_the_unit_follows_the_data() -> None:
     (one, error), (other, _) = two_captures(6)
     lost, came = one.copy(), other.copy()
     lost[0, :3], came[0, 2:7] = np.nan, np.nan
-    found = compare_maps((lost, error), (came, error), GOOD, same_data=False)
+    found = compared((lost, error), (came, error), GOOD, same_data=False)
     assert (found.n_both, found.n_only_one, found.n_only_other) == (N - 7, 4, 2)
     np.testing.assert_allclose(found.z[5], (other - one)[5] / (np.sqrt(2) * error[5]), rtol=1e-12)
-    same = compare_maps((one, error), (other, error), GOOD, same_data=True)
+    same = compared((one, error), (other, error), GOOD, same_data=True)
     np.testing.assert_allclose(same.z, (other - one) / error, rtol=1e-12)
 
 
 def test_nothing_to_compare_is_no_change() -> None:
     empty = np.full((2, 2), np.nan)
-    found = compare_maps((empty, empty), (empty, empty), np.ones((2, 2), bool), same_data=False)
+    found = compared((empty, empty), (empty, empty), np.ones((2, 2), bool), same_data=False)
     assert found.n_counted == 0
     assert not reasons_of_change(found)

@@ -8,11 +8,11 @@ import pytest
 from helpers.report_material import report_data
 
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.data import ReportData, Sample, Samples
 from pchem_pipeline.report.pages.criteria import criteria
 from pchem_pipeline.report.pages.next_steps import next_steps
 from pchem_pipeline.report.pages.report_json import report_json
-from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, sentence
+from pchem_pipeline.report.pages.summary import Flag, answers, flags, key_numbers, sentence
 from pchem_pipeline.report.pages.tables import result_tables
 from pchem_pipeline.report.settings import Criteria
 
@@ -136,6 +136,23 @@ def test_limits_decide(limits: Criteria, word: str) -> None:
     sensor = answers(data)[0]
     assert sensor.word == word
     assert all(f"{each.found} (limit" in sensor.text for each in sensor.criteria if not each.met)
+
+
+@pytest.mark.parametrize("limits", [Criteria(), Criteria(gain_nonuniformity=1e-6)])
+def test_where_results_are_not_reliable_no_limit_is_known_to_be_kept_or_missed(limits: Criteria) -> None:
+    """It was 'Mostly' where a limit is missed, and 'Unknown' where none is."""
+    serious = [Flag("serious", "The model does not describe this sensor.")]
+    sensor, belief = answers(replace(report_data(), criteria=limits), serious)
+    assert (sensor.word, sensor.level, belief.word) == ("Unknown", "caution", "No")
+    assert sensor.text.endswith(", but the results are not reliable.")
+
+
+def test_the_exposure_of_several_samples_says_whose_it_is() -> None:
+    exposures = tuple(Sample(f"{name}.zarr", "exposed", float(time), 9) for time, name in enumerate("abc", 1))
+    data = replace(report_data(), samples=Samples(exposures, "integration_time", {}, shown=2))
+    labels = {number.name: number.label for number in key_numbers(data)}
+    assert labels["quanta_exposure"] == "quanta exposure in c.zarr"
+    assert labels["bias"] == "bias"
 
 
 def test_hot_pixels_are_counted_though_they_are_flagged() -> None:
