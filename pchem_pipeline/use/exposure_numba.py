@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
 from pchem_pipeline.model.law.cells_numba import Cells, Law, cells_of
 from pchem_pipeline.model.law.electron_laws_numba import electron_number
 from pchem_pipeline.model.law.levels_numba import Codes, Levels, list_levels, place_codes
@@ -19,7 +20,6 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _LEAST_EXPOSURE = 1e-7  # e-; less is none
-_LEAST_MASS = 1e-300
 _LEAST_WEIGHT = 1e-6  # of a rival: less moves no standard error
 _MOST_STEPS = 200
 _PRECISION = 1e-9
@@ -57,13 +57,13 @@ def _evaluate(
     for i in range(counts.size):
         if counts[i] > 0.0:
             mass = rest * sums[0, i] + cells.outlier_mass
-            if mass > _LEAST_MASS:
+            if mass > SMALLEST_MASS:
                 ratio = rest * sums[1, i] / mass
                 loglik += counts[i] * math.log(mass)
                 score += counts[i] * ratio
                 information += counts[i] * (ratio * ratio - rest * sums[2, i] / mass)
             else:
-                loglik += counts[i] * math.log(_LEAST_MASS)
+                loglik += counts[i] * math.log(SMALLEST_MASS)
     return loglik, score, information
 
 

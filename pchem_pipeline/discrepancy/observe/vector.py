@@ -25,12 +25,11 @@ from pchem_pipeline.discrepancy.observe.sums import CHANNELS, PixelStatistics, p
 from pchem_pipeline.discrepancy.observe.sums_numba import FrameSums
 from pchem_pipeline.discrepancy.observe.tables_numba import CodeSums, PixelLaws
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals
+from pchem_pipeline.model.arithmetic.significance import OUTLYING
 
 FloatArray = NDArray[np.float64]
 
-#: A pixel beyond this many standard deviations counts as one that stands out.
-STANDS_OUT = 3.5
-_TAIL = float(special.ndtr(-STANDS_OUT))
+_TAIL = float(special.ndtr(-OUTLYING))
 _ENOUGH = 25.0  # samples expected of a code or bin that is judged by itself
 #: Columns of samples seen and expected beyond the support, and far beyond it.
 _TAILS = {
@@ -64,7 +63,7 @@ def pixel_forms(
         two_sided: whether far below counts as far above.
     """
     quantiles = z if normal is None else normal
-    count = int(np.sum((np.abs(quantiles) if two_sided else quantiles) > STANDS_OUT))
+    count = int(np.sum((np.abs(quantiles) if two_sided else quantiles) > OUTLYING))
     spread = np.sum(np.broadcast_to(np.maximum(2.0 + kurtosis, 1.0), z.shape))
     return {
         "mean": float(z.sum() / np.sqrt(z.size)),

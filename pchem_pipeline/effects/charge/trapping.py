@@ -28,7 +28,7 @@ from pydantic import Field
 from pchem_pipeline.effects.estimators.count_scores import charlier_information
 from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL
 from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
-from pchem_pipeline.effects.estimators.regression import CERTAIN, SIGNIFICANT
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -40,6 +40,7 @@ from pchem_pipeline.effects.types import (
     PixelMaps,
     SampleLaw,
 )
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, OUTLYING
 
 # probability that the state of a trap goes back farther than the frames that are simulated for it
 _RARE = 1e-6
@@ -48,7 +49,6 @@ _CAPTURES = np.geomspace(0.002, 0.9, 12)
 _RELEASES = np.geomspace(0.02, 0.9, 9)
 _FRACTIONS = (0.03, 0.1, 0.3)
 _LIMITS = (0.02, 0.95)  # of a release, and the largest of a capture
-_CLEAR = 3.5  # standard deviations of all that pixels show that are worth a hypothesis
 _MOST = 0.8  # share of the pixels with a trap beyond which all have one
 # standard deviations from what is expected beyond which a pixel counts no more
 _CUT = 5.0
@@ -228,7 +228,7 @@ class _Trap(NamedTuple):
     @property
     def seen(self) -> bool:
         """Whether it is worth a hypothesis."""
-        return self.height > _CLEAR**2 / 2.0 and self.in_time > SIGNIFICANT**2 / 2.0
+        return self.height > OUTLYING**2 / 2.0 and self.in_time > SIGNIFICANT**2 / 2.0
 
     def opposite(self, some: float) -> _Trap:
         """Return the trap that catches as often as this one releases, and releases as this one catches."""
@@ -239,7 +239,7 @@ class _Trap(NamedTuple):
 def _first_of(one: _Trap, other: _Trap) -> _Trap:
     """Return of two traps with nearly the same moments the emptier one, unless it is clearly less likely."""
     empty, full = sorted((one, other), key=lambda each: each.capture / each.release)
-    return full if full.height - empty.height > _CLEAR**2 / 2.0 else empty
+    return full if full.height - empty.height > OUTLYING**2 / 2.0 else empty
 
 
 def _observed(evidence: Evidence) -> _Pixels | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -13,7 +15,7 @@ KINDS = ("empty", "copied", "far")
 #: Frames whose level is farther than this many robust standard deviations from those around them are odd, if
 #: they are no more than this share of the run: what more frames do is a property of the sensor.
 _FAR, _MOST = 6.5, 0.05
-FAR_CHANCE = 8.1e-11  # of one frame to be as far, by a normal law
+FAR_CHANCE = math.erfc(_FAR / math.sqrt(2.0))  # of one frame to be as far, by a normal law
 _AROUND, _FEWEST_FRAMES, _FEWEST_PIXELS = 101, 32, 64
 
 

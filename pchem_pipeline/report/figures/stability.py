@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Level, Line, Panel, Stack
 from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.inspector.packing import AT_ONCE
 from pchem_pipeline.report.style.wording import count, short
 
 FloatArray = NDArray[np.float64]
@@ -25,9 +26,7 @@ _FEWEST = 8
 _LINES = ("row", "column")
 #: Robust standard deviations to which the means of pixels are clipped before their spectrum is taken.
 _CLIP = 6.0
-#: Values whose spectra are taken at a time.
-_AT_ONCE = 1 << 21
-_WIDTH = 1.2533  # standard error of a median over that of a mean
+_WIDTH = math.sqrt(math.pi / 2.0)  # standard error of a median over that of a mean
 
 
 def stability_figures(sums: StackSums | None) -> list[Figure]:
@@ -178,7 +177,7 @@ def line_spectra(sums: StackSums) -> tuple[DataTable, ...]:
 
 def _line_power(lines: Lines, length: int) -> FloatArray:
     """Return the mean power of the sums of lines along the sensor, over that of independent pixels."""
-    power, step = np.zeros(length // 2 + 1), max(1, _AT_ONCE // length)
+    power, step = np.zeros(length // 2 + 1), max(1, AT_ONCE // length)
     groups = lines.variance.size // length
     for start in range(0, lines.sums.shape[0] * groups, step):
         frames = slice(start // groups, -(-(start + step) // groups))

@@ -13,14 +13,13 @@ from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.histogram.odd_frames import KINDS, FloatArray, IntArray, left_out, odd_words
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, SummaryAccumulator
 from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.stages.bands import FRAMES_AT_ONCE
 from pchem_pipeline.stages.histogram.arrays import COVARIANCES, MAPS, with_block_length
 from pchem_pipeline.store.tiles import equal_rows
 
 if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.store.run_store import RunStore
-
-_AT_ONCE = 32  # frames
 
 
 def odd_frames_of(store: RunStore) -> tuple[dict[str, IntArray], IntArray]:
@@ -95,7 +94,7 @@ def _leave_out_of_sums(context: StageContext, changed: IntArray, out: IntArray) 
         sums.finish()
         for block in np.unique(changed // length).tolist():
             frames = block * length, min((block + 1) * length, n_frames)
-            with FrameStream(source, [rows], _AT_ONCE, frames=frames) as stream:
+            with FrameStream(source, [rows], FRAMES_AT_ONCE, frames=frames) as stream:
                 done = sums.exchange((piece for _, (piece,) in stream), kept[slice(*frames)])
             for name, values in vars(done).items():
                 store.write(f"summary/{name}", (slice(block, block + 1), *band[1:]), values[None])

@@ -16,7 +16,6 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     FAR_SHARE_OF_PART,
     LARGEST_FACTOR,
     PRICE_OF_MORE,
-    STANDS_OUT,
     Hypothesis,
     Noise,
     fit_set,
@@ -34,6 +33,7 @@ from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import broken_plugins, effect_classes
+from pchem_pipeline.model.arithmetic.significance import CERTAIN
 
 FloatArray = NDArray[np.float64]
 Vector = Mapping[str, float]
@@ -41,7 +41,7 @@ Vector = Mapping[str, float]
 Mapper = Callable[[Sequence[Replicate]], "list[Vector | Exception]"]
 
 MOST_HYPOTHESES = 6  # of one effect
-_MOST_IN_A_PART = 2
+MOST_IN_A_PART = 2
 # times as many hypotheses of all effects in all parts: each is a simulation, and most are in vain
 _MOST_IN_PARTS = 6
 _REFINED = 12  # hypotheses of which the strength is refined by a second simulation
@@ -170,7 +170,7 @@ class ReplicateSimulator:
                 continue
             try:
                 guessed = next(filter(None, (list(effect.estimate(e)) for e in (*known, *evidence))), [])
-                if not guessed and known and known[0].strongest(*effect.signature[:2]) > STANDS_OUT:
+                if not guessed and known and known[0].strongest(*effect.signature[:2]) > CERTAIN:
                     guessed = list(effect.typical())
                 for each in guessed[:1]:
                     identifiable_from_histograms(
@@ -179,7 +179,7 @@ class ReplicateSimulator:
                 found += [] if taken else [window.found(each) for each in guessed[:most]]
                 for part, own in parts:
                     clear = own.strongest(*effect.signature[:2])
-                    for rank, each in enumerate(list(effect.estimate(own))[:_MOST_IN_A_PART]):
+                    for rank, each in enumerate(list(effect.estimate(own))[:MOST_IN_A_PART]):
                         there = window.found(each, part)
                         if not any(self._overlap(there, present, window.shape) for present in taken):
                             found.append(there)

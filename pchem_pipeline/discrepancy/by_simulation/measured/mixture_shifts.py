@@ -24,6 +24,7 @@ from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.readout.empirical import Empirical, MixtureShift, Together
+from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
 
@@ -36,7 +37,6 @@ _FINE = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # DN
 _FARTHEST_E = 6.0  # electrons: shifts beyond are hits of particles or the like
 _ITERATIONS, _HALVINGS = 20, 8
 _CONVERGED = 0.01  # nats
-_NOTHING = 1e-300
 _MOST_SHIFTS = 6
 _CLEAR = 10.0  # nats of likelihood that a move must be worth
 _LEAST = 1e-6  # share
@@ -79,7 +79,7 @@ class _Mixture:
         share[0] = 1.0 - share[1:].sum()
         best = _likelihood(counts, mass, share)
         for _ in range(_ITERATIONS):
-            law = np.maximum(share @ mass, _NOTHING)
+            law = np.maximum(share @ mass, SMALLEST_MASS)
             slope = mass @ (counts / law)
             scaled = mass * (np.sqrt(counts) / law)
             curvature = scaled @ scaled.T
@@ -89,7 +89,7 @@ class _Mixture:
             step = optimize.nnls(root.T, target)[0] - share
             for _ in range(_HALVINGS):
                 new = share + step
-                new /= max(float(new.sum()), _NOTHING)
+                new /= max(float(new.sum()), SMALLEST_MASS)
                 value = _likelihood(counts, mass, new)
                 if value > best:
                     break
@@ -121,7 +121,7 @@ class _Mixture:
 
 
 def _likelihood(counts: FloatArray, mass: FloatArray, share: FloatArray) -> float:
-    return float(counts @ np.log(np.maximum(share @ mass, _NOTHING)))
+    return float(counts @ np.log(np.maximum(share @ mass, SMALLEST_MASS)))
 
 
 @dataclass(frozen=True)
@@ -398,7 +398,7 @@ def _log_ratio(
     """Return by how much likelier samples are if they were moved, nats, shape (m,)."""
     mass = _mixture(laws, samples, moves, samples.other).mass
     moved = shares[1:] @ mass[1:] / max(float(shares[1:].sum()), _LEAST)
-    ratio = np.log(np.maximum(moved, _NOTHING) / np.maximum(mass[0], _NOTHING))
+    ratio = np.log(np.maximum(moved, SMALLEST_MASS) / np.maximum(mass[0], SMALLEST_MASS))
     return np.asarray(ratio.clip(-_SURE, _SURE))
 
 

@@ -15,12 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
-    CERTAIN,
-    Distance,
-    Measurement,
-    PartSamples,
-)
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import Distance, Measurement, PartSamples
 from pchem_pipeline.discrepancy.observe.digital.groups import GROUP
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples, Follows
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
@@ -33,6 +28,7 @@ from pchem_pipeline.effects.analog.empirical_response import (
 )
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.framework.neighbours import neighbours
+from pchem_pipeline.model.arithmetic.significance import CLEAR
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -165,7 +161,7 @@ class _Left:
         """Return what is left of the products of the data beyond those of a model that are certain."""
         products = data.products.copy()
         if model is not None:
-            sure = np.abs(np.nan_to_num(model.z("sample"))) > CERTAIN
+            sure = np.abs(np.nan_to_num(model.z("sample"))) > CLEAR
             products -= np.where(sure, model.products / np.maximum(model.pairs, 1.0) * data.pairs, 0.0)
         return cls(products, data.pairs, data.wider)
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.by_simulation.sensor.population_numba import solve_parabolas
+from pchem_pipeline.discrepancy.effort import MOST_LEARNT_FROM
 from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.fit.climb_numba import LEAST_STEP, MAX_LOG_EXPOSURE
 from pchem_pipeline.model.fit.shared import to_parameters, to_theta
@@ -34,7 +35,6 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_MOST_LEARNT_FROM = 1000  # pixels that the population is learnt from
 _TAILS = 8.0  # degrees of freedom of Student's t: pixels far from the others are no reason to widen T
 _ROUNDS = 8  # of parabolas, each followed by EM
 _EM_STEPS = 60
@@ -153,8 +153,8 @@ def posterior_of(
     """
     pixels = _Pixels(counts, np.asarray(origin, np.int64), law or SampleLaw(), replaced)
     some = np.arange(len(counts))
-    if some.size > _MOST_LEARNT_FROM:
-        some = np.sort(np.random.default_rng(0).choice(some, _MOST_LEARNT_FROM, replace=False))
+    if some.size > MOST_LEARNT_FROM:
+        some = np.sort(np.random.default_rng(0).choice(some, MOST_LEARNT_FROM, replace=False))
     shifts = (0,) if mistaken <= _HARDLY_ANY else _SHIFTS
     best, most = None, -np.inf
     for start, population in _seeds(pixels, parameters, mistaken):
