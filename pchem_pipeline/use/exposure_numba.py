@@ -19,7 +19,7 @@ from pchem_pipeline.model.law.pixel_numba import OWN, Pixel
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_LEAST_EXPOSURE = 1e-7  # e-; less is none
+LEAST_EXPOSURE = 1e-6  # e-; less is none
 _LEAST_WEIGHT = 1e-6  # of a rival: less moves no standard error
 _MOST_STEPS = 200
 _PRECISION = 1e-9
@@ -88,7 +88,7 @@ def _climb(start: float, cells: Cells, levels: Levels, counts: FloatArray, sums:
             ahead = here * math.exp(step)
         else:
             ahead = max(here + score / total, 0.1 * here)  # the EM step of a Poisson law
-        if ahead < _LEAST_EXPOSURE:
+        if ahead < LEAST_EXPOSURE:
             return 0.0
         if abs(ahead - here) < _PRECISION * here:
             return ahead
@@ -185,7 +185,7 @@ def estimate_exposures(
         seen = weights[:n]
         start = (codes.first + moment / total / parts - theta[2]) / theta[1]
         exposure = _climb(start, cells, levels, seen, sums)
-        near = max(exposure, _LEAST_EXPOSURE)
+        near = max(exposure, LEAST_EXPOSURE)
         height, score, information = _evaluate(near, cells, levels, seen, sums)
         curvature = (information + score) / (near * near)
         if exposure == 0.0:

@@ -84,7 +84,8 @@ class Acceptance:
         change, stderr = correction(added.slopes, self.z.final - added.mean, allowed)
         measured = np.array([type(h.effect).empirical for h in added.hypotheses])
         sure = measured | _overwhelming(added.parts, self.z.both - first.mean, first.std)
-        # of what is measured without a name few forms are tried, and only where the data disagree with all others
+        # few forms are tried of what is measured without a name, and only where the data disagree with all
+        # that has one
         clear = np.exp(added.change) > np.where(sure, CLEAR, ESTABLISHED) * added.stderr
         proven = 1.0 + change > np.where(measured, CLEAR, _CONFIRMED) * stderr
         proven &= change > -LARGEST_DECREASE

@@ -21,9 +21,9 @@ from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
 from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
-from pchem_pipeline.discrepancy.observe.vector import SHORTEST_PERIODOGRAM
 from pchem_pipeline.effects.framework.evidence import PixelMaps, Wave
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, FALSE_ALARM
+from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
 
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
@@ -76,7 +76,7 @@ def waves_across(
     samples = Samples.by_laws(Stack(frames[: numbers.size]), laws, maps)
     samples = samples if inside is None else samples.without(~inside)
     pixels = int(np.count_nonzero(samples.usable))
-    if numbers.size < FEWEST_FRAMES or min(ny, nx) < SHORTEST_PERIODOGRAM or not pixels:
+    if numbers.size < FEWEST_FRAMES or min(ny, nx) < FEWEST_LINES or not pixels:
         return Waves((), {})
     u = np.concatenate([chunk for (chunk,) in samples.chunks((1,))])
     mean, ratio = _spectrum(u, numbers, pixels)

@@ -23,6 +23,8 @@ from pchem_pipeline.model.arithmetic.robust import chi_square
 from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
 
 _SMALLEST_MASS = 1e-100
+#: Of a parameter, by which the law is changed to see its slope.
+SMALL_CHANGE = 1e-4
 SMALLEST_WIDTH = 0.1  # DN: below it peaks are single codes
 #: Samples expected beyond the codes of a pixel, on either side, at most.
 ALLOWED = 1e-2

@@ -17,6 +17,8 @@ CUT = 4.0
 CUT_ROUNDS = 4
 #: Share of the pixels beyond which what stands out is the rule, and not an effect of few pixels.
 FEW_PIXELS = 0.3
+#: Share of the pixels beyond which what some have is taken for all.
+NEARLY_ALL = 0.8
 
 
 class Multiple(NamedTuple):

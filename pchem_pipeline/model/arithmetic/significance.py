@@ -22,6 +22,8 @@ NO_CHANCE = 1e-6
 PRICE = 3.0
 #: Nats that change no estimate by more than its standard error.
 NO_DIFFERENCE = 0.5
+#: Nats that leave no choice: the one explains e^10 times as well as the other.
+DECISIVE = 10.0
 
 #: Samples expected in a group, at least, for it to count in a chi-square (Cochran 1954).
 SMALLEST_EXPECTATION = 5.0

@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.maps import summarise
 
-#: Standard errors beyond which a statistic of all pixels counts as changed.
+#: Standard errors beyond which a single pixel, or a statistic of all pixels, counts as changed.
 LIMIT = 5.0
-#: Standard errors beyond which a single pixel counts as changed.
-FAR = 5.0
 #: Share of pixels that may lie beyond: errors of fits have longer tails than the normal law.
 _TAIL = 1e-4
 #: By how much the standard errors of the fits themselves may be wrong.
@@ -91,7 +89,7 @@ class MapDifference:
         median_z: median of ``z`` over the pixels that count.
         spread_z: robust standard deviation of ``z`` over them; 1 where chance alone acts.
         n_counted: pixels that count: good fits in both.
-        n_far: pixels beyond ``FAR`` among them.
+        n_far: pixels beyond ``LIMIT`` among them.
         largest_z: largest absolute value of ``z`` among them.
     """
 
@@ -143,7 +141,7 @@ def compare_maps(
         median_z=core.median,
         spread_z=core.robust_sd,
         n_counted=counted.size,
-        n_far=int((np.abs(counted) > FAR).sum()),
+        n_far=int((np.abs(counted) > LIMIT).sum()),
         largest_z=float(np.max(np.abs(counted), initial=0.0)),
     )
 

@@ -32,7 +32,7 @@ Law = Callable[[FloatArray, FloatArray], SampleLaw]
 _STEP = 1e-5  # of the differences, in units of the parameters' natural scale
 _REACH_EXPOSURE, _REACH_STEP = 2.0, 0.3  # logarithms
 _LOG_16 = float(np.log(16.0))  # a read noise of a quarter of a step
-_LOWEST_LOG_VARIANCE = float(np.log(1e-4))
+LOWEST_LOG_VARIANCE = float(np.log(1e-4))
 _FIRST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e8
 _NO_ELECTRONS = 1e-9  # e-: the exposure of a sample without any
 
@@ -406,7 +406,7 @@ def _limits(theta: FloatArray, n_exposures: int) -> tuple[FloatArray, FloatArray
     step = np.exp(theta[:, m])
     reach = np.full((step.size, m + 2), _REACH_EXPOSURE)
     reach[:, m], reach[:, m + 1] = _REACH_STEP, 1.2 * step
-    low = np.concatenate([theta[:, : m + 2] - reach, np.full((step.size, 1), _LOWEST_LOG_VARIANCE)], axis=1)
+    low = np.concatenate([theta[:, : m + 2] - reach, np.full((step.size, 1), LOWEST_LOG_VARIANCE)], axis=1)
     widest = np.maximum(2.0 * theta[:, m : m + 1] - _LOG_16, theta[:, m + 2 :] + 1.0)
     high = np.concatenate([theta[:, : m + 2] + reach, widest], axis=1)
     low[:, :m] -= _REACH_EXPOSURE

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.checks.run_differences import FAR, MapDifference
+from pchem_pipeline.model.checks.run_differences import LIMIT, MapDifference
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
     Axis,
@@ -62,7 +62,7 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
     alt = (
         f"Map and histogram of the difference in {label}: median "
         f"{measured(each.median, each.median_stderr, unit)} ({signed(each.median_z)} sigma of one pixel); "
-        f"scatter {short(each.spread_z, 2)} sigma; {count(each.n_far, 'good pixel')} beyond {FAR:g} sigma."
+        f"scatter {short(each.spread_z, 2)} sigma; {count(each.n_far, 'good pixel')} beyond {LIMIT:g} sigma."
     )
     caption = (
         "Line: N(0, 1), expected from sampling noise alone."
@@ -134,8 +134,8 @@ def difference_chart(z: FloatArray, n_far: int, title: str, *, same_data: bool) 
     unit, label = _unit(limit)
     end = limit / unit
     top = sensor_stack(z / unit, (-end, end), label, scale=DIVERGING, title=plain(title))
-    edge = limit if same_data else max(limit, FAR)
-    note = f"{count(n_far, 'good pixel')} beyond ±{FAR:g}"
+    edge = limit if same_data else max(limit, LIMIT)
+    note = f"{count(n_far, 'good pixel')} beyond ±{LIMIT:g}"
     pulls = pull_stack(known / unit, edge / unit, f"difference ({label})", note, normal=not same_data)
     return Chart((top, pulls))
 

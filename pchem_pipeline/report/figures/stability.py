@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
+from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
 from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Level, Line, Panel, Stack
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.inspector.packing import AT_ONCE
@@ -21,8 +22,6 @@ FloatArray = NDArray[np.float64]
 
 #: Points of a curve at most; longer runs are averaged over frames, spectra over frequencies.
 _MOST_POINTS, _MOST_FREQUENCIES = 1200, 160
-#: Frames, rows or columns that a spectrum needs.
-_FEWEST = 8
 _LINES = ("row", "column")
 #: Robust standard deviations to which the means of pixels are clipped before their spectrum is taken.
 _CLIP = 6.0
@@ -157,7 +156,7 @@ def pattern_spectra(sums: StackSums) -> tuple[DataTable, ...]:
     image = np.clip(image - middle, -_CLIP * width, _CLIP * width)
     found = []
     for axis, line in enumerate(_LINES):
-        if image.shape[axis] < _FEWEST:
+        if image.shape[axis] < FEWEST_LINES:
             continue
         power = np.abs(np.fft.rfft(image.mean(axis=1 - axis))[1:]) ** 2
         chance = max(float(image.var()), 1e-300) * image.shape[axis] / image.shape[1 - axis]
@@ -171,7 +170,7 @@ def line_spectra(sums: StackSums) -> tuple[DataTable, ...]:
     return tuple(
         _spectrum(_line_power(each, length), length, f"noise_{line}", line)
         for each, length, line in zip(lines, sums.shape, _LINES, strict=True)
-        if length >= _FEWEST and each.freedom > 1
+        if length >= FEWEST_LINES and each.freedom > 1
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pchem_pipeline.model.checks.run_differences import FAR
+from pchem_pipeline.model.checks.run_differences import LIMIT
 from pchem_pipeline.report.comparison import ArrayRow, Comparison, HistoryRow, Pair, Setting
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures
 from pchem_pipeline.report.figures.figure import Figure
@@ -304,7 +304,7 @@ def _map_table(pair: Pair) -> Table:
         f"maps-{pair.other.label}",
         "Differences of the maps",
         f"{pair.other.label} − {pair.one.label}, pixels with a good fit in both runs. {unit_words}",
-        ("map", "median", "median (σ)", "scatter (σ)", f"beyond ±{FAR:g} σ", "largest (σ)", ""),
+        ("map", "median", "median (σ)", "scatter (σ)", f"beyond ±{LIMIT:g} σ", "largest (σ)", ""),
         tuple(rows),
     )
 

@@ -25,6 +25,7 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.readout.empirical import Empirical, MixtureShift, Together
 from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
+from pchem_pipeline.model.arithmetic.significance import DECISIVE
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
 
@@ -38,7 +39,6 @@ _FARTHEST_E = 6.0  # electrons: shifts beyond are hits of particles or the like
 _ITERATIONS, _HALVINGS = 20, 8
 _CONVERGED = 0.01  # nats
 _MOST_SHIFTS = 6
-_CLEAR = 10.0  # nats of likelihood that a move must be worth
 _LEAST = 1e-6  # share
 #: Neighbours: one and two frames before, and those beside in the same frame.
 _PLACES: tuple[Distance, ...] = (
@@ -115,7 +115,7 @@ class _Mixture:
         for one in sorted(used[1:], key=lambda i: shares[i]):
             fewer = [i for i in used if i != one]
             without, likelihood = self.fitted(fewer)
-            if best - likelihood < _CLEAR:
+            if best - likelihood < DECISIVE:
                 used, shares, best = fewer, without, likelihood
         return [i for i in used[1:] if shares[i] > 0.0], shares, best - self.fitted([0])[1]
 
@@ -222,7 +222,7 @@ def _measured_squares(frames: NDArray[np.unsignedinteger], maps: PixelMaps) -> M
         return None
     gain = float(found[best] * np.log(found[best] / expected) - (found[best] - expected))
     share = float(found[best] - expected) / float(number[best])
-    if gain < _CLEAR:
+    if gain < DECISIVE:
         return None
     gain /= len(frames) * np.count_nonzero(usable)
     return _component([MixtureShift()], [1], np.array([1.0 - share, share]), gain, squares=parities[best])
@@ -295,9 +295,9 @@ def _measured_towards(
             continue
         moves = _shifts_towards(place, step)
         gain = _mixture(laws, samples, moves, samples.other).gain()
-        if gain > max(_CLEAR, 0.0 if best is None else best[0]):
+        if gain > max(DECISIVE, 0.0 if best is None else best[0]):
             gain -= _OF_CHANCE * _mixture(laws, samples, moves, samples.chance).gain()
-        if gain > max(_CLEAR, 0.0 if best is None else best[0]):
+        if gain > max(DECISIVE, 0.0 if best is None else best[0]):
             best = gain, place
     if best is None:
         return None
@@ -408,7 +408,7 @@ def _together(
     """Return what is moved alike, by the likelihood, and the share of it that is."""
     ratio = _log_ratio(laws, samples, moves, shares)
     single = min(float(shares[1:].sum()), 1.0 - _LEAST)
-    best = float(np.logaddexp(np.log1p(-single), np.log(single) + ratio).sum()) + _CLEAR
+    best = float(np.logaddexp(np.log1p(-single), np.log(single) + ratio).sum()) + DECISIVE
     found: tuple[Together, float] = ("sample", 0.0)
     for together in _TOGETHER:
         share, likelihood = share_of(_of_groups(ratio, samples.place, together, shape), single)

@@ -34,7 +34,7 @@ from pchem_pipeline.effects.analog.empirical_noise import (
 )
 from pchem_pipeline.effects.estimators.lines import Line, coherent_line
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, CERTAIN, POSSIBLE
+from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, CERTAIN, DECISIVE, POSSIBLE
 from pchem_pipeline.model.law.pcd import pcd_posterior
 
 FloatArray = NDArray[np.float64]
@@ -45,7 +45,7 @@ _CHANGED: tuple[Changed, ...] = ("offset", "gain", "light", "noise")
 _CLEAR = 15.0  # nats
 _NEARLY = 0.5  # of the nats of the clearest change: another one may be it as well
 # by how much bursts must explain more than a Gaussian, of what there is to win, and nats: scores are skewed
-_OF_GAUSSIAN, _BURST = 0.3, 10.0
+_OF_GAUSSIAN = 0.3
 _REACH = 20.0  # widths of the highest peak from it, up to where scores are told apart
 _CHUNK = 256  # frames at once
 _MOST_BLOCKS, _SMALLEST_BLOCK = 8, 4  # along an axis; px
@@ -373,4 +373,4 @@ def _bursts(one: Sums, gaussian: float) -> tuple[float | None, float]:
         nearest = max(found)[2]
         try_sizes(nearest * factor for factor in _BETWEEN)
     gain, share, size = max(found, default=(0.0, 0.0, 0.0))
-    return (share, size) if gain > gaussian + _OF_GAUSSIAN * most + _BURST else (None, 0.0)
+    return (share, size) if gain > gaussian + _OF_GAUSSIAN * most + DECISIVE else (None, 0.0)

@@ -28,7 +28,7 @@ from pchem_pipeline.effects.analog.empirical_response import (
 )
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.framework.neighbours import neighbours
-from pchem_pipeline.model.arithmetic.significance import CLEAR
+from pchem_pipeline.model.arithmetic.significance import CLEAR, DECISIVE
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -39,7 +39,6 @@ _CLEAR = 20.0  # nats that a term must be worth beyond the number of those that 
 _DETAIL = 1e-3  # of the nats of the first term: less may be how the pixels differ in it
 _MOST_TERMS = 16
 _NEARLY_ALL = 0.7  # of the columns
-_BEYOND = 10.0  # nats by which what exceeds some electrons must be followed more clearly than all of them
 _HIGHEST, _FAR = 30, 3.0  # electrons, and standard deviations of the charge: more are hardly ever exceeded
 _STEPS = 8  # up to that, before all numbers near the clearest are tried
 
@@ -249,7 +248,7 @@ def _beyond(samples: FollowingSamples, term: _Term) -> _Term:
     best = clearest_of(range(0, most + 1, step))
     if step > 1:
         best = clearest_of(range(max(best - step + 1, 0), best + step))
-    if best == 0 or found[best][0] < found.get(0, (0.0, 0.0))[0] + _BEYOND:
+    if best == 0 or found[best][0] < found.get(0, (0.0, 0.0))[0] + DECISIVE:
         return term
     gain, slope = found[best]
     return term._replace(value=slope, gain=gain, above=best)

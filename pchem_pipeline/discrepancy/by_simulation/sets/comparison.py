@@ -30,7 +30,11 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood, note_defect
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
+    MOST_STARTS,
+    HistogramLikelihood,
+    note_defect,
+)
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_expensive
 from pchem_pipeline.discrepancy.by_simulation.sets.trials import (
     LOOSE,
@@ -46,7 +50,6 @@ from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
 FloatArray = NDArray[np.float64]
 
 _MOST_SINGLES = 7
-_MOST_OF_ONE = 3  # hypotheses of the same effect
 _MOST_SETS = 5
 # sets that others are grown from, and share of what the best one explains within which another one is as good
 # a seed; how many of these sets are refitted, by how many effects they have besides
@@ -290,7 +293,7 @@ def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesi
     chosen = firsts(choice.best)
     for hypothesis in firsts(hypotheses):
         same = sum(h.tag == hypothesis.tag for h in chosen)
-        most = 1 if type(hypothesis.effect).random_realisation else _MOST_OF_ONE
+        most = 1 if type(hypothesis.effect).random_realisation else MOST_STARTS
         if same < most and len(chosen) < _MOST_SINGLES and hypothesis not in chosen:
             chosen.append(hypothesis)
     return chosen

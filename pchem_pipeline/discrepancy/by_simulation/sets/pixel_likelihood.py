@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError, error_words
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, leads_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
-from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import MOST_IN_A_PART
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import LARGEST_FACTOR, Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, multistart, shift_bias_by_electrons
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.framework.effect import Effect, tag_of
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.model.arithmetic.significance import NO_DIFFERENCE
+from pchem_pipeline.model.arithmetic.significance import DECISIVE, NO_DIFFERENCE
 from pchem_pipeline.model.histogram.count import histogram_frames
 
 FloatArray = NDArray[np.float64]
@@ -37,7 +36,8 @@ _log = logging.getLogger(__name__)
 MANY_PIXELS = 1024
 #: Pixels that tell numbers well enough to begin with.
 FEW_PIXELS = 256
-_MOST_STARTS = 3  # of one effect
+MOST_STARTS = 3  # of one effect
+MOST_IN_A_PART = 2  # hypotheses of an effect, or effects for which no estimator speaks
 # nats that an effect for which no estimator speaks must explain, and times as strong as is typical, where a
 # plain fit is led astray
 _SPEAKS, _STRONG = 15.0, 5.0
@@ -46,7 +46,7 @@ _REMEMBERED = 12  # fits: each holds the masses of all codes
 _ASTRAY = 5.0  # nats of a pixel that an effect explains, from which on it may mistake the peak of no electron
 _FEWEST_PIXELS, _FEWEST_FRAMES = 16, 200  # of a place, whose histograms tell numbers
 # nats of few pixels, and share of what the best one explains, by which an effect is far behind that
-_FAR, _FAR_SHARE = 10.0, 0.1
+_FAR_SHARE = 0.1
 
 
 class PixelLikelihood:
@@ -106,7 +106,7 @@ class PixelLikelihood:
         The likeliest first; none where no fit holds.
         """
         fits: list[tuple[float, Effect]] = []
-        for guess in guesses[:_MOST_STARTS]:
+        for guess in guesses[:MOST_STARTS]:
             one = self._fit([guess], ())
             if one is None or one.members[0].at_limit:
                 continue
@@ -345,7 +345,7 @@ def _likeliest(by: PixelLikelihood, guesses: Mapping[str, Sequence[Effect]]) -> 
     best = max((fits[0][0] for fits in rough.values() if fits), default=0.0)
     found = {}
     for tag, fits in rough.items():
-        near = bool(fits) and fits[0][0] > (1.0 - _FAR_SHARE) * best - _FAR
+        near = bool(fits) and fits[0][0] > (1.0 - _FAR_SHARE) * best - DECISIVE
         fits = by.fitted([effect for _, effect in fits]) if near and few is not by else fits
         found[tag] = [effect for _, effect in fits]
     return found
