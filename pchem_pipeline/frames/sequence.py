@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import shared_facts
+from pchem_pipeline.frames.identity import SCRATCH_BYTES
 from pchem_pipeline.frames.inspect import InputReport
 from pchem_pipeline.frames.reader import FrameReader, check_window, shared_notes
 from pchem_pipeline.frames.settings import InputSettings
-
-#: bytes of decoded frames that a thread holds before they are cut into bands of rows
-SCRATCH_BYTES = 8 << 20
 
 
 class FrameSequence(FrameReader):

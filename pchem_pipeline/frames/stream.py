@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, unstore
-from pchem_pipeline.frames.identity import FileHasher, file_size, identity_of_hashes
+from pchem_pipeline.frames.identity import SCRATCH_BYTES, FileHasher, file_size, identity_of_hashes
 from pchem_pipeline.frames.reader import FrameReader, changed
-from pchem_pipeline.frames.sequence import SCRATCH_BYTES, FrameSequence
+from pchem_pipeline.frames.sequence import FrameSequence
 
 #: first row of a band, and its end
 Rows = tuple[int, int]
