@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.arithmetic.normal_numba import REACH
 from pchem_pipeline.model.law.mass import sample_slopes
 from pchem_pipeline.model.law.pcd import pcd_posterior
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -28,6 +27,7 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 COORDINATES = ("quanta_exposure", "log_gain", "bias_e", "log_read_noise_dn")
 
 _NODES_PER_SIGMA = 3.0  # halving the step changes no digit that matters; see the tests
+_REACH = 10.0  # read noises beyond which nothing is left
 _COARSE = 1.5  # DN: cells and density differ by exp(-2 pi^2 sigma^2)
 _LEAST_EXPOSURE = 1e-12  # below it a sample holds no electrons
 
@@ -70,7 +70,7 @@ def expected_information(
 
 def _range(quanta_exposure: float, noise_e: float) -> tuple[float, float]:
     """Return the smallest and the largest charge that samples show, e-."""
-    width, reach = 12.0 * np.sqrt(quanta_exposure) + 12.0, REACH * noise_e
+    width, reach = 12.0 * np.sqrt(quanta_exposure) + 12.0, _REACH * noise_e
     return max(0.0, np.floor(quanta_exposure - width)) - reach, quanta_exposure + width + reach
 
 

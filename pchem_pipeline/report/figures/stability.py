@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
 from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Level, Line, Panel, Stack
@@ -24,7 +25,6 @@ FloatArray = NDArray[np.float64]
 _MOST_POINTS, _MOST_FREQUENCIES = 1200, 160
 _LINES = ("row", "column")
 #: Robust standard deviations to which the means of pixels are clipped before their spectrum is taken.
-_CLIP = 6.0
 _WIDTH = math.sqrt(math.pi / 2.0)  # standard error of a median over that of a mean
 
 
@@ -153,7 +153,7 @@ def profile_table(sums: StackSums, axis: int) -> DataTable:
 def pattern_spectra(sums: StackSums) -> tuple[DataTable, ...]:
     """Return the power of the means of rows and columns by frequency, over that of unrelated pixels."""
     image, (middle, width) = sums.mean_signal, sums.typical_signal
-    image = np.clip(image - middle, -_CLIP * width, _CLIP * width)
+    image = np.clip(image - middle, -FAR * width, FAR * width)
     found = []
     for axis, line in enumerate(_LINES):
         if image.shape[axis] < FEWEST_LINES:
