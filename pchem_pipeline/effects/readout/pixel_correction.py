@@ -21,7 +21,6 @@ from pchem_pipeline.effects.framework.evidence import PredictedSamples
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
 
-# standard deviations by which samples must equal their prediction too often, and exceed it too seldom
 _FEWEST = 20.0  # samples above the threshold by chance
 
 

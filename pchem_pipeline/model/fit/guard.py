@@ -128,6 +128,7 @@ class _Guard:
         """Tell which fits may have been led by outliers: by single samples or as a whole."""
         out = self.answers.out[pixels]
         fitted = np.isfinite(self.answers.parameters[pixels]).all(axis=1) & np.isfinite(out[:, OUTLYING])
+        # of such a goodness of fit outliers may be to blame
         misfit = (_scores(self.answers)[pixels] > BEYOND_DOUBT) & (not self.limits.cells)
         return np.asarray(fitted & ((out[:, OUTLYING] > 0) | misfit))
 

@@ -37,7 +37,7 @@ FloatArray = NDArray[np.float64]
 
 #: Colours end at least, and at most, at so many standard deviations.
 _LEAST, _MOST = 4.0, 12.0
-#: A pixel beyond this is counted, and ringed if such pixels are few.
+#: Pixels that stand out are counted, and ringed if they are no more.
 _MOST_RINGS = 60
 
 

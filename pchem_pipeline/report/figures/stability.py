@@ -24,7 +24,6 @@ FloatArray = NDArray[np.float64]
 #: Points of a curve at most; longer runs are averaged over frames, spectra over frequencies.
 _MOST_POINTS, _MOST_FREQUENCIES = 1200, 160
 _LINES = ("row", "column")
-#: Robust standard deviations to which the means of pixels are clipped before their spectrum is taken.
 _WIDTH = math.sqrt(math.pi / 2.0)  # standard error of a median over that of a mean
 
 

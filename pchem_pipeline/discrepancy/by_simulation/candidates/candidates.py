@@ -48,9 +48,7 @@ _REFINED = 12  # hypotheses of which the strength is refined by a second simulat
 _STEPS = 2  # that refine a strength
 _CLOSE = 0.15  # relative: a strength known so well is not simulated again
 REPEATS = 3  # simulations of the hypotheses that sets are made of
-# standard deviations of what a single simulation may show by chance, below and above which it is nothing or
-# all of it; of the mean of several, in its own standard errors
-_CHANCE_OF_MEAN = 1.0
+_CHANCE_OF_MEAN = 1.0  # standard errors of the mean of several simulations, below which it is nothing
 
 
 def serial(replicates: Sequence[Replicate]) -> list[Vector | Exception]:
@@ -305,6 +303,7 @@ def _without_chance(shifts: FloatArray) -> FloatArray:
     histograms are drawn anew; regressed on such chance, every strength would come out too low.
     """
     mean, repeats = shifts.mean(axis=0), shifts.shape[0]
+    # below the one a single simulation shows nothing, above the other all of it
     low, high, error = POSSIBLE, CERTAIN, np.ones_like(mean)
     if repeats > 1:
         scatter = shifts.std(axis=0, ddof=1)

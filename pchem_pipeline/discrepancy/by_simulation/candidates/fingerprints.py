@@ -228,7 +228,7 @@ class ScoredSet:
 
     @property
     def penalised_log_likelihood(self) -> float:
-        """Score less the price of its effects, nats."""
+        """Score less the price of its effects, nats: none is there unless something speaks for it."""
         return self.score - PRICE - PRICE_OF_MORE * (len(self.hypotheses) - 1)
 
 

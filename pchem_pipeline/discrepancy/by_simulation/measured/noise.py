@@ -220,6 +220,7 @@ def measured_noise(
     for of, found in profiles.items():
         for key, taken in found.take_off(of, left, of_offset).items():
             error[key] = np.hypot(error[key], _SHAPE_ERROR * taken)
+    # a fit to all statistics comes behind
     clear = [key for key in left if abs(left[key]) > CERTAIN * error[key]]
     modes: list[NoiseMode] = []
     powers: list[float] = []

@@ -45,8 +45,7 @@ _PROBED = 64  # pixels
 _REMEMBERED = 12  # fits: each holds the masses of all codes
 _ASTRAY = 5.0  # nats of a pixel that an effect explains, from which on it may mistake the peak of no electron
 _FEWEST_PIXELS, _FEWEST_FRAMES = 16, 200  # of a place, whose histograms tell numbers
-# nats of few pixels, and share of what the best one explains, by which an effect is far behind that
-_FAR_SHARE = 0.1
+_FAR_SHARE = 0.1  # of what the best effect explains, beside chance, by which one is far behind it
 
 
 class PixelLikelihood:
@@ -130,6 +129,7 @@ class PixelLikelihood:
                 note_defect(self._defects, tag_of(kind), error)
                 continue
             rough = self.fewer().fitted(starts)
+            # an effect that explains less in few pixels is not in more of them
             if rough and rough[0][0] > NO_DIFFERENCE:
                 fits += rough[:1] if self.fewer() is self else self.fitted([rough[0][1]])
         return [effect for rise, effect in sorted(fits, key=lambda fit: -fit[0]) if rise > _SPEAKS]

@@ -295,6 +295,7 @@ class Refitter:
         expensive = is_expensive(h.effect for h in hypotheses)
         for step_number in range(self.steps):
             best = way.best
+            # after a step that brings so little the next ones bring less
             if best.settled or way.gained < NO_DIFFERENCE:
                 break
             if way.kept_its_promise and self._hopeless(best, way.gained, rival):
