@@ -1,7 +1,7 @@
 """How far from what is expected a result counts: one scale for all tests."""
 
-#: Standard errors that may be chance, once in 20 looks, but are worth a hypothesis: a wrong one is thrown out by
-#: the comparison that follows.
+#: Standard errors that may be chance, once in 20 looks, but are worth a hypothesis: a wrong
+#: one is thrown out by the comparison that follows.
 POSSIBLE = 2.0
 #: Standard errors of a single look that is no chance: once in 400.
 CLEAR = 3.0

@@ -44,9 +44,8 @@ BoolArray = NDArray[np.bool_]
 _CHANGED: tuple[Changed, ...] = ("offset", "gain", "light", "noise")
 _CLEAR = 15.0  # nats
 _NEARLY = 0.5  # of the nats of the clearest change: another one may be it as well
-_OF_GAUSSIAN = (
-    0.3  # of what there is to win, by which bursts must explain more than a Gaussian: scores are skewed
-)
+# of what there is to win, by which bursts must explain more than a Gaussian: scores are skewed
+_OF_GAUSSIAN = 0.3
 _REACH = 20.0  # widths of the highest peak from it, up to where scores are told apart
 _CHUNK = 256  # frames at once
 _MOST_BLOCKS, _SMALLEST_BLOCK = 8, 4  # along an axis; px
