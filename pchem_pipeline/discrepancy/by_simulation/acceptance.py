@@ -23,9 +23,8 @@ from pchem_pipeline.model.arithmetic.significance import CLEAR
 
 FloatArray = NDArray[np.float64]
 
-_CONFIRMED = (
-    1.0  # standard errors of its strength in the final frames, half as many, which nothing was chosen by
-)
+# standard errors of a strength in the final frames, half as many, which nothing was chosen by
+_CONFIRMED = 1.0
 # standard deviations of the plain model beyond the others' part from which on an effect is there, though its
 # strength be known badly: so few errors of that do then
 _OVERWHELMING = 30.0
