@@ -44,6 +44,7 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere
+from pchem_pipeline.model.arithmetic.significance import CLEAR, FALSE_ALARM, NO_CHANCE
 
 FloatArray = NDArray[np.float64]
 
@@ -53,10 +54,7 @@ LARGEST_REST = 0.2
 MOST_RIVALS = 3
 _MOST_UNEXPLAINED = 8
 _MOST_RESIDUALS = 3
-_DECIDED = 3.0  # standard errors of a difference of log-likelihoods that decides between two effects
 _MOST_LONGER = 30.0  # largest factor on the number of samples that is recommended
-_NO_CHANCE = 1e-6  # global p-value below which nothing is consistent, and further statistics are listed
-_RARE = 0.02  # global p-value below which a statistic is mentioned as borderline
 # nats per sample from which on a plain fit may be far off: six of seven hidden effects that left so much had
 # moved the gain of 19 to 100 % of the pixels by a fifth or more
 _BEYOND_A_FIT = 0.1
@@ -228,7 +226,7 @@ class Findings:
         additions = self.added.additions
         if not additions:
             # a single highly significant statistic counts even if gap and families are within sampling noise
-            if self.still or self.first.global_p(self.z.both, 2) < _NO_CHANCE:
+            if self.still or self.first.global_p(self.z.both, 2) < NO_CHANCE:
                 return "unexplained"
             return "cannot_tell" if self.doubt else "consistent"
         if any(each.described for each in additions):
@@ -339,7 +337,7 @@ def _still(found: Findings, pulls: FloatArray) -> list[Place]:
     tests = found.last.effective_tests
     chance = [look_elsewhere(p, tests) for p in found.last.p_of(pulls, 2).tolist()]
     order = np.argsort(-np.abs(pulls))[:_MOST_UNEXPLAINED].tolist()
-    kept = [i for n, i in enumerate(order) if n == 0 or chance[i] < _NO_CHANCE]
+    kept = [i for n, i in enumerate(order) if n == 0 or chance[i] < NO_CHANCE]
     return [Place.of(found.last.names[i], z=float(pulls[i])) for i in kept]
 
 
@@ -377,7 +375,7 @@ def _more_samples(other: Candidate) -> str:
     A difference of log-likelihoods grows with the number of samples, its standard error with the root.
     """
     lead = abs(other.score)
-    longer = (_DECIDED * other.stderr / lead) ** 2 if lead > 0.0 else math.inf
+    longer = (CLEAR * other.stderr / lead) ** 2 if lead > 0.0 else math.inf
     if not longer <= _MOST_LONGER:
         return "fit a second exposure, or dark frames, jointly (pchem joint); more of the same will not do"
     return f"about {max(longer, 1.5):.2g} times as many samples"
@@ -387,7 +385,7 @@ def _nearly(found: Findings) -> str:
     """Describe borderline deviations; empty if there are none."""
     words = []
     p = found.first.global_p(found.z.both, 2)
-    if p < _RARE:
+    if p < FALSE_ALARM:
         least = int(np.argmin(found.first.p_values(found.z.both, 2)))
         says = STATISTICS[found.first.names[least]].says(float(found.first.pulls(found.z.both, 2)[least]))
         words.append(f"{says} (p = {p:.1g})")

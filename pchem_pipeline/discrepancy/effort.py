@@ -16,7 +16,7 @@ _SAMPLE, _FIT, _MASS = 2.5e-7, 4.0e-5, 1.0e-7
 _REFIT, _REFIT_BY = 3.5e-5, 6.0e-7
 # of what is learnt of the sensor from a pixel, and the same by components
 _LEARN, _LEARN_BY = 4.0e-4, 1.0e-4
-_MOST_LEARNT_FROM = 1000  # pixels
+MOST_LEARNT_FROM = 1000  # pixels
 # of a sample that is asked for guesses of all effects, or for all forms of what no effect explains
 _ASKED = 2.0e-6
 #: By how many times as long the fit of a pixel takes more where its bias may be off by an electron: more
@@ -106,7 +106,7 @@ class Effort:
             learnt: whether a sensor is learnt by that law; from maps alone that costs next to nothing.
         """
         work = self._hard * pixels * components * (_REFIT + _REFIT_BY * evaluations)
-        learning = (_LEARN + _LEARN_BY * components) * min(pixels, _MOST_LEARNT_FROM)
+        learning = (_LEARN + _LEARN_BY * components) * min(pixels, MOST_LEARNT_FROM)
         self.spent += work + (learning if learnt else 0.0)
         self.tried |= set(tags)
 

@@ -21,6 +21,7 @@ from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.null import NullModel, moments
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere, robust_sd
+from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 
 FloatArray = NDArray[np.float64]
 
@@ -30,7 +31,6 @@ _INTERVAL = 1.96
 # robust standard deviations from the median beyond which a replicate is an outlier: without effects, and with
 # effects, which may occur in a few replicates only
 _APART, _APART_WITH_EFFECTS = 8.0, 30.0
-_BEYOND_CHANCE = 1e-3  # p-value below which a family is significant by itself
 
 
 @dataclass(frozen=True)
@@ -214,4 +214,4 @@ def _stands_out(distance: float, chance: FloatArray, families: int) -> bool:
     if not (mean > 0.0 and variance > 0.0):
         return False
     deviate = float(chi_square(distance, mean, variance))
-    return look_elsewhere(float(special.stdtr(chance.size - 1, -deviate)), families) < _BEYOND_CHANCE
+    return look_elsewhere(float(special.stdtr(chance.size - 1, -deviate)), families) < SIGNIFICANCE

@@ -23,6 +23,7 @@ from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.observe.laws import without_skew
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
 
 FloatArray = NDArray[np.float64]
 
@@ -39,9 +40,7 @@ _SMALLEST_STD = 0.6
 # last words of the names of statistics that are normal quantiles of a count: of few events their scatter is
 # far below 1, but their tail is normal all the same
 _COUNTS = ("cnt", "count", "pixels", "clusters")
-# standard errors of the mean from which a statistic has moved, and the p-value below which it has widened
-_MOVED = 4.0
-_WIDER = 0.01
+_WIDER = 0.01  # p-value below which a statistic has widened
 _REPLICATION = 0.02  # p-value required in each split, with the same sign
 #: Held-out log-likelihood ratio, nats, required where no statistic is significant by itself.
 CONVINCING = 6.0
@@ -49,7 +48,6 @@ _SUSPICION = 0.1  # global p-value below which candidates are compared
 # robust standard deviations at which replicates are winsorised: with effects, which may change a few
 # replicates only, and without
 _STRAY, _STRAY_ALONE = 30.0, 10.0
-_SIGNATURE = 3.0  # standard deviations by which an effect shifts the statistics of its signature
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,7 @@ class NullModel:
             vectors: replicates with the effects, shape (b, m).
         """
         n = len(vectors)
-        moved = np.abs(vectors.mean(axis=0) - self.mean) > _MOVED * self.std / np.sqrt(n)
+        moved = np.abs(vectors.mean(axis=0) - self.mean) > CERTAIN * self.std / np.sqrt(n)
         wider = special.fdtrc(n - 1, self.freedom, vectors.var(axis=0, ddof=1) / self.std**2)
         return np.asarray(moved | (wider < _WIDER))
 
@@ -368,7 +366,7 @@ def misfits(
         significance: probability of a false alarm.
         tolerance: see :func:`disagrees`.
     """
-    signature = np.abs(shift) > _SIGNATURE * null.std
+    signature = np.abs(shift) > CLEAR * null.std
     if not signature.any():
         return False
     smallest = float(_p_values(null, z, tolerance)[signature].min())

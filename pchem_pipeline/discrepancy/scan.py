@@ -24,7 +24,10 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import FAR
+from pchem_pipeline.discrepancy.observe.rare import SEED
 from pchem_pipeline.effects.framework.region import Region, When
+from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
+from pchem_pipeline.model.arithmetic.significance import PRICE, SIGNIFICANCE
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -34,8 +37,6 @@ BoolArray = NDArray[np.bool_]
 _CELLS, _STRETCHES = 32, 400
 _RADII = (1.5, 2.5, 4.0, 6.0, 9.0, 13.0, 19.0, 28.0)
 _FINER = (0.72, 0.8, 0.9, 1.12, 1.25, 1.4)
-#: Probability of a chance, in any place, below which it counts.
-SIGNIFICANCE = 1e-3
 #: Periods of lines, and of frames.
 PERIODS, _FRAME_PERIODS = (2, 4, 8, 16, 32), range(2, 33)
 #: Sweeps of the edges of a rectangle over the pixels, and of a range over the frames.
@@ -43,14 +44,11 @@ _SWEEPS = 3
 _RIDGE = 1e-3  # of a covariance of series that may all but coincide
 #: Pixels, frames or events of a place, at least.
 FEWEST = 3
-_LEAST = -690.0  # logarithm of the smallest probability that is written
+_LEAST = math.log(SMALLEST_MASS)  # of the smallest probability that is written
 _SURE = 0.05  # probability of a chance among all single pixels of a place
 _LITTLE = 0.25  # of the mean inside a place, that outside
-#: Nats by which a place of a further family must be less probable than a simpler one.
-_BETTER = 3.0
 _MOST_SINGLE = 1000  # frames that are listed
 _MOST_EVENTS = 500  # frames with an event that are looked at: so many drawn of them tell a range as well
-_SEED = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -280,7 +278,7 @@ def regions(contrast: Contrast) -> list[Found | None]:
     ]
 
 
-def best_place(contrast: Contrast, families: Sequence[Found | None], better: float = _BETTER) -> Found | None:
+def best_place(contrast: Contrast, families: Sequence[Found | None], better: float = PRICE) -> Found | None:
     """Return the place of the smallest probability of all families; None where none divides the pixels.
 
     Args:
@@ -678,7 +676,7 @@ def scan_event_frames(
     """
     if positions.size > _MOST_EVENTS:
         expected *= _MOST_EVENTS / positions.size
-        positions = np.sort(np.random.default_rng(_SEED).choice(positions, _MOST_EVENTS, replace=False))
+        positions = np.sort(np.random.default_rng(SEED).choice(positions, _MOST_EVENTS, replace=False))
     m, n = positions.size, numbers.size
     if m < FEWEST or n < 2 * shortest:
         return None

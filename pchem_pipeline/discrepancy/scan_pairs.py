@@ -26,8 +26,9 @@ from scipy import special
 from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.observe.pairs import MODES, PERIOD, Pairs, Samples, energies, pairs_of
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
-from pchem_pipeline.discrepancy.scan import PERIODS, SIGNIFICANCE, Suspect, successive
+from pchem_pipeline.discrepancy.scan import PERIODS, Suspect, successive
 from pchem_pipeline.effects.framework.region import Region, Taps
+from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
+from pchem_pipeline.discrepancy.observe.rare import SEED
 from pchem_pipeline.discrepancy.verdict import RARE, Size, parameters_of
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect, Plane
@@ -28,7 +29,6 @@ _BLOCKS, _BLOCK_FRAMES = 100, 40  # spread over the run
 _FEWEST_FRAMES = 20_000
 _FEWEST_BLOCKS = 4  # of the whole sensor
 _BITS = 24
-_SEED = 1
 _CHANGED = 1e-9
 _IN_DN = (Plane.ADC, Plane.READOUT)
 
@@ -58,7 +58,7 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
     blocks = min(blocks, -(-n_frames // _BLOCK_FRAMES))
     stacks = 1 if effect.far_reaching else -(-_FEWEST_FRAMES // (blocks * _BLOCK_FRAMES))
     try:
-        drawn = [_change(effect, maps, n_frames, blocks, _SEED + i) for i in range(stacks)]
+        drawn = [_change(effect, maps, n_frames, blocks, SEED + i) for i in range(stacks)]
     except PchEmError:
         return None
     inside = np.ones_like(maps.usable)

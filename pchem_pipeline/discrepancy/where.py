@@ -11,18 +11,12 @@ from scipy import special
 
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
-from pchem_pipeline.discrepancy.scan import (
-    SIGNIFICANCE,
-    Stretch,
-    Suspect,
-    scan_event_map,
-    scan_map,
-    scan_series,
-)
+from pchem_pipeline.discrepancy.scan import Stretch, Suspect, scan_event_map, scan_map, scan_series
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.effects.framework.evidence import SCORES, Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import parse_place
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
+from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 
 FloatArray = NDArray[np.float64]
 

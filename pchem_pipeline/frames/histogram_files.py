@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.frames.formats.kinds import MOST_PIECE
 from pchem_pipeline.frames.identity import content_identity
 from pchem_pipeline.frames.inspect import FileReport, InputReport, mark_repeated_paths
 from pchem_pipeline.frames.resolve import HISTOGRAM_SUFFIXES, resolve_files
@@ -27,7 +28,6 @@ from pchem_pipeline.frames.settings import InputSettings
 #: more bins than any ADC of interest has codes; a wider span is a mistake in the file
 _MOST_BINS = 1 << 24
 _MOST_BINS_OF_ALL = 1 << 27
-_MOST_UNPACKED = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ def _split_npz(path: Path, archive: Any) -> tuple[NDArray[Any], NDArray[Any]]:
         listed = ", ".join(sorted(held)) or "nothing"
         raise InputError(f"{path}: needs arrays dn and counts, has {listed}; save it with these names")
     unpacked = sum(part.file_size for part in archive.zip.infolist())
-    if unpacked > max(_MOST_UNPACKED, 100 * path.stat().st_size):
+    if unpacked > max(MOST_PIECE, 100 * path.stat().st_size):
         raise InputError(f"{path}: {unpacked} bytes unpacked, too large for histograms; save it again")
     return archive["dn"], np.atleast_2d(archive["counts"])
 

@@ -14,7 +14,8 @@ import xxhash
 
 from pchem_pipeline.base.errors import InputError
 
-_BLOCK = 1 << 22
+#: bytes that a thread reads or decodes at a time
+SCRATCH_BYTES = 8 << 20
 
 
 def _parts(path: Path) -> list[Path]:
@@ -83,7 +84,7 @@ class FileHasher:
         if part is not self.path and not self._begun:
             self._hasher.update(f"{part.relative_to(self.path).as_posix()}\0{size}\0".encode())
         self._begun = True
-        view = memoryview(bytearray(max(1, min(_BLOCK, size - self._offset))))
+        view = memoryview(bytearray(max(1, min(SCRATCH_BYTES, size - self._offset))))
         with part.open("rb", buffering=0) as stream:
             stream.seek(self._offset)
             while count is None or self.done < count:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import shared_facts
+from pchem_pipeline.frames.identity import SCRATCH_BYTES
 from pchem_pipeline.frames.inspect import InputReport
 from pchem_pipeline.frames.reader import FrameReader, check_window, shared_notes
 from pchem_pipeline.frames.settings import InputSettings
-
-_SCRATCH_BYTES = 1 << 24
 
 
 class FrameSequence(FrameReader):
@@ -175,7 +174,7 @@ class FrameSequence(FrameReader):
             reader.read_into(part, t0, t1, *rows)
             return
         height = rows[1] - rows[0]
-        step = max(1, _SCRATCH_BYTES // max(1, height * self._columns * self.dtype.itemsize))
+        step = max(1, SCRATCH_BYTES // max(1, height * self._columns * self.dtype.itemsize))
         scratch = np.empty((min(step, t1 - t0), height, self._columns), self.dtype)
         for t in range(t0, t1, step):
             stop = min(t + step, t1)

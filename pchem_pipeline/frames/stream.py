@@ -21,12 +21,9 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, unstore
-from pchem_pipeline.frames.identity import FileHasher, file_size, identity_of_hashes
+from pchem_pipeline.frames.identity import SCRATCH_BYTES, FileHasher, file_size, identity_of_hashes
 from pchem_pipeline.frames.reader import FrameReader, changed
 from pchem_pipeline.frames.sequence import FrameSequence
-
-#: bytes of decoded frames that a thread holds before they are cut into bands of rows
-_SCRATCH_BYTES = 8 << 20
 
 #: first row of a band, and its end
 Rows = tuple[int, int]
@@ -214,7 +211,7 @@ class HashedFrameStream(FrameStream):
     ) -> None:
         """Take frames that lie plainly in a file from the bytes that are hashed."""
         layout, (first, end) = reader.layout, frames
-        step = max(1, _SCRATCH_BYTES // max(layout.frame_bytes, 1))
+        step = max(1, SCRATCH_BYTES // max(layout.frame_bytes, 1))
         for a in range(first, end, step):
             offsets = layout.offsets[a : min(a + step, end)]
             hasher.read_to(int(offsets[0]))
@@ -235,7 +232,7 @@ class HashedFrameStream(FrameStream):
     def _decode(self, parts: Sequence[NDArray[Any]], t0: int, ranges: Sequence[tuple[int, int]]) -> None:
         """Decode ranges of frames, shared among the threads, each frame once."""
         frame = int(np.prod(self._stack.shape[1:])) * self._stack.dtype.itemsize
-        step = max(1, _SCRATCH_BYTES // max(frame, 1))
+        step = max(1, SCRATCH_BYTES // max(frame, 1))
         cuts = [(a, min(a + step, end)) for start, end in ranges for a in range(start, end, step)]
 
         def decode(a: int, b: int) -> None:

@@ -16,11 +16,11 @@ from scipy.special import logsumexp
 
 from pchem_pipeline.base.units import FEW_STEP
 from pchem_pipeline.model.law.pcd import log_pcd
+from pchem_pipeline.model.law.telegraph import LEAST_EXPOSURE
 from pchem_pipeline.planning.point import FloatArray
 
 _OFFSETS = (1.0, 0.75, 0.5, 1.25)  # e- off at the brightest sample; the rival lies near 1
 _GAIN_CHANGES = (0.1, 0.2)  # of ln g
-_LEAST_EXPOSURE = 0.02
 _PHASE = 0.3  # DN from a whole number to the bias
 
 
@@ -63,7 +63,7 @@ def ambiguity(exposures: Sequence[float], shares: Sequence[float], read_noise_e:
     for side in (-1.0, 1.0):
         heights: list[tuple[float, Ambiguity]] = []
         step = None
-        for offset in (offset for offset in _OFFSETS if top + side * offset >= _LEAST_EXPOSURE):
+        for offset in (offset for offset in _OFFSETS if top + side * offset >= LEAST_EXPOSURE):
             held = top + side * offset
             rival = _Rival(laws, dark, read_noise_e, 2 + len(lights), float(np.log(held)))
             shift, scale = held - top, held / top
@@ -134,7 +134,7 @@ def _split_off_bias(
 
 
 def _logs(exposures: Sequence[float]) -> list[float]:
-    return [float(np.log(max(h, _LEAST_EXPOSURE))) for h in exposures]
+    return [float(np.log(max(h, LEAST_EXPOSURE))) for h in exposures]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pchem_pipeline.run.progress import whole_mebibytes
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.store.files import cure_of, read_record, write_record
 
-_LISTED_FILES = 64
+LISTED_FILES = 64
 
 
 def known_identity(context: StageContext) -> dict[str, Any]:
@@ -113,7 +113,7 @@ def inspect_input(context: StageContext) -> None:
 def shortened(identity: dict[str, Any]) -> dict[str, Any]:
     """Return the identity with the first files only, for the attributes of the store."""
     files = identity["files"]
-    return {**identity, "files": files[:_LISTED_FILES], "n_files": len(files)}
+    return {**identity, "files": files[:LISTED_FILES], "n_files": len(files)}
 
 
 def _mebibytes(files: list[dict[str, Any]]) -> int:

@@ -16,6 +16,10 @@ from pchem_pipeline.store.tiles import Tile, equal_rows
 
 #: bands for each worker: enough to keep all busy to the end
 _BANDS_PER_WORKER = 4
+#: bytes of frames, or of histograms, of a band that are worked on at once
+BAND_BYTES = 64 << 20
+#: frames that are read at a time
+FRAMES_AT_ONCE = 64
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.frames.camera import shared_facts
+from pchem_pipeline.run.input_identity import LISTED_FILES
 from pchem_pipeline.run.sensor import Sample, SensorInfo
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.store.run_store import RunStore
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 
 #: The stage up to which the run of each sample must be brought, before they are fitted together.
 SAMPLES_UNTIL = "histogram"
-
-_LISTED_FILES = 64
 
 
 @dataclass(frozen=True)
@@ -240,7 +239,7 @@ def sample_sensor(config: RunConfig, samples: Sequence[OpenSample]) -> SensorInf
         integration_time=None,
         mode="reference",
         identity={
-            "files": files[:_LISTED_FILES],
+            "files": files[:LISTED_FILES],
             "n_files": len(files),
             "digest": hashlib.sha256(digests.encode()).hexdigest(),
         },

@@ -24,6 +24,7 @@ from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.frames.formats.map_files import read_image
 from pchem_pipeline.frames.identity import content_identity
 from pchem_pipeline.frames.writing import WRITERS, write_frames
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.run.stage import StageContext, open_store
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 TRUTH_FILE = "truth.npz"
-# rows that are decoded together
-_BAND_ROWS = 64
 # memory for the frames in the making, over all workers
 _BUDGET = 256 << 20
 # true electron numbers are stored in chunks of about this size
@@ -95,7 +94,7 @@ def run(context: StageContext) -> None:
     electron_units = _electron_units(settings)
     if electron_units:
         step, (rows, columns) = electron_units[0].stop, settings.shape
-        band = min(rows, _BAND_ROWS)
+        band = min(rows, ROW_GROUP)
         context.create(
             "truth/electron_number",
             lengths={"frame": electron_units[-1].stop, "y": rows, "x": columns},

@@ -13,8 +13,7 @@ from pchem_pipeline.model.law.inputs import kernel_counts, pack
 from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.use import exposure_numba
 from pchem_pipeline.use.calibration import Calibration
-
-_LEAST_PRIOR = 1e-6  # e-; an exposure of 0 forbids all electrons
+from pchem_pipeline.use.exposure_numba import LEAST_EXPOSURE
 
 
 @dataclass(frozen=True)
@@ -68,9 +67,9 @@ class ExposurePool:
         """
         known = np.isfinite(signal) & np.isfinite(noise)
         if not known.any():
-            return cls(_LEAST_PRIOR, 0.0, 0.0, n_frames)
+            return cls(LEAST_EXPOSURE, 0.0, 0.0, n_frames)
         some = np.minimum(signal[known], np.quantile(signal[known], 0.99))
-        mean, within = max(float(some.mean()), _LEAST_PRIOR), float(noise[known].mean())
+        mean, within = max(float(some.mean()), LEAST_EXPOSURE), float(noise[known].mean())
         return cls(mean, max(float(some.var()) - (mean + within) / n_frames, 0.0), within, n_frames)
 
     def priors(self, signal: FloatArray, noise: FloatArray) -> FloatArray:
@@ -82,13 +81,13 @@ class ExposurePool:
         """
         others = self.variance * (self.n_frames - 1)
         own = others / (others + self.mean + noise)
-        mean = np.maximum(self.mean + own * (signal - self.mean), _LEAST_PRIOR)[..., None]
+        mean = np.maximum(self.mean + own * (signal - self.mean), LEAST_EXPOSURE)[..., None]
         left = self.variance * (self.mean + self.noise) / (others + self.mean + self.noise)
         if left < 0.05 * self.mean:  # small beside the variance of the electron number
             return mean
         scale = ((1.0 - own) * self.variance)[..., None] / mean
         found = gammaincinv(mean / scale, np.arange(0.1, 1.0, 0.2)) * scale
-        return np.asarray(np.maximum(found, _LEAST_PRIOR))
+        return np.asarray(np.maximum(found, LEAST_EXPOSURE))
 
 
 def mean_signal(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
 from pchem_pipeline.model.law.cells_numba import Cells, Law, cells_of
 from pchem_pipeline.model.law.electron_laws_numba import electron_number
 from pchem_pipeline.model.law.levels_numba import Codes, Levels, list_levels, place_codes
@@ -18,8 +19,7 @@ from pchem_pipeline.model.law.pixel_numba import OWN, Pixel
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_LEAST_EXPOSURE = 1e-7  # e-; less is none
-_LEAST_MASS = 1e-300
+LEAST_EXPOSURE = 1e-6  # e-; less is none
 _LEAST_WEIGHT = 1e-6  # of a rival: less moves no standard error
 _MOST_STEPS = 200
 _PRECISION = 1e-9
@@ -57,13 +57,13 @@ def _evaluate(
     for i in range(counts.size):
         if counts[i] > 0.0:
             mass = rest * sums[0, i] + cells.outlier_mass
-            if mass > _LEAST_MASS:
+            if mass > SMALLEST_MASS:
                 ratio = rest * sums[1, i] / mass
                 loglik += counts[i] * math.log(mass)
                 score += counts[i] * ratio
                 information += counts[i] * (ratio * ratio - rest * sums[2, i] / mass)
             else:
-                loglik += counts[i] * math.log(_LEAST_MASS)
+                loglik += counts[i] * math.log(SMALLEST_MASS)
     return loglik, score, information
 
 
@@ -88,7 +88,7 @@ def _climb(start: float, cells: Cells, levels: Levels, counts: FloatArray, sums:
             ahead = here * math.exp(step)
         else:
             ahead = max(here + score / total, 0.1 * here)  # the EM step of a Poisson law
-        if ahead < _LEAST_EXPOSURE:
+        if ahead < LEAST_EXPOSURE:
             return 0.0
         if abs(ahead - here) < _PRECISION * here:
             return ahead
@@ -185,7 +185,7 @@ def estimate_exposures(
         seen = weights[:n]
         start = (codes.first + moment / total / parts - theta[2]) / theta[1]
         exposure = _climb(start, cells, levels, seen, sums)
-        near = max(exposure, _LEAST_EXPOSURE)
+        near = max(exposure, LEAST_EXPOSURE)
         height, score, information = _evaluate(near, cells, levels, seen, sums)
         curvature = (information + score) / (near * near)
         if exposure == 0.0:

@@ -20,7 +20,7 @@ from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, find_members
 from pchem_pipeline.discrepancy.by_likelihood.observed import ObservedHistograms, SampleHistograms
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, explain
-from pchem_pipeline.discrepancy.by_likelihood.sets import SIGMAS, FittedSet, SetComparison
+from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap
@@ -33,6 +33,7 @@ from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.registry import effect_classes
+from pchem_pipeline.model.arithmetic.significance import CLEAR
 from pchem_pipeline.model.fit.shared import Samples
 
 FloatArray = NDArray[np.float64]
@@ -228,7 +229,7 @@ class HistogramExplainer(Explainer[Explanation]):
         defects |= self.sets.failed | found.sets.failed
         if not disagreed:
             rise, error = found.sets.difference(found.judged, found.sets.fit(()))
-            if not found.named or rise < max(CONVINCING, SIGMAS * error):
+            if not found.named or rise < max(CONVINCING, CLEAR * error):
                 return None
         self.found = found
         return found if found.named else None

@@ -27,7 +27,7 @@ _FAMILIES = ("shape", "code", "tail")  # of statistics that histograms have
 _MOST_EXTRA = 2
 _MOST_STARTS = 6  # of one effect
 _UNLIMITED = {True: 10.0, False: 1e4}  # of a strength, of another field
-_FARTHEST = 4.0  # factor by which other fields than the strength may move
+FARTHEST = 4.0  # factor by which other fields than the strength may move
 _LONGEST_LIST = 8
 _LEAST_CHANGE = 1e-12
 
@@ -88,7 +88,7 @@ class Member:
             limits = _limits(type(effect), name)
             if name != effect.strength and limits[0] > 0:
                 value = float(getattr(effect, name))
-                limits = max(limits[0], value / _FARTHEST), min(limits[1], value * _FARTHEST)
+                limits = max(limits[0], value / FARTHEST), min(limits[1], value * FARTHEST)
             bounds = [np.sign(b) * min(abs(b), _UNLIMITED[name == effect.strength]) ** power for b in limits]
             found.append(Coordinate(name, power, (float(bounds[0]), float(bounds[1]))))
         return cls(effect, tuple(found))

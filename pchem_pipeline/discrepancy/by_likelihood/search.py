@@ -17,9 +17,8 @@ from pchem_pipeline.discrepancy.by_likelihood.comb import (
     valleys,
 )
 from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap
-from pchem_pipeline.discrepancy.by_likelihood.members import Member
+from pchem_pipeline.discrepancy.by_likelihood.members import FARTHEST, Member
 from pchem_pipeline.discrepancy.by_likelihood.sets import (
-    SIGMAS,
     SWAPPED,
     Choice,
     FittedSet,
@@ -28,13 +27,13 @@ from pchem_pipeline.discrepancy.by_likelihood.sets import (
     find_rivals,
     of_best_kind,
 )
+from pchem_pipeline.model.arithmetic.significance import CLEAR
 
 FloatArray = NDArray[np.float64]
 
 _PAYS = 0.5  # of the gap: more must go with a peak that is set aside
 _PEAKS_TRIED = 3
 _COINCIDE = 0.3  # e-
-_STEADY = 4.0  # factor within which a strength must stay when more codes are compared
 
 
 @dataclass(frozen=True)
@@ -238,7 +237,7 @@ def _alike(one: Member, other: Member) -> bool:
     if not one.effect.strength or one.kind != other.kind:
         return True
     a, b = (float(getattr(m.effect, m.effect.strength)) for m in (one, other))
-    return a * b > 0 and max(abs(a), abs(b)) < _STEADY * min(abs(a), abs(b))
+    return a * b > 0 and max(abs(a), abs(b)) < FARTHEST * min(abs(a), abs(b))
 
 
 def _named(sets: SetComparison, best: FittedSet, member: Member, candidates: Sequence[Member]) -> Named:
@@ -247,7 +246,7 @@ def _named(sets: SetComparison, best: FittedSet, member: Member, candidates: Seq
     rivals = tuple(
         (other, *sets.difference(rival, best)) for rival in found if (other := rival.new(best)) is not None
     )
-    equals = tuple(other.tag for other, behind, error in rivals if -behind < SIGMAS * error)
+    equals = tuple(other.tag for other, behind, error in rivals if -behind < CLEAR * error)
     return Named(member, 0.0, rivals, equals, sets.rise(best, without) if without else 0.0)
 
 

@@ -20,16 +20,13 @@ from pchem_pipeline.discrepancy.build_verdict import MOST_RIVALS
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.arithmetic.significance import CLEAR, PRICE
 from pchem_pipeline.model.fit.shared import Samples, SharedFit, SharedProblem, Tangent, fit_shared
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Standard errors of a difference of scores that is no chance.
-SIGMAS = 3.0
-#: Nats by which an effect must improve the score at least.
-PRICE = 3.0
 _LARGEST_SET = 4
 _FITTED = 3  # candidates fitted in full, of those that a first-order step promises most of
 _TOLERANCE = 0.02  # nats; of a misfit more, since it is known no better
@@ -250,7 +247,7 @@ class SetComparison:
     def beats(self, one: FittedSet, other: FittedSet, least: float = PRICE) -> bool:
         """Tell whether a set predicts better than another one, beyond chance and by so many nats at least."""
         rise, error = self.difference(one, other)
-        return rise > max(SIGMAS * error, least)
+        return rise > max(CLEAR * error, least)
 
     def rise(self, one: FittedSet, other: FittedSet) -> float:
         """Return the score of one above that of the other, nats."""

@@ -19,17 +19,15 @@ from pchem_pipeline.discrepancy.by_simulation.sets.refits import ESTABLISHED, Re
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.model.arithmetic.significance import CLEAR
 
 FloatArray = NDArray[np.float64]
 
-_CONFIRMED = 1.0  # standard errors of it in the final frames, half as many, which nothing was chosen by
-# the same of what is measured without a name, in either: few forms of it are tried, and only where the data
-# disagree with all that has one
-_MEASURED = 3.0
+# standard errors of a strength in the final frames, half as many, which nothing was chosen by
+_CONFIRMED = 1.0
 # standard deviations of the plain model beyond the others' part from which on an effect is there, though its
 # strength be known badly: so few errors of that do then
 _OVERWHELMING = 30.0
-_LEFT_OF_COUNT = 3.0  # standard errors of what an effect leaves of a count that it accounts for
 
 
 @dataclass(frozen=True)
@@ -85,8 +83,10 @@ class Acceptance:
         change, stderr = correction(added.slopes, self.z.final - added.mean, allowed)
         measured = np.array([type(h.effect).empirical for h in added.hypotheses])
         sure = measured | _overwhelming(added.parts, self.z.both - first.mean, first.std)
-        clear = np.exp(added.change) > np.where(sure, _MEASURED, ESTABLISHED) * added.stderr
-        proven = 1.0 + change > np.where(measured, _MEASURED, _CONFIRMED) * stderr
+        # few forms are tried of what is measured without a name, and only where the data disagree with all
+        # that has one
+        clear = np.exp(added.change) > np.where(sure, CLEAR, ESTABLISHED) * added.stderr
+        proven = 1.0 + change > np.where(measured, CLEAR, _CONFIRMED) * stderr
         proven &= change > -LARGEST_DECREASE
         there = (clear & proven) | certain | (self._counted(added) & (change > -LARGEST_DECREASE))
         there &= added.slopes.any(axis=1)  # what moves nothing has a strength without an error
@@ -103,7 +103,7 @@ class Acceptance:
             for each, splits, limit in ((z.both, 2, ESTABLISHED), (z.final, 1, _CONFIRMED))
         )
         more = np.minimum(z.both, z.final) > first.mean + others
-        made = (added.parts > 0.0) & first.moved_by(added.vectors) & (np.abs(added.rest) < _LEFT_OF_COUNT)
+        made = (added.parts > 0.0) & first.moved_by(added.vectors) & (np.abs(added.rest) < CLEAR)
         return np.asarray((seen & final & more & made & first.counts).any(axis=1))
 
 

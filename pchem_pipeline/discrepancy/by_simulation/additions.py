@@ -18,8 +18,6 @@ from pchem_pipeline.discrepancy.build_verdict import (
 )
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
-    MOVED,
-    STANDS_OUT,
     Hypothesis,
     Noise,
     fit_set,
@@ -36,6 +34,7 @@ from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.verdict import Candidate, Rival, sigma_text
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, POSSIBLE
 
 FloatArray = NDArray[np.float64]
 
@@ -252,7 +251,7 @@ class Extension:
         worst = int(np.argmax(np.abs(other.rest)))
         if not other.closes:
             why = "it explains nothing at any strength"
-        elif abs(other.rest[worst]) > STANDS_OUT:
+        elif abs(other.rest[worst]) > CERTAIN:
             # in the unit of all other pulls
             left = self.first.shifted(other.mean - self.first.mean).pulls(self.accept.z.both, 2)[worst]
             says = STATISTICS[self.first.names[worst]].says(left)
@@ -337,9 +336,9 @@ def unexplained_of_its_kind(effect: Effect, part: FloatArray, rest: FloatArray, 
     weight = (part / null.std) ** 2
     families = np.array([STATISTICS[name].family for name in null.names])
     own = [f for f in set(families) if weight[families == f].sum() > _OF_SIGNATURE * weight.sum()]
-    left = np.where(np.isin(families, own) | beside | (weight > MOVED**2), np.abs(rest), 0.0)
+    left = np.where(np.isin(families, own) | beside | (weight > POSSIBLE**2), np.abs(rest), 0.0)
     worst = int(np.argmax(left))
-    if left[worst] <= STANDS_OUT:
+    if left[worst] <= CERTAIN:
         return ""
     return f"it leaves a misfit: {STATISTICS[null.names[worst]].says(float(rest[worst]))}"
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import ENOUGH
 from pchem_pipeline.discrepancy.null import (
     Measured,
     NullModel,
@@ -20,10 +21,8 @@ from pchem_pipeline.discrepancy.null import (
 )
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.arithmetic.significance import NO_CHANCE
 
-_REPLICATES = 12
-# beyond any doubt: a model that was fitted to other pixels is not quite right for these
-_SIGNIFICANCE = 1e-6
 _DETAILS = 0.1  # of what the effects do
 
 
@@ -36,7 +35,7 @@ def deviation(by: Simulations, model: Sequence[Effect]) -> str:
     """
     own = by.observed.statistics()
     try:
-        _, vectors = by.drawn(tuple(model), _REPLICATES)
+        _, vectors = by.drawn(tuple(model), ENOUGH)
     except NotFittedError:
         return "almost no pixel can be fitted with it"
     names = by.observed.names([*own, *vectors])
@@ -44,7 +43,8 @@ def deviation(by: Simulations, model: Sequence[Effect]) -> str:
         return ""
     null = NullModel.from_replicates(names, as_matrix(names, vectors), effects=bool(model))
     z, tolerance = Measured(*as_matrix(names, own)), _DETAILS * np.abs(null.mean)
-    if not disagrees(null, z, _SIGNIFICANCE, tolerance):
+    # a model that was fitted to other pixels is not quite right for these
+    if not disagrees(null, z, NO_CHANCE, tolerance):
         return ""
     off = z.both - null.mean
     worst = int(np.argmax(np.abs(off) / np.hypot(null.std, tolerance)))

@@ -67,7 +67,7 @@ IntArray = NDArray[np.int64]
 #: bias that may be off by one electron: all that is looked at stays nearly the same, but to choose the pixels
 #: with an unambiguous sample would bias the statistics of the rest.
 UNTRUSTWORTHY = FAILED | FitStatus.NOT_INFORMATIVE
-_MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
+MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
 _FINEST_STEP = 2.5  # DN per electron, the least that whole DN show
 _FAR_FINER = 2.0 / 3.0  # of the step of most pixels
 _ALIKE, _FEW = 1.25, 0.1  # ratio of like steps, and share of the pixels that makes a gain of their own
@@ -288,7 +288,7 @@ def _without_steps(gain: FloatArray, usable: NDArray[np.bool_]) -> NDArray[np.bo
 
 def _inside(seen: PixelHistograms) -> NDArray[np.bool_]:
     """Return which histograms hold nearly all samples of their pixel, (n,)."""
-    return np.asarray(seen.outside.sum(axis=1) <= _MOST_OUTSIDE * seen.counts.sum(axis=1))
+    return np.asarray(seen.outside.sum(axis=1) <= MOST_OUTSIDE * seen.counts.sum(axis=1))
 
 
 def fitted_maps(frames: NDArray[np.unsignedinteger[Any]], exclude: NDArray[np.bool_]) -> PixelMaps:

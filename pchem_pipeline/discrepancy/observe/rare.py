@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.observe.sums import MOST_HITS
 from pchem_pipeline.discrepancy.observe.tables import analog_width
-from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.evidence import MOST_HITS, Evidence, PixelMaps
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -26,7 +25,7 @@ N_SETS = 4
 _BY_CHANCE = 1.0  # of the rarer samples, in the whole stack
 _REACH, _FURTHER = 12.0, 15  # electron numbers about H, in its root and beside that
 _CHUNK = 256  # samples
-_SEED = 1
+SEED = 1
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def single_samples(hits: IntArray) -> IntArray:
     """
     frames, pixels = set[int](), set[tuple[int, int]]()
     kept = []
-    for i in np.random.default_rng(_SEED).permutation(len(hits)):
+    for i in np.random.default_rng(SEED).permutation(len(hits)):
         frame, y, x = (int(number) for number in hits[i, :3])
         if frame not in frames and (y, x) not in pixels:
             frames.add(frame)

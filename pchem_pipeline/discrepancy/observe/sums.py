@@ -18,7 +18,7 @@ from pchem_pipeline.discrepancy.observe import sums_numba as kernel
 from pchem_pipeline.discrepancy.observe import tables_numba as columns_of
 from pchem_pipeline.discrepancy.observe.sums_numba import FrameSums
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
-from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.evidence import MOST_HITS, PixelMaps
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -27,7 +27,6 @@ IntArray = NDArray[np.int64]
 CHANNELS = ("charge", "readout")
 #: Blocks whose means are compared, and frames whose course along time is looked at, at least.
 MINIMUM_BLOCKS, FEWEST_FRAMES = 4, 64
-MOST_HITS = 20_000
 _NO_CODE = np.iinfo(np.int64).max  # above all
 _CHUNK_SAMPLES = 1 << 16
 _LEAST_NOISE = 0.5  # of the variance of r^2: residuals of hardly two values tell nothing of their size

@@ -25,12 +25,12 @@ from pchem_pipeline.discrepancy.observe.sums import CHANNELS, PixelStatistics, p
 from pchem_pipeline.discrepancy.observe.sums_numba import FrameSums
 from pchem_pipeline.discrepancy.observe.tables_numba import CodeSums, PixelLaws
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals
+from pchem_pipeline.model.arithmetic.significance import OUTLYING
+from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
 
 FloatArray = NDArray[np.float64]
 
-#: A pixel beyond this many standard deviations counts as one that stands out.
-STANDS_OUT = 3.5
-_TAIL = float(special.ndtr(-STANDS_OUT))
+_TAIL = float(special.ndtr(-OUTLYING))
 _ENOUGH = 25.0  # samples expected of a code or bin that is judged by itself
 #: Columns of samples seen and expected beyond the support, and far beyond it.
 _TAILS = {
@@ -39,8 +39,6 @@ _TAILS = {
 }
 _SMALLEST_EIGENVALUE = 0.02  # of residuals, relative to Poisson counts: below it the fits have absorbed them
 _Slices = tuple[slice, slice]
-
-SHORTEST_PERIODOGRAM = 8
 
 
 def in_order(found: Mapping[str, float]) -> dict[str, float]:
@@ -64,7 +62,7 @@ def pixel_forms(
         two_sided: whether far below counts as far above.
     """
     quantiles = z if normal is None else normal
-    count = int(np.sum((np.abs(quantiles) if two_sided else quantiles) > STANDS_OUT))
+    count = int(np.sum((np.abs(quantiles) if two_sided else quantiles) > OUTLYING))
     spread = np.sum(np.broadcast_to(np.maximum(2.0 + kurtosis, 1.0), z.shape))
     return {
         "mean": float(z.sum() / np.sqrt(z.size)),
@@ -358,7 +356,7 @@ def _lag1(view: FrameView, u: FloatArray) -> float:
 def _line(view: FrameView, u: FloatArray) -> float:
     blocks = view.full_blocks(u)
     length = blocks.shape[1]
-    if length < SHORTEST_PERIODOGRAM or blocks.shape[0] == 0:
+    if length < FEWEST_LINES or blocks.shape[0] == 0:
         return float("nan")
     power = np.abs(np.fft.rfft(blocks, axis=1)[:, 1 : (length + 1) // 2]) ** 2 / length
     return laws.largest_power(power.mean(axis=0), blocks.shape[0])
@@ -503,7 +501,7 @@ def _line_over_lines(view: FrameView, rest: FloatArray, used: int) -> float:
     """Return the statistic of a wave across the lines, coherent over a block or over one frame only."""
     blocks = view.full_blocks(rest)
     count, length, lines = blocks.shape
-    if count == 0 or min(length, used) < SHORTEST_PERIODOGRAM:
+    if count == 0 or min(length, used) < FEWEST_LINES:
         return float("nan")
     power = np.abs(np.fft.fft(np.fft.rfft(blocks, axis=2)[:, :, 1:], axis=1)) ** 2 / (length * used)
     single = power[:, :, : (lines - 1) // 2].mean(axis=(0, 1))

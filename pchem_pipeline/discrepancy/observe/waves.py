@@ -21,17 +21,16 @@ from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
 from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
-from pchem_pipeline.discrepancy.observe.vector import SHORTEST_PERIODOGRAM
 from pchem_pipeline.effects.framework.evidence import PixelMaps, Wave
+from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, FALSE_ALARM
+from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
 
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 _MOST_SAMPLES = 1 << 22
-_RAISED = 5.0  # standard errors by which the noise at some frequency must exceed white noise, to be no line
 _ALL_OF_IT = 0.7  # of the amplitude of a wave at any phase, for one whose phase runs on
-_FALSE_ALARM = 0.02  # probability of any wave where there is none
 _ROUNDS, _STEPS = 8, 9
 _NARROWER = 2.5  # from round to round
 _AROUND = 7  # frequencies along rows and columns whose median is the noise of the one in their middle
@@ -77,7 +76,7 @@ def waves_across(
     samples = Samples.by_laws(Stack(frames[: numbers.size]), laws, maps)
     samples = samples if inside is None else samples.without(~inside)
     pixels = int(np.count_nonzero(samples.usable))
-    if numbers.size < FEWEST_FRAMES or min(ny, nx) < SHORTEST_PERIODOGRAM or not pixels:
+    if numbers.size < FEWEST_FRAMES or min(ny, nx) < FEWEST_LINES or not pixels:
         return Waves((), {})
     u = np.concatenate([chunk for (chunk,) in samples.chunks((1,))])
     mean, ratio = _spectrum(u, numbers, pixels)
@@ -134,7 +133,7 @@ def _levels(power: Float32Array) -> list[Float32Array]:
     """
     of_place, of_time = (np.median(power, axis=axes, keepdims=True) / np.log(2.0) for axes in (0, (1, 2)))
     return [
-        np.where(found > 1.0 + _RAISED / np.sqrt(number), found, 1.0).astype(np.float32)
+        np.where(found > 1.0 + BEYOND_DOUBT / np.sqrt(number), found, 1.0).astype(np.float32)
         for found, number in ((of_place, power.shape[0]), (of_time, power[0].size))
     ]
 
@@ -143,7 +142,7 @@ def _steady(u: Float32Array, numbers: IntArray, ratio: Float32Array) -> Wave | N
     """Return the wave whose phase runs on from frame to frame, if one stands out."""
     place = np.unravel_index(int(ratio.argmax()), ratio.shape)
     excess = float(ratio[place]) - float(np.log(ratio.size))
-    if excess < -np.log(_FALSE_ALARM):
+    if excess < -np.log(FALSE_ALARM):
         return None
     sizes = ratio.shape[0], *u.shape[1:]
     # spectra along rows and columns begin behind the mean
@@ -163,7 +162,7 @@ def _loose(u: Float32Array, mean: Float32Array) -> Wave | None:
     noise = float(around[place])
     sigma = (float(mean[place]) / noise - 1.0) * n**0.5
     excess = sigma**2 / 2.0 - float(np.log(mean.size))
-    if sigma < 0.0 or excess < -np.log(_FALSE_ALARM):
+    if sigma < 0.0 or excess < -np.log(FALSE_ALARM):
         return None
     start = [(int(at) + 1) / size for at, size in zip(place, shape, strict=True)]
     cycles, sums = _climbed(u, {"y": np.arange(shape[0]), "x": np.arange(shape[1])}, start, shape)

@@ -18,9 +18,10 @@ from pydantic import Field
 from scipy import special
 
 from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL
-from pchem_pipeline.effects.estimators.regression import CERTAIN, SIGNIFICANT, multiple_of
+from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
+from pchem_pipeline.model.arithmetic.significance import CERTAIN
 
 _LINEAR = 0.15  # e- of a bright sample before, up to which a correlation is in proportion to the memory
 _NODES = 40  # of a quadrature over the pixels' memories

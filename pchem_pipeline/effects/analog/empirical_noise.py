@@ -20,7 +20,7 @@ from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.families.offsets import add_offset
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.context import DIMS, Dim
-from pchem_pipeline.effects.framework.effect import Dn, Effect, Plane, register_effect
+from pchem_pipeline.effects.framework.effect import MOST_TOLD, Dn, Effect, Plane, register_effect
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -43,7 +43,6 @@ _MOST_TAPS, _SMALLEST_TAP = 200, 0.01  # of the moving average; of the largest w
 _LINE: dict[Dim, str] = {"frame": "frame", "y": "row", "x": "column"}
 _NODES, _NARROWEST = 5, 0.05  # of the law of noise of changing size; relative, to be a law
 _NYQUIST = 0.5  # cycles
-_FEW = 4  # distances that are told in words
 _CHANGED = {"gain": "gain", "light": "light", "noise": "read noise"}
 
 
@@ -132,9 +131,9 @@ class NoiseMode(Section):
         """Return in words what varies by so many DN (None: that is said elsewhere), and who shares it."""
         own = self.of == "sample" and (self.lags or self.wave is not None)
         whole = "" if own else f"common to each {self.of}"
-        order = np.argsort(-np.abs(self.correlation))[:_FEW]
+        order = np.argsort(-np.abs(self.correlation))[:MOST_TOLD]
         apart = [f"{self.correlation[i]:+.2g} over {_lag_words(self.lags[i])}" for i in order]
-        more = f" and {len(self.lags) - _FEW} other distances" if len(self.lags) > _FEW else ""
+        more = f" and {len(self.lags) - MOST_TOLD} other distances" if len(self.lags) > MOST_TOLD else ""
         shared = f"correlation {', '.join(apart)}{more}" if apart else ""
         if self.profile:
             whole = f"with a profile along each {self.of} ({', '.join(f'{p:+.2g}' for p in self.profile)})"

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.context import ALL_ROWS
-from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.framework.effect import MOST_TOLD, Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 from pchem_pipeline.effects.framework.region import Region, Span
 from pchem_pipeline.effects.types import AnyArray, EffectContext, FloatArray, PixelMaps, SampleLaw
@@ -30,7 +30,6 @@ Axis = Literal["rows", "columns"]
 AXES: dict[Axis, int] = {"rows": 2, "columns": 1}
 _ALONG: dict[Source, tuple[int, ...]] = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}
 _FAR = 8.0  # standard deviations of the charge, and electrons, beyond which there is none
-_FEW = 4  # that are told in words, of terms that follow the same and of others
 
 
 class ResponseTerm(Section):
@@ -247,12 +246,12 @@ class EmpiricalResponse(Effect):
             followed.setdefault(term.describe(), []).append(
                 f"{100.0 * self.response * term.weight:+.2g} %{only}"
             )
-        told = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:_FEW]]
-        more = f", and {len(followed) - _FEW} more" if len(followed) > _FEW else ""
+        told = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:MOST_TOLD]]
+        more = f", and {len(followed) - MOST_TOLD} more" if len(followed) > MOST_TOLD else ""
         return f"samples{place} depend on the charge of other samples ({', '.join(told)}{more})"
 
 
 def _few(parts: Sequence[str]) -> str:
     """Return the first of some parts in words, and how many more there are."""
-    more = f" and {len(parts) - _FEW} more" if len(parts) > _FEW else ""
-    return f"{', '.join(parts[:_FEW])}{more}"
+    more = f" and {len(parts) - MOST_TOLD} more" if len(parts) > MOST_TOLD else ""
+    return f"{', '.join(parts[:MOST_TOLD])}{more}"

@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.common_modes import (
-    WORTH_A_GUESS,
     line_excess,
     mean_variance,
     responsivity,
@@ -24,6 +23,7 @@ from pchem_pipeline.effects.estimators.common_modes import (
 from pchem_pipeline.effects.families.offsets import SharedNoise
 from pchem_pipeline.effects.framework.effect import Dn, register_effect
 from pchem_pipeline.effects.types import Evidence, FloatArray, TimeSeries
+from pchem_pipeline.model.arithmetic.significance import POSSIBLE
 
 
 @register_effect
@@ -73,7 +73,7 @@ class FrameNoise(SharedNoise):
         excess = float((steps**2).mean() / 2.0 - expected)
         # successive differences share a frame: their squares are correlated by 1/4
         error = expected * np.sqrt(3.0 / steps.size)
-        if excess < WORTH_A_GUESS * error:
+        if excess < POSSIBLE * error:
             return ()
         return (cls(frame_noise_dn=float(np.sqrt(excess)) / responsivity(evidence)),)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.common_modes import run_position
-from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
+from pchem_pipeline.effects.estimators.pixel_law import SMALL_CHANGE, PixelLaw, typical_pixels
 from pchem_pipeline.effects.estimators.time_profiles import likely_profiles
 from pchem_pipeline.effects.families.drifts import Drift
 from pchem_pipeline.effects.framework.effect import Plane, Ratio, register_effect
@@ -30,7 +30,6 @@ from pchem_pipeline.effects.types import (
 )
 
 _LEAST_RESPONSE = 0.15
-_SMALL = 1e-4  # relative change of the gain
 
 
 @register_effect
@@ -153,7 +152,7 @@ def _response(evidence: Evidence) -> tuple[float, float]:
         law = PixelLaw(maps, int(pixel), evidence.n_frames)
         step = 1.0 / float(law.maps.conversion_gain[0])
         charge, readout = law.charge - law.charge @ law.mass, law.readout - law.readout @ law.mass
-        change = law.change(law.scaled(1.0 + _SMALL)) / _SMALL
+        change = law.change(law.scaled(1.0 + SMALL_CHANGE)) / SMALL_CHANGE
         taken[i] = float(readout @ change) / (float(law.maps.quanta_exposure[0]) * step)
         scale = group.size * step / float(readout**2 @ law.mass)
         above += scale * float((charge * readout) @ change)

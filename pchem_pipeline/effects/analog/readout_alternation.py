@@ -13,14 +13,11 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.common_modes import (
-    WORTH_A_GUESS,
-    mean_variance,
-    responsivity,
-)
+from pchem_pipeline.effects.estimators.common_modes import mean_variance, responsivity
 from pchem_pipeline.effects.families.offsets import OffsetEffect
 from pchem_pipeline.effects.framework.effect import Dn, SharedOffset, register_effect
 from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
+from pchem_pipeline.model.arithmetic.significance import POSSIBLE
 
 
 @register_effect
@@ -72,7 +69,7 @@ class ReadoutAlternation(OffsetEffect):
         size = float(means[even].mean() - means[~even].mean()) / 2.0
         scatter = float((means[even].var() * n_even + means[~even].var() * n_odd) / (n_even + n_odd))
         error = np.sqrt(max(scatter, float(mean_variance(evidence))) * (1.0 / n_even + 1.0 / n_odd)) / 2.0
-        if abs(size) < WORTH_A_GUESS * error:
+        if abs(size) < POSSIBLE * error:
             return ()
         return (cls(alternation_dn=size / responsivity(evidence)),)
 

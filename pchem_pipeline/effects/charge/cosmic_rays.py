@@ -28,6 +28,7 @@ from pchem_pipeline.effects.framework.effect import (
     Ratio,
     register_effect,
 )
+from pchem_pipeline.effects.framework.evidence import MOST_HITS
 from pchem_pipeline.effects.types import (
     AnyArray,
     EffectContext,
@@ -40,8 +41,6 @@ from pchem_pipeline.effects.types import (
 
 # points per pixel along a track
 _POINTS = 8
-# the evidence lists no more hits than this
-_MOST_HITS = 20_000
 # of a pixel's samples: enough for the fit to disregard those far off, too little to matter for the others
 _SHARE_OF_SAMPLES = 1e-6
 # standard deviations of a cloud out to which it is drawn: of some ten thousand electrons none is farther
@@ -177,7 +176,7 @@ class CosmicRays(Effect):
         time, maps = evidence.time, evidence.maps
         if time is None or time.hits.shape[0] < 3:
             return ()
-        whole = time.hits.shape[0] < _MOST_HITS
+        whole = time.hits.shape[0] < MOST_HITS
         n_seen = time.frames.size if whole else int(np.searchsorted(time.frames, time.hits[:, 0].max())) + 1
         y, x = time.hits[:, 1], time.hits[:, 2]
         exposure = maps.quanta_exposure[y, x]

@@ -17,7 +17,7 @@ from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.estimators.electrons import binomial_upper
 from pchem_pipeline.effects.framework.compose import place_words
-from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.framework.effect import DEPTH, Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -31,7 +31,6 @@ from pchem_pipeline.effects.types import (
 #: What happens to electrons: some that have others in their sample are lost or moved, or each brings others,
 #: or all of a sample are lost together.
 Fate = Literal["lost", "moved", "followed", "emptied"]
-_DEPTH = 4  # frames through which electrons that follow others are followed themselves
 _MOST_LATER = 0.9  # others that an electron brings to later frames, beyond which there is no steady number
 _EMPTY = 1e-9  # of its exposure, what a sample has that loses all of its electrons
 
@@ -102,11 +101,11 @@ class EmpiricalElectrons(Effect):
 
     def halo(self) -> int:
         """Return how far electrons come across rows, px."""
-        return max(abs(mode.place[1]) for mode in self.modes) * (_DEPTH if self.history() else 1)
+        return max(abs(mode.place[1]) for mode in self.modes) * (DEPTH if self.history() else 1)
 
     def history(self) -> int:
         """Return how many frames before it matter."""
-        return _DEPTH * max(mode.place[0] for mode in self.modes)
+        return DEPTH * max(mode.place[0] for mode in self.modes)
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, without those that go and with those that come."""
@@ -119,7 +118,7 @@ class EmpiricalElectrons(Effect):
                 own = own - gone + (_arrived(gone, mode.place) if mode.fate == "moved" else 0)
         followed = [n for n, mode in enumerate(self.modes) if mode.fate == "followed"]
         found = own
-        for _ in range(_DEPTH if self.history() else 1):
+        for _ in range(DEPTH if self.history() else 1):
             before, found = found, own
             for number in followed:
                 place = self.modes[number].place

@@ -28,9 +28,8 @@ from pchem_pipeline.effects.types import (
     PixelMaps,
     SampleLaw,
 )
+from pchem_pipeline.model.arithmetic.significance import CLEAR
 
-# standard errors by which two kinds of exposures must differ
-_APART = 3.0
 # nodes of a law of log-normal exposures, from so many times the variance of shot noise on
 _NODES, _BEYOND = (3, 5, 7, 11, 17), (0.05, 0.3, 0.7, 1.3)
 
@@ -121,7 +120,7 @@ class OverdispersedCounts(Effect):
         exposure = evidence.maps.quanta_exposure[evidence.maps.usable]
         apart = a**2 * np.sqrt(evidence.n_frames * np.nansum(exposure**3.0) / 6.0)
         kinds: tuple[Literal["gamma", "lognormal"], ...] = ("gamma", "lognormal")
-        return tuple(cls(relative_variance=a, exposures=kind) for kind in kinds[: 2 if apart > _APART else 1])
+        return tuple(cls(relative_variance=a, exposures=kind) for kind in kinds[: 2 if apart > CLEAR else 1])
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with negative binomial electron numbers, or mixed over log-normal exposures."""

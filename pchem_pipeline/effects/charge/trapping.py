@@ -27,8 +27,8 @@ from pydantic import Field
 
 from pchem_pipeline.effects.estimators.count_scores import charlier_information
 from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL
-from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
-from pchem_pipeline.effects.estimators.regression import CERTAIN, SIGNIFICANT
+from pchem_pipeline.effects.estimators.pixel_law import SMALL_CHANGE, PixelLaw, typical_pixels
+from pchem_pipeline.effects.estimators.regression import NEARLY_ALL, SIGNIFICANT
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -40,6 +40,7 @@ from pchem_pipeline.effects.types import (
     PixelMaps,
     SampleLaw,
 )
+from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, CERTAIN, OUTLYING
 
 # probability that the state of a trap goes back farther than the frames that are simulated for it
 _RARE = 1e-6
@@ -48,11 +49,6 @@ _CAPTURES = np.geomspace(0.002, 0.9, 12)
 _RELEASES = np.geomspace(0.02, 0.9, 9)
 _FRACTIONS = (0.03, 0.1, 0.3)
 _LIMITS = (0.02, 0.95)  # of a release, and the largest of a capture
-_CLEAR = 3.5  # standard deviations of all that pixels show that are worth a hypothesis
-_MOST = 0.8  # share of the pixels with a trap beyond which all have one
-# standard deviations from what is expected beyond which a pixel counts no more
-_CUT = 5.0
-_SMALL = 1e-3  # chance at which the law of a sample is looked at
 
 
 @register_effect
@@ -142,7 +138,7 @@ class Trapping(Effect):
             found = [_first_of(alike, other)]
         some = _refined(pixels, max((starts[f] for f in _FRACTIONS), key=lambda one: one.height))
         clear = some.height - max(alike.height, 0.0) > CERTAIN**2 / 2.0
-        if clear and some.seen and some.fraction < _MOST:
+        if clear and some.seen and some.fraction < NEARLY_ALL:
             found.insert(0, some)
         return [cls(capture=one.capture, release=one.release, fraction=one.fraction) for one in found]
 
@@ -228,7 +224,7 @@ class _Trap(NamedTuple):
     @property
     def seen(self) -> bool:
         """Whether it is worth a hypothesis."""
-        return self.height > _CLEAR**2 / 2.0 and self.in_time > SIGNIFICANT**2 / 2.0
+        return self.height > OUTLYING**2 / 2.0 and self.in_time > SIGNIFICANT**2 / 2.0
 
     def opposite(self, some: float) -> _Trap:
         """Return the trap that catches as often as this one releases, and releases as this one catches."""
@@ -239,7 +235,7 @@ class _Trap(NamedTuple):
 def _first_of(one: _Trap, other: _Trap) -> _Trap:
     """Return of two traps with nearly the same moments the emptier one, unless it is clearly less likely."""
     empty, full = sorted((one, other), key=lambda each: each.capture / each.release)
-    return full if full.height - empty.height > _CLEAR**2 / 2.0 else empty
+    return full if full.height - empty.height > OUTLYING**2 / 2.0 else empty
 
 
 def _observed(evidence: Evidence) -> _Pixels | None:
@@ -276,7 +272,9 @@ def _of_score(evidence: Evidence) -> FloatArray:
     found = np.zeros(exposure.size)
     for pixel, group in zip(*typical_pixels(maps), strict=True):
         law = PixelLaw(maps, int(pixel), evidence.n_frames)
-        exact = law.score_shift("C2", law.change(SampleLaw().with_counts("trapped", _SMALL))) / _SMALL
+        exact = (
+            law.score_shift("C2", law.change(SampleLaw().with_counts("trapped", SMALL_CHANGE))) / SMALL_CHANGE
+        )
         several = -np.expm1(-exposure[group]) - exposure[group] * np.exp(-exposure[group])
         by_variance = 2.0 * several * np.sqrt(charlier_information(exposure[group], noise[group]))
         by_variance /= exposure[group] ** 2
@@ -286,7 +284,7 @@ def _of_score(evidence: Evidence) -> FloatArray:
 
 def _rise(seen: FloatArray, expected: FloatArray) -> FloatArray:
     """Return the logarithm of the likelihood of normal numbers of variance 1 over that of mean 0."""
-    kept = expected + np.clip(seen - expected, -_CUT, _CUT)
+    kept = expected + np.clip(seen - expected, -BEYOND_DOUBT, BEYOND_DOUBT)
     return np.asarray(kept * expected - expected**2 / 2.0)
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray, PixelMaps, TimeSeries
-
-_FAR = 7.5  # median deviations of the logarithm of a gain: five standard deviations
+from pchem_pipeline.model.arithmetic.robust import OF_MEDIAN_DEVIATION
+from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 
 
 class ExposureProfile(NamedTuple):
@@ -95,8 +95,9 @@ def against_usual_gain(maps: PixelMaps) -> FloatArray:
     with np.errstate(divide="ignore", invalid="ignore"):
         log_gain = np.log(maps.conversion_gain)
     apart = log_gain - np.median(log_gain[maps.usable])
-    usual = float(np.median(np.abs(apart[maps.usable])))
-    return np.asarray(np.where(np.abs(apart) > _FAR * usual, np.exp(apart), 1.0))
+    usual = OF_MEDIAN_DEVIATION * float(np.median(np.abs(apart[maps.usable])))
+    far = np.abs(apart) > BEYOND_DOUBT * usual
+    return np.asarray(np.where(far, np.exp(apart), 1.0))
 
 
 def block_signal(evidence: Evidence) -> BlockCharge | None:

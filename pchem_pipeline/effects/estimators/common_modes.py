@@ -19,10 +19,7 @@ from pchem_pipeline.effects.types import (
     FloatArray,
     IntArray,
 )
-
-#: Standard errors from which on an excess is worth a hypothesis. One split of the frames sees less than all
-#: of them together, and a wrong hypothesis is thrown out by the comparison that follows: so not too many.
-WORTH_A_GUESS = 2.0
+from pchem_pipeline.model.arithmetic.significance import POSSIBLE
 
 
 def run_position(frames: IntArray, n_run: int) -> FloatArray:
@@ -105,4 +102,4 @@ def line_noise(evidence: Evidence, of: Literal["frame", "row", "column"]) -> flo
     rows = of == "row"
     means = evidence.time.row_readout if rows else evidence.time.column_readout
     excess, error = line_excess(means, mean_variance(evidence, axis=1 if rows else 0))
-    return None if excess < WORTH_A_GUESS * error else excess**0.5 / responsivity(evidence)
+    return None if excess < POSSIBLE * error else excess**0.5 / responsivity(evidence)

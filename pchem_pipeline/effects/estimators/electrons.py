@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.effects.types import FloatArray, IntArray
+from pchem_pipeline.model.arithmetic.limits import LEAST_EXPONENT
 
 _STEPS = np.array([[0, 1], [0, -1], [1, 0], [-1, 0]])
-# beyond this the mass at zero underflows and the recursion has no start
-_LARGEST_EXPONENT = 500.0
 
 
 def further_uniform(u: FloatArray, draw: IntArray | int) -> FloatArray:
@@ -55,7 +54,7 @@ def binomial_upper(u: FloatArray, n: IntArray, p: FloatArray | float) -> IntArra
     p = np.broadcast_to(np.asarray(p, np.float64), u.shape)
     exponent = n * np.log1p(-p)
     count = np.zeros(u.size, np.int64)
-    active = np.flatnonzero(exponent > -_LARGEST_EXPONENT)
+    active = np.flatnonzero(exponent > LEAST_EXPONENT)
     mass, above = np.exp(exponent[active]), -np.expm1(exponent[active])
     odds = p / (1.0 - p)
     j = 0
@@ -66,7 +65,8 @@ def binomial_upper(u: FloatArray, n: IntArray, p: FloatArray | float) -> IntArra
         count[active] = j
         mass = mass * (n[active] - j + 1) / j * odds[active]
         above = above - mass
-    many = np.flatnonzero(exponent <= -_LARGEST_EXPONENT)
+    # where the mass at zero underflows the recursion has no start
+    many = np.flatnonzero(exponent <= LEAST_EXPONENT)
     if many.size:
         from scipy.stats import binom
 

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.effects.types import AnyArray, FloatArray, IntArray
+from pchem_pipeline.model.arithmetic.significance import FALSE_ALARM
 
-# probability of any line where there is none
-_FALSE_ALARM = 0.02
 # frames of a spectrum over frames and lines: enough to tell a line, and bounded memory
 _MOST_CELLS = 1 << 24
 # slow changes that are no lines: cosines of up to so many half periods per run
@@ -71,7 +70,7 @@ def coherent_line(means: AnyArray, frames: IntArray, n_run: int) -> Line | None:
     ratio = power / _level(power)
     place = np.unravel_index(int(ratio.argmax()), ratio.shape)
     excess = float(ratio[place]) - np.log(ratio.size)
-    if excess < -np.log(_FALSE_ALARM):
+    if excess < -np.log(FALSE_ALARM):
         return None
     start = (float(np.fft.fftfreq(length)[place[0]]), float(place[1] / n_lines))
     return _refined(field, numbers, lines, start, (1.0 / length, 1.0 / n_lines), float(excess))
@@ -95,7 +94,7 @@ def incoherent_line(means: AnyArray) -> Line | None:
     place = 6 + int(power[kept].argmax())
     sigma = (power[place] / level - 1.0) * np.sqrt(field.shape[0])
     excess = float(sigma**2 / 2.0 - np.log(n_lines / 2.0)) if sigma > 0 else 0.0
-    if excess < -np.log(_FALSE_ALARM):
+    if excess < -np.log(FALSE_ALARM):
         return None
     fine = np.clip((place + np.linspace(-1.0, 1.0, 41)) / n_lines, 0.0, 0.5)
     peaks = _mean_power(field, lines, fine)

@@ -16,17 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.effects.framework.evidence import SCORES
 from pchem_pipeline.effects.types import FloatArray, PixelMaps, SampleLaw
 from pchem_pipeline.model.arithmetic.robust import chi_square
+from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
 
-_N_PARAMETERS = 4  # of the PCD
 _SMALLEST_MASS = 1e-100
-_SMALLEST_WIDTH = 0.1  # DN
-# samples expected beyond the codes of a pixel, on either side
-_ALLOWED = 1e-2
-# samples expected in a code for it to count in chi squared
-_FEWEST = 5.0
+#: Of a parameter, by which the law is changed to see its slope.
+SMALL_CHANGE = 1e-4
+SMALLEST_WIDTH = 0.1  # DN: below it peaks are single codes
+#: Samples expected beyond the codes of a pixel, on either side, at most.
+ALLOWED = 1e-2
 # standard deviations of the noise, and electrons, that are considered beyond the peaks
 _REACH, _REACH_E = 12.0, 6.0
 # samples of a histogram without noise of its own
@@ -76,14 +77,14 @@ class PixelLaw:
             float(getattr(self.maps, name)[0])
             for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
         )
-        analog = float(np.sqrt(max(sigma**2 - QUANTISATION_VARIANCE, _SMALLEST_WIDTH**2)))
+        analog = float(np.sqrt(max(sigma**2 - QUANTISATION_VARIANCE, SMALLEST_WIDTH**2)))
         first, last = _counts(exposure)
         self._wide = _wide_codes(bias + first / gain, bias + last / gain, analog, gain)
         law = np.empty((self._wide.size, cell_scores_numba.N_COLUMNS))
         cell_scores_numba.fill_law(exposure, 1.0 / gain, bias - self._wide[0], analog, first, last, True, law)
         mass = law[:, 0]
         below, above = np.cumsum(mass), np.cumsum(mass[::-1])[::-1]
-        inside = (below * n_frames >= _ALLOWED) & (above * n_frames >= _ALLOWED)
+        inside = (below * n_frames >= ALLOWED) & (above * n_frames >= ALLOWED)
         self.codes = self._wide[inside]
         # between narrow peaks there may be nothing
         within = np.maximum(mass[inside], _SMALLEST_MASS)
@@ -131,8 +132,8 @@ class PixelLaw:
         """
         first = np.arange(0, self.mass.size, max(round(float(self.maps.read_noise_dn[0])), 1))
         mass, moved = (np.add.reduceat(values, first) for values in (self.mass, change))
-        grouped = mass * n_frames >= _FEWEST
-        degrees = max(int(grouped.sum()) - _N_PARAMETERS, 1)
+        grouped = mass * n_frames >= SMALLEST_EXPECTATION
+        degrees = max(int(grouped.sum()) - len(PARAMETERS), 1)
         excess = n_frames * float((moved[grouped] ** 2 / mass[grouped]).sum())
         return float(chi_square(degrees + excess, degrees))
 

@@ -9,10 +9,10 @@ import numpy as np
 from pchem_pipeline.effects.estimators.common_modes import mean_variance, responsivity
 from pchem_pipeline.effects.estimators.regression import multiple_of
 from pchem_pipeline.effects.types import Evidence, FloatArray, TimeSeries
+from pchem_pipeline.model.arithmetic.significance import CLEAR
 
 _TAPS = (1, 2, 4, 8)
 _LAGS = 8  # rows
-_LEAST = 3.0  # standard errors
 _LEAST_BESIDE = 0.005  # of what such rows show, that it must show beside them
 _LEAST_SHAPE = 6.0  # chi2 by which it must beat rows whose pixels move together, each row by itself
 
@@ -56,14 +56,14 @@ def pink_noise_of(evidence: Evidence) -> list[tuple[float, int]]:
         taps: _fitted(seen, shape, error)
         for taps, shape in shapes.items()
         # coupled neighbours are alike, too, but not whole rows
-        if _fitted(seen[in_rows], shape[in_rows], error[in_rows])[0] > _LEAST**2
+        if _fitted(seen[in_rows], shape[in_rows], error[in_rows])[0] > CLEAR**2
     }
     # rows that move each by itself: their variance, and that of neighbours within them
     alone = np.where(np.isin(np.arange(seen.size), (0, _LAGS + 1)), 1.0, 0.0)
     alone[_LAGS + 1] = float(np.nanmean(evidence.readout_std**-2.0))
     alone[in_rows] -= 1.0 / rows  # the frame's mean is taken from each
     by_rows = _fitted(seen, alone, error)[0]
-    if whole and max(whole.values())[0] >= max(_LEAST**2, by_rows + _LEAST_SHAPE):
+    if whole and max(whole.values())[0] >= max(CLEAR**2, by_rows + _LEAST_SHAPE):
         coupled = np.where(np.arange(seen.size) > _LAGS, 1.0, 0.0)
         beside = {taps: _fitted_beside(seen, coupled, shapes[taps], error) for taps in whole}
         likely = dict(map(_best, (whole, beside)))
@@ -75,7 +75,7 @@ def pink_noise_of(evidence: Evidence) -> list[tuple[float, int]]:
         for taps, shape in shapes.items()
     }
     taps, variance = _best(both)
-    seen_beside = both[taps][0] - by_rows > _LEAST**2 + _LEAST_BESIDE * by_rows
+    seen_beside = both[taps][0] - by_rows > CLEAR**2 + _LEAST_BESIDE * by_rows
     return [(float(np.sqrt(variance)), taps)] if seen_beside else []
 
 

@@ -11,14 +11,14 @@ from pchem_pipeline.effects.types import FloatArray
 #: Standard errors from which on most effects are worth a hypothesis: by chance once in 160 times, of either
 #: sign once in 80. A wrong hypothesis is thrown out by the comparison that follows, and costs time only.
 SIGNIFICANT = 2.5
-#: Standard deviations, as a likelihood ratio, by which the pixels of a sensor are not alike.
-CERTAIN = 4.0
 #: Standard deviations up to which a pixel's deviation counts: what is beyond is another effect's.
 CUT = 4.0
 #: Times that a mean is taken anew about which deviations are cut: by then it stays.
 CUT_ROUNDS = 4
 #: Share of the pixels beyond which what stands out is the rule, and not an effect of few pixels.
 FEW_PIXELS = 0.3
+#: Share of the pixels beyond which what some have is taken for all.
+NEARLY_ALL = 0.8
 
 
 class Multiple(NamedTuple):

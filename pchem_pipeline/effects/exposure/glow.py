@@ -20,7 +20,14 @@ from pchem_pipeline.effects.estimators.common_modes import run_position
 from pchem_pipeline.effects.estimators.fading_images import FadingCells
 from pchem_pipeline.effects.estimators.spots import Spot, best_bursts, best_spot
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, Ratio, register_effect
+from pchem_pipeline.effects.framework.effect import (
+    FEWEST_SHOWN,
+    Effect,
+    Electrons,
+    Plane,
+    Ratio,
+    register_effect,
+)
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.framework.spot import Falloff, spot_image, spot_to_sensor, spot_to_window
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, IntArray, PixelMaps
@@ -28,7 +35,6 @@ from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, Floa
 _GRID = 16  # cells along either side of the map of what grows
 _STRAIGHT = 50.0  # runs: a time constant so long is a straight line
 _LEAST_GROWTH = 20.0  # chi2 that the best of some 1,000 spots must explain
-_FEWEST_SHOWN = 6.0  # bursts in a simulation that shows what they do
 
 
 @register_effect
@@ -143,7 +149,7 @@ class Glow(Effect):
 
     def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return rare bursts more often than they are, and how much rarer they are."""
-        return self._shown_at_least("burst_share", _FEWEST_SHOWN / max(frames.size, 1), 1.0)
+        return self._shown_at_least("burst_share", FEWEST_SHOWN / max(frames.size, 1), 1.0)
 
 
 def _growing(evidence: Evidence) -> Spot | None:

@@ -53,6 +53,13 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
 
+#: Frames through which the samples that an effect without a name moves are followed.
+DEPTH = 4
+#: Parts of such an effect that are told in words.
+MOST_TOLD = 4
+#: Events in a simulation that shows what they do, where fewer are to be expected.
+FEWEST_SHOWN = 8
+
 _registered: dict[str, type[Effect]] = {}
 
 

@@ -22,6 +22,8 @@ from pchem_pipeline.model.law.parameters import PixelParameters
 #: Per-pixel efficient scores: products of Hermite (readout) and Charlier (charge) polynomials beyond the four
 #: that are the PCD's own parameters.
 SCORES = ("C2", "C3", "He3", "He4", "He2C1", "He1C2", "He2C2", "He3C1")
+#: Hits of particles that are listed at most.
+MOST_HITS = 20_000
 #: Whose samples a misplaced line holds: those of the line after or before it, its own a sample early or late,
 #: or that from some sample on only, as where one is lost or delivered twice.
 PLACES = ("next", "before", "early", "late", "lost", "twice")

@@ -24,13 +24,13 @@ from pchem_pipeline.effects.types import (
     PixelMaps,
     SampleLaw,
 )
+from pchem_pipeline.model.arithmetic.significance import CLEAR
 
 Fault = Literal["zero", "one", "flip"]
 _FAULTS: tuple[Fault, ...] = ("zero", "one", "flip")
 _MOST_BITS = 24
 # fall of chi2 that the best of some 30 faults must bring: by chance once in 1e4 stacks
 _LEAST_GAIN = 22.0
-_WORTH_A_LOOK = 3.0  # standard deviations of a statistic of the signature
 _FEWEST_PERIODS = 4  # of a bit, that codes must span for it to be stuck
 
 
@@ -95,7 +95,7 @@ class BitErrors(Effect):
         """
         code = evidence.code
         codes = code.first + np.arange(code.expected.size)
-        if evidence.time is None or evidence.strongest(*cls.signature) < _WORTH_A_LOOK:
+        if evidence.time is None or evidence.strongest(*cls.signature) < CLEAR:
             return ()
         broken = _never_seen(codes, code.observed)
         if broken is not None:

@@ -18,7 +18,7 @@ from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import place_words
 from pchem_pipeline.effects.framework.context import DIMS
-from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.framework.effect import DEPTH, MOST_TOLD, Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.types import (
@@ -33,8 +33,6 @@ from pchem_pipeline.effects.types import (
 
 #: What is moved together.
 Together = Literal["sample", "row", "column", "frame"]
-_DEPTH = 4  # frames through which a move towards an earlier frame is followed
-_MOST_TOLD = 4
 
 
 class MixtureShift(Section):
@@ -146,11 +144,11 @@ class Empirical(Effect):
     def halo(self) -> int:
         """Return how far the neighbours lie across rows, px."""
         reach = max(abs(move.towards[1]) if move.towards else int(bool(self.squares)) for move in self.moves)
-        return reach * (_DEPTH if self.history() else 1)
+        return reach * (DEPTH if self.history() else 1)
 
     def history(self) -> int:
         """Return how many frames before it matter: those of the neighbours, and of theirs."""
-        return _DEPTH * max(-move.towards[0] if move.towards else 0 for move in self.moves)
+        return DEPTH * max(-move.towards[0] if move.towards else 0 for move in self.moves)
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN, with some samples moved."""
@@ -163,7 +161,7 @@ class Empirical(Effect):
             return _averaged(own, (drawn < self.share) & first).astype(values.dtype)
         found = own
         # each pass follows the moves of earlier frames one frame further back
-        for _ in range(_DEPTH if self.history() else 1):
+        for _ in range(DEPTH if self.history() else 1):
             before, found = found, own
             for number, move in enumerate(self.moves):
                 here: BoolArray = which == number
@@ -200,7 +198,7 @@ class Empirical(Effect):
                 f"{columns} columns on, equal the mean of their samples"
             )
         shares = self.shares()
-        order = np.argsort(-shares)[:_MOST_TOLD]
+        order = np.argsort(-shares)[:MOST_TOLD]
         told = [f"{per_cent(shares[i])} {self.moves[i].describe()}" for i in order]
         how = f" {self.moves[0].describe()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
         return f"{per_cent(self.share)} of the {what}{place} are shifted{how}"

@@ -15,14 +15,13 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.prediction import PREDICTORS, Predictor, predicted
+from pchem_pipeline.effects.estimators.regression import NEARLY_ALL
 from pchem_pipeline.effects.framework.effect import Code, Effect, Plane, Ratio, Replacement, register_effect
 from pchem_pipeline.effects.framework.evidence import PredictedSamples
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
 
-# standard deviations by which samples must equal their prediction too often, and exceed it too seldom
-_EQUAL, _ABOVE = 4.0, 3.0
 _FEWEST = 20.0  # samples above the threshold by chance
-_NEARLY_ALL = 0.8
 
 
 @register_effect
@@ -92,12 +91,12 @@ class PixelCorrection(Effect):
             return ()
         kinds = evidence.time.predicted
         best = max(PREDICTORS, key=lambda kind: kinds[kind].equal_z if kind in kinds else 0.0)
-        if best not in kinds or kinds[best].equal_z < _EQUAL:
+        if best not in kinds or kinds[best].equal_z < CERTAIN:
             return ()
         found = _threshold(kinds[best])
         if found is None:
             return ()
-        shares = (1.0, found[1]) if _NEARLY_ALL <= found[1] < 1.0 else (found[1],)
+        shares = (1.0, found[1]) if NEARLY_ALL <= found[1] < 1.0 else (found[1],)
         return [cls(threshold_dn=found[0], share=share, predictor=best) for share in shares]
 
 
@@ -110,7 +109,7 @@ def _threshold(seen: PredictedSamples) -> tuple[int, float] | None:
     with np.errstate(divide="ignore", invalid="ignore"):
         fall = np.where(own > 0, own * np.log(own / one), 0.0) - (own - one)
         z = (one - own) / np.sqrt(own + one / 3.0)
-    fall = np.where((z > _ABOVE) & (one >= _FEWEST), fall, 0.0)
+    fall = np.where((z > CLEAR) & (one >= _FEWEST), fall, 0.0)
     place = int(fall.argmax())
     if fall[place] <= 0.0:
         return None

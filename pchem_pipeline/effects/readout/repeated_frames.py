@@ -14,15 +14,11 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, field_validator
 
-from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.framework.effect import FEWEST_SHOWN, Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, IntArray
 
 # longer runs of repeats are left out of the simulation if they are rarer than this
 _RARE = 1e-12
-
-
-# repeats in a simulation that shows what they do, where fewer are to be expected
-_FEWEST_SHOWN = 4
 
 
 @register_effect
@@ -135,7 +131,7 @@ class RepeatedFrames(Effect):
         if self.frames or not self.probability * second.size > 0:
             return self, 1.0
         mean = self.probability * second.size
-        shown = min(max(round(mean), _FEWEST_SHOWN), second.size)
+        shown = min(max(round(mean), FEWEST_SHOWN), second.size)
         places = (np.arange(shown) * second.size) // shown
         listed = tuple(int(frame) for frame in second[places])
         return type(self)(frames=listed, rows=self.rows), mean / shown

@@ -13,11 +13,9 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.framework.context import DIMS
-from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.framework.effect import FEWEST_SHOWN, Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.framework.neighbours import along_axis
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, IntArray
-
-_FEWEST_SHOWN = 8.0  # repeats of each line in a simulation that shows what they do
 
 
 @register_effect
@@ -73,4 +71,4 @@ class RepeatedLines(Effect):
 
     def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return rare repeats more often than they are, and how much rarer they are."""
-        return self._shown_at_least("share", _FEWEST_SHOWN / max(frames.size, 1), 0.5)
+        return self._shown_at_least("share", FEWEST_SHOWN / max(frames.size, 1), 0.5)

@@ -19,7 +19,7 @@ from pchem_pipeline.frames.settings import InputSettings
 #: rows or columns, above which a header is damaged; it keeps a row of frames in memory
 _MOST_PIXELS = 1 << 20
 #: a file of coded frames, and a coded piece of it, that may hold much in little
-_MOST_CODED, _MOST_PIECE, _MOST_RATIO = 1 << 30, 1 << 28, 10_000
+_MOST_CODED, MOST_PIECE, _MOST_RATIO = 1 << 30, 1 << 28, 10_000
 #: of the largest and of the smallest coded pieces, as many as are unpacked to see how much they hold
 _FEW_PIECES = 32
 #: where coded bytes say how many they hold: first byte, end, order (lz4 and bitshuffle as filters of HDF5)
@@ -130,7 +130,7 @@ def check_coded(
             f"{path}: damaged header: {size} bytes cannot hold {shape[0]} frames of {shape[1]} x {shape[2]}; "
             "copy the file again"
         )
-    if one > max(_MOST_PIECE, 4 * total):
+    if one > max(MOST_PIECE, 4 * total):
         raise InputError(
             f"{path}: damaged header: pieces of {' x '.join(map(str, piece))} samples; copy the file again"
         )

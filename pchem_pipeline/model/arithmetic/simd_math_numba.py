@@ -49,7 +49,7 @@ _TAIL_EVEN = (
 )
 _FARTHEST = 37.4  # where exp(-z^2 / 2) is 1e-304
 _STEEP = 1e300  # makes a sign of a number
-_PER_ROOT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
+PER_ROOT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 @kernel(borrows=True)
@@ -103,5 +103,5 @@ def simd_tail(z: Simd) -> tuple[Simd, Simd, Simd]:
         odd = fused(odd, square, _TAIL_ODD[power])
         even = fused(even, square, _TAIL_EVEN[power])
     bell = simd_exp(near * near * -0.5)
-    density = bell * _PER_ROOT_2PI
+    density = bell * PER_ROOT_2PI
     return side * bell * fused(odd, t, even) * beside * both, density, near * density

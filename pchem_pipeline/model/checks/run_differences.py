@@ -19,7 +19,7 @@ from pchem_pipeline.model.checks.multiple_testing import false_discovery
 from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.maps import summarise
 
-#: Standard errors beyond which a statistic of all pixels counts as changed.
+#: Standard errors beyond which a single pixel, or a statistic of all pixels, counts as changed.
 LIMIT = 5.0
 #: By how much the standard errors of the fits themselves may be wrong.
 _TRUST = 0.1

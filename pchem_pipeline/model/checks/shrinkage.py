@@ -21,6 +21,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.arithmetic.robust import OF_MEDIAN_DEVIATION
 from pchem_pipeline.model.fit.settings import FitSettings
 
 FloatArray = NDArray[np.float64]
@@ -35,7 +36,6 @@ _FEWEST = 30  # pixels that make a pool
 # known to some 15 %, and the scatter has heavy tails.
 _CHANCE = 1.3
 _LEAST_GAP = 0.3  # nats: a smaller gap says nothing of its slope
-_MAD = 1.4826
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class _Prior:
     @classmethod
     def of(cls, values: FloatArray, errors: FloatArray) -> _Prior:
         centre = float(np.median(values))
-        scatter = _MAD * float(np.median(np.abs(values - centre)))
+        scatter = OF_MEDIAN_DEVIATION * float(np.median(np.abs(values - centre)))
         return cls(centre, max(0.0, scatter**2 - _CHANCE * float(np.median(errors)) ** 2))
 
     def shrunk(self, values: FloatArray, errors: FloatArray) -> FloatArray:
@@ -116,7 +116,9 @@ class NoisePool:
         if some.noise.size < _FEWEST:
             return None
         noise = _Prior.of(some.noise, some.stderr)
-        near = np.abs(some.noise - noise.centre) <= 3.0 * _MAD * np.median(np.abs(some.noise - noise.centre))
+        near = np.abs(some.noise - noise.centre) <= 3.0 * OF_MEDIAN_DEVIATION * np.median(
+            np.abs(some.noise - noise.centre)
+        )
         return cls(noise, _Prior.of(*some.looseness()), _slope(some.of(near), noise.centre))
 
     def weak(self, pixels: Judged, settings: FitSettings) -> NDArray[np.bool_]:

@@ -24,7 +24,7 @@ IntArray = NDArray[np.int64]
 #: Stored where a pixel has no parameters and so no electron number.
 NO_NUMBER = 65535
 #: Larger electron numbers are cut to this.
-LARGEST_NUMBER = 65534
+LARGEST_NUMBER = NO_NUMBER - 1
 #: A pixel's table holds no more codes than this.
 _MOST_CODES = 1 << 17
 

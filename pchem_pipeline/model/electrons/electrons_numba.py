@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.arithmetic.limits import NEGLIGIBLE, SMALLEST_MASS
 from pchem_pipeline.model.law.cells_numba import Law, cells_of
 from pchem_pipeline.model.law.levels_numba import (
     fill_level,
@@ -26,9 +27,6 @@ IntArray = NDArray[np.int64]
 
 #: Exposure that stands for a prior in which all electron numbers are alike.
 NO_PRIOR = -1.0
-
-_LEAST_MASS = 1e-300
-_LEAST_LIKELY = 1e-17  # of an electron number
 
 
 class PixelLaws(NamedTuple):
@@ -134,7 +132,7 @@ def fill_tables(
         lowest, end = number_range(theta, cells, codes)
         for k in range(lowest, end):
             likely = 1.0 if prior[p] < 0.0 else number_mass(k, prior[p], cells)
-            if likely < _LEAST_LIKELY:
+            if likely < NEGLIGIBLE:
                 continue
             low, high = fill_level(k, likely, theta, cells, codes, share)
             for i in range(low, high):
@@ -149,7 +147,7 @@ def fill_tables(
             if detailed:
                 mass[at + i] = rest * sums[0, i] + cells.outlier_mass
                 right[at + i] = rest * sums[2, i]
-            if sums[0, i] > _LEAST_MASS:
+            if sums[0, i] > SMALLEST_MASS:
                 if detailed:
                     expected[at + i] = np.float32(sums[1, i] / sums[0, i])
             elif prior[p] != 0.0:  # farther from all levels than any sample of the law: the nearest
@@ -195,7 +193,7 @@ def convert_frames(frames: NDArray[Any], tables: CodeTables, missing: int, out: 
             known = start[p] <= i < start[p + 1]
             out.number[t, p] = number[i] if known else missing
             if with_probability:
-                sure = known and mass[i] > _LEAST_MASS
+                sure = known and mass[i] > SMALLEST_MASS
                 out.probability[t, p] = np.float32(right[i] / mass[i] if sure else math.nan)
             if with_expected:
                 out.expected[t, p] = expected[i] if known else np.float32(math.nan)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, NEGLIGIBLE
 from pchem_pipeline.model.arithmetic.normal_numba import NARROW, normal_mass, reach_of
 from pchem_pipeline.model.arithmetic.simd_math_numba import simd_tail
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, simd_load, simd_store
@@ -23,8 +24,6 @@ from pchem_pipeline.model.ensemble.ensemble_numba import (
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_LEAST_VARIANCE = 1e-6  # DN^2
-_LEAST_LIKELY = 1e-17  # of an electron number
 _NEGLIGIBLE = 1e-13  # of what is expected of an electron number
 _SURE = 0.02  # of a code: thresholds of densities and of masses are nearer to each other
 _INFINITE, _LEAST_LOG = 1e300, -1e3
@@ -72,7 +71,7 @@ def sum_by_thresholds(
         errors[p] = 1.0 - right
         # farther from all levels than any sample of the law: the nearest
         ends = bias + low * step, bias + high * step
-        likely = max(weights[low], _LEAST_LIKELY), max(weights[high], _LEAST_LIKELY)
+        likely = max(weights[low], NEGLIGIBLE), max(weights[high], NEGLIGIBLE)
         farthest = (
             max(reach_of(math.log(likely[0])) * sd, step),
             max(reach_of(math.log(likely[1])) * sd, step),
@@ -128,7 +127,7 @@ def _scratch(parameters: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray
 @kernel(borrows=True)
 def _analog_variance(read_noise: float) -> float:
     """Return the variance of the samples of a level before rounding, DN^2."""
-    return max(read_noise * read_noise - QUANTISATION_VARIANCE, _LEAST_VARIANCE)
+    return max(read_noise * read_noise - QUANTISATION_VARIANCE, LEAST_VARIANCE)
 
 
 @kernel(borrows=True)
@@ -150,9 +149,9 @@ def _place_edges(
     variance = _analog_variance(theta[3])
     low, high = poisson_weights(exposure, weights)
     log_exposure = math.log(exposure) if exposure > 0.0 else -_INFINITE
-    while low < high and weights[low] < _LEAST_LIKELY:
+    while low < high and weights[low] < NEGLIGIBLE:
         low += 1
-    while high > low and weights[high] < _LEAST_LIKELY:
+    while high > low and weights[high] < NEGLIGIBLE:
         high -= 1
     rows[_EDGE, 0] = -_INFINITE
     for k in range(low, high):

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.arithmetic.limits import LEAST_EXPONENT, NEGLIGIBLE, SMALLEST_MASS
 from pchem_pipeline.model.arithmetic.normal_numba import NARROW, REACH, add_mass, reach_of
-from pchem_pipeline.model.arithmetic.simd_math_numba import simd_exp
+from pchem_pipeline.model.arithmetic.simd_math_numba import PER_ROOT_2PI, simd_exp
 from pchem_pipeline.model.arithmetic.simd_numba import (
     SIMD_WIDTH,
     counting,
@@ -27,15 +28,9 @@ from pchem_pipeline.model.arithmetic.simd_numba import (
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Poisson weights below this part of the largest are left out.
-SMALLEST = 1e-18
-#: For the logarithm of an exposure of none.
-LEAST_EXPOSURE = 1e-300
 
 _ERROR_SHARE = 1e-10  # of a pixel's highest component: less is not seen in an error
 _ROOM = 2 * SIMD_WIDTH  # after the last place, for loops that write some places at a time
-_PER_ROOT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
-_LEAST_EXPONENT = -700.0
 _SCANNED = 16  # bins that are looked at together
 _GROUPS = 16  # of places that follow from the first
 
@@ -55,11 +50,11 @@ def poisson_weights(mean: float, weights: FloatArray) -> tuple[int, int]:
         return top, top
     weights[mode] = peak
     low = mode
-    while low > 0 and weights[low] > SMALLEST * peak:
+    while low > 0 and weights[low] > NEGLIGIBLE * peak:
         weights[low - 1] = weights[low] * (low / mean)
         low -= 1
     high = mode
-    while high < top and weights[high] > SMALLEST * peak:
+    while high < top and weights[high] > NEGLIGIBLE * peak:
         weights[high + 1] = weights[high] * (mean / (high + 1.0))
         high += 1
     return low, high
@@ -129,7 +124,7 @@ def sum_pcd_pixels(
     places, held = np.zeros(total.size, np.int32), np.zeros(nuced.total.size + 2)
     for p in range(exposure.size):
         low, high = poisson_weights(exposure[p], weights)
-        step, log_exposure = 1.0 / gain[p], math.log(max(exposure[p], LEAST_EXPOSURE))
+        step, log_exposure = 1.0 / gain[p], math.log(max(exposure[p], SMALLEST_MASS))
         reach = (REACH + 1.0) * sigma[p] + 1.0
         first = max(0, math.floor(bias[p] + low * step - reach) - dn_start)
         last = min(total.size - 1, math.ceil(bias[p] + high * step + reach) - dn_start)
@@ -165,11 +160,11 @@ def _add_bell(
     if weight <= 0.0:
         return
     inverse, end = 1.0 / sigma, min(n, math.floor(centre + reach) + 1)
-    peak, pace = weight * _PER_ROOT_2PI * inverse, SIMD_WIDTH * inverse
+    peak, pace = weight * PER_ROOT_2PI * inverse, SIMD_WIDTH * inverse
     for begin in range(max(0, math.ceil(centre - reach)), end, _GROUPS * SIMD_WIDTH):
         z = (counting() + (begin - centre)) * inverse
-        value = peak * simd_exp(most(z * z * -0.5, _LEAST_EXPONENT))
-        ratio = simd_exp(most((z + 0.5 * pace) * -pace, _LEAST_EXPONENT))
+        value = peak * simd_exp(most(z * z * -0.5, LEAST_EXPONENT))
+        ratio = simd_exp(most((z + 0.5 * pace) * -pace, LEAST_EXPONENT))
         for i in range(begin, min(end, begin + _GROUPS * SIMD_WIDTH), SIMD_WIDTH):
             simd_store(row, 0, i, value + simd_load(row, 0, i))
             value = value * ratio
@@ -319,11 +314,11 @@ def _add_slopes(
     """
     weight, rise, shift, sigma = part
     inverse = 1.0 / sigma
-    peak = weight * _PER_ROOT_2PI * inverse
+    peak = weight * PER_ROOT_2PI * inverse
     for i in range(begin, end, SIMD_WIDTH):
         z = fused(counting() + float(i), pitch, z0)
         square = z * z
-        value = peak * simd_exp(most(square * -0.5, _LEAST_EXPONENT))
+        value = peak * simd_exp(most(square * -0.5, LEAST_EXPONENT))
         pull = value * z * inverse
         simd_store(slopes, 0, i, fused(value, rise, simd_load(slopes, 0, i)))
         simd_store(slopes, 1, i, fused(pull, -shift, simd_load(slopes, 1, i)))
@@ -402,7 +397,7 @@ def sum_nuced_product(
     base = float(nuced_start)
     for m in range(sigma_e.size):
         for k in range(electron_mass.size):
-            if electron_mass[k] > SMALLEST:
+            if electron_mass[k] > NEGLIGIBLE:
                 add_mass(out, base, sigma_share[m] * electron_mass[k], k / width, sigma_e[m] / width)
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.arithmetic.limits import LEAST_EXPONENT
+from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
 from pchem_pipeline.model.errors.algebra_numba import invert_arrow, to_natural
 from pchem_pipeline.model.law.density_scores_numba import N_MEANS, density_scores, posterior
 from pchem_pipeline.model.law.pixel_numba import (
@@ -34,9 +36,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     make_pixel,
     make_scratch,
 )
-
-_FAR = 700.0  # exponents below minus this are 0
-_SMALLEST_EXPECTATION = 5.0
 
 
 @kernel(inline=True)
@@ -111,11 +110,11 @@ def grouped_trace(
         for x in range(first[p], last[p] + 1):
             logged = posterior(float(x), exposure, step, bias, sigma, means)
             density_scores(means, exposure, step, sigma, score)
-            mass = frames[p] * math.exp(max(logged, -_FAR))
+            mass = frames[p] * math.exp(max(logged, LEAST_EXPONENT))
             expected += mass
             for i in range(4):
                 held[i] += mass * score[i]
-            if expected >= _SMALLEST_EXPECTATION and remaining - expected >= _SMALLEST_EXPECTATION:
+            if expected >= SMALLEST_EXPECTATION and remaining - expected >= SMALLEST_EXPECTATION:
                 trace += _form(held, covariance[p]) / expected
                 remaining -= expected
                 for i in range(4):

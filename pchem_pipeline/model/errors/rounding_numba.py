@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.arithmetic.normal_numba import add_mass
+from pchem_pipeline.model.arithmetic.normal_numba import REACH, add_mass
 from pchem_pipeline.model.errors.algebra_numba import invert_arrow, solve_arrow
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
@@ -26,7 +26,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     make_scratch,
 )
 
-_REACH = 8.0  # standard deviations
 _NO_FRAMES = 1e-9  # expected with a number of electrons that hardly occurs
 
 
@@ -50,8 +49,8 @@ def _shift(parameters: NDArray[np.float64], n: float, evaluate: Any, shift: NDAr
     analog2 = sigma * sigma - QUANTISATION_VARIANCE
     if not (analog2 > 0.0 and exposure > 0.0 and math.isfinite(a + bias + n)):
         return False
-    first = math.floor(-_REACH * sigma) - 1
-    n_bins = int((exposure + _REACH * math.sqrt(exposure) + 8.0) * a + _REACH * sigma) + 2 - first
+    first = math.floor(-REACH * sigma) - 1
+    n_bins = int((exposure + REACH * math.sqrt(exposure) + 8.0) * a + REACH * sigma) + 2 - first
     offset = bias - math.floor(bias)
     pixel = make_pixel(np.zeros(1, np.bool_), n_bins, 0, 0)
     scratch = make_scratch(1, n_bins, np.bool_(False))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
 from pchem_pipeline.base.units import FEW_STEP
+from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.fisher import observed_covariance
 from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_may_matter
@@ -37,7 +38,6 @@ _CLEAR_GAP = search_numba.CLEAR_GAP
 # what the parameters know: it is half a degree of freedom or so.
 _FEW_FRAMES, _FEW_GROUPS = 5000, 40
 _FEWEST_CODES = 5
-_EXCLUDED = 5.0  # standard errors
 #: Nats below which a rival an electron away counts in the moments, and the distance that holds it, e-.
 _RIVAL_GAP, _RIVAL_REACH = 10.0, 1.5
 _LOST_SHARE = 2e-3  # of the samples, outside of the window, from which exposure and bias are not known
@@ -493,7 +493,7 @@ class _Batch:
         with np.errstate(invalid="ignore", divide="ignore"):
             skewness = plain.quanta_exposure.reshape(self.n) / (gain * deviation) ** 3
             error = np.sqrt(6.0 / self.given.counts.sum(axis=1, dtype=np.int64)) * (1.0 + 3.0 * skewness)
-            aliased = skewness < 1.0 / (deviation * (1.0 - gain)) + _EXCLUDED * error
+            aliased = skewness < 1.0 / (deviation * (1.0 - gain)) + BEYOND_DOUBT * error
             aliased |= (plain.fit_status & int(FitStatus.POOR_FIT)) != 0
             return np.asarray((gain > 1.0 / FEW_STEP) | ((gain > 1.0 / ALIASED_STEP) & aliased))
 

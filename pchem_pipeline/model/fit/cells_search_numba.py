@@ -6,9 +6,11 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
+from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, LEAST_STEP, same_place
 from pchem_pipeline.model.fit.satellites_numba import search_satellites
 from pchem_pipeline.model.fit.search_numba import (
@@ -85,7 +87,7 @@ _LEAST_VARIANCE = 0.01  # DN^2, of the analog read noise at a start
 _LEAST_SHARE = (
     0.1  # of the variance and the exposure of the density's fit, left to the pixel itself at the start
 )
-_POOR = 3.0902  # standard normal: a pixel at a limit is started anew
+_POOR = float(-special.ndtri(SIGNIFICANCE))  # standard normal: a pixel at a limit is started anew
 # what calls for other starts of free satellites: a bad fit (standard normal), or one without resolved peaks,
 # e-
 _SUSPICIOUS = 2.3

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.fit import guard_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
 from pchem_pipeline.model.fit.search_numba import CHI2, FIT_NOT_CONVERGED, GAIN_NOT_IDENTIFIED, OUTLYING
@@ -23,7 +24,6 @@ from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT
 Pixels = NDArray[np.intp]
 
 _MOST_PASSES = 8
-_MISFIT = 5.0  # standard normal: a goodness of fit that outliers may be to blame for
 # attempts: without what the fit of all samples does not expect, without the ends, without what a gap cuts off
 _EXPECTED, _ENDS, _CORE, _N_ATTEMPTS = range(4)
 
@@ -65,7 +65,7 @@ def fit_guarded(
     far = guard.gone > 0
     guard.gone[:] = (given.counts * left).sum(axis=1) if resumed.any() else 0.0
     fit(np.flatnonzero(~far | resumed), False)
-    good = (_scores(answers) <= _MISFIT) | limits.cells
+    good = (_scores(answers) <= BEYOND_DOUBT) | limits.cells
     suspicious = ~far & ~resumed & guard.suspicious(everything)
     guard.keep(np.flatnonzero(suspicious))
     answers.out[~far & ~suspicious & ~resumed, OUTLYING] = 0.0
@@ -128,7 +128,8 @@ class _Guard:
         """Tell which fits may have been led by outliers: by single samples or as a whole."""
         out = self.answers.out[pixels]
         fitted = np.isfinite(self.answers.parameters[pixels]).all(axis=1) & np.isfinite(out[:, OUTLYING])
-        misfit = (_scores(self.answers)[pixels] > _MISFIT) & (not self.limits.cells)
+        # of such a goodness of fit outliers may be to blame
+        misfit = (_scores(self.answers)[pixels] > BEYOND_DOUBT) & (not self.limits.cells)
         return np.asarray(fitted & ((out[:, OUTLYING] > 0) | misfit))
 
     def begin(self, pixels: Pixels, far: NDArray[np.bool_]) -> Pixels:

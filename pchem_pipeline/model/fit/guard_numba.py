@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE
 from pchem_pipeline.model.fit.climb_numba import Limits
 from pchem_pipeline.model.fit.search_numba import AMPLITUDE, SATELLITE_WEIGHT
 from pchem_pipeline.model.fit.tile_numba import Answers, Histograms, load_pixel, make_room, theta_of
@@ -34,7 +35,6 @@ from pchem_pipeline.model.law.pixel_numba import (
 _CORE_TAIL = 0.02  # share of the frames beyond either end of the core
 _FAR = 0.6  # widths of the core: a wider gap beyond it makes a sample far
 _FEW_DN = 4.0
-_LEAST_VARIANCE = 1e-6
 
 
 @kernel(inline=True)
@@ -163,7 +163,7 @@ def leave_out_tile(
         theta_of(answers.parameters[index], pixel, limits, theta)
         if limits.cells:
             variance = np.exp(theta[n + LOG_VARIANCE]) - QUANTISATION_VARIANCE
-            theta[n + LOG_VARIANCE] = np.log(max(variance, _LEAST_VARIANCE))
+            theta[n + LOG_VARIANCE] = np.log(max(variance, LEAST_VARIANCE))
             theta[n + SATELLITE] = answers.out[index, SATELLITE_WEIGHT]
         total = 0.0
         for j in range(n):

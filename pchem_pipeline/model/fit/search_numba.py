@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
+from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
 from pchem_pipeline.model.errors.algebra_numba import invert_arrow
 from pchem_pipeline.model.fit.climb_numba import (
     CONVERGED,
@@ -91,8 +93,7 @@ _COARSE_STEP = 2.5
 NEAR_TWO = 0.06  # e-/DN from 0.5: combs of whole numbers with aliases
 _SAME_COMB = 1e-3  # nats: two maxima of one comb, farther apart in height than climbs to one of them
 
-SMALLEST_EXPECTATION = 5.0
-FITTED_PARAMETERS = 4  # of one sample
+FITTED_PARAMETERS = len(PARAMETERS)  # of one sample
 
 
 class Tools(NamedTuple):

@@ -22,17 +22,17 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.mass import sample_mass, sample_slopes
+from pchem_pipeline.model.law.mass_numba import LEAST_SEEN
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
 #: From the shared parameters (d,) and the pixels' (H, g, mu, sigma), shape (n, 4), to their law.
 Law = Callable[[FloatArray, FloatArray], SampleLaw]
 
-_LEAST_MASS = 1e-60
 _STEP = 1e-5  # of the differences, in units of the parameters' natural scale
 _REACH_EXPOSURE, _REACH_STEP = 2.0, 0.3  # logarithms
 _LOG_16 = float(np.log(16.0))  # a read noise of a quarter of a step
-_LOWEST_LOG_VARIANCE = float(np.log(1e-4))
+LOWEST_LOG_VARIANCE = float(np.log(1e-4))
 _FIRST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e8
 _NO_ELECTRONS = 1e-9  # e-: the exposure of a sample without any
 
@@ -168,8 +168,8 @@ class SharedProblem:
     def log_masses(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
         """Return the logarithm of the mass given that the code is kept, shape (n, B); 0 where it is not."""
         mass = np.where(self.kept, self.masses(theta, shared), 0.0)
-        inside = np.maximum(mass.sum(axis=1, keepdims=True), _LEAST_MASS)
-        return np.where(self.kept, np.log(np.maximum(mass, _LEAST_MASS) / inside), 0.0)
+        inside = np.maximum(mass.sum(axis=1, keepdims=True), LEAST_SEEN)
+        return np.where(self.kept, np.log(np.maximum(mass, LEAST_SEEN) / inside), 0.0)
 
     def log_likelihood(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
         """Return the log-likelihood of each pixel, nats; -inf where the law refuses."""
@@ -406,7 +406,7 @@ def _limits(theta: FloatArray, n_exposures: int) -> tuple[FloatArray, FloatArray
     step = np.exp(theta[:, m])
     reach = np.full((step.size, m + 2), _REACH_EXPOSURE)
     reach[:, m], reach[:, m + 1] = _REACH_STEP, 1.2 * step
-    low = np.concatenate([theta[:, : m + 2] - reach, np.full((step.size, 1), _LOWEST_LOG_VARIANCE)], axis=1)
+    low = np.concatenate([theta[:, : m + 2] - reach, np.full((step.size, 1), LOWEST_LOG_VARIANCE)], axis=1)
     widest = np.maximum(2.0 * theta[:, m : m + 1] - _LOG_16, theta[:, m + 2 :] + 1.0)
     high = np.concatenate([theta[:, : m + 2] + reach, widest], axis=1)
     low[:, :m] -= _REACH_EXPOSURE
@@ -424,9 +424,9 @@ def _differences(
     found[:, 1] /= own[:, 1:2]  # of the logarithm of 1/g
     kept = problem.kept[:, None, :]
     inside = np.where(problem.kept, mass, 0.0).sum(axis=1)
-    change = np.where(kept, found, 0.0).sum(axis=2) / np.maximum(inside, _LEAST_MASS)[:, None]
-    relative = found / np.maximum(mass, _LEAST_MASS)[:, None, :] - change[:, :, None]
-    slopes[:, :4] = np.where(kept & (mass > _LEAST_MASS)[:, None, :], relative, 0.0)
+    change = np.where(kept, found, 0.0).sum(axis=2) / np.maximum(inside, LEAST_SEEN)[:, None]
+    relative = found / np.maximum(mass, LEAST_SEEN)[:, None, :] - change[:, :, None]
+    slopes[:, :4] = np.where(kept & (mass > LEAST_SEEN)[:, None, :], relative, 0.0)
     for index in range(problem.n_shared):
         moved = shared.copy()
         step = _STEP * problem.scale[index]

@@ -61,7 +61,6 @@ N_LOBES = 90
 _SIDE_BY_SIDE = 3  # vectors of frequencies at a time
 _HIGHEST_FREQUENCY = 0.5  # cycles/DN: whole numbers cannot tell f from 1 - f
 
-_TWO_PI = 2.0 * math.pi
 
 N_ATTEMPTS = 2  # the first start, then all steps of the comb; at several samples some starts, then all
 #: Frequencies of the scan over the step of the comb: the first is 1 over the range of the sample, each is
@@ -85,7 +84,7 @@ def regression_basis() -> NDArray[np.float64]:
     """Return ``1 - cos(2 pi f a)`` for every frequency f (rows) and every trial step a (columns)."""
     frequency = FREQUENCY_STEP * np.arange(1, N_FREQUENCIES + 1)
     satellite = LOBE_FIRST + LOBE_STEP * np.arange(N_LOBES)
-    return np.asarray(1.0 - np.cos(_TWO_PI * frequency[:, None] / satellite[None, :]))
+    return np.asarray(1.0 - np.cos(math.tau * frequency[:, None] / satellite[None, :]))
 
 
 @kernel(borrows=True)
@@ -120,7 +119,7 @@ def _clenshaw(histogram: Histogram, first: int, end: int, work: NDArray[np.float
 @kernel(borrows=True)
 def ecf_power(histogram: Histogram, step: float, n_frequencies: int, work: NDArray[np.float64]) -> None:
     """Leave the squared modulus of the ECF at ``step * (1 ... n)`` in ``work[0]``."""
-    base = 2.0 * math.cos(_TWO_PI * step)
+    base = 2.0 * math.cos(math.tau * step)
     before, present = 2.0, base
     for m in range(n_frequencies + _SIDE_BY_SIDE * SIMD_WIDTH):
         work[1, m] = present
@@ -135,7 +134,7 @@ def ecf_power(histogram: Histogram, step: float, n_frequencies: int, work: NDArr
 @kernel(borrows=True)
 def ecf_at(histogram: Histogram, frequency: float) -> tuple[float, float]:
     """Return modulus (unnormalised) and phase of the ECF at one frequency, cycles/DN."""
-    weights, angle = histogram.weights, _TWO_PI * frequency
+    weights, angle = histogram.weights, math.tau * frequency
     turn_c, turn_s = math.cos(angle), math.sin(angle)
     c0, s0 = math.cos(angle * histogram.first), math.sin(angle * histogram.first)
     c1, s1 = c0 * turn_c - s0 * turn_s, c0 * turn_s + s0 * turn_c
@@ -188,7 +187,7 @@ def _regress(
         if not weight > floor:
             continue
         f = FREQUENCY_STEP * (m + 1)
-        quadratic = 0.5 * _TWO_PI * _TWO_PI * f * f
+        quadratic = 0.5 * math.tau * math.tau * f * f
         target = -0.5 * math.log(min(weight, 1.0))
         weighted_q, weighted_y = weight * quadratic, weight * target
         qq += weighted_q * quadratic
@@ -263,7 +262,7 @@ def _on_lobe(
     exposure = max((variance - s2) / (a * a), 1e-3)
     bias = mean - exposure * a
     if clear:
-        anchor = phase * a / _TWO_PI
+        anchor = phase * a / math.tau
         bias = anchor + a * math.floor((mean - exposure * a - anchor) / a + 0.5)
         if bias > mean - 0.01 * a:
             bias -= a * math.ceil((bias - mean + 0.01 * a) / a)
@@ -346,7 +345,7 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
     highest = min(_SCAN_END / sd, 1.0 / (LEAST_STEP if cells else MIN_STEP))
     end, frequency = first, 1.0 / (histogram.n_bins + 1.0)
     while frequency < highest and end < work.shape[1] - _SIDE_BY_SIDE * SIMD_WIDTH:
-        work[0, end], work[1, end] = frequency, 2.0 * math.cos(_TWO_PI * frequency)
+        work[0, end], work[1, end] = frequency, 2.0 * math.cos(math.tau * frequency)
         frequency += min(_SCAN_SHARE * frequency, _SCAN_STEP / sd)
         end += 1
     for m in range(end, work.shape[1]):
@@ -356,10 +355,10 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
     for m in range(first, end):
         frequency = work[0, m]
         real = work[2, m] - 0.5 * work[3, m] * work[1, m]
-        imaginary = work[3, m] * math.sin(_TWO_PI * frequency)
+        imaginary = work[3, m] * math.sin(math.tau * frequency)
         lobe = (
             math.hypot(real, imaginary),
-            math.atan2(imaginary, real) + _TWO_PI * frequency * histogram.first,
+            math.atan2(imaginary, real) + math.tau * frequency * histogram.first,
         )
         central, clear = frequency * sd < _CENTRAL_LOBE, lobe[0] > _CLEAR * math.sqrt(histogram.n)
         if central or clear or frequency > _UNRESOLVED * last:

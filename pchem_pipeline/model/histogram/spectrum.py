@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage, special
 
 #: Samples that are looked at, of the first frames, and rows and columns that a spectrum needs.
-MOST_SAMPLES, _FEWEST_LINES = 1 << 22, 8
+MOST_SAMPLES = 1 << 22
+#: Frames, rows or columns that a spectrum needs.
+FEWEST_LINES = 8
 #: Factor by which zeros lengthen either axis of a frame: the step between frequencies is so much smaller.
 _PADDED = 2
 #: Frequencies on either side, along rows or columns, whose median is the noise of the one in their middle.
@@ -32,7 +34,7 @@ class FrameSpectrum:
         """Begin with no frames of some rows and columns."""
         self._shape = _PADDED * shape[0], _PADDED * shape[1]
         self._power = np.zeros((max(self._shape[0] - 1, 0), self._shape[1] // 2))
-        self.most = MOST_SAMPLES // max(shape[0] * shape[1], 1) if min(shape) >= _FEWEST_LINES else 0
+        self.most = MOST_SAMPLES // max(shape[0] * shape[1], 1) if min(shape) >= FEWEST_LINES else 0
         self._n, self._pixels, self._sd = 0, 0, 0.0
         self._lines = [np.zeros((2, length // 2)) for length in shape]
 

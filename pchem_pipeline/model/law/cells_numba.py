@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
 from pchem_pipeline.model.arithmetic.normal_numba import FARTHEST
 from pchem_pipeline.model.arithmetic.simd_math_numba import simd_log, simd_tail
 from pchem_pipeline.model.arithmetic.simd_numba import (
@@ -104,9 +105,7 @@ _CUT = (1e-17, 1e-50, 1e-305)
 _OUTLIER = (1e-9, 1e-40, 0.0)
 #: Stages of :func:`fill_masses`: as far out as most samples lie, down to 1e-50, to the ends of the tails.
 CORE, NEAR, EXACT = range(3)
-_LEAST_MASS = 1e-300
 _TO_ONE = 1e306  # makes 1 of a mass that counts
-_LEAST_VARIANCE = 1e-6  # DN^2
 _NO_ELECTRONS = -60.0  # log H of a sample without electrons
 
 
@@ -323,7 +322,7 @@ def component(k: float, peak: int, theta: NDArray[np.float64], cells: Cells, rea
     mean = theta[_BIAS] + a * charge + peaks[SHIFT_DN, peak] + by_sigma
     own = peaks[WIDTH, peak] * peaks[WIDTH, peak] * analog2
     spread = cells.extra_e2 + k * (cells.per_electron + k * cells.per_electron2)
-    variance = max(own + a * a * spread + cells.extra_dn2, _LEAST_VARIANCE)
+    variance = max(own + a * a * spread + cells.extra_dn2, LEAST_VARIANCE)
     sd = math.sqrt(variance)
     place = mean - cells.first
     n = float(cells.n_bins)
@@ -534,13 +533,13 @@ def _log_mass(cells: Cells, room: NDArray[np.float64]) -> float:
     """Return the log-likelihood of the masses in the room."""
     total, inside = counting() * 0.0, 1.0
     for i in range(0, cells.n_bins, SIMD_WIDTH):
-        weight, own = simd_load(cells.bins, WEIGHT, i), most(simd_load(room, MASS, i), _LEAST_MASS)
+        weight, own = simd_load(cells.bins, WEIGHT, i), most(simd_load(room, MASS, i), SMALLEST_MASS)
         total = fused(weight, simd_log(own), total)
     if cells.conditional:
         inside = 0.0
         for i in range(cells.n_bins):
             inside += cells.bins[KEPT, i] * room[MASS, i]
-    return float(simd_sum(total)) - cells.frames * math.log(max(inside, _LEAST_MASS))
+    return float(simd_sum(total)) - cells.frames * math.log(max(inside, SMALLEST_MASS))
 
 
 @kernel(inline=True)
@@ -553,10 +552,10 @@ def _sum_up(
     """
     total = counting() * 0.0
     for i in range(0, cells.n_bins, SIMD_WIDTH):
-        weight, own = simd_load(cells.bins, WEIGHT, i), most(simd_load(room, MASS, i), _LEAST_MASS)
+        weight, own = simd_load(cells.bins, WEIGHT, i), most(simd_load(room, MASS, i), SMALLEST_MASS)
         total = fused(weight, simd_log(own), total)
         # a mass that is hardly one has no slope
-        per_mass = least((own - _LEAST_MASS) * _TO_ONE, 1.0) / own
+        per_mass = least((own - SMALLEST_MASS) * _TO_ONE, 1.0) / own
         simd_store(room, PER_MASS, i, per_mass)
         simd_store(room, RATIO, i, weight * per_mass)
     simd_store(room, RATIO, cells.n_bins, 0.0)
@@ -605,7 +604,7 @@ def _condition(
         inside += cells.bins[KEPT, cell] * mass[cell]
         for i in range(N_BLOCK):
             change[i] += cells.bins[KEPT, cell] * slopes[i, cell]
-    inside = max(inside, _LEAST_MASS)
+    inside = max(inside, SMALLEST_MASS)
     for i in range(N_BLOCK):
         change[i] /= inside
     for i in range(N_BLOCK):

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.arithmetic.limits import LEAST_EXPONENT
 from pchem_pipeline.model.arithmetic.simd_math_numba import simd_exp, simd_log
 from pchem_pipeline.model.arithmetic.simd_numba import (
     SIMD_WIDTH,
@@ -76,7 +77,6 @@ FloatArray = NDArray[np.float64]
 # nats below the nearest component at which a component is left out: exp(-22) = 3e-10 moves estimates by some
 # 1e-7 standard errors; and of the log-likelihood alone
 _DROPPED, _DROPPED_ALONE = 22.0, 14.0
-_SMALLEST = -700.0  # logarithm of what counts as 0 beside 1
 _LONGEST = 340.0  # logarithm of r, its largest and smallest, times half the components: needles
 _ALL_BINS = 1e9
 
@@ -156,7 +156,7 @@ def _fill_coefficients(coefficients: FloatArray, rows: FloatArray, comb: _Comb) 
         side = counting() + float(place - half)
         there = least(most(side + float(comb.last + 1), 0.0), 1.0)
         level = simd_load(rows, _LEVEL, n + place) - rows[_LEVEL, n + half]
-        own = there * simd_exp(most(fused(side * side, power, level), _SMALLEST))
+        own = there * simd_exp(most(fused(side * side, power, level), LEAST_EXPONENT))
         simd_store(coefficients, n, place, own)
         for cell in range(n - 1, -1, -1):
             j = float(comb.first + cell + 1)
@@ -346,7 +346,7 @@ def _loglik_alone(
             density = fused(density, r, spliced(own, left[k], right[k]))
         level = fused(d * d, spread, level)
         if frames > 0.0:
-            level = simd_exp(most(least(level, -_SMALLEST), _SMALLEST))
+            level = simd_exp(most(least(level, -LEAST_EXPONENT), LEAST_EXPONENT))
             simd_store(bins, EXPECTED, start, density * frames * level)
         else:
             c = spliced(stop - start, simd_load(bins, WEIGHT, start), 0.0)

@@ -13,15 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.arithmetic.limits import NEGLIGIBLE
+from pchem_pipeline.model.law.density_numba import LOG_2PI
 
 FloatArray = NDArray[np.float64]
 
 #: Places of the posterior means of k, k^2, e, k e and e^2.
 K, KK, E, KE, EE = range(5)
 N_MEANS = 5
-
-_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
-_SMALL = 1e-17  # terms below this share of their sum are left out
 
 
 @kernel(borrows=True)
@@ -60,7 +59,7 @@ def posterior(x: float, exposure: float, step: float, bias: float, sigma: float,
             term *= ratio * (exposure / (k + 1.0) if side > 0.0 else k / exposure)
             ratio *= fall
             k += side
-            if not term >= _SMALL * total:
+            if not term >= NEGLIGIBLE * total:
                 break
             rest = x - bias - k * step
             total += term
@@ -74,7 +73,7 @@ def posterior(x: float, exposure: float, step: float, bias: float, sigma: float,
     )  # fmt: skip
     log_mass = top * math.log(exposure) - math.lgamma(top + 1.0) if top > 0.0 else 0.0
     z = e / sigma
-    return log_mass - exposure - 0.5 * z * z + math.log(total / sigma) - _HALF_LOG_2PI
+    return log_mass - exposure - 0.5 * z * z + math.log(total / sigma) - 0.5 * LOG_2PI
 
 
 @kernel(borrows=True)

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.arithmetic.limits import NEGLIGIBLE
 
 # laws of the electron number
 POISSON, NEGATIVE_BINOMIAL, BOREL, TRAPPED, LOST = 0, 1, 2, 3, 4
 
 _MOST_LOST, _SURELY_LOST = 400, 0.99
-_NEGLIGIBLE = 1e-18  # of a mass
 
 
 @kernel(borrows=True)
@@ -67,7 +67,7 @@ def _lost(chance: float, k: float, exposure: float) -> tuple[float, float, float
         mass += term
         slope += term * (n - exposure)
         bend += term * ((n - exposure) * (n - exposure) - exposure)
-        if n > exposure and term < _NEGLIGIBLE * mass:
+        if n > exposure and term < NEGLIGIBLE * mass:
             break
     first = slope / mass
     return largest + math.log(mass), first, bend / mass - first * first

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
+from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
 from pchem_pipeline.model.arithmetic.normal_numba import FARTHEST, REACH, normal_mass, reach_of
 from pchem_pipeline.model.arithmetic.simd_math_numba import simd_tail
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, fused, simd_load, simd_store
@@ -38,7 +39,6 @@ IntArray = NDArray[np.int64]
 
 _TOP_REACH = 12.0
 _SEEN = 7.5  # standard deviations within which samples are seen
-_NO_EXPOSURE = 1e-300  # e-; stands for none
 _LEAST_MASS = 1e-14  # of an electron number that is looked at
 
 
@@ -98,7 +98,7 @@ def share_scratch(n_codes: int) -> FloatArray:
 def number_mass(k: int, exposure: float, cells: Cells) -> float:
     """Return P(k; H) of a pixel; H may be 0."""
     mass: float = electron_number(
-        cells.count_law, cells.dispersion, k, max(exposure, _NO_EXPOSURE), cells.mixtures
+        cells.count_law, cells.dispersion, k, max(exposure, SMALLEST_MASS), cells.mixtures
     )[0]
     return mass
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE
 from pchem_pipeline.model.law.cells_numba import (
     CORE,
     NEAR,
@@ -36,12 +37,11 @@ from pchem_pipeline.model.law.pixel_numba import (
 FloatArray = NDArray[np.float64]
 
 
-_LEAST_VARIANCE = 1e-6  # DN^2
 _MOST_EXPOSURE = 1e6  # e-: each electron number costs, and cumulants may ask for 1e13 of them
 _FAR = 1e-9  # mass of an occupied code below which the tails are looked at
 # mass of a cell that tells nothing: a difference of two tails that are alike, whose slopes are left over
 _LEAST_TOLD = 1e-15
-_LEAST_SEEN = 1e-60  # mass of an occupied code, at least
+LEAST_SEEN = 1e-60  # mass of an occupied code, at least
 
 
 @kernel
@@ -67,7 +67,7 @@ def known_theta(parameters: FloatArray, centre: int, weight: float, theta: Float
     theta[0] = math.log(parameters[0])
     theta[1] = 1.0 / parameters[1]
     theta[2] = parameters[2] - centre
-    theta[3] = math.log(max(parameters[3] * parameters[3] - QUANTISATION_VARIANCE, _LEAST_VARIANCE))
+    theta[3] = math.log(max(parameters[3] * parameters[3] - QUANTISATION_VARIANCE, LEAST_VARIANCE))
     theta[4] = weight
     return True
 
@@ -190,7 +190,7 @@ def parabola_tile(
         score[index] = 0.0
         information[index] = 0.0
         for i in range(n_bins):
-            mass = max(cell[MASS, i], _LEAST_SEEN)
+            mass = max(cell[MASS, i], LEAST_SEEN)
             if weights[i] > 0.0:
                 value[index] += weights[i] * math.log(mass)
             for a in range(size):

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaln, ndtr, xlogy
 
+from pchem_pipeline.model.arithmetic.normal_numba import REACH
+
 _Array = NDArray[np.float64]
 
-_REACH = 9.0  # standard deviations of a Gaussian beyond which nothing is left of it
 _TERMS = 2**22  # of a sum over electron numbers, at once
 
 
@@ -131,7 +132,7 @@ def pcd_mass(
     )
     # without noise a number between two cells is half in each
     flat = [np.ravel(a) for a in (gain * (at - offset), exposure, 0.5 * gain, np.maximum(noise, 1e-200))]
-    reach = float(np.nanmax(_REACH * flat[3] + flat[2], initial=0.0))
+    reach = float(np.nanmax(REACH * flat[3] + flat[2], initial=0.0))
     around = np.arange(-int(reach) - 1, int(reach) + 2)
 
     def summed(y: _Array, h: _Array, half: _Array, s: _Array) -> _Array:

@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 _RISES = (6.0, 5.0)
 # rise that one of the starts must bring by itself, nats: one pixel in fifty of constant exposure does
 _PROMISING = 2.0
-_LEAST_EXPOSURE = 0.02  # e-
+LEAST_EXPOSURE = 0.02  # e-
 _LARGEST_STEP = 50.0  # e-
 _LEAST_SHARE = 0.02
 _SHORTEST = 0.5  # frames
@@ -103,11 +103,11 @@ class _Series:
         longest = np.log(max(self.run, 4.0 * _SHORTEST))
         logit = np.log(1.0 / _LEAST_SHARE - 1.0)
         process = [
-            (np.log(_LEAST_EXPOSURE), np.log(_LARGEST_STEP)),
+            (np.log(LEAST_EXPOSURE), np.log(_LARGEST_STEP)),
             (-logit, logit),
             (np.log(_SHORTEST), longest),
         ]
-        bounds = [(np.log(_LEAST_EXPOSURE), None), *process * (theta.size // 3)]
+        bounds = [(np.log(LEAST_EXPOSURE), None), *process * (theta.size // 3)]
         found = minimize(lambda t: -self.height(t), theta, method="L-BFGS-B", bounds=bounds)
         return -float(found.fun), np.asarray(found.x)
 

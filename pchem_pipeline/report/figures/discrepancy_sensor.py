@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.where import PAIRS, map_of
 from pchem_pipeline.effects.framework.evidence import SCORES
 from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
     Axis,
@@ -36,8 +37,8 @@ FloatArray = NDArray[np.float64]
 
 #: Colours end at least, and at most, at so many standard deviations.
 _LEAST, _MOST = 4.0, 12.0
-#: A pixel beyond this is counted, and ringed if such pixels are few.
-_STANDS_OUT, _MOST_RINGS = 5.0, 60
+#: Pixels that stand out are counted, and ringed if they are no more.
+_MOST_RINGS = 60
 
 
 _SCORE_WORDS = {
@@ -220,7 +221,7 @@ def _pixel_map(words: str, values: NDArray[Any], region: Region | None = None) -
     z = np.asarray(values, dtype=np.float64)
     known = finite(z)
     n = max(known.size, 1)
-    outliers = int((np.abs(known) > _STANDS_OUT).sum())
+    outliers = int((np.abs(known) > BEYOND_DOUBT).sum())
     if known.size == 0:
         return PixelMap(words, z, float("nan"), 0, region)
     # fewer than one pixel in a million is beyond 5 sigma by sampling noise: each counts fully
@@ -257,7 +258,7 @@ def _map_stack(
     limit = _LEAST
     if each.far > 0:
         limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
-    beyond: NDArray[np.bool_] = np.abs(np.nan_to_num(each.z)) > _STANDS_OUT
+    beyond: NDArray[np.bool_] = np.abs(np.nan_to_num(each.z)) > BEYOND_DOUBT
     rings = np.zeros_like(beyond)
     for y, x in ((y - origin[0], x - origin[1]) for y, x in flagged):
         if 0 <= y < rings.shape[0] and 0 <= x < rings.shape[1]:

@@ -11,23 +11,20 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
+from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
 from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Level, Line, Panel, Stack
 from pchem_pipeline.report.figures.figure import DataTable, Figure
+from pchem_pipeline.report.inspector.packing import AT_ONCE
 from pchem_pipeline.report.style.wording import count, short
 
 FloatArray = NDArray[np.float64]
 
 #: Points of a curve at most; longer runs are averaged over frames, spectra over frequencies.
 _MOST_POINTS, _MOST_FREQUENCIES = 1200, 160
-#: Frames, rows or columns that a spectrum needs.
-_FEWEST = 8
 _LINES = ("row", "column")
-#: Robust standard deviations to which the means of pixels are clipped before their spectrum is taken.
-_CLIP = 6.0
-#: Values whose spectra are taken at a time.
-_AT_ONCE = 1 << 21
-_WIDTH = 1.2533  # standard error of a median over that of a mean
+_WIDTH = math.sqrt(math.pi / 2.0)  # standard error of a median over that of a mean
 
 
 def stability_figures(sums: StackSums | None) -> list[Figure]:
@@ -155,10 +152,10 @@ def profile_table(sums: StackSums, axis: int) -> DataTable:
 def pattern_spectra(sums: StackSums) -> tuple[DataTable, ...]:
     """Return the power of the means of rows and columns by frequency, over that of unrelated pixels."""
     image, (middle, width) = sums.mean_signal, sums.typical_signal
-    image = np.clip(image - middle, -_CLIP * width, _CLIP * width)
+    image = np.clip(image - middle, -FAR * width, FAR * width)
     found = []
     for axis, line in enumerate(_LINES):
-        if image.shape[axis] < _FEWEST:
+        if image.shape[axis] < FEWEST_LINES:
             continue
         power = np.abs(np.fft.rfft(image.mean(axis=1 - axis))[1:]) ** 2
         chance = max(float(image.var()), 1e-300) * image.shape[axis] / image.shape[1 - axis]
@@ -172,13 +169,13 @@ def line_spectra(sums: StackSums) -> tuple[DataTable, ...]:
     return tuple(
         _spectrum(_line_power(each, length), length, f"noise_{line}", line)
         for each, length, line in zip(lines, sums.shape, _LINES, strict=True)
-        if length >= _FEWEST and each.freedom > 1
+        if length >= FEWEST_LINES and each.freedom > 1
     )
 
 
 def _line_power(lines: Lines, length: int) -> FloatArray:
     """Return the mean power of the sums of lines along the sensor, over that of independent pixels."""
-    power, step = np.zeros(length // 2 + 1), max(1, _AT_ONCE // length)
+    power, step = np.zeros(length // 2 + 1), max(1, AT_ONCE // length)
     groups = lines.variance.size // length
     for start in range(0, lines.sums.shape[0] * groups, step):
         frames = slice(start // groups, -(-(start + step) // groups))

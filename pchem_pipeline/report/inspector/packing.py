@@ -28,8 +28,8 @@ _NONE, _BELOW, _FIRST, _LAST, _ABOVE = 0, 1, 2, 65534, 65535
 _TAIL = 1e-3
 #: Values from which quantiles are taken, at least.
 _ENOUGH = 500_009
-#: Values whose codes are made at a time.
-_AT_ONCE = 1 << 17
+#: Values that are worked on at a time.
+AT_ONCE = 1 << 17
 #: Step of logarithmic maps: 2.3 %.
 _LOG_STEP = 0.01
 #: Bars of a map's histogram, at least and at most.
@@ -127,8 +127,8 @@ def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
     flat = np.asarray(values).ravel()
     codes = np.empty(flat.size, "<u2")
     bars = _empty_bars(flat, scale)
-    for start in range(0, flat.size, _AT_ONCE):
-        part = slice(start, start + _AT_ONCE)
+    for start in range(0, flat.size, AT_ONCE):
+        part = slice(start, start + AT_ONCE)
         place = _places(flat[part], scale)
         if bars is not None:
             _count(place, bars)

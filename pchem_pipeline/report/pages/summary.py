@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from pchem_pipeline.base.variables import CHARGE_RATES
+from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 from pchem_pipeline.model.checks.map_parts import Parts
 from pchem_pipeline.model.fit.status import FLAGGED, FitStatus, flags_of
 from pchem_pipeline.report.data import ReportData
@@ -36,8 +37,6 @@ KEY_MAPS = ("read_noise_e", "conversion_gain", *CHARGE_RATES, "quanta_exposure",
 _RMSE_GOOD, _RMSE_BAD = 1.3, 3.0
 #: Share of pixels with one reason for caution from which the first screen says so.
 _CAUTION_SHARE = 0.01
-#: A pixel's fit is poor below this probability.
-_POOR_P = 1e-3
 #: Read noise, e-, above which electrons cannot be told apart.
 _TOO_NOISY = 0.5
 
@@ -267,10 +266,10 @@ def _goodness(data: ReportData) -> Iterator[Flag]:
     p = finite(data.fit.get("goodness_p", np.empty(0)))
     if p.size == 0:
         return
-    poor = int((p < _POOR_P).sum())
-    expected = _POOR_P * p.size
+    poor = int((p < SIGNIFICANCE).sum())
+    expected = SIGNIFICANCE * p.size
     text = (
-        f"{percent(poor, p.size)} of the {data.noun}s fail the goodness-of-fit test (p < {_POOR_P:g}); "
+        f"{percent(poor, p.size)} of the {data.noun}s fail the goodness-of-fit test (p < {SIGNIFICANCE:g}); "
         f"{percent(expected, p.size)} expected"
     )
     model = f"The model {data.run['model']}" if "model" in data.run else "The PCD"
@@ -319,7 +318,7 @@ def _agreement(data: ReportData) -> Iterator[Flag]:
         tested = "" if p is None else f" (chi-square: {p_value_text(p)})"
         text = f"The RMSE of the predicted {words} ensemble is {short(ratio, 2)} times the sampling noise"
         text += tested
-        if ratio <= _RMSE_GOOD or (p is not None and p >= _POOR_P):
+        if ratio <= _RMSE_GOOD or (p is not None and p >= SIGNIFICANCE):
             yield Flag("good", f"{text}: the model describes the data.")
         elif ratio <= _RMSE_BAD:
             yield Flag("caution", f"{text}: small differences remain.")

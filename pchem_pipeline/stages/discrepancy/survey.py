@@ -27,13 +27,15 @@ from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_law
 from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
 from pchem_pipeline.discrepancy.quick.places import CellMap, sensor_cells, sensor_place
-from pchem_pipeline.discrepancy.scan import SIGNIFICANCE, Suspect
+from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
 from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
 from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.frames.stream import FrameSource
+from pchem_pipeline.model.arithmetic.significance import NO_CHANCE, SIGNIFICANCE
 from pchem_pipeline.run.model_versions import model_of
+from pchem_pipeline.stages.bands import FRAMES_AT_ONCE
 from pchem_pipeline.stages.discrepancy.window import Window, choose_window, frame_blocks
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
 from pchem_pipeline.stages.quick_look import read_sums
@@ -48,8 +50,6 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Probability of a chance in any map of shapes: they rest on fits, whose errors are not quite normal.
-_SIGNIFICANCE_OF_SHAPES = 1e-6
 #: Codes of the tables of a band at most, and rows at least.
 _MOST_CODES, _FEWEST_ROWS = 1 << 26, 8
 #: Bytes of a band for each code of a law, for each pixel, and for each sample that is looked at at once.
@@ -60,7 +60,6 @@ _SUPPORT, _PEAK_CODES = 1.2, 8
 _MOST_AT_ONCE = 1 << 22
 #: Samples whose pairs are summed at most: some five minutes.
 _MOST_SAMPLES = 1 << 31
-_BLOCK = 64  # frames that are read at a time where not all are
 _WRITTEN = ("p", "inside", "outside")  # of a place, beside its region
 _FEWEST_SAMPLES = 50  # of a histogram that is compared with its law
 
@@ -230,7 +229,8 @@ def places_of_bands(
                 places[name] = place
     shares = {PAIRS: numbers.size / n}
     if plain:
-        places |= _places(maps, _SIGNIFICANCE_OF_SHAPES)
+        # maps of shapes rest on fits, whose errors are not quite normal
+        places |= _places(maps, NO_CHANCE)
         shares[SHAPES] = 1.0
     return places, shares
 
@@ -281,8 +281,8 @@ def _spread_frames(n: int, most: int) -> IntArray:
     """Return the numbers of all frames, or of blocks spread over the run."""
     if most >= n:
         return np.arange(n, dtype=np.int64)
-    starts = np.unique(np.linspace(0, n - _BLOCK, max(most // _BLOCK, 1)).astype(np.int64))
-    return np.unique((starts[:, None] + np.arange(min(_BLOCK, n))).ravel())
+    starts = np.unique(np.linspace(0, n - FRAMES_AT_ONCE, max(most // FRAMES_AT_ONCE, 1)).astype(np.int64))
+    return np.unique((starts[:, None] + np.arange(min(FRAMES_AT_ONCE, n))).ravel())
 
 
 def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]:

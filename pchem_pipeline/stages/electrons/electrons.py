@@ -25,7 +25,7 @@ from pchem_pipeline.model.electrons.electrons import (
 )
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.stage import StageContext, open_store
-from pchem_pipeline.stages.bands import tile_bands
+from pchem_pipeline.stages.bands import BAND_BYTES, tile_bands
 from pchem_pipeline.stages.fit.fitted_model import fitted_pixels
 
 if TYPE_CHECKING:
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
 #: Frames and columns of a chunk; its rows are those of a tile.
 _CHUNK_FRAMES, _CHUNK_COLUMNS = 256, 128
-#: Bytes of a block of frames of a band.
-_BLOCK_BYTES = 64 << 20
 
 
 def electrons_tile(
@@ -74,7 +72,7 @@ def run(context: StageContext) -> None:
     source = open_source(context)
     n_frames, _, nx = source.shape
     rows_of_tile, columns_of_tile = context.tile
-    depth = max(1, min(_CHUNK_FRAMES, _BLOCK_BYTES // (rows_of_tile * nx * 2)))
+    depth = max(1, min(_CHUNK_FRAMES, BAND_BYTES // (rows_of_tile * nx * 2)))
     context.create(
         "electrons/electron_number",
         lengths={"frame": n_frames},
@@ -84,7 +82,7 @@ def run(context: StageContext) -> None:
         largest_number=LARGEST_NUMBER,
     )
     depth = context.store.array("electrons/electron_number").chunks[0]
-    rows = _BLOCK_BYTES // (depth * nx * 2)
+    rows = BAND_BYTES // (depth * nx * 2)
     bands = tile_bands(context, "fit", rows, source.rows_per_read)
     task = functools.partial(_do_band, store=context.store.path, source=source, depth=depth)
     context.run_units(bands, task, unit_name="band", needs="fit")

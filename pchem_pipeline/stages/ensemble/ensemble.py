@@ -34,7 +34,7 @@ from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.progress import parts_told
 from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
-from pchem_pipeline.stages.bands import tile_bands
+from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, tile_bands
 from pchem_pipeline.stages.electrons.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
 from pchem_pipeline.stages.fit.code_sums import on_axis
@@ -52,9 +52,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
     from pchem_pipeline.store.tiles import Tile
 
-#: Frames read at a time, and bytes of histograms of a band.
-_BLOCK_FRAMES = 64
-_BAND_BYTES = 64 << 20
 #: of the maps of a tile
 _PIXEL_BYTES = 40 * 8
 _SUMS = ("integers", "floats")
@@ -198,14 +195,14 @@ def run(context: StageContext) -> None:
     job = _Job(
         store.path, context.config, sensor, axes, numbered, frames, codes, source, truth, effects, limits
     )
-    rows = max(1, _BAND_BYTES // (sensor.nx * fitted.bins * 4))
+    rows = max(1, BAND_BYTES // (sensor.nx * fitted.bins * 4))
     bands = tiles if source is None else tile_bands(context, "fit", rows, source.rows_per_read)
     task = functools.partial(_do_band, job=job)
     counted = fitted.bins * store.array("histogram/counts").dtype.itemsize
     held = context.tile_pixels * (2 * counted + _PIXEL_BYTES)
     if source is not None:
         highest = max(band.y1 - band.y0 for band in bands)
-        held += highest * sensor.nx * (counted + 2 * _BLOCK_FRAMES * source.dtype.itemsize)
+        held += highest * sensor.nx * (counted + 2 * FRAMES_AT_ONCE * source.dtype.itemsize)
     unit_name = "tile" if source is None else "band"
     done = context.run_units(bands, task, unit_name=unit_name, needs="fit", unit_bytes=held)
     finished = [tile for tile in tiles if tile.key in done]
@@ -383,7 +380,7 @@ def _inside(tile: Tile, part: tuple[slice, slice]) -> NDArray[np.bool_]:
 def _stream(job: _Job, band: Band | Tile, frames: tuple[int, int]) -> FrameStream:
     """Open the stream of the frames of a band."""
     assert job.source is not None
-    return FrameStream(job.source, [(band.y0, band.y1)], _BLOCK_FRAMES, frames=frames)
+    return FrameStream(job.source, [(band.y0, band.y1)], FRAMES_AT_ONCE, frames=frames)
 
 
 def _count(job: _Job, band: Band | Tile) -> PixelHistograms:

@@ -16,6 +16,7 @@ from pchem_pipeline.model.histogram.odd_frames import KINDS, FloatArray, IntArra
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, SummaryAccumulator
 from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.stages.bands import FRAMES_AT_ONCE
 from pchem_pipeline.stages.histogram.arrays import COVARIANCES, MAPS, with_block_length
 from pchem_pipeline.store.tiles import equal_rows
 
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.store.run_store import RunStore
     from pchem_pipeline.store.tiles import Tile
-
-_AT_ONCE = 32  # frames
 
 
 def odd_frames_of(store: RunStore) -> tuple[dict[str, IntArray], IntArray]:
@@ -89,8 +88,8 @@ def _leave_out_of_histograms(context: StageContext, frames: IntArray) -> None:
 
 def _samples(source: FrameSource, tile: Tile, frames: Iterable[int]) -> Iterator[tuple[int, IntArray]]:
     """Yield the samples of a tile, (y, x), of each of some frames, which are read by blocks."""
-    for block, some in groupby(frames, lambda t: t // _AT_ONCE):
-        t0, t1 = block * _AT_ONCE, min((block + 1) * _AT_ONCE, source.shape[0])
+    for block, some in groupby(frames, lambda t: t // FRAMES_AT_ONCE):
+        t0, t1 = block * FRAMES_AT_ONCE, min((block + 1) * FRAMES_AT_ONCE, source.shape[0])
         held = np.empty((t1 - t0, tile.y1 - tile.y0, source.shape[2]), source.dtype)
         source.read_into(held, t0, t1, tile.y0, tile.y1)
         for t in some:
@@ -128,7 +127,7 @@ def _leave_out_of_sums(context: StageContext, changed: IntArray, out: IntArray) 
         sums.finish()
         for block in np.unique(changed // length).tolist():
             frames = block * length, min((block + 1) * length, n_frames)
-            with FrameStream(source, [rows], _AT_ONCE, frames=frames) as stream:
+            with FrameStream(source, [rows], FRAMES_AT_ONCE, frames=frames) as stream:
                 done = sums.exchange((piece for _, (piece,) in stream), kept[slice(*frames)])
             for name, values in vars(done).items():
                 store.write(f"summary/{name}", (slice(block, block + 1), *band[1:]), values[None])

@@ -24,7 +24,7 @@ from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
-from pchem_pipeline.report.inspector.packing import PackedMap, choose_scale, pack_map, some_of
+from pchem_pipeline.report.inspector.packing import AT_ONCE, PackedMap, choose_scale, pack_map, some_of
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
 
 if TYPE_CHECKING:
@@ -82,8 +82,6 @@ _FIRST = (
 #: Groups in the order of the list; what a group of ``fit`` repeats of ``maps`` is left out.
 _GROUPS = ("maps", "fit", "discrepancy", "summary", "histogram", "truth")
 _MANY_PIXELS = 1_000_000
-#: Pixels of which two maps are compared at a time.
-_AT_ONCE = 1 << 20
 _WORDS = re.compile(r"(\d+) ([^,;:]+)")
 
 
@@ -300,7 +298,7 @@ def _multiple_of_exposure(maps: StoredMaps, variable: Variable) -> tuple[str, fl
     current, exposure = maps.read(variable.path), maps.read(other)
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = _median(some_of(current.ravel()) / some_of(exposure.ravel()))
-    rows = max(1, _AT_ONCE // current.shape[1])
+    rows = max(1, AT_ONCE // current.shape[1])
     bands = [np.s_[y : y + rows] for y in range(0, current.shape[0], rows)]
     same = factor != 0 and all(_proportional(current[band], exposure[band], factor) for band in bands)
     return (other, factor) if same else None

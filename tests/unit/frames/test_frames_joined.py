@@ -111,7 +111,7 @@ def test_range_and_region(tmp_path: Path, format: str) -> None:
 
 def test_region_through_a_small_scratch_buffer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(tmp_path / "a.npy", STACK)
-    monkeypatch.setattr("pchem_pipeline.frames.sequence._SCRATCH_BYTES", 3 * 17 * 19 * 2)
+    monkeypatch.setattr("pchem_pipeline.frames.sequence.SCRATCH_BYTES", 3 * 17 * 19 * 2)
     reader = opened(tmp_path / "a.npy", roi=(0, 17, 5, 6))
     np.testing.assert_array_equal(reader.read(), STACK[:, :, 5:6])
 

@@ -16,7 +16,6 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     FAR_SHARE_OF_PART,
     LARGEST_FACTOR,
     PRICE_OF_MORE,
-    STANDS_OUT,
     Hypothesis,
     Noise,
     fit_set,
@@ -24,6 +23,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Acquisition, Replicate
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
+    MOST_IN_A_PART,
     identifiable_from_histograms,
     note_defect,
 )
@@ -34,6 +34,7 @@ from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import broken_plugins, effect_classes
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, POSSIBLE
 
 FloatArray = NDArray[np.float64]
 Vector = Mapping[str, float]
@@ -41,17 +42,13 @@ Vector = Mapping[str, float]
 Mapper = Callable[[Sequence[Replicate]], "list[Vector | Exception]"]
 
 MOST_HYPOTHESES = 6  # of one effect
-_MOST_IN_A_PART = 2
 # times as many hypotheses of all effects in all parts: each is a simulation, and most are in vain
 _MOST_IN_PARTS = 6
 _REFINED = 12  # hypotheses of which the strength is refined by a second simulation
 _STEPS = 2  # that refine a strength
 _CLOSE = 0.15  # relative: a strength known so well is not simulated again
 REPEATS = 3  # simulations of the hypotheses that sets are made of
-# standard deviations of what a single simulation may show by chance, below and above which it is nothing or
-# all of it; of the mean of several, in its own standard errors
-_CHANCE, _CERTAIN = 2.0, 4.0
-_CHANCE_OF_MEAN, _CERTAIN_OF_MEAN = 1.0, 2.0
+_CHANCE_OF_MEAN = 1.0  # standard errors of the mean of several simulations, below which it is nothing
 
 
 def serial(replicates: Sequence[Replicate]) -> list[Vector | Exception]:
@@ -170,7 +167,7 @@ class ReplicateSimulator:
                 continue
             try:
                 guessed = next(filter(None, (list(effect.estimate(e)) for e in (*known, *evidence))), [])
-                if not guessed and known and known[0].strongest(*effect.signature[:2]) > STANDS_OUT:
+                if not guessed and known and known[0].strongest(*effect.signature[:2]) > CERTAIN:
                     guessed = list(effect.typical())
                 for each in guessed[:1]:
                     identifiable_from_histograms(
@@ -179,7 +176,7 @@ class ReplicateSimulator:
                 found += [] if taken else [window.found(each) for each in guessed[:most]]
                 for part, own in parts:
                     clear = own.strongest(*effect.signature[:2])
-                    for rank, each in enumerate(list(effect.estimate(own))[:_MOST_IN_A_PART]):
+                    for rank, each in enumerate(list(effect.estimate(own))[:MOST_IN_A_PART]):
                         there = window.found(each, part)
                         if not any(self._overlap(there, present, window.shape) for present in taken):
                             found.append(there)
@@ -306,12 +303,13 @@ def _without_chance(shifts: FloatArray) -> FloatArray:
     histograms are drawn anew; regressed on such chance, every strength would come out too low.
     """
     mean, repeats = shifts.mean(axis=0), shifts.shape[0]
-    low, high, error = _CHANCE, _CERTAIN, np.ones_like(mean)
+    # below the one a single simulation shows nothing, above the other all of it
+    low, high, error = POSSIBLE, CERTAIN, np.ones_like(mean)
     if repeats > 1:
         scatter = shifts.std(axis=0, ddof=1)
         # few simulations do not know their scatter well: never below that of most statistics
         error = np.maximum(scatter, np.sqrt(np.mean(scatter**2))) / np.sqrt(repeats)
-        low, high = _CHANCE_OF_MEAN, _CERTAIN_OF_MEAN
+        low, high = _CHANCE_OF_MEAN, POSSIBLE
     weight = np.clip((np.abs(mean) - low * error) / np.maximum((high - low) * error, 1e-12), 0.0, 1.0)
     return np.asarray(mean * weight)
 

@@ -15,11 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
-    STANDS_OUT,
-    Hypothesis,
-    log_density,
-)
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, log_density
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     identifiable_from_histograms,
@@ -36,6 +32,7 @@ from pchem_pipeline.discrepancy.by_simulation.sets.refits import (
 )
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.arithmetic.significance import CERTAIN
 
 FloatArray = NDArray[np.float64]
 
@@ -76,7 +73,7 @@ def may_be_tuned(refitter: Refitter, one: Refitted) -> bool:
     if not places:
         return False
     scatter = refitter.scatter(one.covariance, len(one.vectors))
-    left = np.where(np.abs(one.rest) > STANDS_OUT, one.rest**2, 0.0)
+    left = np.where(np.abs(one.rest) > CERTAIN, one.rest**2, 0.0)
     moved = np.abs(one.parts[places]).max(axis=0) > _MOVED * scatter
     return bool(left.sum() > 0.0 and left[~moved].sum() < _ELSEWHERE * left.sum())
 

@@ -21,22 +21,16 @@ from scipy import optimize
 
 from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.arithmetic.significance import OUTLYING, POSSIBLE, PRICE
 
 FloatArray = NDArray[np.float64]
 
 _REWEIGHTINGS = 3
 _LEAK = 0.1
 LARGEST_DECREASE, _LARGEST_INCREASE = 0.75, 3.0
-_PRICE = 3.0  # nats for the first effect of a set: none is there unless something speaks for it
 PRICE_OF_MORE = 6.0  # nats for every further one
 _LARGEST_SET = 3
 _SHORTLIST = 9
-_SMALLEST_FACTOR = 2.0  # standard errors: less of an effect is none
-_SEEN = 3.5  # standard deviations by which some statistic must ask for an effect among others
-#: Standard deviations by which the effect itself must move it.
-MOVED = 2.0
-#: Deviations that a model leaves of a statistic for it to stand out.
-STANDS_OUT = 4.0
 #: Nats behind from which on a fingerprint is no rival of a right set, and share of what there is to explain,
 #: in addition, for a set that leaves something.
 FAR, FAR_SHARE_OF_PART = 40.0, 0.5
@@ -234,8 +228,8 @@ class ScoredSet:
 
     @property
     def penalised_log_likelihood(self) -> float:
-        """Score less the price of its effects, nats."""
-        return self.score - _PRICE - PRICE_OF_MORE * (len(self.hypotheses) - 1)
+        """Score less the price of its effects, nats: none is there unless something speaks for it."""
+        return self.score - PRICE - PRICE_OF_MORE * (len(self.hypotheses) - 1)
 
 
 @dataclass(frozen=True)
@@ -371,7 +365,7 @@ def _all_needed(scored: ScoredSet, shifts: tuple[FloatArray, FloatArray], noise:
     first, second = scored.fits
     factor = (first.factors + second.factors) / 2.0
     error = np.hypot(first.stderr, second.stderr) / 2.0
-    there = factor > _SMALLEST_FACTOR * error
+    there = factor > POSSIBLE * error
     if not np.all(there | first.certain | second.certain):
         return False
     parts = (first.parts + second.parts) / 2.0
@@ -394,4 +388,4 @@ def seen_among(part: FloatArray, others: FloatArray, shift: FloatArray, noise: N
     blur = _BLUR * tolerance(others, noise.model_error, noise.events)
     scale = np.sqrt(noise.covariance.variances + blur**2)
     left, own = (shift - others.sum(axis=0)) / scale, part / scale
-    return bool(np.any((np.abs(left) > _SEEN) & (np.abs(own) > MOVED) & (left * own > 0.0)))
+    return bool(np.any((np.abs(left) > OUTLYING) & (np.abs(own) > POSSIBLE) & (left * own > 0.0)))

@@ -25,7 +25,6 @@ from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.observe.rare import N_SETS, rare_samples
 from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
 from pchem_pipeline.discrepancy.scan import (
-    SIGNIFICANCE,
     Cluster,
     Stretch,
     Suspect,
@@ -45,6 +44,7 @@ from pchem_pipeline.discrepancy.where import frame_series, pixel_maps, suspected
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.model.arithmetic.robust import robust_sd
+from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

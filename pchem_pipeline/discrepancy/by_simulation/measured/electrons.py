@@ -23,6 +23,7 @@ from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
 from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons, Fate
 from pchem_pipeline.effects.estimators.count_scores import charlier_information
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -31,7 +32,6 @@ BoolArray = NDArray[np.bool_]
 _PLACES: tuple[Distance, ...] = ((1, 0, 0), (2, 0, 0), (3, 0, 0), (0, 0, 1), (0, 1, 0))
 _OWN: Distance = (0, 0, 0)
 _NEXT: Distance = (1, 0, 0)
-_CLEAR = 5.0  # standard errors of a chance
 _FEWEST = 1000  # products
 _ALIKE = 2.0  # factor within which the chances are that electrons go, and that they come elsewhere
 _MOST = 0.5  # of a chance
@@ -142,24 +142,24 @@ def measured_electrons(data: Electrons, model: Electrons) -> Measurement | None:
         for place, chances in data.together.items()
     }
     each, _ = following.get(_NEXT, _NOTHING)
-    chain = each.value if each.clear > _CLEAR else 0.0
+    chain = each.value if each.clear > BEYOND_DOUBT else 0.0
     more, of_pairs = _without_chain(*_beyond(data.excess, model.excess), chain)
     found: list[tuple[Fate, Distance, float]] = []
     # what makes electrons come in company: others that follow them, or samples without any
     ways: list[tuple[float, tuple[Fate, Distance, float]]] = []
-    if more.clear > _CLEAR:
+    if more.clear > BEYOND_DOUBT:
         ways.append((more.clear, ("followed", _OWN, more.value)))
-    if of_pairs.clear > _CLEAR:
+    if of_pairs.clear > BEYOND_DOUBT:
         # of samples of which a share p is emptied Var K = H + p / (1 - p) H^2
         emptied = 2.0 * of_pairs.value / (1.0 + 2.0 * of_pairs.value)
         ways.append((of_pairs.clear, ("emptied", _OWN, emptied)))
     fate: Fate = "lost"
-    where, lost = _OWN, -of_pairs.value if of_pairs.clear < -_CLEAR else 0.0
+    where, lost = _OWN, -of_pairs.value if of_pairs.clear < -BEYOND_DOUBT else 0.0
     gain = 0.5 * max(abs(more.clear), abs(of_pairs.clear)) ** 2 if ways or lost else 0.0
     for place, (each, arriving) in following.items():
         # those that came to the next frame have brought others themselves
         each = each._replace(value=each.value - (chain ** place[0] if place[0] > 1 else 0.0))
-        if each.clear < _CLEAR:
+        if each.clear < BEYOND_DOUBT:
             continue
         gain += 0.5 * each.clear**2
         if fate == "lost" and lost < _ALIKE * arriving.value < _ALIKE**2 * lost:

@@ -24,6 +24,8 @@ from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.readout.empirical import Empirical, MixtureShift, Together
+from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
+from pchem_pipeline.model.arithmetic.significance import DECISIVE
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
 
@@ -36,9 +38,7 @@ _FINE = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # DN
 _FARTHEST_E = 6.0  # electrons: shifts beyond are hits of particles or the like
 _ITERATIONS, _HALVINGS = 20, 8
 _CONVERGED = 0.01  # nats
-_NOTHING = 1e-300
 _MOST_SHIFTS = 6
-_CLEAR = 10.0  # nats of likelihood that a move must be worth
 _LEAST = 1e-6  # share
 #: Neighbours: one and two frames before, and those beside in the same frame.
 _PLACES: tuple[Distance, ...] = (
@@ -79,7 +79,7 @@ class _Mixture:
         share[0] = 1.0 - share[1:].sum()
         best = _likelihood(counts, mass, share)
         for _ in range(_ITERATIONS):
-            law = np.maximum(share @ mass, _NOTHING)
+            law = np.maximum(share @ mass, SMALLEST_MASS)
             slope = mass @ (counts / law)
             scaled = mass * (np.sqrt(counts) / law)
             curvature = scaled @ scaled.T
@@ -89,7 +89,7 @@ class _Mixture:
             step = optimize.nnls(root.T, target)[0] - share
             for _ in range(_HALVINGS):
                 new = share + step
-                new /= max(float(new.sum()), _NOTHING)
+                new /= max(float(new.sum()), SMALLEST_MASS)
                 value = _likelihood(counts, mass, new)
                 if value > best:
                     break
@@ -115,13 +115,13 @@ class _Mixture:
         for one in sorted(used[1:], key=lambda i: shares[i]):
             fewer = [i for i in used if i != one]
             without, likelihood = self.fitted(fewer)
-            if best - likelihood < _CLEAR:
+            if best - likelihood < DECISIVE:
                 used, shares, best = fewer, without, likelihood
         return [i for i in used[1:] if shares[i] > 0.0], shares, best - self.fitted([0])[1]
 
 
 def _likelihood(counts: FloatArray, mass: FloatArray, share: FloatArray) -> float:
-    return float(counts @ np.log(np.maximum(share @ mass, _NOTHING)))
+    return float(counts @ np.log(np.maximum(share @ mass, SMALLEST_MASS)))
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ def _measured_squares(frames: NDArray[np.unsignedinteger], maps: PixelMaps) -> M
         return None
     gain = float(found[best] * np.log(found[best] / expected) - (found[best] - expected))
     share = float(found[best] - expected) / float(number[best])
-    if gain < _CLEAR:
+    if gain < DECISIVE:
         return None
     gain /= len(frames) * np.count_nonzero(usable)
     return _component([MixtureShift()], [1], np.array([1.0 - share, share]), gain, squares=parities[best])
@@ -295,9 +295,9 @@ def _measured_towards(
             continue
         moves = _shifts_towards(place, step)
         gain = _mixture(laws, samples, moves, samples.other).gain()
-        if gain > max(_CLEAR, 0.0 if best is None else best[0]):
+        if gain > max(DECISIVE, 0.0 if best is None else best[0]):
             gain -= _OF_CHANCE * _mixture(laws, samples, moves, samples.chance).gain()
-        if gain > max(_CLEAR, 0.0 if best is None else best[0]):
+        if gain > max(DECISIVE, 0.0 if best is None else best[0]):
             best = gain, place
     if best is None:
         return None
@@ -398,7 +398,7 @@ def _log_ratio(
     """Return by how much likelier samples are if they were moved, nats, shape (m,)."""
     mass = _mixture(laws, samples, moves, samples.other).mass
     moved = shares[1:] @ mass[1:] / max(float(shares[1:].sum()), _LEAST)
-    ratio = np.log(np.maximum(moved, _NOTHING) / np.maximum(mass[0], _NOTHING))
+    ratio = np.log(np.maximum(moved, SMALLEST_MASS) / np.maximum(mass[0], SMALLEST_MASS))
     return np.asarray(ratio.clip(-_SURE, _SURE))
 
 
@@ -408,7 +408,7 @@ def _together(
     """Return what is moved alike, by the likelihood, and the share of it that is."""
     ratio = _log_ratio(laws, samples, moves, shares)
     single = min(float(shares[1:].sum()), 1.0 - _LEAST)
-    best = float(np.logaddexp(np.log1p(-single), np.log(single) + ratio).sum()) + _CLEAR
+    best = float(np.logaddexp(np.log1p(-single), np.log(single) + ratio).sum()) + DECISIVE
     found: tuple[Together, float] = ("sample", 0.0)
     for together in _TOGETHER:
         share, likelihood = share_of(_of_groups(ratio, samples.place, together, shape), single)

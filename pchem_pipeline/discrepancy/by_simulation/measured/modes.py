@@ -34,6 +34,7 @@ from pchem_pipeline.effects.analog.empirical_noise import (
 )
 from pchem_pipeline.effects.estimators.lines import Line, coherent_line
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, CERTAIN, DECISIVE, POSSIBLE
 from pchem_pipeline.model.law.pcd import pcd_posterior
 
 FloatArray = NDArray[np.float64]
@@ -43,14 +44,11 @@ BoolArray = NDArray[np.bool_]
 _CHANGED: tuple[Changed, ...] = ("offset", "gain", "light", "noise")
 _CLEAR = 15.0  # nats
 _NEARLY = 0.5  # of the nats of the clearest change: another one may be it as well
-# by how much bursts must explain more than a Gaussian, of what there is to win, and nats: scores are skewed
-_OF_GAUSSIAN, _BURST = 0.3, 10.0
+# of what there is to win, by which bursts must explain more than a Gaussian: scores are skewed
+_OF_GAUSSIAN = 0.3
 _REACH = 20.0  # widths of the highest peak from it, up to where scores are told apart
 _CHUNK = 256  # frames at once
 _MOST_BLOCKS, _SMALLEST_BLOCK = 8, 4  # along an axis; px
-_UNEVEN = 5.0  # standard errors of its power by which a shape must be clearer than the same everywhere
-_OF_ERROR = 2.0  # standard errors: blocks of less have none
-_CERTAIN = 4.0  # standard errors of a correlation
 _SIZES = (0.02, 0.03, 0.05, 0.08, 0.12, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.0)  # relative changes in bursts
 _BETWEEN = (0.7, 0.8, 0.9, 1.1, 1.2, 1.35)  # of the likeliest of them
 _MOST_IN_BURSTS = 0.3
@@ -302,10 +300,10 @@ def _shaped(one: Sums) -> tuple[Sums, tuple[tuple[float, ...], ...]]:
     powers, shapes = np.linalg.eigh(in_noise.T @ in_noise / n)
     power, shape = float(powers[-1]), shapes[:, -1]
     chance = (1.0 + np.sqrt(shape.size / n)) ** 2 - 1.0
-    if power - max(one.ratio, 1.0) < chance + _UNEVEN * power * np.sqrt(2.0 / n):
+    if power - max(one.ratio, 1.0) < chance + BEYOND_DOUBT * power * np.sqrt(2.0 / n):
         return one, ()
     error = np.sqrt(power / n) / (power - 1.0)
-    shape = np.where((abs(shape) > _OF_ERROR * error) & (information > 0.0), shape / scale, 0.0)
+    shape = np.where((abs(shape) > POSSIBLE * error) & (information > 0.0), shape / scale, 0.0)
     # as strong in the mean as a change that is the same everywhere, and mostly positive
     shape *= np.sign(shape.sum()) / np.sqrt(float(information @ shape**2) / information.sum())
     blocks = tuple(tuple(np.round(row, 3).tolist()) for row in shape.reshape(one.blocks[1].shape))
@@ -344,7 +342,7 @@ def _correlation(one: Sums, power: float) -> tuple[tuple[Lag, ...], tuple[float,
             continue
         products = (scaled[first] * scaled[later])[:, one.information > 0.0]
         value, error = float(products.mean()), float(products.std() / np.sqrt(products.size))
-        if abs(value) > _CERTAIN * error:
+        if abs(value) > CERTAIN * error:
             lags.append((step, 0, 0))
             found.append(round(float(np.clip(value / power, -0.99, 0.99)), 4))
     return tuple(lags), tuple(found)
@@ -375,4 +373,4 @@ def _bursts(one: Sums, gaussian: float) -> tuple[float | None, float]:
         nearest = max(found)[2]
         try_sizes(nearest * factor for factor in _BETWEEN)
     gain, share, size = max(found, default=(0.0, 0.0, 0.0))
-    return (share, size) if gain > gaussian + _OF_GAUSSIAN * most + _BURST else (None, 0.0)
+    return (share, size) if gain > gaussian + _OF_GAUSSIAN * most + DECISIVE else (None, 0.0)

@@ -19,7 +19,6 @@ from scipy import fft
 
 from pchem_pipeline.discrepancy.by_simulation.measured.modes import MADE
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
-    CERTAIN,
     FARTHEST,
     Measurement,
     PartSamples,
@@ -36,6 +35,7 @@ from pchem_pipeline.effects.analog.empirical_noise import (
 )
 from pchem_pipeline.effects.estimators.common_modes import mean_response
 from pchem_pipeline.effects.framework.evidence import Evidence
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -44,7 +44,6 @@ BoolArray = NDArray[np.bool_]
 _SHARED: tuple[Shared, ...] = ("frame", "row", "column", "sample")
 _LINES: tuple[Shared, ...] = ("row", "column")
 _GROUPS = 60  # of frames, whose scatter tells the error
-_CLEAR = 4.0  # standard errors that a covariance must have; a fit to all statistics comes behind
 _MOST_LAGS = 64
 # of the variance of single samples, over the least: a spectrum that vanishes needs a long moving average
 _OVER_LEAST = 1.15
@@ -207,7 +206,7 @@ def measured_noise(
         inside: pixels that were looked at, shape (y, x).
     """
     inside = inside & evidence.maps.usable
-    own = {key: one for key, one in model.pairs.items() if abs(one.value) > CERTAIN * one.error}
+    own = {key: one for key, one in model.pairs.items() if abs(one.value) > CLEAR * one.error}
     none = Covariance(0.0, 0.0)
     left = {key: one.value - own.get(key, none).value for key, one in data.pairs.items()}
     error = {key: np.hypot(one.error, own.get(key, none).error) for key, one in data.pairs.items()}
@@ -221,7 +220,8 @@ def measured_noise(
     for of, found in profiles.items():
         for key, taken in found.take_off(of, left, of_offset).items():
             error[key] = np.hypot(error[key], _SHAPE_ERROR * taken)
-    clear = [key for key in left if abs(left[key]) > _CLEAR * error[key]]
+    # a fit to all statistics comes behind
+    clear = [key for key in left if abs(left[key]) > CERTAIN * error[key]]
     modes: list[NoiseMode] = []
     powers: list[float] = []
     for shared in _SHARED:

@@ -15,12 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
-    CERTAIN,
-    Distance,
-    Measurement,
-    PartSamples,
-)
+from pchem_pipeline.discrepancy.by_simulation.measured.samples import Distance, Measurement, PartSamples
 from pchem_pipeline.discrepancy.observe.digital.groups import GROUP
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples, Follows
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
@@ -33,6 +28,7 @@ from pchem_pipeline.effects.analog.empirical_response import (
 )
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.framework.neighbours import neighbours
+from pchem_pipeline.model.arithmetic.significance import CLEAR, DECISIVE
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -43,7 +39,6 @@ _CLEAR = 20.0  # nats that a term must be worth beyond the number of those that 
 _DETAIL = 1e-3  # of the nats of the first term: less may be how the pixels differ in it
 _MOST_TERMS = 16
 _NEARLY_ALL = 0.7  # of the columns
-_BEYOND = 10.0  # nats by which what exceeds some electrons must be followed more clearly than all of them
 _HIGHEST, _FAR = 30, 3.0  # electrons, and standard deviations of the charge: more are hardly ever exceeded
 _STEPS = 8  # up to that, before all numbers near the clearest are tried
 
@@ -165,7 +160,7 @@ class _Left:
         """Return what is left of the products of the data beyond those of a model that are certain."""
         products = data.products.copy()
         if model is not None:
-            sure = np.abs(np.nan_to_num(model.z("sample"))) > CERTAIN
+            sure = np.abs(np.nan_to_num(model.z("sample"))) > CLEAR
             products -= np.where(sure, model.products / np.maximum(model.pairs, 1.0) * data.pairs, 0.0)
         return cls(products, data.pairs, data.wider)
 
@@ -253,7 +248,7 @@ def _beyond(samples: FollowingSamples, term: _Term) -> _Term:
     best = clearest_of(range(0, most + 1, step))
     if step > 1:
         best = clearest_of(range(max(best - step + 1, 0), best + step))
-    if best == 0 or found[best][0] < found.get(0, (0.0, 0.0))[0] + _BEYOND:
+    if best == 0 or found[best][0] < found.get(0, (0.0, 0.0))[0] + DECISIVE:
         return term
     gain, slope = found[best]
     return term._replace(value=slope, gain=gain, above=best)

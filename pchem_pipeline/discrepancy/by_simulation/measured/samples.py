@@ -22,8 +22,6 @@ BoolArray = NDArray[np.bool_]
 Distance = tuple[int, int, int]
 #: Frames, rows and columns between samples that are compared, at most.
 FARTHEST = 3
-#: Standard errors of what a model makes, in frames simulated with it: less is taken for none.
-CERTAIN = 3.0
 Answer = TypeVar("Answer")
 
 

@@ -18,6 +18,7 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.population import (
     posterior_of_estimates,
     shrinkage_bias,
 )
+from pchem_pipeline.discrepancy.observe.observe import MOST_OUTSIDE
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
@@ -38,7 +39,6 @@ UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "rea
 
 _LEAST_LEFT = 0.2  # of the fitted exposure, or variance of the read noise, without what effects add to it
 _FEWEST_CODES = 3  # that a pixel must have shown
-_MOST_OUTSIDE = 0.01  # of a pixel's samples outside of its histogram
 # near their plain fit pixels arrive in some ten evaluations, or hardly ever; a fit within 0.005 of its error
 _SEARCHED = FitSettings(max_iterations=60, tolerance=1e-5)
 # pixels that are fitted before all others, and the share of them that a law must fit
@@ -363,7 +363,7 @@ def learn_sensor(
         counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
         outside = (histograms.under + histograms.over).ravel()
         drawn = (counts > 0).sum(axis=1) >= _FEWEST_CODES
-        drawn &= (outside <= _MOST_OUTSIDE * counts.sum(axis=1)) | usable
+        drawn &= (outside <= MOST_OUTSIDE * counts.sum(axis=1)) | usable
         origin = histograms.origin.ravel()
         replaced = _replaced(effects, frames if before is None else before, places, origin, counts.shape[1])
         posterior = posterior_of(

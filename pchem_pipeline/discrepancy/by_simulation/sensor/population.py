@@ -24,9 +24,10 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.by_simulation.sensor.population_numba import solve_parabolas
+from pchem_pipeline.discrepancy.effort import MOST_LEARNT_FROM
 from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.fit.climb_numba import LEAST_STEP, MAX_LOG_EXPOSURE
-from pchem_pipeline.model.fit.shared import to_parameters, to_theta
+from pchem_pipeline.model.fit.shared import LOWEST_LOG_VARIANCE, to_parameters, to_theta
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -34,7 +35,6 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_MOST_LEARNT_FROM = 1000  # pixels that the population is learnt from
 _TAILS = 8.0  # degrees of freedom of Student's t: pixels far from the others are no reason to widen T
 _ROUNDS = 8  # of parabolas, each followed by EM
 _EM_STEPS = 60
@@ -45,7 +45,7 @@ _SETTLED = 0.02  # nats: a smaller rise of the marginal likelihood per pixel end
 _LARGEST_STEP = np.array([0.7, 0.15, 0.5, 0.8])  # of theta at once; of mu in DN per electron
 # scatters below which pixels are alike for all purposes: of log H, log 1/g, mu (DN), log sigma_R^2
 _LEAST_SCATTER = np.array([2e-3, 2e-4, 5e-3, 2e-3])
-_LOWEST_LOG_EXPOSURE, _LOWEST_LOG_VARIANCE = float(np.log(1e-5)), float(np.log(1e-4))
+_LOWEST_LOG_EXPOSURE = float(np.log(1e-5))
 _HARDLY_ANY = 0.003  # share of mistaken pixels up to which the fits are nearly the truth
 #: The same beyond which they are no start, and what is learnt does not rest on the pixels' maxima.
 MANY_MISTAKEN = 0.3
@@ -153,8 +153,8 @@ def posterior_of(
     """
     pixels = _Pixels(counts, np.asarray(origin, np.int64), law or SampleLaw(), replaced)
     some = np.arange(len(counts))
-    if some.size > _MOST_LEARNT_FROM:
-        some = np.sort(np.random.default_rng(0).choice(some, _MOST_LEARNT_FROM, replace=False))
+    if some.size > MOST_LEARNT_FROM:
+        some = np.sort(np.random.default_rng(0).choice(some, MOST_LEARNT_FROM, replace=False))
     shifts = (0,) if mistaken <= _HARDLY_ANY else _SHIFTS
     best, most = None, -np.inf
     for start, population in _seeds(pixels, parameters, mistaken):
@@ -423,7 +423,7 @@ def _inside(theta: FloatArray) -> FloatArray:
     """Return theta with some exposure and some read noise."""
     found = theta.copy()
     found[..., 0] = np.clip(found[..., 0], _LOWEST_LOG_EXPOSURE, MAX_LOG_EXPOSURE)
-    found[..., 3] = np.maximum(found[..., 3], _LOWEST_LOG_VARIANCE)
+    found[..., 3] = np.maximum(found[..., 3], LOWEST_LOG_VARIANCE)
     return found
 
 

@@ -20,7 +20,6 @@ from scipy import special
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     FAR,
-    STANDS_OUT,
     Choice,
     Hypothesis,
     ScoredSet,
@@ -31,7 +30,11 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood, note_defect
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
+    MOST_STARTS,
+    HistogramLikelihood,
+    note_defect,
+)
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_expensive
 from pchem_pipeline.discrepancy.by_simulation.sets.trials import (
     LOOSE,
@@ -42,17 +45,16 @@ from pchem_pipeline.discrepancy.by_simulation.sets.trials import (
 )
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
 
 FloatArray = NDArray[np.float64]
 
 _MOST_SINGLES = 7
-_MOST_OF_ONE = 3  # hypotheses of the same effect
 _MOST_SETS = 5
 # sets that others are grown from, and share of what the best one explains within which another one is as good
 # a seed; how many of these sets are refitted, by how many effects they have besides
 _MOST_SEEDS, _REACH_SHARE = 2, 0.05
 _MOST_GROWN = {1: 2, 2: 1}
-_MOVED = 3.0  # deviations by which an effect must move a statistic that stands out without it
 _UNTOUCHED = 0.5  # of that, the most by which the others may move it
 
 
@@ -282,8 +284,8 @@ def own_signature(own: FloatArray, others: FloatArray, left: FloatArray, noise: 
         noise: standard deviations of the statistics with the others, shape (m,).
     """
     touched = np.abs(others).max(axis=0, initial=0.0)
-    mine = (np.abs(own) > _MOVED * noise) & (touched < _UNTOUCHED * np.abs(own))
-    return bool(np.any(mine & (np.abs(left) > STANDS_OUT) & (left * own > 0.0)))
+    mine = (np.abs(own) > CLEAR * noise) & (touched < _UNTOUCHED * np.abs(own))
+    return bool(np.any(mine & (np.abs(left) > CERTAIN) & (left * own > 0.0)))
 
 
 def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesis]:
@@ -291,7 +293,7 @@ def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesi
     chosen = firsts(choice.best)
     for hypothesis in firsts(hypotheses):
         same = sum(h.tag == hypothesis.tag for h in chosen)
-        most = 1 if type(hypothesis.effect).random_realisation else _MOST_OF_ONE
+        most = 1 if type(hypothesis.effect).random_realisation else MOST_STARTS
         if same < most and len(chosen) < _MOST_SINGLES and hypothesis not in chosen:
             chosen.append(hypothesis)
     return chosen
@@ -442,7 +444,7 @@ def _untouched(one: Refitted, place: int, noise: FloatArray) -> bool:
     """
     own = np.abs(one.parts[place])
     touched = np.abs(np.delete(one.parts, place, axis=0)).max(axis=0, initial=0.0)
-    return bool(np.any((own > _MOVED * noise) & (touched < _UNTOUCHED * own)))
+    return bool(np.any((own > CLEAR * noise) & (touched < _UNTOUCHED * own)))
 
 
 def _apart(first: Refitted, second: Refitted) -> float:

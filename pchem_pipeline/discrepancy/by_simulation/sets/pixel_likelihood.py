@@ -24,6 +24,7 @@ from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.framework.effect import Effect, tag_of
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.arithmetic.significance import DECISIVE, NO_DIFFERENCE
 from pchem_pipeline.model.histogram.count import histogram_frames
 
 FloatArray = NDArray[np.float64]
@@ -35,19 +36,16 @@ _log = logging.getLogger(__name__)
 MANY_PIXELS = 1024
 #: Pixels that tell numbers well enough to begin with.
 FEW_PIXELS = 256
-_MOST_STARTS = 3  # of one effect
+MOST_STARTS = 3  # of one effect
+MOST_IN_A_PART = 2  # hypotheses of an effect, or effects for which no estimator speaks
 # nats that an effect for which no estimator speaks must explain, and times as strong as is typical, where a
 # plain fit is led astray
 _SPEAKS, _STRONG = 15.0, 5.0
 _PROBED = 64  # pixels
-_SILENT = 0.5  # nats of so many pixels: an effect that explains less is not in more of them
 _REMEMBERED = 12  # fits: each holds the masses of all codes
-_ALIKE = 0.5  # nats: fits that came to the same
 _ASTRAY = 5.0  # nats of a pixel that an effect explains, from which on it may mistake the peak of no electron
 _FEWEST_PIXELS, _FEWEST_FRAMES = 16, 200  # of a place, whose histograms tell numbers
-_MOST_IN_A_PART = 2  # effects for which no estimator speaks
-# nats of few pixels, and share of what the best one explains, by which an effect is far behind that
-_FAR, _FAR_SHARE = 10.0, 0.1
+_FAR_SHARE = 0.1  # of what the best effect explains, beside chance, by which one is far behind it
 
 
 class PixelLikelihood:
@@ -107,12 +105,12 @@ class PixelLikelihood:
         The likeliest first; none where no fit holds.
         """
         fits: list[tuple[float, Effect]] = []
-        for guess in guesses[:_MOST_STARTS]:
+        for guess in guesses[:MOST_STARTS]:
             one = self._fit([guess], ())
             if one is None or one.members[0].at_limit:
                 continue
             rise = float(one.fit.log_likelihood.sum()) - self._without[self._sets.present]
-            if not any(abs(rise - known) < _ALIKE for known, _ in fits):
+            if not any(abs(rise - known) < NO_DIFFERENCE for known, _ in fits):
                 fits.append((rise, one.members[0].effect))
         return sorted(fits, key=lambda fit: -fit[0])
 
@@ -131,7 +129,8 @@ class PixelLikelihood:
                 note_defect(self._defects, tag_of(kind), error)
                 continue
             rough = self.fewer().fitted(starts)
-            if rough and rough[0][0] > _SILENT:
+            # an effect that explains less in few pixels is not in more of them
+            if rough and rough[0][0] > NO_DIFFERENCE:
                 fits += rough[:1] if self.fewer() is self else self.fitted([rough[0][1]])
         return [effect for rise, effect in sorted(fits, key=lambda fit: -fit[0]) if rise > _SPEAKS]
 
@@ -201,7 +200,7 @@ class PixelLikelihood:
             if not _refuses(error):
                 note_defect(self._defects, (*besides, *effects)[-1].tag, error)
             return None
-        return None if without - float(fitted.fit.log_likelihood.sum()) > _ALIKE else fitted
+        return None if without - float(fitted.fit.log_likelihood.sum()) > NO_DIFFERENCE else fitted
 
 
 @dataclass(frozen=True)
@@ -316,7 +315,7 @@ class Histograms:
             known = {g.tag for g in guesses if (g.region, g.when) == (part.region, part.when)}
             by = self._of(part)
             kinds = [kind for tag, kind in classes.items() if tag not in known]
-            likely = [] if by is None else by.suggested(kinds)[:_MOST_IN_A_PART]
+            likely = [] if by is None else by.suggested(kinds)[:MOST_IN_A_PART]
             found += [effect.at_place(part.region, part.when) for effect in likely]
         self.told += found
         return found
@@ -346,7 +345,7 @@ def _likeliest(by: PixelLikelihood, guesses: Mapping[str, Sequence[Effect]]) -> 
     best = max((fits[0][0] for fits in rough.values() if fits), default=0.0)
     found = {}
     for tag, fits in rough.items():
-        near = bool(fits) and fits[0][0] > (1.0 - _FAR_SHARE) * best - _FAR
+        near = bool(fits) and fits[0][0] > (1.0 - _FAR_SHARE) * best - DECISIVE
         fits = by.fitted([effect for _, effect in fits]) if near and few is not by else fits
         found[tag] = [effect for _, effect in fits]
     return found

@@ -31,20 +31,20 @@ from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere
+from pchem_pipeline.model.arithmetic.significance import FALSE_ALARM, NO_DIFFERENCE, OUTLYING
 
 FloatArray = NDArray[np.float64]
 
 _SPLITS = 2  # train and test frames, whose mean is explained
 #: Replicates at each strength on the way.
 FEW = 6
-_ENOUGH = 12  # replicates that tell a scatter
+ENOUGH = 12  # replicates that tell a scatter
 _MOST_STEPS = 5
 _STEPS_OF_EXPENSIVE = 2
 #: Standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
 #: than a single one would by chance.
 ESTABLISHED = 4.5
 _CLOSE = 0.05  # relative change of a factor that is not worth another simulation
-_CERTAIN = 3.5  # errors of a difference of means: less is chance
 #: Of the logarithm of a factor: shorter steps say nothing about the slope.
 SMALLEST_SECANT = 0.05
 _TRIAL = 0.3  # step of the logarithm of a factor by which a slope is measured
@@ -54,11 +54,9 @@ _FINE_ERROR = 0.03  # relative error of what a set does to the statistics at its
 # nats by which a set must promise to come near the best one, beside a tenth of what that explains or several
 # times what its next step promises to gain
 _REACH, _REACH_SHARE, _MISJUDGED = 30.0, 0.1, 5.0
-_LEAST_GAIN = 0.5  # nats of a step, about a standard error of a strength: the next ones bring less
 _SLIGHT = (
     0.15  # of what a set leaves beyond chance, gained by a step that leaves it behind another set: in vain
 )
-_LEFT = 0.02  # chance of what a complete set may leave, anywhere among the statistics
 _LITTLE = 0.03  # of what there is to explain, nats, that the details of effects may leave
 # nats, and share of what there is to explain, that a set must promise to leave for it not to be all there is;
 # the logarithm of a factor up to which its promise is believed
@@ -297,7 +295,8 @@ class Refitter:
         expensive = is_expensive(h.effect for h in hypotheses)
         for step_number in range(self.steps):
             best = way.best
-            if best.settled or way.gained < _LEAST_GAIN:
+            # after a step that brings so little the next ones bring less
+            if best.settled or way.gained < NO_DIFFERENCE:
                 break
             if way.kept_its_promise and self._hopeless(best, way.gained, rival):
                 break
@@ -415,7 +414,7 @@ class Refitter:
     def passes_goodness_of_fit(self, one: Refitted) -> bool:
         """Tell whether a set leaves no statistic beyond chance."""
         p = float(self.null.p_of(one.rest, _SPLITS).min())
-        return look_elsewhere(p, self.null.effective_tests) > _LEFT
+        return look_elsewhere(p, self.null.effective_tests) > FALSE_ALARM
 
     def ranked(self, sets: Iterable[Refitted]) -> list[Refitted]:
         """Return sets, the best first: the likeliest; if it leaves nothing, the smallest that does so."""
@@ -463,7 +462,7 @@ class Refitter:
         residual = self.target - mean
         scaling = np.array([bool(h.effect.strength) for h in hypotheses])
         scatter = None
-        if replicates >= _ENOUGH:
+        if replicates >= ENOUGH:
             scatter = (vectors - mean) * np.sqrt(1.0 / _SPLITS + 1.0 / replicates)
         kept = self.kept(hypotheses)
         change, stderr = correction(
@@ -584,7 +583,7 @@ def lesser(slopes: FloatArray, parts: FloatArray) -> FloatArray:
 
 def beyond_chance(difference: FloatArray, error: FloatArray) -> FloatArray:
     """Return differences of means where they are beyond chance, 0 elsewhere."""
-    return np.asarray(np.where(np.abs(difference) > _CERTAIN * error, difference, 0.0))
+    return np.asarray(np.where(np.abs(difference) > OUTLYING * error, difference, 0.0))
 
 
 def _spread(parts: FloatArray, rest: FloatArray) -> FloatArray:

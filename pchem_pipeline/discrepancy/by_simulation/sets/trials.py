@@ -13,7 +13,6 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     FAR,
     FAR_SHARE_OF_PART,
     PRICE_OF_MORE,
-    STANDS_OUT,
     Hypothesis,
     fit_set,
     meets_itself,
@@ -27,13 +26,13 @@ from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
 )
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import ESTABLISHED, Refitted, Refitter, is_expensive
 from pchem_pipeline.discrepancy.effort import EffortSpentError
+from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, CERTAIN
 
 _MOST_EXPENSIVE = 4  # sets whose refit takes long
 #: Relative error of a fingerprint before its refit.
 LOOSE = 0.1
 _HARDLY = 0.1  # of a deviation, what effects may move the statistic by that cannot account for it
 _FAR_SHARE = 0.25  # of what there is to explain, beside `FAR`, for a set that leaves nothing
-_CLEARLY = 5.0  # standard errors of a difference of likelihoods
 #: What sets are sorted by.
 PENALISED = operator.attrgetter("penalised_log_likelihood")
 
@@ -219,7 +218,7 @@ class Trials:
         fit = fit_set(members, shift, noise)
         parts = fit.parts
         left = np.abs(shift - parts.sum(axis=0)) / np.sqrt(noise.of(parts).variances)
-        blind = (left > STANDS_OUT) & (np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift))
+        blind = (left > CERTAIN) & (np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift))
         if complete and np.any(blind):
             return True
         trust = _FAR_SHARE if complete and len(members) >= len(self.best.hypotheses) else FAR_SHARE_OF_PART
@@ -240,7 +239,7 @@ class Trials:
         """
         effects = [h.effect for h in members]
         answer = self.likelihood.behind(effects, self.best.effects, FEW_PIXELS)
-        return answer is not None and answer[0] < -FAR - _CLEARLY * answer[1]
+        return answer is not None and answer[0] < -FAR - BEYOND_DOUBT * answer[1]
 
 
 def vanished(one: Refitted) -> set[str]:

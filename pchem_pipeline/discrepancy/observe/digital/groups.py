@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.effects.estimators.prediction import PREDICTORS, predicted
 from pchem_pipeline.effects.framework.evidence import PixelMaps, PredictedSamples, PreviousBits
+from pchem_pipeline.model.arithmetic.significance import CLEAR
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -29,7 +30,6 @@ MOST_SAMPLES, MOST_PAIRED = 1 << 18, 1 << 19
 _MOST_THRESHOLDS = 96
 _FARTHEST = 4.0  # of the thresholds, standard deviations of the samples
 _TAIL = 3e-3  # of samples above the threshold that is tested
-_EQUAL = 3.0  # standard deviations by which samples equal a prediction too often for it to be looked into
 _WITHIN = (0.0, 0.15, 0.5, 1.5)  # read noises
 _INDEPENDENT = 2.5  # of these
 _FEWEST = 50.0  # pairs of which one agrees and another does not
@@ -91,7 +91,7 @@ def _compared(
     # as many pairs of a sample with itself as with each other frame, of which the mean is taken
     chance = np.count_nonzero(others == 0) / (GROUP - 1)
     z = float((equal - chance) / np.sqrt(max(chance, 1.0) * GROUP / (GROUP - 1)))
-    if not always and z < _EQUAL:
+    if not always and z < CLEAR:
         return PredictedSamples(z, thresholds[:0], np.zeros(0), np.zeros((GROUP - 1, 0)))
     first, second, third = others
     low, high = np.minimum(first, second), np.maximum(first, second)

@@ -24,6 +24,7 @@ from pchem_pipeline.discrepancy.observe.digital.misplaced_numba import (
     fill_ratios,
 )
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.arithmetic.significance import CERTAIN
 from pchem_pipeline.model.histogram.count import histogram_frames
 
 FloatArray = NDArray[np.float64]
@@ -34,7 +35,6 @@ _LINES: tuple[Lines, Lines] = ("rows", "columns")
 
 _SHARE = 1e-3  # of the lines, for which the statistic is the best one
 _CHANCE = 4.0  # variance of the sum where hardly a line is likely anywhere else: one or two of them
-_CLEAR = 4.0  # standard deviations beyond which shares are looked for
 _STEPS = 40
 _FARTHEST = 60.0  # logarithm of a ratio: beyond it nothing changes
 
@@ -70,7 +70,7 @@ def misplaced_lines(
         gain, chance = (table.compared(turned, each, whole=False)[0] for each in strides)
         beyond = float((gain.sum() - chance.sum()) / np.sqrt(2.0 * (chance**2).sum() + _CHANCE))
         z[f"space.misplaced.{lines}"] = beyond
-        if beyond > _CLEAR:
+        if beyond > CERTAIN:
             seen, mixed = (_shares(table.compared(turned, each, whole=True)[1]) for each in strides)
             shares[lines] = np.maximum(seen - mixed, 0.0)
     return z, shares

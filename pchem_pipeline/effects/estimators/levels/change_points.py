@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pchem_pipeline.effects.types import FloatArray, IntArray
+from pchem_pipeline.model.arithmetic.significance import CERTAIN
 
-# cosines of the common mode, where it wanders, and the errors that a jump must be large
+# cosines of the common mode, where it wanders
 _WAVES = (0, 12)
-_JUMP = 4.0
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def _with_common(
             for cut, square in zip(begins[1:], squares, strict=True):
                 weakest[cut] = min(weakest.get(cut, (np.inf, q)), (float(square), q))
         # one series a cut: the others' jumps are the surer without it
-        dropped = {(cut, q) for cut, (square, q) in weakest.items() if square < _JUMP**2}
+        dropped = {(cut, q) for cut, (square, q) in weakest.items() if square < CERTAIN**2}
         if not dropped:
             left = float(((wanted - design @ found) ** 2).sum()) / variance
             return left + float(np.log(n)) * found.size, starts, levels

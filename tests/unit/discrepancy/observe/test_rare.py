@@ -11,8 +11,7 @@ from scipy import stats
 
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.rare import expected_beyond, rare_samples, single_samples
-from pchem_pipeline.discrepancy.observe.sums import MOST_HITS
-from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.evidence import MOST_HITS, PixelMaps
 
 
 def observed(frames):
