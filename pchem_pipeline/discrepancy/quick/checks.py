@@ -206,7 +206,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "frame_lag": (math.inf, math.inf),
     "neighbours_x": (0.005, 0.05),
     "neighbours_y": (0.005, 0.05),
-    "repeated_frames": (1e-3, 0.05),
+    "repeated_frames": (1e-3, 1.0),
     "wandering_pixels": (0.01, 0.2),
     "codes": (0.1, 0.5),
     "top_code": (1e-4, 1e-2),

@@ -39,6 +39,7 @@ from pchem_pipeline.stages.electrons.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
 from pchem_pipeline.stages.fit.code_sums import on_axis
 from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_effects, fitted_satellites
+from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of, uncounted_frames
 from pchem_pipeline.store.files import without_nan
 
 if TYPE_CHECKING:
@@ -393,9 +394,12 @@ def _count(job: _Job, band: Band | Tile) -> PixelHistograms:
     origin += first
     counts = np.zeros((*origin.shape, size), like.dtype)
     under, over = np.zeros((2, *origin.shape), dtype=np.uint32)
+    gone = uncounted_frames(odd_frames_of(store)[0])
     with _stream(job, band, job.frames) as stream:
-        for _, (block,) in stream:
-            count_frames(block, origin.astype(np.int32), counts, under, over)
+        for t, (block,) in stream:
+            kept = ~np.isin(np.arange(t, t + len(block)), gone)
+            counted = block if kept.all() else block[kept]
+            count_frames(counted, origin.astype(np.int32), counts, under, over)
     return PixelHistograms(counts, origin, under + over)
 
 
@@ -432,7 +436,11 @@ def _totals(store: RunStore, job: _Job, rows: list[int]) -> EnsembleTotals:
         job: what is summed.
         rows: of the finished tiles in the sums.
     """
-    samples = (1, 1) if job.frames is None else (job.frames[1] - job.frames[0], job.sensor.n_frames)
+    samples = (1, 1)
+    if job.frames is not None:
+        gone = uncounted_frames(odd_frames_of(store)[0])
+        chosen, first = gone[gone < job.frames[1]], job.frames[0]
+        samples = job.frames[1] - first - int((chosen >= first).sum()), job.sensor.n_frames - gone.size
     integers, floats = (
         sum(store.read(f"ensemble_tiles/{name}", (number, slice(None))) for number in rows) for name in _SUMS
     )

@@ -5,7 +5,7 @@ All frames are counted before. A link that drops or repeats frames says nothing 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
 from typing import TYPE_CHECKING
 
@@ -34,6 +34,11 @@ def odd_frames_of(store: RunStore) -> tuple[dict[str, IntArray], IntArray]:
     return kinds, np.array(known.get("left_out", []), np.int64)
 
 
+def uncounted_frames(odd: Mapping[str, IntArray]) -> IntArray:
+    """Return the frames that are in no histogram: empty ones and copies of others."""
+    return np.union1d(odd["empty"], odd["copied"])
+
+
 def leave_out_odd_frames(
     context: StageContext, odd: dict[str, IntArray], mean: FloatArray, variance: FloatArray
 ) -> None:
@@ -50,10 +55,10 @@ def leave_out_odd_frames(
         StoreError: the store refuses.
     """
     out, (_, before) = left_out(odd, mean.size), odd_frames_of(context.store)
-    useless = {kind: odd[kind] for kind in ("empty", "copied")}
-    gone = np.union1d(*useless.values())
+    gone = uncounted_frames(odd)
     if gone.size:
         _leave_out_of_histograms(context, gone)
+        useless = {kind: odd[kind] for kind in ("empty", "copied")}
         context.note(f"{odd_words(useless, mean, variance)}: not counted")
     changed = np.union1d(out, before)
     if changed.size:

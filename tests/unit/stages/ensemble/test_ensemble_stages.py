@@ -185,6 +185,21 @@ def test_ensemble_is_that_of_the_chosen_frames(finished: StageContext) -> None:
     assert found["nuced_density"].sum() * step == pytest.approx(1.0, abs=1e-3)
 
 
+def test_copies_and_empty_frames_are_in_no_ensemble(prepared: Path, tmp_path: Path) -> None:
+    fresh_copy(prepared, tmp_path)
+    context = make_context(tmp_path, frames=250)
+    write_fit(context)
+    odd = {"copied": list(range(1, 200, 2)), "empty": [6, 399]}
+    context.store.set_attributes("summary", {"odd_frames": odd})
+    assert execute("ensemble", context).state == "complete"
+    kept = np.delete(np.load(tmp_path / "frames" / "frames.npy")[:250], [*odd["copied"], 6], 0)
+    found = ensemble_of(context.store)
+    expected = np.bincount(np.delete(kept.reshape(len(kept), -1), 3 * NX + 5, 1).ravel())[found["dn"][0] :]
+    np.testing.assert_array_equal(found["counts"][: expected.size], expected)
+    facts = context.store.attributes("ensemble")
+    assert (facts["n_frames"], facts["n_frames_all"]) == (149, FRAMES - 102)
+
+
 def test_the_true_parameters_predict_to_the_noise(finished: StageContext) -> None:
     facts = finished.store.attributes("ensemble")
     error = facts["rmse"]
