@@ -10,7 +10,6 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.model.histogram import count, count_numba
 from pchem_pipeline.model.histogram.count import (
     HistogramAccumulator,
-    RowHistograms,
     choose_bins,
     counts_dtype,
     histogram_frames,
@@ -22,30 +21,6 @@ def pcd_like(seed: int, shape: tuple[int, int, int], dtype: type = np.uint16) ->
     rng = np.random.default_rng(seed)
     bias = rng.normal(100, 6, shape[1:])
     return np.rint(bias + 11 * (rng.poisson(1.5, shape) + rng.normal(0, 0.3, shape))).astype(dtype)
-
-
-def expand(histograms: RowHistograms, y: int, x: int, size: int) -> NDArray[np.int64]:
-    """Counts of a pixel on the axis DN = 0, 1, ... size - 1."""
-    full = np.zeros(size + histograms.counts.shape[2], np.int64)
-    start = histograms.origin[y, x]
-    full[start : start + histograms.counts.shape[2]] = histograms.counts[y, x]
-    assert not full[size:].any()
-    return full[:size]
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
-def test_equals_bincount_of_every_pixel(dtype):
-    frames = pcd_like(1, (700, 5, 7), dtype)
-    result = histogram_frames(frames)
-    assert result.counts.dtype == np.uint16
-    for y in range(5):
-        for x in range(7):
-            expected = np.bincount(frames[:, y, x], minlength=512)
-            np.testing.assert_array_equal(expand(result, y, x, 512), expected)
-    assert not result.under.any()
-    assert not result.over.any()
-    np.testing.assert_array_equal(result.minimum, frames.min(axis=0))
-    np.testing.assert_array_equal(result.maximum, frames.max(axis=0))
 
 
 def test_what_fits_is_in_the_middle_of_its_window():
