@@ -5,32 +5,12 @@ from __future__ import annotations
 import mpmath
 import numpy as np
 import pytest
-from scipy.special import roots_genlaguerre
-from scipy.stats import nbinom
 
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
-from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, ensemble_sums
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, ensemble_sums
 from pchem_pipeline.model.ensemble.ensemble_binned import HistogramChoice, epcd_independent
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
-
-
-@pytest.mark.parametrize("k", [0, 1, 4, 9])
-def test_electron_mass_from_the_moment_generating_function(k: int) -> None:
-    # second form of eq. K_ensemble_pmf: (-1)^k / k! d^k/dt^k M_H(-t) at t = 1
-    exposure = [0.2, 1.7, 3.1, 6.5]
-    with mpmath.workdps(40):
-        derivative = mpmath.diff(lambda t: mpmath.fsum(mpmath.exp(-t * h) for h in exposure) / 4, 1, k)
-        expected = float((-1) ** k * derivative / mpmath.factorial(k))
-    assert electron_pmf(np.array(exposure), 10)[k] == pytest.approx(expected, rel=1e-12)
-
-
-def test_electron_mass_of_a_gamma_exposure_is_negative_binomial() -> None:
-    # Gauss-Laguerre nodes and weights of the gamma density as cells, for which the mixture is known
-    shape, scale = 3.0, 0.8
-    nodes, weights = roots_genlaguerre(60, shape - 1)
-    mass = electron_pmf(nodes * scale, 20, weights / weights.sum())
-    np.testing.assert_allclose(mass, nbinom.pmf(np.arange(20), shape, 1 / (1 + scale)), rtol=1e-9)
 
 
 def test_density_of_one_pixel_to_forty_digits() -> None:

@@ -117,15 +117,6 @@ def test_any_division_gives_the_same_frames(name, frames, rows):
     np.testing.assert_array_equal(electrons, WHOLE[name][1])
 
 
-@settings(max_examples=20, deadline=None)
-@given(y0=st.integers(0, SHAPE[0] - 1), height=st.integers(1, SHAPE[0]))
-def test_maps_of_a_band_are_part_of_the_whole(y0, height):
-    y1 = min(y0 + height, SHAPE[0])
-    band = draw_truth(SENSORS["plain"], rows=(y0, y1)).arrays()
-    for name, values in TRUTH["plain"].arrays().items():
-        np.testing.assert_array_equal(band[name], values[y0:y1])
-
-
 def test_threads_give_the_same_frames():
     name = "every kind of state"
     blocks = [(t, t + 1) for t in range(N_FRAMES)]

@@ -40,12 +40,6 @@ def test_the_joint_fit_is_efficient(noise, dark):
         assert alone[1, 1] / bound[size, size] - 1 > 20 * np.sqrt(2 / N_PIXELS)
 
 
-def test_a_bias_stack_tells_more_than_another_exposure():
-    with_bias = cramer_rao([1.0, 4.0, 0.0], 0.1, 8.0, 1000)
-    without = cramer_rao([1.0, 4.0, 2.0], 0.1, 8.0, 1000)
-    assert with_bias[4, 4] < 0.5 * without[4, 4]
-
-
 def test_clipped_samples_are_censored():
     # the ADC ends inside the brighter sample: its last code takes what lies beyond
     series = draw_series(np.random.default_rng(4), [0.8, 4.0], 0.5, 80)

@@ -39,10 +39,6 @@ def judge_together(fit: FitResult) -> FitResult:
     return replace(fit, fit_status=fit.fit_status | word.astype(np.uint16))
 
 
-def estimates(fit: FitResult) -> Array:
-    return fit.columns
-
-
 def errors(fit: FitResult) -> Array:
     return np.asarray(np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)))
 
@@ -66,7 +62,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say(case: tuple[float, float
     fit = fit_histograms(pixels.counts, pixels.origin)
     assert np.mean(fit.fit_status == 0) > 0.99
     good = fit.fit_status == 0
-    values, stderr, truth = estimates(fit)[good], errors(fit)[good], pixels.truth[good]
+    values, stderr, truth = fit.columns[good], errors(fit)[good], pixels.truth[good]
     for level in (0.68, 0.95):
         z = quantile_of(level)
         limit = 5 * np.sqrt(level * (1 - level) / n) + 0.005  # the rest: second order at 2000 frames
@@ -95,7 +91,7 @@ def test_pixels_that_pass_together_are_no_selection(case: tuple[float, float, in
     def tail(fit: FitResult) -> float:
         """Return the smallest probability of so few intervals, or fewer, that hold the truth."""
         good = fit.fit_status == 0
-        held = np.abs(estimates(fit) - pixels.truth)[good] <= 1.96 * errors(fit)[good]
+        held = np.abs(fit.columns - pixels.truth)[good] <= 1.96 * errors(fit)[good]
         return float(binom.cdf(held.sum(axis=0), good.sum(), 0.95).min())
 
     five = 2.9e-7  # probability beyond five standard deviations, one side
@@ -156,12 +152,12 @@ def test_a_few_outliers_move_nothing(case: tuple[float, float, int]) -> None:
     pixels = draw(np.random.default_rng(64), np.full(150, h), 11.0, noise, n_frames=n_frames)
     hit = spoiled(np.random.default_rng(65), pixels)
     clean, on = fit_histograms(pixels.counts, pixels.origin), fit_histograms(hit.counts, hit.origin)
-    shift = np.abs(estimates(on) - estimates(clean)) / errors(clean)
+    shift = np.abs(on.columns - clean.columns) / errors(clean)
     assert shift.max() < 0.1
     np.testing.assert_allclose(on.outlier_share * (n_frames + 5), 5, atol=1.001)
     np.testing.assert_array_equal(on.fit_status, clean.fit_status)
     off = fit_histograms(hit.counts, hit.origin, settings=GUARD_OFF)
-    moved = np.abs(estimates(off) - estimates(clean)) / errors(clean)
+    moved = np.abs(off.columns - clean.columns) / errors(clean)
     assert np.nanmedian(moved.max(axis=1)) > 2  # 20 times as much
     assert (off.outlier_share == 0).all()
 
@@ -173,8 +169,8 @@ def test_the_guard_costs_nothing_on_clean_pixels() -> None:
     hit = on.outlier_share > 0
     # expected below the floor: 1e-3 per DN times the length of the tails, some DN
     assert hit.mean() < 0.02
-    np.testing.assert_array_equal(estimates(on)[~hit], estimates(off)[~hit])
-    square = [(((estimates(fit) - pixels.truth) / errors(off)) ** 2).mean(axis=0) for fit in (on, off)]
+    np.testing.assert_array_equal(on.columns[~hit], off.columns[~hit])
+    square = [(((fit.columns - pixels.truth) / errors(off)) ** 2).mean(axis=0) for fit in (on, off)]
     assert (square[0] / square[1] < 1.01).all()
 
 
@@ -189,7 +185,7 @@ def test_sandwich_errors_hold_where_the_model_does_not() -> None:
     fit = fit_histograms(counts, first, settings=GUARD_OFF)
     settings = GUARD_OFF.model_copy(update={"errors": "sandwich"})
     sandwich = fit_histograms(counts, first, settings=settings).covariance
-    scatter = estimates(fit).std(axis=0)[0]
+    scatter = fit.columns.std(axis=0)[0]
     limit = 5 / np.sqrt(2 * n)
     assert np.median(np.sqrt(sandwich[:, 0, 0])) == pytest.approx(scatter, rel=limit)
     assert np.median(errors(fit)[:, 0]) < scatter * (1 - limit)
@@ -204,7 +200,7 @@ def test_the_error_of_the_ensemble_is_its_scatter() -> None:
     for _ in range(n):
         pixels = draw(rng, exposure, 11.0, 0.3, bias, n_frames=2000)
         fit = fit_histograms(pixels.counts, pixels.origin)
-        some = UsablePixels(*np.ascontiguousarray(estimates(fit).T))
+        some = UsablePixels(*np.ascontiguousarray(fit.columns.T))
         curves.append(ensemble_sums(some, dn).raw / len(some))
         raw, corrected = curve_errors(some, fit.covariance, dn, nuced)
         predicted += np.sqrt(raw) / len(some) / n

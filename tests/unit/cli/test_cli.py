@@ -157,28 +157,27 @@ def test_init_writes_a_valid_file_once(tmp_path, monkeypatch):
     assert load_config(tmp_path / "c.yaml").simulate is not None
 
 
-def test_errors_are_one_line_with_their_exit_code(monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (
+            InputError("frames.tif is truncated;\n copy it again"),
+            4,
+            "frames.tif is truncated; copy it again\n",
+        ),
+        (MemoryError(), 1, ""),
+        (KeyboardInterrupt(), 130, ""),
+    ],
+)
+def test_errors_are_one_line_with_their_exit_code(monkeypatch, capsys, error, code, words):
     def fail(**_):
-        raise InputError("frames.tif is truncated;\n copy it again")
+        raise error
 
     monkeypatch.setattr(app, "app", fail)
     with pytest.raises(SystemExit) as caught:
         app.main([])
-    assert caught.value.code == 4
-    assert capsys.readouterr().err == "pchem: frames.tif is truncated; copy it again\n"
-
-
-def test_out_of_memory_and_ctrl_c_have_their_codes(monkeypatch, capsys):
-    for error, code in ((MemoryError(), 1), (KeyboardInterrupt(), 130)):
-
-        def fail(error=error, **_):
-            raise error
-
-        monkeypatch.setattr(app, "app", fail)
-        with pytest.raises(SystemExit) as caught:
-            app.main([])
-        assert caught.value.code == code
-        assert capsys.readouterr().err.startswith("pchem: ")
+    assert caught.value.code == code
+    assert capsys.readouterr().err.startswith(f"pchem: {words}")
 
 
 def test_a_library_that_cannot_be_imported_is_one_line(tmp_path):

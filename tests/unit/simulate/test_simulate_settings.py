@@ -12,11 +12,6 @@ from pchem_pipeline.simulate.settings import ParameterSettings, SimulateSettings
 CONSTANT = {"kind": "constant", "value": 0.1}
 
 
-def test_defaults_survive_a_round_trip_through_json():
-    settings = SimulateSettings()
-    assert SimulateSettings.model_validate_json(settings.model_dump_json()) == settings
-
-
 def test_giving_the_second_way_replaces_the_first():
     parameters = ParameterSettings(dark_current=CONSTANT, conversion_gain=CONSTANT)
     assert list(parameters.given()) == ["dark_current", "conversion_gain", "bias", "analog_read_noise_e"]

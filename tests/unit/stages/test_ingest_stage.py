@@ -301,12 +301,6 @@ def test_ready_made_histograms(tmp_path: Path) -> None:
     assert run(make_context(tmp_path, files=[str(SIPM / "*.csv")])).state == "complete"
 
 
-def test_bad_histograms(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("1,-2\n")
-    with pytest.raises(InputError, match="negative counts"):
-        run(make_context(tmp_path, files=["a.csv"]))
-
-
 def test_sidecar_belongs_to_the_content(tmp_path: Path) -> None:
     (tmp_path / "cam").mkdir()
     (tmp_path / "cam" / "a.raw").write_bytes(STACK.tobytes())

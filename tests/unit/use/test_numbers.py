@@ -111,8 +111,6 @@ def test_parts_of_a_dn_give_the_same_as_whole_ones():
 
 
 def test_exposure_does_not_depend_on_the_unit_of_codes():
-    from pchem_pipeline.use.exposure import estimate_exposure
-
     rng = np.random.default_rng(34)
     camera = KnownCamera.drawn(rng, (4, 4))
     _, frames = camera.frames(rng, 2.0, 300)

@@ -29,16 +29,6 @@ def test_facts_are_taken_from_the_header(tmp_path: Path, keyword: str, extension
     assert reader.bit_depth == 16
 
 
-@pytest.mark.parametrize(
-    ("comment", "seconds"), [("[ms] exposure", 0.0125), ("exposure", 12.5), ("[s] it", 12.5)]
-)
-def test_unit_of_the_exposure(tmp_path: Path, comment: str, seconds: float) -> None:
-    unit = fits.PrimaryHDU(STACK)
-    unit.header["EXPOSURE"] = (12.5, comment)
-    unit.writeto(tmp_path / "a.fits")
-    assert FitsReader.open(tmp_path / "a.fits", InputSettings()).integration_time == pytest.approx(seconds)
-
-
 def test_values_that_may_be_no_samples_are_reported(tmp_path: Path) -> None:
     for i in range(3):
         unit = fits.PrimaryHDU(STACK[i : i + 3])

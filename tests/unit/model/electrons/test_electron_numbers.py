@@ -61,20 +61,6 @@ def test_the_paper_s_example_is_not_centred() -> None:
     assert edges[0] < 0.5 < edges[2] - 2
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_codes_have_the_number_of_largest_joint_mass(case: tuple[float, ...]) -> None:
-    x = np.arange(int(case[2]) - 30, int(case[2]) + 300)
-    joint = joint_mass(x, *case)
-    found = converted(x[:, None, None].astype(np.uint16), known(*(np.full((1, 1), v) for v in case))).ravel()
-    seen = joint.max(axis=0) > 1e-15  # the others are never seen: any number will do
-    np.testing.assert_array_equal(found[seen], joint.argmax(axis=0)[seen])
-    assert seen.sum() > 50
-    # the thresholds of the density differ by no more than what they lie from a code
-    edges = thresholds(*case, 399)
-    near = np.abs(edges[:, None] - x).min(axis=0) < 0.1
-    np.testing.assert_array_equal(found[seen & ~near], np.searchsorted(edges, x)[seen & ~near])
-
-
 def test_pixels_without_parameters_have_no_number() -> None:
     frames = np.full((2, 1, 3), 130, dtype=np.uint16)
     maps = [np.array([[v, v, v]]) for v in (2.0, 0.1, 100.0, 3.0)]

@@ -126,30 +126,6 @@ def test_independent_on_a_short_axis_is_a_cut_of_the_long_one() -> None:
     )
 
 
-def test_a_map_of_equal_pixels_gives_the_pcd_in_every_way() -> None:
-    ones = np.ones(16)
-    pixels, dn = UsablePixels(3.0 * ones, 0.1 * ones, 90.0 * ones, 3.0 * ones), DnAxis(40, 300)
-    expected = pcd(dn.dn, 3.0, 0.1, 90.0, 9.0)
-    for result in (
-        ensemble_sums(pixels, dn).raw / len(pixels),
-        epcd_dependent(pixels, dn, HistogramChoice()),
-        epcd_independent(pixels, dn, HistogramChoice()),
-    ):
-        np.testing.assert_allclose(result, expected, rtol=1e-9, atol=1e-15)
-
-
-def test_more_bins_lead_to_the_exact_mean() -> None:
-    pixels, dn = make_pixels(3000), DnAxis(50, 250)
-    exact = ensemble_sums(pixels, dn).raw / len(pixels)
-    errors = [np.abs(epcd_dependent(pixels, dn, HistogramChoice(b)) - exact).max() for b in (4, 16, 64, 200)]
-    assert errors[0] > 5 * errors[1]
-    assert errors[1] > 5 * errors[2]
-    assert errors[3] < 2e-4 * exact.max()
-    # the correlation of gain and read noise is what the independent form loses, at any number of bins
-    independent = epcd_independent(pixels, dn, HistogramChoice(200))
-    assert np.abs(independent - exact).max() > 50 * errors[3]
-
-
 def test_nuced_is_the_sum_of_bin_means() -> None:
     pixels, axis = make_pixels(60), NucedAxis(0.25, -8, 60)
     choice = HistogramChoice(3)

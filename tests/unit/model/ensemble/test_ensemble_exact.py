@@ -7,7 +7,6 @@ import pytest
 from helpers.plain_law import joint_mass
 from scipy.stats import norm, poisson
 
-from pchem_pipeline.model.arithmetic import normal_numba
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.ensemble import (
     DnAxis,
@@ -92,21 +91,6 @@ def test_poisson_weights(exposure: float) -> None:
     k = np.arange(low, high + 1)
     np.testing.assert_allclose(weights[low : high + 1], poisson.pmf(k, exposure), rtol=1e-8, atol=1e-300)
     assert weights[low : high + 1].sum() == pytest.approx(1.0, abs=1e-9)
-
-
-def test_compiled_and_plain_kernels_agree() -> None:
-    pixels, axis = make_pixels(6), NucedAxis(0.1, -20, 150)
-    results = []
-    for kernel in (ensemble_numba.sum_pcd_pixels, ensemble_numba.sum_pcd_pixels.py_func):
-        raw = ensemble_numba.AxisSums(50, 1.0, *np.zeros((2, 300)))
-        bins = ensemble_numba.AxisSums(axis.start, axis.width, *np.zeros((2, axis.size)))
-        kernel(tuple(pixels.maps), raw, bins)
-        results.append(np.concatenate([raw.total, raw.square, bins.total, bins.square]))
-    np.testing.assert_allclose(*results, rtol=1e-13)
-    outs = np.zeros((2, 60))
-    normal_numba.add_mass(outs[0], 3.0, 0.7, 20.2, 2.5)
-    normal_numba.add_mass.py_func(outs[1], 3.0, 0.7, 20.2, 2.5)
-    np.testing.assert_allclose(outs[0], outs[1], rtol=1e-13)
 
 
 def test_tally_is_that_of_the_samples() -> None:

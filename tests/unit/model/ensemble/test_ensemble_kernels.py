@@ -36,6 +36,12 @@ EMPTY_TABLES = electrons_numba.CodeTables(
 NUMBER_TABLES = EMPTY_TABLES._replace(number=TABLE)
 
 ENSEMBLE: dict[str, tuple[Any, ...]] = {
+    "sum_pcd_pixels": (
+        (H, G, MU, SIGMA),
+        ensemble_numba.AxisSums(10, 1.0, *np.zeros((2, 90))),
+        ensemble_numba.AxisSums(-8, 0.1, *np.zeros((2, 80))),
+    ),
+    "add_mass": (np.zeros(60), 3.0, 0.7, 20.2, 2.5),
     "sum_pcd_cells": (SHARE, H, G, MU, SIGMA, 3, np.zeros(90)),
     "sum_nuced_cells": (SHARE, H, G * SIGMA, 0.1, -8, np.zeros(80)),
     "sum_nuced_product": (MASS, SHARE, G * SIGMA, 0.1, -8, np.zeros(80)),

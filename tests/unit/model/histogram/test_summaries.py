@@ -112,19 +112,6 @@ def test_one_frame_has_sums_and_no_covariance():
     assert np.isnan(maps.lag1_covariance).all()
 
 
-def test_neighbours_across_a_group_of_rows_are_left_out():
-    frames = noise(5, (40, ROW_GROUP + 3, 2))
-    _, maps = summarise(frames, 16)
-    missing = np.isnan(maps.neighbour_covariance_y).all(axis=1)
-    assert np.flatnonzero(missing).tolist() == [ROW_GROUP - 1, ROW_GROUP + 2]
-    _, first = summarise(frames[:, :ROW_GROUP], 16)
-    _, second = summarise(frames[:, ROW_GROUP:], 16)
-    for name, whole in vars(maps).items():
-        np.testing.assert_array_equal(
-            whole, np.concatenate([getattr(first, name), getattr(second, name)]), err_msg=name
-        )
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
 def test_line_sums(dtype):
     frames = noise(6, (5, ROW_GROUP + 6, 9), dtype)

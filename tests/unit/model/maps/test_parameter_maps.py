@@ -198,16 +198,6 @@ def test_a_display_has_the_beta_shape() -> None:
     np.testing.assert_allclose(displayed(-values).ravel(), 1 - level, atol=1.001e-3)
 
 
-def test_a_display_keeps_order_and_ties() -> None:
-    values = np.array([1.0, 1.0, 5.0, -2.0, 1e9])
-    shown = displayed(values)
-    assert shown[0] == shown[1] == pytest.approx(beta(2, 2).ppf(0.4), abs=1e-3)
-    assert shown[3] < shown[0] < shown[2] < shown[4]
-    np.testing.assert_allclose(displayed(np.ones(5)), 0.5)
-    few = np.array([3.0, 3.0, 3.0, 7.0])
-    assert displayed(few).tolist() == pytest.approx(beta(2, 2).ppf([0.375] * 3 + [0.875]), abs=1e-3)
-
-
 def test_settings_refuse_nonsense() -> None:
     with pytest.raises(ValueError, match="at least one frame"):
         EnsembleSettings(frames=0)

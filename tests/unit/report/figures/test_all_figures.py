@@ -1,4 +1,4 @@
-"""Every figure, on data as they should be and on data as they are."""
+"""Every figure, on data as they should be and on data as they are; spectra show what is planted."""
 
 import io
 from collections.abc import Callable
@@ -7,11 +7,13 @@ from dataclasses import replace
 import matplotlib as mpl
 import numpy as np
 import pytest
+from helpers.quick_stacks import stack, sums_of
 from helpers.report_material import CASES, PARAMETERS, pixel_fit, report_data, true_maps
 from PIL import Image
 
+from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.model.fit.status import MEANINGS, FitStatus
-from pchem_pipeline.report.charts.chart import COLUMN_MM, PAGE_MM
+from pchem_pipeline.report.charts.chart import COLUMN_MM, PAGE_MM, Words
 from pchem_pipeline.report.charts.on_paper import draw_chart
 from pchem_pipeline.report.data import PixelFit
 from pchem_pipeline.report.figures.ensemble import (
@@ -21,7 +23,7 @@ from pchem_pipeline.report.figures.ensemble import (
     ensemble_chart,
     ensemble_tables,
 )
-from pchem_pipeline.report.figures.figure import DataTable
+from pchem_pipeline.report.figures.figure import DataTable, csv_text
 from pchem_pipeline.report.figures.maps import (
     histogram_table,
     map_chart,
@@ -37,8 +39,18 @@ from pchem_pipeline.report.figures.pixels import (
     pixels_chart,
     shown_bins,
 )
+from pchem_pipeline.report.figures.plan import frames_chart
+from pchem_pipeline.report.figures.stability import (
+    frame_table,
+    line_spectra,
+    pattern_spectra,
+    power_table,
+    profile_table,
+    stability_figures,
+)
 from pchem_pipeline.report.style.palette import DARK, LIGHT
 from pchem_pipeline.report.style.style import Drawing, Look, drawing_bytes, palette_of, small_png
+from pchem_pipeline.report.style.wording import power_of_ten
 
 LOOK = Look()
 WORDS = {int(bit): text for bit, text in MEANINGS.items()}
@@ -327,3 +339,115 @@ def test_dark_paper_has_light_ink() -> None:
     assert dark.axes[0].lines[0].get_color() == DARK.ink
     assert palette_of(mpl.style.library["dark_background"]).ink == "#ffffff"
     assert palette_of({}) == LIGHT
+
+
+def test_labels_of_contours_lie_on_them_and_none_is_cut() -> None:
+    """On the drawn axes these contours are straight lines, from corner to corner."""
+    noise, exposure = np.meshgrid(np.linspace(0.1, 1.1, 41), np.logspace(-1.0, 1.0, 41), indexing="ij")
+    frames = 10.0 ** (2.0 + 4.0 * noise - 2.0 * np.log10(exposure))
+    columns = {"read_noise_e": noise, "quanta_exposure": exposure, "frames for bias to 1 %": frames}
+    (stack,) = frames_chart(
+        DataTable({name: values.ravel() for name, values in columns.items()}), None
+    ).stacks
+    (panel,) = stack.panels
+    labels = [mark for mark in panel.marks if isinstance(mark, Words)]
+    assert len(labels) > 3
+    powers = {power_of_ten(power): power for power in range(9)}
+    for label in labels:
+        across, up = float(label.x), float(label.up)
+        assert 0.04 < (across + 1.0) / 2.0 < 0.96
+        assert 0.0 < up < 0.96
+        there = 2.0 + 4.0 * (0.1 + up * 1.0) - 2.0 * across
+        # the words stand on the line: a tenth of the picture is 0.4 decades
+        assert there == pytest.approx(powers[label.text], abs=0.2)
+
+
+N, NY, NX = 400, 40, 48
+
+
+def simulated(seed: int, moved=lambda dn: dn) -> StackSums:
+    return sums_of(stack(np.random.default_rng(seed), (N, NY, NX), moved))
+
+
+@pytest.fixture(scope="module")
+def clean() -> StackSums:
+    return simulated(11)
+
+
+def test_independent_pixels_give_the_power_of_chance(clean: StackSums) -> None:
+    power = power_table(clean)["power"]
+    assert np.all(power > 0)
+    # a frame's mean scatters as chance says: n - 1 degrees of freedom
+    ratio = frame_table(clean)["mean"].var() / frame_table(clean)["error of chance"][0] ** 2
+    assert abs(ratio - 1.0) < 5.0 * np.sqrt(2.0 / N)
+    for table in line_spectra(clean):
+        each = table["power"]
+        # means over N frames of squares that are exponential at each frequency but the last
+        assert np.all(np.abs(each[:-1] - 1.0) < 5.0 / np.sqrt(N - 2))
+    for table in pattern_spectra(clean):
+        assert abs(table["power"].mean() - 1.0) < 5.0 / np.sqrt(table["power"].size)
+
+
+@pytest.mark.parametrize(("line", "cycles"), [("row", 5), ("column", 6)])
+def test_a_planted_wave_has_its_power_at_its_frequency(line: str, cycles: int) -> None:
+    amplitude, length, across = 2.0, *((NY, NX) if line == "row" else (NX, NY))
+    rng = np.random.default_rng(5)
+    phase = rng.uniform(0.0, 2.0 * np.pi, (N, 1, 1))
+    place = np.arange(length) * 2.0 * np.pi * cycles / length
+
+    def moved(dn: np.ndarray) -> np.ndarray:
+        wave = amplitude * np.sin((place[:, None] if line == "row" else place) + phase)
+        return dn + wave
+
+    sums = simulated(12, moved)
+    table = next(each for each in line_spectra(sums) if each.part == f"noise_{line}")
+    expected = 1.0 + across * length * amplitude**2 / 4.0 / float(np.mean(sums.variance))
+    assert np.argmax(table["power"]) == cycles - 1
+    assert table["frequency"][cycles - 1] == pytest.approx(cycles / length)
+    height = table["power"][cycles - 1]
+    assert height > 20.0
+    if line == "row":  # columns are summed over groups of rows, each with less of it
+        assert height == pytest.approx(expected, rel=5.0 * np.sqrt(2.0 / N))
+
+
+def test_what_moves_in_time_and_what_repeats_in_space_is_seen() -> None:
+    def moved(dn: np.ndarray) -> np.ndarray:
+        time = np.arange(N)[:, None, None]
+        return dn + 0.5 * np.sin(2.0 * np.pi * 0.2 * time) + 5.0 * (np.arange(NX) % 8 == 0)
+
+    sums = simulated(13, moved)
+    spectrum = power_table(sums)
+    assert spectrum["frequency"][np.argmax(spectrum["largest"])] == pytest.approx(0.2, rel=0.05)
+    assert spectrum["largest"].max() > 100.0
+    columns = profile_table(sums, 1)
+    outside = columns["mean signal"] > columns["chance to"]
+    assert outside[::8].all()
+    assert outside.sum() < 12
+    pattern = next(each for each in pattern_spectra(sums) if each.part == "pattern_column")
+    assert pattern["power"][NX // 8 - 1] > 20.0
+
+
+def test_hot_pixels_leave_the_pattern_as_it_is() -> None:
+    spoiled = simulated(11, lambda dn: dn + 900.0 * ((np.arange(NY)[:, None] == 7) & (np.arange(NX) == 9)))
+    assert max(table["power"].max() for table in pattern_spectra(spoiled)) < 20.0
+
+
+def test_long_runs_are_averaged_and_figures_come_with_their_tables(clean: StackSums) -> None:
+
+    long = replace(clean, numbers=np.arange(10 * N), all_means=np.tile(clean.all_means, 10))
+    assert frame_table(long)["mean"].size == 1000
+    assert frame_table(long)["mean"].mean() == pytest.approx(clean.frame_mean.mean())
+    figures = stability_figures(clean)
+    assert [figure.name for figure in figures] == ["frame_means", "profiles", "spatial_spectra"]
+    for figure in figures:
+        assert drawing_bytes(figure.draw(Look(figure.width_mm)), "png", dpi=50)
+        assert all(csv_text(table).count("\n") > 5 for table in figure.tables)
+        assert any(sign.isdigit() for sign in figure.alt)
+    assert stability_figures(None) == []
+
+
+def test_a_line_of_channels_has_what_it_can(clean: StackSums) -> None:
+    line = sums_of(stack(np.random.default_rng(3), (200, 1, 30)))
+
+    for figure in stability_figures(line):
+        assert drawing_bytes(figure.draw(Look()), "png", dpi=50)

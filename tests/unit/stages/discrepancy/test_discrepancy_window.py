@@ -1,19 +1,28 @@
-"""Which part of a stack is looked at."""
+"""Which part of a stack is looked at, the limits it starts from, and what ends the stage."""
 
+from __future__ import annotations
+
+import contextlib
 import json
+import signal
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.discrepancy_material import verdict_of
 
-from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.verdict import Elsewhere, Verdict
+from pchem_pipeline.effects.adc.clipping import Clipping
 from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.signals import InterruptedRunError
 from pchem_pipeline.stages.discrepancy import discrepancy
+from pchem_pipeline.stages.discrepancy.discrepancy import _limits
 from pchem_pipeline.stages.discrepancy.survey import Survey
 from pchem_pipeline.stages.discrepancy.window import (
     Window,
@@ -29,13 +38,11 @@ from pchem_pipeline.stages.discrepancy.window import (
 WHOLE = DiscrepancySettings(max_pixels=1 << 25)
 
 
-class Frames:
-    """Frames in memory whose value tells where they come from."""
+class Stack:
+    """Frames in memory."""
 
-    def __init__(self, shape):
-        t, y, x = np.ogrid[: shape[0], : shape[1], : shape[2]]
-        self.values = (t * 10_000 + y * 100 + x).astype(np.uint32)
-        self.shape, self.dtype, self.rows_per_read = shape, self.values.dtype, 1
+    def __init__(self, values):
+        self.values, self.shape, self.dtype, self.rows_per_read = values, values.shape, values.dtype, 1
 
     def read_into(self, buffer, t0, t1, y0=0, y1=None):
         buffer[...] = self.values[t0:t1, y0:y1]
@@ -145,7 +152,8 @@ def test_the_region_asked_for_is_looked_at():
 
 
 def test_frames_of_the_window_are_those_of_the_stack():
-    source = Frames((300, 9, 11))
+    t, y, x = np.ogrid[:300, :9, :11]
+    source = Stack((t * 10_000 + y * 100 + x).astype(np.uint32))  # a value tells where it comes from
     window = choose_window(
         (300, 9, 11), DiscrepancySettings(max_samples=1 << 20, block_frames=20), (2, 6, 3, 8)
     )
@@ -177,16 +185,6 @@ def test_without_a_place_or_outside_of_the_region_asked_for_the_middle_is_looked
     elsewhere = {"lag": place(rows=[500, 512])}
     asked = choose_window((17750, 512, 512), WHOLE, (0, 256, 0, 256), elsewhere)
     assert asked.rows == choose_window((17750, 512, 512), WHOLE, (0, 256, 0, 256)).rows
-
-
-class Stack:
-    """Frames in memory."""
-
-    def __init__(self, values):
-        self.values, self.shape, self.dtype, self.rows_per_read = values, values.shape, values.dtype, 1
-
-    def read_into(self, buffer, t0, t1, y0=0, y1=None):
-        buffer[...] = self.values[t0:t1, y0:y1]
 
 
 ALL = DiscrepancySettings().max_samples
@@ -287,3 +285,39 @@ def test_a_name_that_does_not_hold_elsewhere_is_in_part():
         "; it does not hold in rows 0 to 31, columns 8 to 39, where row means scatter."
     )
     assert Verdict.from_json(found.to_json()) == found
+
+
+def context(low, high):
+    return SimpleNamespace(sensor=SimpleNamespace(seen_limits=(low, high)))
+
+
+def test_the_limits_of_the_run_are_in_the_model_of_the_search_once():
+    assert _limits(context(None, None), ()) == ()
+    assert _limits(context(None, 135), ()) == (Clipping(high=135),)
+    assert _limits(context(40, 135), ()) == (Clipping(low=40, high=135),)
+    assert _limits(context(None, 135), (Clipping(high=130),)) == ()
+
+
+@pytest.mark.parametrize("error", [InterruptedRunError(signal.SIGINT), StoreError("no space left")])
+def test_a_stop_in_the_middle_of_a_comparison_makes_no_verdict(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    """Not even where the search takes whatever a candidate raises for a defect of the candidate."""
+
+    def run_units(*_: Any, **__: Any) -> None:
+        raise error
+
+    def search(context: Any, *_: Any) -> None:
+        try:
+            discrepancy._Mapper(context)([])
+        except Exception:
+            pytest.fail("the stop was taken for a defect")
+
+    context = SimpleNamespace(sensor=SimpleNamespace(kind="frames"), reporter=Reporter(quiet=True))
+    context.run_units = run_units
+    context.stop = SimpleNamespace(at_once=contextlib.nullcontext)
+    monkeypatch.setattr(discrepancy, "_start", lambda _: ((), None))
+    monkeypatch.setattr(discrepancy, "_run_frames", search)
+    with pytest.raises(type(error)) as found:
+        discrepancy.run(context)
+    assert found.value is error

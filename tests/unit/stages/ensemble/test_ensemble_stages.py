@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import pickle
 import re
 import shutil
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import written_fit
+from helpers.pickled_tasks import PickledTasks
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.base.variables import PARAMETERS, variables_of
@@ -263,21 +263,12 @@ def test_electron_stack(finished: StageContext) -> None:
     np.testing.assert_array_equal(ensemble["electron_counts"], np.bincount(use, minlength=ensemble["k"].size))
 
 
-class _PickledTasks(SerialExecutor):
-    """Sends tasks and units through pickle, as a backend of other processes does."""
-
-    shares_memory = False
-
-    def map(self, function, items, on_result):
-        super().map(pickle.loads(pickle.dumps(function)), pickle.loads(pickle.dumps(list(items))), on_result)
-
-
 @pytest.mark.parametrize(("tile", "backend"), [(8, "serial"), (64, "threads"), (16, "pickled")])
 def test_result_depends_on_neither_tile_nor_backend(
     finished: StageContext, tmp_path: Path, tile: int, backend: str
 ) -> None:
     shutil.copytree(finished.base_dir / "frames", tmp_path / "frames")
-    executor = _PickledTasks() if backend == "pickled" else None
+    executor = PickledTasks() if backend == "pickled" else None
     if backend == "threads":
         executor = make_executor(ComputeSettings(backend="threads", workers=3))
     context = make_context(tmp_path, tile=tile, executor=executor, frames=250)

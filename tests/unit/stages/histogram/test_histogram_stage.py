@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.pickled_tasks import PickledTasks
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError, StoreError
@@ -137,25 +137,16 @@ def test_result_depends_on_neither_tile_nor_memory_nor_mode(tmp_path, frames, ex
     assert counts.chunks[:2] == {256: (15, NX), 64: (64, NX)}.get(tile, (tile, tile))
 
 
-def test_result_does_not_depend_on_threads(tmp_path, frames, expected):
-    executor = make_executor(ComputeSettings(backend="threads", workers=3))
-    context = make_context(tmp_path, frames, executor=executor)
-    assert execute("histogram", context).state == "complete"
-    assert_equal(contents(context.store), expected)
-
-
-class _PickledTasks(SerialExecutor):
-    """Sends tasks and units through pickle, as a backend of other processes does."""
-
-    shares_memory = False
-
-    def map(self, function, items, on_result):
-        super().map(pickle.loads(pickle.dumps(function)), pickle.loads(pickle.dumps(list(items))), on_result)
-
-
-@pytest.mark.parametrize("mode", ["copy", "reference"])
-def test_tasks_can_go_to_other_processes(tmp_path, frames, expected, mode):
-    context = make_context(tmp_path, frames, mode=mode, executor=_PickledTasks())
+@pytest.mark.parametrize(
+    ("mode", "executor"),
+    [
+        ("reference", make_executor(ComputeSettings(backend="threads", workers=3))),
+        ("reference", PickledTasks()),
+        ("copy", PickledTasks()),
+    ],
+)
+def test_tasks_can_go_to_threads_and_other_processes(tmp_path, frames, expected, mode, executor):
+    context = make_context(tmp_path, frames, mode=mode, executor=executor)
     assert execute("histogram", context).state == "complete"
     assert_equal(contents(context.store), expected)
 

@@ -233,14 +233,6 @@ def test_a_noisy_sensor_counts_no_electrons() -> None:
     assert answers(replace(data, maps=noisy))[0].word == "Too noisy to count electrons"
 
 
-def test_a_wrong_model_is_not_to_be_believed() -> None:
-    data = report_data((40, 40), failed=0.0)
-    rmse = {"rmse": {"epcd_exact": 5e-4, "noise_floor": 1e-4}}
-    belief = answers(replace(data, ensemble_facts=rmse))[1]
-    assert (belief.level, belief.word) == ("serious", "No")
-    assert "does not describe the data" in belief.text
-
-
 def test_no_fit_at_all() -> None:
     data = report_data((8, 8))
     status = np.full((8, 8), int(FitStatus.TOO_FEW_BINS), np.uint16)

@@ -1,0 +1,202 @@
+"""The stage fit: a tile, tiles of several samples, and the sensor as a whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.drawn_pixels import draw
+
+from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, PARAMETERS, interval_names, variables_of
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.run.stage import StageContext
+from pchem_pipeline.runner.execute import execute
+from pchem_pipeline.stages.fit import together
+from pchem_pipeline.stages.fit.fit import fit_tile
+from pchem_pipeline.stages.fit.samples import SampleFit, fit_samples_tile
+from pchem_pipeline.store.run_store import RunStore
+
+WEAK = np.uint16(int(FitStatus.WEAKLY_IDENTIFIED))
+
+
+def sensor(folder: Path, noise: float, steps: float, n_frames: int, tile: int) -> StageContext:
+    """A run up to its fit: H = 2, equal pixels."""
+    values = {"quanta_exposure": 2.0, "dn_per_electron": steps, "analog_read_noise_e": noise}
+    constant = {name: {"kind": "constant", "value": value} for name, value in values.items()}
+    simulate = {
+        "shape": [12, 14],
+        "n_frames": n_frames,
+        "format": "npy",
+        "parameters": {**constant, "correlations": [], "hot_pixels": {"fraction": 0}},
+    }
+    return fitted(folder, "simulate", run={"tile": tile, "store": f"run{tile}.zarr"}, simulate=simulate)
+
+
+def fitted(folder: Path, *before: str, **sections: dict[str, Any]) -> StageContext:
+    """A run up to its fit, and what comes before it."""
+    config = RunConfig.model_validate(sections)
+    store = RunStore.create(folder / config.run.store)
+    context = StageContext(config, folder, store)
+    for stage in (*before, "ingest", "histogram", "fit"):
+        assert execute(stage, context).state == "complete"
+    return context
+
+
+def test_words_given_in_common_depend_on_no_tiling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    contexts = [sensor(tmp_path, 0.48, 7.0, 2000, tile) for tile in (8, 64)]
+    words = [context.store.read("fit/fit_status") for context in contexts]
+    np.testing.assert_array_equal(*words)
+    assert (words[0] & WEAK != 0).all()
+    assert np.count_nonzero((words[0] & ~WEAK) == 0) > 5  # clear one by one
+    # given again it is the same, and a pool of some pixels says the same of all
+    context = contexts[0]
+    assert together.judge_sensor(context) == words[0].size
+    monkeypatch.setattr(together, "_LARGEST_POOL", 60)
+    assert together.judge_sensor(context) == words[0].size
+    np.testing.assert_array_equal(context.store.read("fit/fit_status"), words[0])
+    monkeypatch.setattr(together, "_LARGEST_KEPT", 0)
+    assert together.judge_sensor(context) == words[0].size
+    # fewer pixels than make a pool take the words back
+    monkeypatch.setattr(together, "_LARGEST_POOL", 10)
+    assert together.judge_sensor(context) == 0
+    np.testing.assert_array_equal(context.store.read("fit/fit_status"), words[0] & ~WEAK)
+
+
+def test_a_good_sensor_keeps_its_words(tmp_path: Path) -> None:
+    words = sensor(tmp_path, 0.3, 7.0, 4000, 64).store.read("fit/fit_status")
+    assert not (words & WEAK).any()
+    assert (words == 0).mean() > 0.95
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 200), (90, 255)])
+def test_samples_cut_off_at_a_code_that_no_file_states_are_censored(
+    tmp_path: Path, low: int, high: int
+) -> None:
+    """A fifth of the samples at 200 DN, in 16 bits: the gain came out twelve times too large."""
+    rng = np.random.default_rng(3)
+    electrons = rng.poisson(1.5, (1500, 12, 14)) + 0.3 * rng.standard_normal((1500, 12, 14))
+    dn = 100.0 + 2.0 * rng.standard_normal((12, 14)) + 40.0 * electrons
+    np.save(tmp_path / "frames.npy", np.rint(dn).clip(low, high).astype(np.uint16))
+    context = fitted(tmp_path, input={"files": ["frames.npy"]}, run={"store": "run.zarr"})
+    assert context.adc_limits == (low, high)
+    for name, truth in (("quanta_exposure", 1.5), ("conversion_gain", 1 / 40.0)):
+        value, error = (context.store.read(f"fit/{each}") for each in (name, f"{name}_stderr"))
+        pulls = (value - truth) / error
+        assert np.abs(pulls).max() < 5.0
+        assert abs(pulls.mean()) < 5.0 / np.sqrt(pulls.size)
+
+
+SHAPE, FRAMES = (8, 8), 2500
+GAIN, BIAS, NOISE = 0.1, 100.3, 0.35
+BRANCHING = 0.12
+
+
+def histogram(rng, exposure, branching=0.0):
+    """Draw the histograms of a tile; every electron makes Poisson many (mean ``branching``) more."""
+    born = rng.poisson(exposure * (1.0 - branching), (FRAMES, *SHAPE))
+    electrons = born.copy()
+    while born.any():
+        born = rng.poisson(branching * born)
+        electrons += born
+    codes = np.rint(BIAS + (electrons + NOISE * rng.standard_normal(born.shape)) / GAIN).astype(int)
+    origin, width = codes.min(), int(np.ptp(codes)) + 1
+    counts = np.apply_along_axis(lambda x: np.bincount(x - origin, minlength=width), 0, codes)
+    nothing = np.zeros(SHAPE, np.uint32)
+    return {
+        "counts": np.ascontiguousarray(np.moveaxis(counts, 0, -1)).astype(np.uint32),
+        "origin": np.full(SHAPE, origin, np.int32),
+        "under": nothing,
+        "over": nothing,
+    }
+
+
+def tile(branching=0.0):
+    rng = np.random.default_rng(5)
+    return [histogram(rng, exposure, branching) for exposure in (1.0, 3.0, 7.0, 0.0)]
+
+
+def test_the_shown_sample_stands_where_a_run_of_one_has_its_own():
+    arrays = fit_samples_tile(tile(), SampleFit([False, False, False, True], 1, FitSettings()))
+    ends = {path for name in (*PARAMETERS, "read_noise_e") for path in interval_names(name)}
+    named = {v.path for v in variables_of("fit") if v.name not in ends | set(FREE_SATELLITES)}
+    assert {path for path in arrays if path.startswith("fit/")} == named
+    for end in ("", "_stderr"):
+        np.testing.assert_array_equal(
+            arrays[f"fit/quanta_exposure{end}"], arrays[f"samples/quanta_exposure{end}"][1]
+        )
+    assert arrays["samples/covariance"].shape == (*SHAPE, 7, 7)
+    np.testing.assert_allclose(
+        arrays["fit/bias_stderr"] ** 2, arrays["samples/covariance"][..., 5, 5], rtol=1e-12
+    )
+    assert (arrays["samples/quanta_exposure"][3] == 0).all()
+
+
+def test_one_sample_is_the_fit_of_a_run_of_one():
+    one = tile()[1]
+    alone = fit_tile(one, FitSettings(), None)
+    arrays = fit_samples_tile([one], SampleFit([False], 0, FitSettings()))
+    for name in PARAMETERS:
+        error = alone[f"{name}_stderr"]
+        assert (np.abs(arrays[f"fit/{name}"] - alone[name]) < 1e-3 * error).all(), name
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        FitSettings(),
+        FitSettings(likelihood="exact", errors="sandwich", intervals="profile"),
+    ],
+    ids=["information", "sandwich and profile"],
+)
+def test_effects_go_with_several_samples(settings):
+    given, bias = tile(BRANCHING), [False, False, False, True]
+    plain = fit_samples_tile(given, SampleFit(bias, 1, FitSettings()))
+    how = SampleFit(bias, 1, settings, effects=(BranchingCounts(branching=BRANCHING),))
+    arrays = fit_samples_tile(given, how)
+    n = plain["fit/bias"].size
+    # the plain model is refused almost everywhere, the law with the effect as often as chance wants
+    assert (plain["fit/goodness_p"] < 0.01).mean() > 0.9
+    p = arrays["fit/goodness_p"]
+    assert abs(p.mean() - 0.5) < 5 / np.sqrt(12 * n)
+    truth = {"quanta_exposure": 3.0, "conversion_gain": GAIN, "bias": BIAS}
+    for name, value in truth.items():
+        pulls = (arrays[f"fit/{name}"] - value) / arrays[f"fit/{name}_stderr"]
+        assert abs(pulls.mean()) < 5 / np.sqrt(n), name
+        assert abs(pulls.std() - 1) < 5 / np.sqrt(2 * n), name
+    if settings.intervals == "profile":
+        low, high = (arrays[f"fit/conversion_gain_{end}"] for end in ("low", "high"))
+        share = ((low < GAIN) & (high > GAIN)).mean()
+        level = settings.interval_level
+        assert abs(share - level) < 5 * np.sqrt(level * (1 - level) / n)
+
+
+def test_tile_has_every_array_in_its_place() -> None:
+    pixels = draw(np.random.default_rng(6), [0.5, 2.0, 1.0, 4.0, 3.0, 0.2], 11.0, 0.3)
+    histogram = {
+        "counts": pixels.counts.reshape(2, 3, -1),
+        "origin": pixels.origin.reshape(2, 3).astype(np.int32),
+        "under": np.array([[0, 0, 0], [0, 7, 0]], np.uint32),
+        "over": np.zeros((2, 3), np.uint32),
+    }
+    ends = {path for name in INTERVALS for path in interval_names(name)}
+    absent = ends | set(FREE_SATELLITES)
+    arrays = fit_tile(histogram, FitSettings(), None)
+    assert set(arrays) == {variable.name for variable in variables_of("fit")} - absent
+    expected = fit_histograms(
+        pixels.counts, pixels.origin, histogram["under"].ravel(), histogram["over"].ravel()
+    )
+    np.testing.assert_array_equal(arrays["conversion_gain"].ravel(), expected.conversion_gain)
+    np.testing.assert_array_equal(arrays["fit_status"].ravel(), expected.fit_status)
+    np.testing.assert_array_equal(arrays["bias_stderr"][1, 0], np.sqrt(expected.covariance[3, 2, 2]))
+    assert arrays["fit_status"][1, 1] == 256
+    for variable in variables_of("fit"):
+        if variable.name in absent:
+            continue
+        assert arrays[variable.name].shape[:2] == (2, 3), variable.name
+        assert arrays[variable.name].dtype == np.dtype(variable.dtype), variable.name
