@@ -200,7 +200,7 @@ def store_damage(case: Case, flip: bool) -> None:
             chunk.unlink()
         return [[stage, str(store), "--force"], ["run", str(store)]]
 
-    case.again, case.words = damage, "" if flip else r"(?i)c/\d\S* is missing|damaged|corrupt"
+    case.again, case.words = damage, "" if flip else r"(?i)is missing|damaged|corrupt"
 
 
 def report_deleted(case: Case) -> None:

@@ -8,8 +8,6 @@ charge: on average by ``alpha = Var(r) / sigma^2`` (Stein's identity for the Gau
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 
 from pchem_pipeline.effects.types import (
@@ -19,7 +17,6 @@ from pchem_pipeline.effects.types import (
     FloatArray,
     IntArray,
 )
-from pchem_pipeline.model.arithmetic.significance import POSSIBLE
 
 
 def run_position(frames: IntArray, n_run: int) -> FloatArray:
@@ -90,16 +87,3 @@ def line_excess(means: AnyArray, variance: FloatArray) -> tuple[float, float]:
     degrees = (n_frames - 1) * (n_lines - 1)
     excess = float((kept**2).sum() / degrees - expected.mean())
     return excess, float(np.sqrt(2.0 / degrees) * np.sqrt((expected**2).mean()))
-
-
-def line_noise(evidence: Evidence, of: Literal["frame", "row", "column"]) -> float | None:
-    """Return the standard deviation of the rows' or columns' offsets, DN; None where none is worth a guess.
-
-    From the excess variance of their means within their frames (moment estimate).
-    """
-    if evidence.time is None:
-        return None
-    rows = of == "row"
-    means = evidence.time.row_readout if rows else evidence.time.column_readout
-    excess, error = line_excess(means, mean_variance(evidence, axis=1 if rows else 0))
-    return None if excess < POSSIBLE * error else excess**0.5 / responsivity(evidence)

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pchem_pipeline.effects.estimators.common_modes import line_noise
-from pchem_pipeline.effects.framework.context import DIMS
-from pchem_pipeline.effects.framework.effect import Effect, Plane, SharedOffset
-from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
+from pchem_pipeline.effects.framework.effect import Effect, Plane
+from pchem_pipeline.effects.types import AnyArray, EffectContext, FloatArray, PixelMaps, SampleLaw
 
 # below this ratio of the spread of an offset to the read noise its shape is lost: the fourth cumulant that
 # a Gaussian of the same variance misses is 2e-4 of the squared variance, for the worst (two-valued) law
@@ -57,33 +53,6 @@ class OffsetEffect(Effect):
         if not noise.size or spread < _NARROW * float(np.median(noise)):
             return model.with_variance(dn2=spread**2)
         return model.with_noise(np.full(values.size, 1.0 / values.size), shift_dn=values - values.mean())
-
-
-class SharedNoise(OffsetEffect):
-    """Base of noise that the pixels of a frame, row or column share: an offset that is new in every frame.
-
-    The strength is its standard deviation.
-
-    Attributes:
-        shared_by: what has one offset.
-    """
-
-    power = 2.0
-    shared_by: ClassVar[Literal["frame", "row", "column"]]
-
-    def offsets(self, context: EffectContext) -> FloatArray:
-        """Return one offset for each frame, or for each row or column of a frame, DN."""
-        return np.asarray(getattr(self, self.strength) * context.random.normal(DIMS[self.shared_by]))
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the excess variance of the means of rows (columns) within their frames (moment estimate)."""
-        found = line_noise(evidence, cls.shared_by)
-        return () if found is None else (cls.model_validate({cls.strength: found}),)
-
-    def shared_offset(self) -> SharedOffset:
-        """Return its offset."""
-        return SharedOffset(self.shared_by, getattr(self, self.strength) ** 2)
 
 
 def add_offset(values: AnyArray, offset_dn: ArrayLike, context: EffectContext) -> AnyArray:

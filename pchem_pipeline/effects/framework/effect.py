@@ -1,6 +1,6 @@
 """What an effect is, and the registry of our own.
 
-An effect is one file in the folder of its plane: a frozen settings class that is at once its YAML
+An effect is one class in the folder of its plane: a frozen settings class that is at once its YAML
 section, its documentation and its forward model. What several have in common is a base class of a family
 (:mod:`pchem_pipeline.effects.families`), and they only what differs. An effect is a function of a block of
 frames and of random numbers keyed on position, so that the simulated frames do not depend on how the work is

@@ -79,8 +79,8 @@ def installed(monkeypatch):
 def test_our_effects_are_found_in_the_folder_of_their_plane():
     found = registry.effect_classes()
     assert {"exposure_drift", "row_noise", "clipping"} <= found.keys()
-    for tag, effect in found.items():
-        assert effect.__module__ == f"pchem_pipeline.effects.{effect.plane.value}.{tag}"
+    for effect in found.values():
+        assert effect.__module__.startswith(f"pchem_pipeline.effects.{effect.plane.value}.")
 
 
 def test_every_effect_is_documented():
@@ -106,7 +106,7 @@ def test_a_plugin_is_found_and_used(installed):
 @pytest.mark.parametrize(
     ("point", "reason"),
     [
-        (entry("Impostor"), "taken by pchem_pipeline.effects.analog.row_noise"),
+        (entry("Impostor"), "taken by pchem_pipeline.effects.analog.shared_noise"),
         (entry("Missing"), "AttributeError"),
         (entry("gone", "package_that_is_not_there:Effect"), "ModuleNotFoundError"),
         (entry("NOT_AN_EFFECT"), "is not an effect"),

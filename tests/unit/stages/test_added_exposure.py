@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.exposure.persistence import Persistence
 from pchem_pipeline.effects.framework.added_exposure import AddedExposure, added_exposures

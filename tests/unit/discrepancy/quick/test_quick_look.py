@@ -19,8 +19,7 @@ from pchem_pipeline.discrepancy.quick.checks import _SIGNS, SIGNIFICANCE, Check,
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.levels import levels_check
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
-from pchem_pipeline.effects.analog.column_noise import ColumnNoise
-from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.analog.shared_noise import ColumnNoise, RowNoise
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region

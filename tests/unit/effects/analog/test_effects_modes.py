@@ -15,11 +15,9 @@ from pchem_pipeline.effects.adc.adc_inl import AdcInl
 from pchem_pipeline.effects.adc.clipping import Clipping
 from pchem_pipeline.effects.analog.bias_drift import BiasDrift
 from pchem_pipeline.effects.analog.bias_jumps import BiasJumps
-from pchem_pipeline.effects.analog.column_noise import ColumnNoise
-from pchem_pipeline.effects.analog.frame_noise import FrameNoise
 from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
 from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
-from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.analog.shared_noise import ColumnNoise, FrameNoise, RowNoise
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
 from pchem_pipeline.simulate.chain import simulate_block

@@ -8,7 +8,7 @@ from helpers.sensor_of_modes import context_of, drawn_truth, offsets, seen, take
 from hidden.chain import hide
 
 from pchem_pipeline.effects.analog.read_order_noise import ReadOrderNoise
-from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
 
 SHAPE = (16, 12)

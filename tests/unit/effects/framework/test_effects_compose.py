@@ -13,8 +13,8 @@ from pchem_pipeline.base.variables import INTERVALS, interval_names, variables_o
 from pchem_pipeline.effects.adc.adc_inl import AdcInl
 from pchem_pipeline.effects.adc.black_clamp import BlackClamp
 from pchem_pipeline.effects.adc.clipping import Clipping
-from pchem_pipeline.effects.analog.row_noise import RowNoise
 from pchem_pipeline.effects.analog.rts_noise import RtsNoise
+from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.framework.compose import along_chain, model_words, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames

@@ -7,7 +7,7 @@ import pytest
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.config.load import load_config, parse_config, write_model
-from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.framework.compose import effect_words, model_words
 from pchem_pipeline.effects.framework.effect import registered_effects
 from pchem_pipeline.effects.framework.region import Region, When

@@ -20,7 +20,7 @@ from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import Prepared
 from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise
-from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.readout.empirical import Empirical
 

@@ -31,7 +31,7 @@ from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.effects.adc.adc_inl import AdcInl
 from pchem_pipeline.effects.analog.heavy_tailed_noise import HeavyTailedNoise
 from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
-from pchem_pipeline.effects.analog.row_noise import RowNoise
+from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
 from pchem_pipeline.effects.exposure.persistence import Persistence
 from pchem_pipeline.effects.framework.added_exposure import added_exposures
