@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.checks.residuals import central_window, noise_floor, rmse
-from pchem_pipeline.model.electrons.electrons import Outcomes
-from pchem_pipeline.model.electrons.thresholds import numbers_by_thresholds
+from pchem_pipeline.model.electrons.electrons import KnownPixels, Outcomes, number_tables
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, ensemble_sums, nuced_axis, tally
 from pchem_pipeline.model.ensemble.ensemble_binned import (
     HistogramChoice,
@@ -33,6 +32,7 @@ from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.pcd import pcd_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
 
@@ -139,9 +139,10 @@ def compare(chunks: list[Chunk], n_frames: int, n_chosen: int, bins: int, clock:
         part, use = UsablePixels.from_maps(chunk.fitted)
         began = time.process_time()
         data = tally(chunk.chosen[use], chunk.origin[use], part, dn, axis)
-        found = numbers_by_thresholds(chunk.chosen[use], chunk.origin[use], part, numbers.size)
-        numbers += found[0]
-        errors.append(found[2])
+        known, histograms = KnownPixels(part, SampleLaw()), (chunk.chosen[use], chunk.origin[use])
+        tables = number_tables(*known.codes(*histograms), known.exposure, known, detailed=True)
+        numbers += tables.tally(*histograms, numbers.size)[0]
+        errors.append(tables.outcomes(numbers.size))
         clock.lap("tally data and electron numbers", began)
         raw += data.raw
         nuced += data.nuced

@@ -6,10 +6,17 @@ import math
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtr
+from scipy.stats import poisson
 
-from pchem_pipeline.model.electrons.thresholds import errors_by_thresholds
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE
+from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.totals import EnsembleTotals
-from pchem_pipeline.model.law.parameters import UsablePixels
+from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
+from pchem_pipeline.model.law.sample_law import SampleLaw
+
+_AT_ONCE = 4096  # pixels
 
 
 def error_rates(totals: EnsembleTotals, pixels: UsablePixels, true: UsablePixels | None) -> dict[str, Any]:
@@ -40,10 +47,37 @@ def error_rates(totals: EnsembleTotals, pixels: UsablePixels, true: UsablePixels
         "samples_compared": compared,
     }
     if true is not None:
-        error, least = (errors_by_thresholds(deciding, true) for deciding in (pixels, true))
+        error, least = (errors_of_numbers(deciding, true) for deciding in (pixels, true))
         facts |= {
             "expected_error_rate_from_truth": float(error.mean()),
             "error_rate_stderr": math.sqrt(float(np.mean(error * (1.0 - error))) / compared),
             "least_error_rate": float(least.mean()),
         }
     return facts
+
+
+def errors_of_numbers(deciding: UsablePixels, data: UsablePixels) -> FloatArray:
+    """Return how often numbers that some parameters decide are wrong in samples of others, shape (n,).
+
+    The number of a code is right with the probability ``P(k; H) [Phi((x + 1/2 - m_k) / s) - Phi((x - 1/2 -
+    m_k) / s)]`` of that code and number, ``m_k = mu + k / g``, s the read noise before rounding.
+
+    Args:
+        deciding: n pixels.
+        data: what their samples follow.
+    """
+    errors = np.empty(len(deciding))
+    for part in np.array_split(np.arange(errors.size), errors.size // _AT_ONCE + 1):
+        some = np.isin(np.arange(errors.size), part)
+        known, true = (KnownPixels(pixels.of(some), SampleLaw()) for pixels in (deciding, data))
+        tables = number_tables(*true.codes(), known.exposure, known)
+        pixel = np.repeat(np.arange(part.size), np.diff(tables.start))
+        code = np.arange(pixel.size) - tables.start[pixel] + tables.first[pixel]
+        h, g, mu, sigma = (column[pixel] for column in data.of(some).maps)
+        off, sd = (
+            code - mu - tables.number / g,
+            np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, LEAST_VARIANCE)),
+        )
+        mass = poisson.pmf(tables.number, h) * (ndtr((off + 0.5) / sd) - ndtr((off - 0.5) / sd))
+        errors[part] = 1.0 - np.bincount(pixel, mass, part.size)
+    return errors

@@ -14,7 +14,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.electrons.electrons import KnownPixels, NumberTables, Outcomes, number_tables
-from pchem_pipeline.model.electrons.thresholds import numbers_by_thresholds
 from pchem_pipeline.model.ensemble.ensemble import curve_errors, ensemble_sums, mass_sums, tally
 from pchem_pipeline.model.ensemble.error_sample import PixelErrors
 from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
@@ -139,15 +138,10 @@ def _numbers_of_samples(chosen: NDArray[np.int64], everything: NDArray[np.int64]
 
 
 def _numbers(
-    known: KnownPixels,
-    pixels: UsablePixels,
-    histograms: PixelHistograms,
-    axes: EnsembleAxes,
-) -> tuple[NDArray[np.int64], int, Outcomes, NumberTables | None]:
-    """Return the samples of each electron number, those beyond, what is expected, and the tables, if any."""
+    known: KnownPixels, histograms: PixelHistograms, axes: EnsembleAxes
+) -> tuple[NDArray[np.int64], int, Outcomes, NumberTables]:
+    """Return the samples of each electron number, those beyond, what is expected, and the tables."""
     origin = histograms.origin
-    if not axes.extended:
-        return (*numbers_by_thresholds(histograms.counts, origin, pixels, axes.n_k), None)
     low, high = known.codes(histograms.counts, origin)
     if np.any(known.law.outlier_share):  # may be anything, on the whole axis
         low, high = np.minimum(low, axes.dn.start), np.maximum(high, axes.dn.start + axes.dn.size - 1)
@@ -185,7 +179,7 @@ def _group_sums(
     data = data_all = tally(histograms.counts, histograms.origin, pixels, axes.dn, axes.nuced)
     if histograms_all is not histograms:
         data_all = tally(histograms_all.counts, histograms_all.origin, pixels, axes.dn)
-    numbers, beyond, expected, tables = _numbers(known, pixels, histograms, axes)
+    numbers, beyond, expected, tables = _numbers(known, histograms, axes)
     outside = int(histograms.outside.sum())
     tallies: dict[str, NDArray[np.int64] | int] = {
         "counts": data.raw,
@@ -208,4 +202,4 @@ def _group_sums(
         "error": expected.error.sum(),
         "error_variance": np.sum(expected.error * (1.0 - expected.error)),
     }
-    return tallies, parts | _predicted(tables, pixels, n, axes)
+    return tallies, parts | _predicted(tables if axes.extended else None, pixels, n, axes)

@@ -14,7 +14,7 @@ from pchem_pipeline.model.electrons.electrons import (
     compare_electron_numbers,
     number_tables,
 )
-from pchem_pipeline.model.electrons.thresholds import errors_by_thresholds, numbers_by_thresholds
+from pchem_pipeline.model.electrons.error_rates import errors_of_numbers
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.pcd import thresholds
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -121,7 +121,7 @@ def test_errors_are_those_of_all_integers() -> None:
             joint = joint_mass(x, *true, n_k=200)
             number = joint_mass(x, *guess, n_k=200).argmax(axis=0)
             errors.append(1.0 - joint[number, np.arange(x.size)].sum())
-        found = errors_by_thresholds(UsablePixels(*used), UsablePixels(*truth))
+        found = errors_of_numbers(UsablePixels(*used), UsablePixels(*truth))
         np.testing.assert_allclose(found, errors, atol=1e-11)
 
 
@@ -135,41 +135,6 @@ def test_tables_expect_what_all_integers_show() -> None:
     found = number_tables(*data.codes(), data.exposure, data, detailed=True).outcomes(60)
     np.testing.assert_allclose(found.estimated, total, atol=1e-11)
     np.testing.assert_allclose(found.error, errors, atol=1e-11)
-
-
-@pytest.mark.parametrize(
-    ("h", "g", "noise"),
-    [
-        (0.0, 0.1, 0.3),
-        (0.05, 0.1, 0.2),
-        (2.0, 0.09, 0.3),
-        (20.0, 0.5, 0.3),
-        (300.0, 0.05, 0.5),
-        (1e-6, 0.9, 0.1),  # read noise of a tenth of a DN: thresholds of densities lie elsewhere
-        (2.0, 2.0, 0.5),  # codes without a number of their own, numbers without a code
-    ],
-)
-def test_thresholds_tell_what_tables_over_all_codes_tell(h: float, g: float, noise: float) -> None:
-    rng, n = np.random.default_rng(31), 60
-    low, high = rng.uniform(0.8, 1.2, (2, n))
-    pixels = UsablePixels(h * low, g * high, rng.uniform(90, 110, n), np.hypot(noise / g / high, 0.3))
-    electrons = rng.poisson(pixels.quanta_exposure, (200, n))
-    x = pixels.bias + electrons / pixels.conversion_gain + pixels.read_noise_dn * rng.normal(size=(200, n))
-    x[0, :10] += 50.0 / g  # far above all levels
-    codes = np.round(x).astype(np.int64)
-    origin = codes.min(axis=0)
-    counts = np.stack([np.bincount(column - column.min(), minlength=np.ptp(codes)) for column in codes.T])
-    n_k = int(h + 12 * np.sqrt(h) + 40)
-    known_pixels = KnownPixels(pixels, SampleLaw())
-    ends = known_pixels.codes(counts, origin)
-    tables = number_tables(*ends, known_pixels.exposure, known_pixels, detailed=True)
-    expected = tables.outcomes(n_k)
-    observed, beyond, outcomes = numbers_by_thresholds(counts.astype(np.uint16), origin, pixels, n_k)
-    numbers, beyond_too = tables.tally(counts.astype(np.uint16), origin, n_k)
-    np.testing.assert_array_equal(observed, numbers)
-    assert beyond == beyond_too
-    np.testing.assert_allclose(outcomes.estimated, expected.estimated, atol=1e-9)
-    np.testing.assert_allclose(outcomes.error, expected.error, atol=1e-11)
 
 
 def test_numbers_are_decided_with_the_effects_of_the_law() -> None:

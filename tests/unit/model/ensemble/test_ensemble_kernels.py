@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.model.electrons import electrons_numba, thresholds_numba
+from pchem_pipeline.model.electrons import electrons_numba
 from pchem_pipeline.model.electrons.electrons import KnownPixels
 from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -56,11 +56,6 @@ ENSEMBLE: dict[str, tuple[Any, ...]] = {
         np.zeros((3, 2)),
     ),
 }
-PLAIN = np.stack([H, G, MU, SIGMA], axis=1)
-THRESHOLDS: dict[str, tuple[Any, ...]] = {
-    "sum_by_thresholds": (COUNTS, ORIGIN, PLAIN, 9, np.zeros(8, dtype=np.int64), np.zeros(8), np.zeros(3)),
-    "fill_errors": (PLAIN, PLAIN[::-1].copy(), np.zeros(3)),
-}
 ELECTRONS: dict[str, tuple[Any, ...]] = {
     "count_errors": (NUMBERS, TRUE, 65535, np.zeros(4, dtype=np.int64)),
     "tally_numbers": (COUNTS, ORIGIN, NUMBER_TABLES, 65535, np.zeros(5, dtype=np.int64)),
@@ -74,9 +69,8 @@ ELECTRONS: dict[str, tuple[Any, ...]] = {
     [
         *((getattr(ensemble_numba, name), arguments) for name, arguments in ENSEMBLE.items()),
         *((getattr(electrons_numba, name), arguments) for name, arguments in ELECTRONS.items()),
-        *((getattr(thresholds_numba, name), arguments) for name, arguments in THRESHOLDS.items()),
     ],
-    ids=[*ENSEMBLE, *ELECTRONS, *THRESHOLDS],
+    ids=[*ENSEMBLE, *ELECTRONS],
 )
 def test_compiled_and_plain_agree(kernel: Any, arguments: tuple[Any, ...]) -> None:
     results = []
