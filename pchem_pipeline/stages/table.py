@@ -73,7 +73,7 @@ _ALL = (
     ),
     Stage(
         "histogram",
-        version=2,
+        version=3,
         upstream=("ingest",),
         # not band_memory: it changes no result
         settings=(
@@ -91,7 +91,7 @@ _ALL = (
     ),
     Stage(
         "fit",
-        version=7,
+        version=8,
         upstream=("histogram",),
         settings=("fit", "run.tile"),
         reads=("frames/excluded", *(f"histogram/{name}" for name in ("counts", "origin", "under", "over"))),
@@ -114,7 +114,7 @@ _ALL = (
     ),
     Stage(
         "ensemble",
-        version=3,
+        version=4,
         upstream=("histogram", "fit"),
         settings=("ensemble", "run.tile"),
         reads=("frames", "histogram", "fit", "truth"),
@@ -148,7 +148,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=9,
+        version=10,
         upstream=("ingest",),
         settings=("discrepancy",),
         reads=("frames", "summary", "histogram", "fit"),
