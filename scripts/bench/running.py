@@ -65,7 +65,8 @@ def evict(path: Path) -> None:
 def write_stack(path: Path, frames: int, shape: tuple[int, int]) -> None:
     """Write a raw file of uint16 frames of some rows and columns, with its sidecar.
 
-    The first 1,000 frames are simulated, and repeated from then on: a fit would find that out.
+    The first 1,000 frames are simulated, and repeated from then on, one half of the columns later each time:
+    no frame is a copy, but a fit would find it out.
     """
     from pchem_pipeline.simulate.chain import simulate_block
     from pchem_pipeline.simulate.maps import draw_truth
@@ -77,8 +78,9 @@ def write_stack(path: Path, frames: int, shape: tuple[int, int]) -> None:
     times = -(-rows // 64), -(-columns // 64)
     with path.open("wb") as stream:
         for start in range(0, frames, _AT_ONCE):
-            first = start % _SIMULATED
-            some = small[first : first + min(_AT_ONCE, frames - start)].astype("<u2")
+            t = np.arange(start, min(start + _AT_ONCE, frames))
+            later = (t + 37 * (t // _SIMULATED)) % _SIMULATED
+            some = np.concatenate([small[t % _SIMULATED, :, :32], small[later, :, 32:]], axis=2).astype("<u2")
             stream.write(np.ascontiguousarray(np.tile(some, (1, *times))[:, :rows, :columns]).data)
     path.with_name(f"{path.name}.json").write_text(json.dumps({"shape": shape, "dtype": "uint16"}))
 

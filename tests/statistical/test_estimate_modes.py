@@ -19,7 +19,7 @@ from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
 from pchem_pipeline.effects.analog.shared_noise import ColumnNoise, FrameNoise, RowNoise
 from pchem_pipeline.effects.estimators.levels.change_points import find_steps
 from pchem_pipeline.effects.estimators.levels.two_levels import between_two_levels
-from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.effect import FEWEST_SHOWN, Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
 from pchem_pipeline.simulate.streams import KeyedStreams
@@ -225,9 +225,9 @@ def test_rare_repeats_are_simulated_in_their_mean_number():
     numbers = np.concatenate([np.arange(0, 500), np.arange(900, 1401)])
     shown, share = RepeatedFrames(probability=1e-3, rows=(0, 4)).representative(numbers)
     assert shown.rows == (0, 4)
-    assert len(shown.frames) == 4
+    assert len(shown.frames) == FEWEST_SHOWN
     assert set(shown.frames) <= set(numbers) - {0, 900}  # the frames before these are not there
-    assert share == pytest.approx(1e-3 * 999 / 4)
+    assert share == pytest.approx(1e-3 * 999 / FEWEST_SHOWN)
     many, share = RepeatedFrames(probability=0.02).representative(numbers)
     assert (len(many.frames), share) == (20, pytest.approx(0.02 * 999 / 20))
     listed = RepeatedFrames(frames=(3, 9))
