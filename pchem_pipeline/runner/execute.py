@@ -80,9 +80,8 @@ def _perform(
     old = records.known(stage.name)
     # a stage that was stopped before its first unit may lack arrays
     resumes = before.state in ("partial", "complete") and old is not None and old.keys > 0
-    if (
-        before.state == "stale" and not restart and old is not None
-    ):  # chosen tiles mend chunks, and keep the rest
+    if before.state == "stale" and not restart and old is not None:
+        # chosen tiles mend chunks, and keep the rest
         same = fingerprint_of(content) == old.fingerprint
         resumes = same and not changed_file(old, context.store).endswith(DESCRIPTION)
     if resumes and context.options.force and restart:

@@ -104,9 +104,7 @@ def _odd_frames(sums: StackSums) -> list[Check]:
     n, odd = sums.all_means.size, sums.odd
     if not odd:
         return []
-    equal, far = chance_of_copies(sums.rows.variance, n), odd["far"]
-    first = far.size > 0 and int(far[-1]) == far.size - 1
-    how = f"with --frames {far.size}: (input.frame_range)" if first else "by input.frame_range"
+    equal = chance_of_copies(sums.rows.variance, n)
     checks = []
     for name, kinds, p in (
         ("odd_frames", ("far",), n * FAR_CHANCE),
@@ -120,8 +118,18 @@ def _odd_frames(sums: StackSums) -> list[Check]:
         if name in ("empty_frames", "repeated_frames"):  # the title says how they are odd
             where = frame_words(odd[kinds[0]])
         p = min(p, 1.0) if number else 1.0
+        how = _without(np.concatenate([*some.values(), np.empty(0, np.int64)]), n)
         checks.append(check_of(name, p, number / n, limit=1.0 / n, where=where, how=how))
     return checks
+
+
+def _without(frames: NDArray[np.int64], n: int) -> str:
+    """Return how a run of n frames does without some of them: a range leaves out its ends."""
+    if frames.size and int(frames.max()) == frames.size - 1:
+        return f"with --frames {frames.size}: (input.frame_range)"
+    if frames.size and int(frames.min()) == n - frames.size:
+        return f"with --frames :{n - frames.size} (input.frame_range)"
+    return "of the files"
 
 
 def _wave(sums: StackSums, others: Sequence[Check]) -> list[Check]:

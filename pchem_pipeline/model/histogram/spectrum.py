@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage, special
 
-#: Samples that are looked at, of the first frames, and rows and columns that a spectrum needs.
+#: Samples that are looked at, of the first frames.
 MOST_SAMPLES = 1 << 22
-#: Frames, rows or columns that a spectrum needs.
+#: Rows and columns that a spectrum needs; frames of a series in time likewise.
 FEWEST_LINES = 8
 #: Factor by which zeros lengthen either axis of a frame: the step between frequencies is so much smaller.
 _PADDED = 2

@@ -321,6 +321,21 @@ def test_repeated_and_single_frames_are_told_by_their_numbers() -> None:
     assert found["odd_frames"].level == "caution"
 
 
+@pytest.mark.parametrize(
+    ("odd", "cure"),
+    [
+        ([0, 1, 2], "with --frames 3: (input.frame_range)"),
+        ([-2, -1], "with --frames :{} (input.frame_range)"),
+        ([5, 77], "of the files"),  # no range leaves these out
+    ],
+)
+def test_the_cure_of_odd_frames_leaves_them_out(odd: list[int], cure: str) -> None:
+    frames = stack(np.random.default_rng(9), SHAPE)
+    frames[odd] += 5
+    found = by_name(looked(frames))["odd_frames"]
+    assert found.advice.endswith(f"leave them out {cure.format(len(frames) - len(odd))}")
+
+
 @pytest.mark.parametrize("shape", [(400, 32, 32), (700, 64, 24), (300, 48, 70)])
 @pytest.mark.parametrize("gain", [0.05, 0.125])
 @pytest.mark.parametrize("kind", ["half lost", "half dark", "noisy", "shifted", "shifted down"])
