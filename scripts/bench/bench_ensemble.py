@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.checks.residuals import central_window, noise_floor, rmse
 from pchem_pipeline.model.electrons.electrons import KnownPixels, Outcomes, number_tables
-from pchem_pipeline.model.ensemble.ensemble import DnAxis, ensemble_sums, nuced_axis, tally
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, mass_sums, nuced_axis, tally
 from pchem_pipeline.model.ensemble.ensemble_binned import (
     HistogramChoice,
     epcd_dependent,
@@ -131,7 +131,9 @@ def compare(chunks: list[Chunk], n_frames: int, n_chosen: int, bins: int, clock:
     print(f"{mask.size} pixels, {mask.size - n} without a value; {n_chosen} of {n_frames} frames")
     print(f"median read noise {np.median(pixels.read_noise_e):.4f} e-, NUCed bins of {axis.width:.4f} e-\n")
     began = time.process_time()
-    sums = ensemble_sums(pixels, dn, axis)
+    whole = KnownPixels(pixels, SampleLaw())
+    law = number_tables(*whole.codes(), whole.exposure, whole, detailed=True)
+    sums, _ = mass_sums(law.mass, law.first, law.start, pixels, dn, axis)
     clock.lap("exact EPCD and NUCed EPCD", began)
     raw, raw_all, nuced = (np.zeros(m, dtype=np.int64) for m in (dn.size, dn.size, axis.size))
     numbers, errors = np.zeros(60, dtype=np.int64), []

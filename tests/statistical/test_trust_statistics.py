@@ -13,13 +13,14 @@ from scipy.stats import binom, kstest
 
 from pchem_pipeline.model.checks.multiple_testing import false_discovery
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
-from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_errors, ensemble_sums
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_errors, weighted_mass
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.pcd import pcd_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.model.maps.maps import summarise
 
 Array = NDArray[np.float64]
@@ -201,8 +202,8 @@ def test_the_error_of_the_ensemble_is_its_scatter() -> None:
         pixels = draw(rng, exposure, 11.0, 0.3, bias, n_frames=2000)
         fit = fit_histograms(pixels.counts, pixels.origin)
         some = UsablePixels(*np.ascontiguousarray(fit.columns.T))
-        curves.append(ensemble_sums(some, dn).raw / len(some))
-        raw, corrected = curve_errors(some, fit.covariance, dn, nuced)
+        curves.append(weighted_mass(some, dn, np.full(len(some), 1 / len(some))))
+        raw, corrected = curve_errors(SampleLaw(), some, fit.covariance, dn, nuced)
         predicted += np.sqrt(raw) / len(some) / n
         assert (corrected[5:] > 0).all()
     scatter = np.std(curves, axis=0)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pchem_pipeline.model.electrons import electrons_numba
 from pchem_pipeline.model.electrons.electrons_numba import NO_PRIOR, CodeTables, PixelLaws, SampleNumbers
 from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
+from pchem_pipeline.model.law.mass import code_ranges
 from pchem_pipeline.model.law.parameters import FloatArray, Parameters, columns_of, usable_pixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -60,7 +61,6 @@ class KnownPixels:
         columns = columns_of(self.parameters)
         n = len(columns)
         columns[np.isnan(self.exposure)] = np.nan
-        columns[:, 0] = np.where(columns[:, 0] == 0.0, 1.0, columns[:, 0])  # the prior is given apart
         return PixelLaws(columns, satellites_of(self.parameters, self.satellites, n), pack([self.law], n))
 
     def codes(
@@ -72,10 +72,7 @@ class KnownPixels:
             counts: histograms whose samples are among the codes, too, shape (n, n_bins); None: no samples.
             origin: DN of their bin 0, shape (n,).
         """
-        exposure = np.nan_to_num(self.exposure)
-        reach = np.empty((exposure.size, 2), np.int64)
-        electrons_numba.find_reach(exposure, self.kernel_inputs(), reach)
-        low, high = reach.T
+        low, high = code_ranges(self.law, self.parameters, self.satellites)
         if counts is None or origin is None:
             return low, np.minimum(high, low + _MOST_CODES)
         seen = counts > 0

@@ -16,7 +16,6 @@ from pchem_pipeline.model.law.levels_numba import (
     number_mass,
     number_range,
     place_codes,
-    reach_of_law,
     share_scratch,
 )
 from pchem_pipeline.model.law.mass_numba import known_theta, pixel_scratch
@@ -69,19 +68,6 @@ class SampleNumbers(NamedTuple):
     number: NDArray[Any]
     probability: NDArray[np.float32]
     expected: NDArray[np.float32]
-
-
-@kernel
-def find_reach(exposure: FloatArray, pixels: PixelLaws, out: IntArray) -> None:
-    """Fill the first and last code that each pixel shows, DN, shape (n, 2); (0, -1) without parameters."""
-    parameters, satellites, law = pixels
-    pixel, scratch = pixel_scratch(2, law)
-    theta = scratch.small[OWN]
-    for p in range(exposure.size):
-        out[p, 0], out[p, 1] = 0, -1
-        placed, _ = place_codes(p, 0, 1, 1, law, satellites, pixel)
-        if known_theta(parameters[p], placed.centre, satellites[p, 1], theta):
-            out[p, 0], out[p, 1] = reach_of_law(exposure[p], p, theta, placed, law)
 
 
 @kernel

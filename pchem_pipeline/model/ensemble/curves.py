@@ -29,7 +29,7 @@ from pchem_pipeline.model.ensemble.ensemble_binned import (
     within_limits,
 )
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
-from pchem_pipeline.model.ensemble.totals import EnsembleTotals
+from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleTotals
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
 #: Components are shown up to the electron number whose mass is above this.
@@ -79,9 +79,9 @@ def curves(
         "nuced_dependent": nuced_dependent(pixels, axes.nuced, choice),
         "nuced_independent": nuced_independent(pixels, axes.nuced, choice),
     }
-    if not axes.extended:
-        arrays["epcd_stderr"] = np.sqrt(totals.variance("pcd_error"))
-        arrays["nuced_stderr"] = np.sqrt(totals.variance("nuced_error"))
+    errors = [np.sqrt(totals.variance(name)) for name in MODEL_ERRORS]
+    if any(each.any() for each in errors):
+        arrays["epcd_stderr"], arrays["nuced_stderr"] = errors[0], errors[1] / width
     for prefix, noise in (("", variance), ("nuced_", nuced_variance)):
         exact = arrays["nuced_exact" if prefix else "epcd_exact"]
         arrays[f"{prefix}residual"] = normalised_residuals(arrays[f"{prefix}density"], exact, noise)

@@ -14,9 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
 from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.law.inputs import kernel_counts
+from pchem_pipeline.model.law.mass import parts_of_similar_width, sample_mass, sample_slopes
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 IntArray = NDArray[np.int64]
 
@@ -64,14 +68,12 @@ class EnsembleSums:
     """Sums over pixels of the predicted mass of each bin, and of its square.
 
     Attributes:
-        n_pixels: number of pixels in the sums.
-        raw: sum of f_X at the integer DN, 1/DN, shape (n_dn,).
+        raw: sum of the mass of each whole DN, shape (n_dn,).
         raw_square: sum of its square.
         nuced: sum of the mass in the bins of the NUCed axis, shape (n_bins,).
         nuced_square: sum of its square.
     """
 
-    n_pixels: int
     raw: FloatArray
     raw_square: FloatArray
     nuced: FloatArray
@@ -127,42 +129,15 @@ def nuced_axis(pixels: UsablePixels, dn: DnAxis, *, width: float | None = None, 
     return NucedAxis(bin_width, start, max(math.ceil(highest / bin_width) - start, 1))
 
 
-def ensemble_sums(pixels: UsablePixels, dn: DnAxis, nuced: NucedAxis | None = None) -> EnsembleSums:
-    """Sum the pixels' PCDs at the integer DN, and the same masses sorted into NUCed bins.
-
-    The sorted masses are what the NUCed data must show, lattice and all: each DN of a pixel lies at ``(x
-    - mu) g`` and falls into one bin as a whole (Hendrickson et al. 2023, eq. partial_ensemble_dist,
-    before the lattice is smoothed over).
-
-    Args:
-        pixels: the pixels.
-        dn: axis of the raw prediction; it should hold all of the data.
-        nuced: axis of the NUCed prediction, or None for none.
-
-    Returns:
-        The sums; divide by ``n_pixels`` for the means.
-    """
-    raw, bins = _raw_sums(dn), _nuced_sums(nuced)
-    ensemble_numba.sum_pcd_pixels(tuple(pixels.maps), raw, bins)
-    return EnsembleSums(len(pixels), raw.total, raw.square, bins.total, bins.square)
-
-
-def _raw_sums(dn: DnAxis) -> ensemble_numba.AxisSums:
-    return ensemble_numba.AxisSums(dn.start, 1.0, *np.zeros((2, dn.size)))
-
-
-def _nuced_sums(nuced: NucedAxis | None) -> ensemble_numba.AxisSums:
-    if nuced is None:
-        return ensemble_numba.AxisSums(0, 0.0, *np.zeros((2, 0)))
-    return ensemble_numba.AxisSums(nuced.start, nuced.width, *np.zeros((2, nuced.size)))
-
-
 def mass_sums(
     mass: FloatArray, first: IntArray, start: IntArray, pixels: UsablePixels, dn: DnAxis, nuced: NucedAxis
 ) -> tuple[EnsembleSums, FloatArray]:
     """Sum the masses that any law gives to the codes of pixels, at the integer DN and sorted into NUCed bins.
 
-    Their mean replaces that of the PCDs (Hendrickson et al. 2023, eq. full_ensemble_dist).
+    The mean over pixels of the raw masses is the ensemble (Hendrickson et al. 2023, eq. full_ensemble_dist),
+    with the mass of each whole code in place of the density. The sorted masses are what the NUCed data must
+    show, lattice and all: each DN of a pixel lies at ``(x - mu) g`` and falls into one bin as a whole (eq.
+    partial_ensemble_dist, before the lattice is smoothed over).
 
     Args:
         mass: of successive codes, one pixel after the other.
@@ -175,43 +150,91 @@ def mass_sums(
     Returns:
         The sums, and those of the means of the NUCed value (e-) and of its square (e-^2), shape (2,).
     """
-    raw, bins, moments = _raw_sums(dn), _nuced_sums(nuced), np.zeros(2)
+    raw = ensemble_numba.AxisSums(dn.start, 1.0, *np.zeros((2, dn.size)))
+    bins = ensemble_numba.AxisSums(nuced.start, nuced.width, *np.zeros((2, nuced.size)))
+    moments = np.zeros(2)
     _, gain, bias, _ = pixels.maps
     ensemble_numba.sort_masses(mass, first, start, gain, bias, raw, bins, moments)
-    return EnsembleSums(len(pixels), raw.total, raw.square, bins.total, bins.square), moments
+    return EnsembleSums(raw.total, raw.square, bins.total, bins.square), moments
 
 
-def curve_errors(
-    pixels: UsablePixels, covariance: FloatArray, dn: DnAxis, nuced: NucedAxis
-) -> tuple[FloatArray, FloatArray]:
-    """Sum the pixels' variances of the two predicted densities that the errors of their parameters cause.
-
-    By the delta method, pixels being independent; the standard error of a mean over n pixels is
-    ``sqrt(sum) / n``. After correction only H and sigma_e- matter.
+def weighted_mass(pixels: UsablePixels, dn: DnAxis, share: FloatArray) -> FloatArray:
+    """Compute the sum over pixels of a share times the mass of each code under the PCD.
 
     Args:
         pixels: n pixels.
+        dn: the codes.
+        share: of each pixel, shape (n,).
+
+    Returns:
+        ``sum_i share_i P_i(x)``, shape (n_dn,).
+    """
+    out = np.zeros(dn.size)
+    law = SampleLaw()
+    for some, first, n_codes in parts_of_similar_width(law, pixels, (dn.start, dn.start + dn.size - 1)):
+        codes = first[:, None] + np.arange(n_codes)
+        mass = sample_mass(law, pixels.of(some), codes, far_tails=False)
+        out += _along(dn, codes, share[some, None] * mass)
+    return out
+
+
+def curve_errors(
+    law: SampleLaw, pixels: UsablePixels, covariance: FloatArray, dn: DnAxis, nuced: NucedAxis
+) -> tuple[FloatArray, FloatArray]:
+    """Sum the pixels' variances of the two predicted masses that the errors of their parameters cause.
+
+    By the delta method, pixels being independent: ``D' C D`` with the slopes D of the mass of a code, or of a
+    NUCed bin, in (H, g, mu, sigma). The standard error of a mean over n pixels is ``sqrt(sum) / n``.
+
+    Args:
+        law: of the samples of n pixels, without their free satellites.
+        pixels: the pixels.
         covariance: of (H, g, mu, sigma), shape (n, 4, 4); entries that are not known count as 0.
         dn: axis of the raw prediction.
         nuced: axis of the NUCed prediction.
 
     Returns:
-        Sums of the variances of f_X, 1/DN^2, shape (n_dn,), and of the NUCed density, 1/e-^2, shape
-        (n_bins,).
+        Sums of the variances of the mass of a whole DN, shape (n_dn,), and of the mass of a NUCed bin,
+        shape (n_bins,).
     """
     raw, bins = np.zeros(dn.size), np.zeros(nuced.size)
-    plain = pixels.columns
-    ensemble_numba.curve_variance(plain, np.ascontiguousarray(covariance), float(dn.start), 1.0, raw)
-    n, (_, gain, _, noise) = len(pixels), pixels.maps
-    corrected = np.stack([pixels.quanta_exposure, np.ones(n), np.zeros(n), pixels.read_noise_e], axis=1)
     known = np.where(np.isfinite(covariance), covariance, 0.0)
-    moved = np.zeros((n, 4, 4))  # sigma_e- = g sigma
-    moved[:, 0, 0] = known[:, 0, 0]
-    moved[:, 0, 3] = moved[:, 3, 0] = noise * known[:, 0, 1] + gain * known[:, 0, 3]
-    moved[:, 3, 3] = noise * noise * known[:, 1, 1] + gain * gain * known[:, 3, 3]
-    moved[:, 3, 3] += 2.0 * noise * gain * known[:, 1, 3]
-    ensemble_numba.curve_variance(corrected, moved, nuced.start * nuced.width, nuced.width, bins)
+    for some, first, n_codes in parts_of_similar_width(law, pixels, (dn.start, dn.start + dn.size - 1)):
+        part, codes = pixels.of(some), first[:, None] + np.arange(n_codes)
+        slopes = _mass_slopes(law.of(some), part, first, n_codes) * _inside(dn, codes)[:, None]
+        raw += _along(dn, codes, _variance(slopes, known[some]))
+        value = (codes - part.bias[:, None]) * part.conversion_gain[:, None]
+        place = np.clip(np.floor(value / nuced.width + 0.5) - nuced.start, -1, nuced.size).astype(np.int64)
+        room = nuced.size + 2  # one more at either end, for what lies beyond
+        place += 1 + room * np.arange(len(part))[:, None]
+        held = (np.bincount(place.ravel(), each.ravel(), len(part) * room) for each in slopes.swapaxes(0, 1))
+        in_bins = np.stack([each.reshape(-1, room)[:, 1:-1] for each in held], axis=1).astype(np.float64)
+        bins += _variance(in_bins, known[some]).sum(axis=0)
     return raw, bins
+
+
+def _mass_slopes(law: SampleLaw, pixels: UsablePixels, first: IntArray, n_codes: int) -> FloatArray:
+    """Return the slopes of the mass of successive codes in (H, g, mu, sigma), shape (n, 4, n_codes)."""
+    exposure, gain, _, sigma = pixels.maps
+    _, slopes = sample_slopes(law, pixels, first, n_codes)
+    analog = np.maximum(sigma**2 - QUANTISATION_VARIANCE, LEAST_VARIANCE)
+    unit = 1.0 / np.maximum(exposure, SMALLEST_MASS), -(gain**-2.0), np.ones_like(gain), 2.0 * sigma / analog
+    return np.asarray(slopes * np.stack(unit, axis=1)[:, :, None])
+
+
+def _variance(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return ``D' C D``, shape (n, m), of slopes (n, 4, m) and covariances (n, 4, 4)."""
+    return np.asarray(np.sum(slopes * (covariance @ slopes), axis=1))
+
+
+def _inside(dn: DnAxis, codes: IntArray) -> NDArray[np.bool_]:
+    return np.asarray((codes >= dn.start) & (codes < dn.start + dn.size))
+
+
+def _along(dn: DnAxis, codes: IntArray, values: FloatArray) -> FloatArray:
+    """Return the sums of values at the same code of an axis."""
+    inside = _inside(dn, codes)
+    return np.asarray(np.bincount(codes[inside] - dn.start, values[inside], dn.size), np.float64)
 
 
 def tally(

@@ -12,15 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.arithmetic.normal_numba import NARROW, REACH
-from pchem_pipeline.model.ensemble import ensemble_numba
-from pchem_pipeline.model.ensemble.ensemble import DnAxis, IntArray, NucedAxis, electron_pmf
+from pchem_pipeline.model.arithmetic.limits import NEGLIGIBLE
+from pchem_pipeline.model.arithmetic.normal_numba import REACH
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, IntArray, NucedAxis, electron_pmf, weighted_mass
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
 #: Cells for each pixel up to which a table of all of them is faster than sorting.
@@ -130,14 +130,10 @@ def epcd_dependent(pixels: UsablePixels, dn: DnAxis, choice: HistogramChoice) ->
     Returns:
         f_E, 1/DN, shape (n_dn,).
     """
-    exposure, gain, bias, sigma = pixels.maps
-    cells = joint_cells((exposure, gain, bias, sigma**2), choice)
-    out = np.zeros(dn.size)
-    values = cells.values
-    ensemble_numba.sum_pcd_cells(
-        cells.share, values[0], values[1], values[2], np.sqrt(values[3]), dn.start, out
-    )
-    return out
+    *first, sigma = pixels.maps
+    cells = joint_cells((*first, sigma**2), choice)
+    exposure, gain, bias, variance = cells.values
+    return weighted_mass(UsablePixels(exposure, gain, bias, np.sqrt(variance)), dn, cells.share)
 
 
 def epcd_independent(pixels: UsablePixels, dn: DnAxis, choice: HistogramChoice) -> FloatArray:
@@ -178,17 +174,15 @@ def _inverted(
     """Invert the characteristic function of pixels of similar exposures; return first DN and density."""
     origin, period = _period(exposures, gains, biases, variances, dn)
     variance = variances.values[0]
-    narrow = variance < NARROW**2
     # the finest structure that so many frequencies resolve
     least = max(_NARROWEST, period * REACH / (2 * np.pi * _MOST_FREQUENCIES)) ** 2
-    spread = np.maximum(np.where(narrow, variance - QUANTISATION_VARIANCE, variance), least)
+    spread = np.maximum(variance - QUANTISATION_VARIANCE, least)
     n_frequencies = math.ceil(period * REACH / (2 * np.pi * math.sqrt(spread.min())))
     folded = np.zeros(period, dtype=np.complex128)
     for start in range(0, n_frequencies + 1, 64):
         order = np.arange(start, min(start + 64, n_frequencies + 1))
         t = 2 * np.pi * order / period
-        noise = np.exp(-0.5 * np.multiply.outer(t**2, spread))
-        noise = np.where(narrow, noise * np.sinc(t / (2 * np.pi))[:, None], noise) @ variances.share
+        noise = np.sinc(t / (2 * np.pi)) * (np.exp(-0.5 * np.multiply.outer(t**2, spread)) @ variances.share)
         offset = np.exp(1j * np.multiply.outer(t, biases.values[0] - origin)) @ biases.share
         product = noise * offset * _electrons_in_dn(t, exposures, gains)
         # frequencies beyond the sampling of the DN grid fold onto it, and those below zero are conjugates
@@ -261,10 +255,7 @@ def nuced_dependent(pixels: UsablePixels, axis: NucedAxis, choice: HistogramChoi
         f_E', 1/e-, shape (n_bins,).
     """
     cells = joint_cells((pixels.quanta_exposure, pixels.read_noise_e**2), choice)
-    out = np.zeros(axis.size)
-    sigma_e = np.sqrt(cells.values[1])
-    ensemble_numba.sum_nuced_cells(cells.share, cells.values[0], sigma_e, axis.width, axis.start, out)
-    return out / axis.width
+    return _in_bins(cells.values[0], np.zeros(cells.share.size), cells.values[1], axis, cells.share)
 
 
 def nuced_independent(pixels: UsablePixels, axis: NucedAxis, choice: HistogramChoice) -> FloatArray:
@@ -282,9 +273,19 @@ def nuced_independent(pixels: UsablePixels, axis: NucedAxis, choice: HistogramCh
     """
     mass = electron_pmf_binned(pixels.quanta_exposure, _enough_k(pixels.quanta_exposure), choice)
     noise = joint_cells((pixels.read_noise_e**2,), choice)
-    out = np.zeros(axis.size)
-    ensemble_numba.sum_nuced_product(mass, noise.share, np.sqrt(noise.values[0]), axis.width, axis.start, out)
-    return out / axis.width
+    share = np.multiply.outer(mass, noise.share)
+    electrons, variance = np.broadcast_arrays(np.arange(mass.size)[:, None], noise.values)
+    some = share > NEGLIGIBLE
+    return _in_bins(np.zeros(int(some.sum())), electrons[some], variance[some], axis, share[some])
+
+
+def _in_bins(
+    exposure: FloatArray, offset: NDArray[Any], variance: FloatArray, axis: NucedAxis, share: FloatArray
+) -> FloatArray:
+    """Return the density of ``offset + K + R`` in the bins of an axis: as of codes of so many electrons."""
+    width, noise = axis.width, np.sqrt(variance / axis.width**2 + QUANTISATION_VARIANCE)
+    pixels = UsablePixels(exposure, np.full(exposure.size, width), offset / width, noise)
+    return weighted_mass(pixels, DnAxis(axis.start, axis.size), share) / width
 
 
 def electron_pmf_binned(quanta_exposure: FloatArray, n_k: int, choice: HistogramChoice) -> FloatArray:

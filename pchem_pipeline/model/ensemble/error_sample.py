@@ -17,8 +17,8 @@ from pchem_pipeline.model.errors.fisher import covariance_from
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
 #: Pixels of ordinary errors that are taken of a sensor. The variances that they add scatter by 1.4 times the
-#: mean: 65,536 give the standard error of a curve to 0.3 % of itself (2 % at its ends, where few add much).
-WANTED = 1 << 16
+#: mean: 16,384 give the standard error of a curve to 0.6 % of itself (4 % at its ends, where few add much).
+WANTED = 1 << 14
 #: Sum over the four parameters of their variances over those of resolved peaks: what half of the pixels of a
 #: sensor with a read noise of 0.3 e- stay below.
 _ORDINARY = 20.0

@@ -13,7 +13,12 @@ from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
 
 def moment_rows(
-    totals: EnsembleTotals, pixels: UsablePixels, per_pixel: int | NDArray[Any], weight: FloatArray
+    totals: EnsembleTotals,
+    pixels: UsablePixels,
+    per_pixel: int | NDArray[Any],
+    weight: FloatArray,
+    *,
+    extended: bool = False,
 ) -> list[dict[str, Any]]:
     """Return the moments of Appendix A, from the maps and from the data.
 
@@ -25,12 +30,13 @@ def moment_rows(
         pixels: the pixels.
         per_pixel: samples of each pixel.
         weight: of each pixel in Var(mu), see :func:`bias_weight`.
+        extended: whether the model holds effects, or samples lie at the limits of the codes.
 
     Returns:
         Rows ``{name, quantity, unit, predicted, observed, stderr}``; terms have nothing to be observed.
     """
     plain_ones, errors = predicted_moments(pixels, weight), moment_errors(pixels, per_pixel)
-    expected = _extended_moments(totals, plain_ones) if totals.axes.extended else plain_ones
+    expected = _extended_moments(totals, plain_ones) if extended else plain_ones
     share, dn = totals.mean("share"), totals.axes.dn.dn
     mean = float(share @ dn / share.sum())
     variance = float(share @ (dn - mean) ** 2 / share.sum())
@@ -69,7 +75,7 @@ def moment_rows(
             errors.nuced_variance,
         ),
     ]
-    if totals.axes.extended:
+    if extended:
         added = expected.variance - plain_ones.variance
         rows.insert(7, ("effects", "of which effects and limits of the codes", "DN2", added, None, None))
     names = ("name", "quantity", "unit", "predicted", "observed", "stderr")

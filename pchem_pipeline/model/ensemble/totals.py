@@ -24,10 +24,15 @@ _INTEGERS = (
     "compared",
     "signed_error",
 )
-_FLOATS = ("nuced_sum", "nuced_sum_square", "error", "error_variance")
-#: The same two, predicted; without effects they follow from the parameters.
-_EXTENDED_FLOATS = ("nuced_predicted_sum", "nuced_predicted_sum_square")
-#: Variances of the predictions by the errors of the maps; known without effects.
+_FLOATS = (
+    "nuced_sum",
+    "nuced_sum_square",
+    "nuced_predicted_sum",
+    "nuced_predicted_sum_square",
+    "error",
+    "error_variance",
+)
+#: Variances of the predictions by the errors of the maps.
 MODEL_ERRORS = ("pcd_error", "nuced_error")
 
 
@@ -39,13 +44,11 @@ class EnsembleAxes:
         dn: DN of the raw ensemble.
         nuced: bins of the NUCed ensemble.
         n_k: number of electron numbers.
-        extended: whether the model of the pixels holds effects.
     """
 
     dn: DnAxis
     nuced: NucedAxis
     n_k: int
-    extended: bool = False
 
     @cached_property
     def integers(self) -> dict[str, slice]:
@@ -64,9 +67,8 @@ class EnsembleAxes:
             lengths[name] = self.nuced.size
         for name in ("electron_share", "electron_expected"):
             lengths[name] = self.n_k
-        if not self.extended:
-            lengths |= dict(zip(MODEL_ERRORS, (self.dn.size, self.nuced.size), strict=True))
-        return _places(lengths | dict.fromkeys((*_FLOATS, *(_EXTENDED_FLOATS if self.extended else ())), 1))
+        lengths |= dict(zip(MODEL_ERRORS, (self.dn.size, self.nuced.size), strict=True))
+        return _places(lengths | dict.fromkeys(_FLOATS, 1))
 
 
 def _places(lengths: dict[str, int]) -> dict[str, slice]:

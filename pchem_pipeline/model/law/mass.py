@@ -2,17 +2,64 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.law import mass_numba
 from pchem_pipeline.model.law.cells_numba import EXACT, NEAR
 from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
-from pchem_pipeline.model.law.parameters import Parameters, columns_of
+from pchem_pipeline.model.law.parameters import Parameters, columns_of, usable_pixels
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
+
+#: Pixels whose masses are held at a time.
+_AT_ONCE = 256
+
+
+def code_ranges(
+    model: SampleLaw, maps: Parameters, satellites: tuple[ArrayLike, ArrayLike] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the first and last code that pixels show, DN, shape (n,); 0 and -1 without usable parameters.
+
+    Args:
+        model: the law.
+        maps: (H, g, mu, sigma) of n pixels.
+        satellites: as of :func:`sample_mass`.
+    """
+    columns = columns_of(maps)
+    n = columns.shape[0]
+    columns[~usable_pixels(*columns.T)] = np.nan
+    reach = np.empty((n, 2), np.int64)
+    mass_numba.find_reach(columns, satellites_of(maps, satellites, n), pack([model], n), reach)
+    return reach[:, 0], reach[:, 1]
+
+
+def parts_of_similar_width(
+    model: SampleLaw, maps: Parameters, limits: tuple[int, int] | None = None
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.int64], int]]:
+    """Give pixels in parts whose codes take little memory: those with as many codes come together.
+
+    Args:
+        model: the law.
+        maps: (H, g, mu, sigma) of n pixels; those without usable parameters are in no part.
+        limits: first and last code that are wanted, DN; None: all.
+
+    Yields:
+        Places of the pixels, the first code of each, DN, and how many codes the widest has.
+    """
+    low, high = code_ranges(model, maps)
+    if limits is not None:
+        low, high = np.maximum(low, limits[0]), np.minimum(high, limits[1])
+    width = high - low + 1
+    order = np.argsort(width, kind="stable")
+    order = order[width[order] > 0]
+    for begin in range(0, order.size, _AT_ONCE):
+        some = order[begin : begin + _AT_ONCE]
+        yield some, low[some], int(width[some[-1]])
 
 
 def sample_mass(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE
+from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
 from pchem_pipeline.model.law.cells_numba import (
     CORE,
     NEAR,
@@ -18,6 +18,7 @@ from pchem_pipeline.model.law.cells_numba import (
     fill_masses,
     resolve,
 )
+from pchem_pipeline.model.law.levels_numba import place_codes, reach_of_law
 from pchem_pipeline.model.law.pixel_numba import (
     DERIVATIVES,
     FIRST,
@@ -64,12 +65,24 @@ def known_theta(parameters: FloatArray, centre: int, weight: float, theta: Float
     """Fill a sample's own theta from (H, g, mu, sigma); False unless known, and H that of a pixel."""
     if not (math.isfinite(parameters.sum()) and parameters[0] < _MOST_EXPOSURE):
         return False
-    theta[0] = math.log(parameters[0])
+    theta[0] = math.log(max(parameters[0], SMALLEST_MASS))
     theta[1] = 1.0 / parameters[1]
     theta[2] = parameters[2] - centre
     theta[3] = math.log(max(parameters[3] * parameters[3] - QUANTISATION_VARIANCE, LEAST_VARIANCE))
     theta[4] = weight
     return True
+
+
+@kernel
+def find_reach(parameters: FloatArray, satellites: FloatArray, law: Law, out: NDArray[np.int64]) -> None:
+    """Fill the first and last code that each pixel shows, DN, shape (n, 2); (0, -1) without parameters."""
+    pixel, scratch = pixel_scratch(2, law)
+    theta = scratch.small[OWN]
+    for p in range(parameters.shape[0]):
+        out[p, 0], out[p, 1] = 0, -1
+        placed, _ = place_codes(p, 0, 1, 1, law, satellites, pixel)
+        if known_theta(parameters[p], placed.centre, satellites[p, 1], theta):
+            out[p, 0], out[p, 1] = reach_of_law(parameters[p, 0], p, theta, placed, law)
 
 
 @kernel

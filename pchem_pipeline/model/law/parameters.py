@@ -92,7 +92,7 @@ class UsablePixels(PixelParameters):
         """Return the number of pixels."""
         return int(self.quanta_exposure.size)
 
-    def of(self, pixels: NDArray[np.bool_]) -> UsablePixels:
+    def of(self, pixels: NDArray[np.bool_] | NDArray[np.intp]) -> UsablePixels:
         """Return some of them."""
         return UsablePixels(*(column[pixels] for column in self.maps))
 

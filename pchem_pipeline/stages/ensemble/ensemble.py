@@ -130,7 +130,7 @@ class _Fitted:
             return None
         return known
 
-    def axes(self, settings: EnsembleSettings, *, extended: bool) -> EnsembleAxes | None:
+    def axes(self, settings: EnsembleSettings) -> EnsembleAxes | None:
         """Choose the axes of the ensemble; None where no pixel has a value."""
         if len(self.pixels) == 0:
             return None
@@ -141,7 +141,7 @@ class _Fitted:
         largest = min(float(self.pixels.quanta_exposure.max()), 60_000.0)
         mass = electron_pmf(self.pixels.quanta_exposure, int(largest + 12 * math.sqrt(largest) + 40))
         n_k = int(np.searchsorted(np.cumsum(mass), 1.0 - 1e-7)) + 2
-        return EnsembleAxes(dn, nuced, n_k, extended)
+        return EnsembleAxes(dn, nuced, n_k)
 
 
 def _pixels_of(
@@ -182,7 +182,7 @@ def run(context: StageContext) -> None:
     fitted_tiles = [tile for tile in tiles if tile.key in ready]
     fitted = _Fitted.read(store, fitted_tiles)
     limits = fitted.limits(context.adc_limits)
-    axes = fitted.axes(settings, extended=bool(effects) or limits is not None)
+    axes = fitted.axes(settings)
     if sensor.kind == "histograms":
         context.note("input is histograms: the ensemble has all samples, with equal weight per channel")
     if axes is None:
@@ -327,10 +327,8 @@ def _sum_tile(
 
 def _law(
     store: RunStore, maps: list[NDArray[np.float64]], place: tuple[slice, slice], job: _Job
-) -> SampleLaw | None:
-    """Return the law of the samples, with effects and limits of the codes; None: the PCD."""
-    if not job.axes.extended:
-        return None
+) -> SampleLaw:
+    """Return the law of the samples, with effects and limits of the codes."""
     law = FittedModel.read(store, place).law(maps)
     low, high = job.limits or (None, None)
     return replace(
@@ -496,7 +494,9 @@ def _write_result(
         "n_pixels": totals.count("pixels"),
         "n_pixels_without_value": totals.count("excluded"),
         "pixels_of_open_bias": float(np.sum(1.0 - weight)),
-        "moments": moment_rows(totals, pixels, per_pixel, weight),
+        "moments": moment_rows(
+            totals, pixels, per_pixel, weight, extended=bool(job.effects) or job.limits is not None
+        ),
         "component_cases": COMPONENT_CASES,
         "missing": missing,
     }

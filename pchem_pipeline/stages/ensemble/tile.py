@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.electrons.electrons import KnownPixels, NumberTables, Outcomes, number_tables
-from pchem_pipeline.model.ensemble.ensemble import curve_errors, ensemble_sums, mass_sums, tally
+from pchem_pipeline.model.ensemble.ensemble import curve_errors, mass_sums, tally
 from pchem_pipeline.model.ensemble.error_sample import PixelErrors
 from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
 from pchem_pipeline.model.law.inputs import kernel_counts
@@ -89,7 +89,7 @@ def ensemble_tile(
         maps: (H, g, mu, sigma) of the pixels, each of shape (n,); NaN where the fit failed.
         chosen: histograms of the chosen frames.
         everything: histograms of all frames.
-        axes: axes of the ensemble, ``extended`` where the law is that of a model with effects.
+        axes: axes of the ensemble.
         law: of the samples; None: that of the PCD.
         satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n,); None: none.
         errors: of the maps; None: not known.
@@ -109,9 +109,9 @@ def ensemble_tile(
     everything = chosen if same else everything.of(mask)
     samples = chosen.samples
     samples_all = samples if same else everything.samples
-    if errors is not None and not axes.extended:
+    if errors is not None:
         some, covariance = errors.of(mask).sampled(pixels, samples_all)
-        found = curve_errors(pixels.of(some), covariance, axes.dn, axes.nuced)
+        found = curve_errors(law.of(some), pixels.of(some), covariance, axes.dn, axes.nuced)
         for name, variance in zip(MODEL_ERRORS, found, strict=True):
             floats[axes.floats[name]] = variance
     for n, n_all in _numbers_of_samples(samples, samples_all):
@@ -149,21 +149,16 @@ def _numbers(
     return (*tables.tally(histograms.counts, origin, axes.n_k), tables.outcomes(axes.n_k), tables)
 
 
-def _predicted(
-    tables: NumberTables | None, pixels: UsablePixels, n: int, axes: EnsembleAxes
-) -> dict[str, Any]:
+def _predicted(tables: NumberTables, pixels: UsablePixels, n: int, axes: EnsembleAxes) -> dict[str, Any]:
     """Return what the law predicts of pixels that have n samples each."""
-    parts: dict[str, Any] = {}
-    if tables is not None:
-        sums, moments = mass_sums(tables.mass, tables.first, tables.start, pixels, axes.dn, axes.nuced)
-        parts["nuced_predicted_sum"], parts["nuced_predicted_sum_square"] = moments
-    else:
-        sums = ensemble_sums(pixels, axes.dn, axes.nuced)
-    return parts | {
+    sums, moments = mass_sums(tables.mass, tables.first, tables.start, pixels, axes.dn, axes.nuced)
+    return {
         "pcd": sums.raw,
         "pcd_variance": (sums.raw - sums.raw_square) / n,
         "nuced": sums.nuced,
         "nuced_variance": (sums.nuced - sums.nuced_square) / n,
+        "nuced_predicted_sum": moments[0],
+        "nuced_predicted_sum_square": moments[1],
     }
 
 
@@ -202,4 +197,4 @@ def _group_sums(
         "error": expected.error.sum(),
         "error_variance": np.sum(expected.error * (1.0 - expected.error)),
     }
-    return tallies, parts | _predicted(tables if axes.extended else None, pixels, n, axes)
+    return tallies, parts | _predicted(tables, pixels, n, axes)

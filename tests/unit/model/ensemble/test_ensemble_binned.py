@@ -6,9 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
+from helpers.plain_law import joint_mass
 from scipy.stats import norm, poisson
 
-from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, ensemble_sums
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, weighted_mass
 from pchem_pipeline.model.ensemble.ensemble_binned import (
     HistogramChoice,
     electron_pmf_binned,
@@ -35,7 +36,7 @@ def make_pixels(n: int, seed: int = 1) -> UsablePixels:
 
 
 def pcd(dn: np.ndarray, h: float, g: float, mu: float, variance: float) -> np.ndarray:
-    return np.asarray(poisson.pmf(K, h) @ norm.pdf(dn[None, :], mu + K[:, None] / g, np.sqrt(variance)))
+    return joint_mass(dn, h, g, mu, np.sqrt(variance), K.size).sum(axis=0)
 
 
 def test_cells_are_those_of_numpy() -> None:
@@ -93,7 +94,7 @@ def test_dependent_is_the_sum_over_cells(representative: str) -> None:
     h, g, mu, sigma = pixels.maps
     cells = joint_cells((h, g, mu, sigma**2), choice)
     expected = sum(w * pcd(dn.dn, *v) for w, v in zip(cells.share, cells.values.T, strict=True))
-    np.testing.assert_allclose(epcd_dependent(pixels, dn, choice), expected, rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(epcd_dependent(pixels, dn, choice), expected, rtol=1e-10, atol=1e-13)
 
 
 @pytest.mark.parametrize("representative", ["mean", "centre"])
@@ -113,7 +114,7 @@ def test_independent_integrates_narrow_noise_over_the_cell() -> None:
     pixels = UsablePixels(np.array([2.0]), np.array([0.5]), np.array([10.3]), np.array([0.6]))
     dn = DnAxis(0, 60)
     density = epcd_independent(pixels, dn, HistogramChoice(2))
-    np.testing.assert_allclose(density, ensemble_sums(pixels, dn).raw / len(pixels), atol=1e-14)
+    np.testing.assert_allclose(density, weighted_mass(pixels, dn, np.ones(1)), atol=1e-14)
     assert density.sum() == pytest.approx(1.0, abs=1e-12)
 
 
@@ -173,8 +174,8 @@ def test_exposures_far_from_each_other_are_inverted_apart() -> None:
         *(zip(x.values[0], x.share, strict=True) for x in (g, mu, s2))
     ):
         centre = bias + k / gain_cell
-        bells = np.exp(-0.5 * (dn.dn[:, None] - centre) ** 2 / v) / np.sqrt(2 * np.pi * v)
-        expected += a * b * c * (bells @ mass)
+        low, high = (norm.cdf(dn.dn[:, None] + side, centre, np.sqrt(v - 1 / 12)) for side in (-0.5, 0.5))
+        expected += a * b * c * ((high - low) @ mass)
     np.testing.assert_allclose(epcd_independent(pixels, dn, choice), expected, atol=1e-13)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.plain_law import joint_mass
-from scipy.stats import norm, poisson
+from scipy.stats import poisson
 
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.ensemble import (
@@ -13,10 +13,10 @@ from pchem_pipeline.model.ensemble.ensemble import (
     NucedAxis,
     electron_pmf,
     ensemble_numba,
-    ensemble_sums,
     mass_sums,
     nuced_axis,
     tally,
+    weighted_mass,
 )
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.parameters import UsablePixels, usable_pixels
@@ -34,51 +34,21 @@ def make_pixels(n: int, seed: int = 1, gain: float = 0.1) -> UsablePixels:
     )
 
 
-def plain_pcd(pixels: UsablePixels, dn: np.ndarray) -> np.ndarray:
-    """PCD of every pixel at every DN, eq. X_density term by term."""
-    k = np.arange(200)
-    rows = []
-    for h, g, mu, sigma in zip(*pixels.maps, strict=True):
-        rows.append(poisson.pmf(k, h) @ norm.pdf(dn[None, :], mu + k[:, None] / g, sigma))
-    return np.array(rows)
-
-
-def test_sum_over_pixels_is_that_of_the_formula() -> None:
-    pixels, dn = make_pixels(30), DnAxis(40, 300)
-    rows = plain_pcd(pixels, dn.dn)
-    sums = ensemble_sums(pixels, dn)
-    np.testing.assert_allclose(sums.raw, rows.sum(axis=0), rtol=1e-11, atol=1e-15)
-    np.testing.assert_allclose(sums.raw_square, (rows**2).sum(axis=0), rtol=1e-11, atol=1e-15)
-
-
-def test_nuced_sums_sort_whole_dn_into_bins() -> None:
-    pixels, dn, axis = make_pixels(30), DnAxis(0, 400), NucedAxis(0.13, -40, 320)
-    rows = plain_pcd(pixels, dn.dn)
-    expected, squares = np.zeros((2, axis.size))
-    for row, g, mu in zip(rows, pixels.conversion_gain, pixels.bias, strict=True):
-        place = np.floor((dn.dn - mu) * g / axis.width + 0.5).astype(int) - axis.start
-        inside = (place >= 0) & (place < axis.size)
-        mass = np.bincount(place[inside], weights=row[inside], minlength=axis.size)
-        expected += mass
-        squares += mass**2
-    sums = ensemble_sums(pixels, dn, axis)
-    np.testing.assert_allclose(sums.nuced, expected, rtol=1e-11, atol=1e-14)
-    np.testing.assert_allclose(sums.nuced_square, squares, rtol=1e-11, atol=1e-14)
-    assert sums.nuced.sum() == pytest.approx(sums.raw.sum(), rel=1e-12)
-    assert sums.raw.sum() == pytest.approx(30.0, abs=1e-3)
-
-
-def test_narrow_pixels_give_the_mass_of_the_cell() -> None:
-    # sigma = 0.6 DN at an integer + 0.3: the density at the integers does not add up to 1, the masses do
-    pixels = UsablePixels(np.array([1.5]), np.array([0.5]), np.array([10.3]), np.array([0.6]))
-    dn = DnAxis(0, 60)
-    expected = joint_mass(dn.dn, 1.5, 0.5, 10.3, 0.6, 60).sum(axis=0)
-    np.testing.assert_allclose(ensemble_sums(pixels, dn).raw, expected, atol=1e-14)
+def test_weighted_mass_is_that_of_the_formula() -> None:
+    # the last one is narrow, at an integer + 0.3: its density at the integers does not add up to 1
+    wide = make_pixels(30)
+    last = (0.0, 1.5), (0.1, 0.5), (100.2, 70.3), (3.0, 0.6)
+    pixels = UsablePixels(*(np.append(own, more) for own, more in zip(wide.maps, last, strict=True)))
+    dn, share = DnAxis(40, 300), np.random.default_rng(5).random(32)
+    rows = [joint_mass(dn.dn, *each).sum(axis=0) for each in zip(*pixels.maps, strict=True)]
+    np.testing.assert_allclose(weighted_mass(pixels, dn, share), share @ rows, rtol=1e-10, atol=1e-13)
+    part = weighted_mass(pixels, DnAxis(90, 20), share)
+    np.testing.assert_allclose(part, (share @ rows)[50:70], rtol=1e-10, atol=1e-13)
 
 
 def test_a_hot_pixel_keeps_its_mass() -> None:
     pixels = UsablePixels(np.array([3000.0]), np.array([0.1]), np.array([100.0]), np.array([3.0]))
-    density = ensemble_sums(pixels, DnAxis(0, 60_000)).raw / len(pixels)
+    density = weighted_mass(pixels, DnAxis(0, 60_000), np.ones(1))
     assert density.sum() == pytest.approx(1.0, abs=1e-10)
     assert density @ np.arange(60_000) == pytest.approx(100.0 + 30_000.0, rel=1e-10)
 
@@ -161,10 +131,10 @@ def test_absurd_parameters_are_not_usable(place: int, value: float) -> None:
     np.testing.assert_array_equal(usable_pixels(*columns), [True, False])
 
 
-def test_masses_of_any_law_are_sorted_onto_both_axes() -> None:
+@pytest.mark.parametrize("law", [SampleLaw(), SampleLaw().with_noise([0.5, 0.5], shift_e=[0.0, 0.5])])
+def test_masses_are_sorted_onto_both_axes(law: SampleLaw) -> None:
     pixels, dn = make_pixels(8), DnAxis(40, 220)
     axis = NucedAxis(0.1, -100, 400)
-    law = SampleLaw().with_noise([0.5, 0.5], shift_e=[0.0, 0.5])
     known = KnownPixels(pixels, law)
     tables = number_tables(*known.codes(), known.exposure, known, detailed=True)
     sums, moments = mass_sums(tables.mass, tables.first, tables.start, pixels, dn, axis)

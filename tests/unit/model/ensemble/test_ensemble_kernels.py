@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pchem_pipeline.model.arithmetic.normal_numba import add_mass
 from pchem_pipeline.model.electrons import electrons_numba
 from pchem_pipeline.model.electrons.electrons import KnownPixels
 from pchem_pipeline.model.ensemble import ensemble_numba
@@ -36,15 +37,6 @@ EMPTY_TABLES = electrons_numba.CodeTables(
 NUMBER_TABLES = EMPTY_TABLES._replace(number=TABLE)
 
 ENSEMBLE: dict[str, tuple[Any, ...]] = {
-    "sum_pcd_pixels": (
-        (H, G, MU, SIGMA),
-        ensemble_numba.AxisSums(10, 1.0, *np.zeros((2, 90))),
-        ensemble_numba.AxisSums(-8, 0.1, *np.zeros((2, 80))),
-    ),
-    "add_mass": (np.zeros(60), 3.0, 0.7, 20.2, 2.5),
-    "sum_pcd_cells": (SHARE, H, G, MU, SIGMA, 3, np.zeros(90)),
-    "sum_nuced_cells": (SHARE, H, G * SIGMA, 0.1, -8, np.zeros(80)),
-    "sum_nuced_product": (MASS, SHARE, G * SIGMA, 0.1, -8, np.zeros(80)),
     "sum_poisson": (SHARE, H, np.zeros(12)),
     "tally_counts": (
         COUNTS,
@@ -59,7 +51,6 @@ ENSEMBLE: dict[str, tuple[Any, ...]] = {
 ELECTRONS: dict[str, tuple[Any, ...]] = {
     "count_errors": (NUMBERS, TRUE, 65535, np.zeros(4, dtype=np.int64)),
     "tally_numbers": (COUNTS, ORIGIN, NUMBER_TABLES, 65535, np.zeros(5, dtype=np.int64)),
-    "find_reach": (H, PIXELS, np.zeros((3, 2), dtype=np.int64)),
     "fill_tables": (EMPTY_TABLES, 1, H, PIXELS, 9, 65535),
 }
 
@@ -67,10 +58,11 @@ ELECTRONS: dict[str, tuple[Any, ...]] = {
 @pytest.mark.parametrize(
     ("kernel", "arguments"),
     [
+        (add_mass, (np.zeros(60), 3.0, 0.7, 20.2, 2.5)),
         *((getattr(ensemble_numba, name), arguments) for name, arguments in ENSEMBLE.items()),
         *((getattr(electrons_numba, name), arguments) for name, arguments in ELECTRONS.items()),
     ],
-    ids=[*ENSEMBLE, *ELECTRONS],
+    ids=["add_mass", *ENSEMBLE, *ELECTRONS],
 )
 def test_compiled_and_plain_agree(kernel: Any, arguments: tuple[Any, ...]) -> None:
     results = []

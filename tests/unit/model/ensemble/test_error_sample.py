@@ -9,6 +9,7 @@ from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_erro
 from pchem_pipeline.model.ensemble.error_sample import PixelErrors
 from pchem_pipeline.model.errors.fisher import covariance_from
 from pchem_pipeline.model.law.parameters import UsablePixels
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 N, FRAMES = 40_000, 600
 
@@ -35,11 +36,11 @@ def test_all_pixels_are_taken_where_they_are_few(sensor: tuple[UsablePixels, Pix
 
 def test_some_pixels_give_the_same_errors_within_theirs(sensor: tuple[UsablePixels, PixelErrors]) -> None:
     pixels, errors = sensor
-    axes = DnAxis(80, 120), NucedAxis(0.09, -10, 120)
-    exact = curve_errors(pixels, covariance_from(errors.stderr, errors.correlation), *axes)
+    law, axes = SampleLaw(), (DnAxis(80, 120), NucedAxis(0.09, -10, 120))
+    exact = curve_errors(law, pixels, covariance_from(errors.stderr, errors.correlation), *axes)
     few = PixelErrors(errors.stderr, errors.correlation, errors.place, 0.1)
     some, covariance = few.sampled(pixels, np.full(N, FRAMES))
-    found = curve_errors(pixels.of(some), covariance, *axes)
+    found = curve_errors(law, pixels.of(some), covariance, *axes)
     # ordinary pixels one in ten, nearly all of the others (one in a hundred has no errors to add)
     assert 0.1 * N < some.sum() < 0.13 * N
     # variances of the ordinary scatter by no more than twice their mean; of a standard error it is half
@@ -51,7 +52,7 @@ def test_some_pixels_give_the_same_errors_within_theirs(sensor: tuple[UsablePixe
     rng = np.random.default_rng(1)
     plain = rng.random(N) < 0.1
     raw, _ = curve_errors(
-        pixels.of(plain), 10 * covariance_from(errors.stderr[plain], errors.correlation[plain]), *axes
+        law, pixels.of(plain), 10 * covariance_from(errors.stderr[plain], errors.correlation[plain]), *axes
     )
     seen = exact[0] > 1e-3 * exact[0].max()
     assert np.abs(np.sqrt(raw[seen] / exact[0][seen]) - 1.0).max() > limit

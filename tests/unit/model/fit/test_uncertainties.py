@@ -11,14 +11,17 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.variables import INTERVALS, interval_names
 from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.model.checks.multiple_testing import false_discovery, misfit, poorest
-from pchem_pipeline.model.ensemble import ensemble_numba
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_errors
 from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.fisher import correlations, covariance_from
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import INTERVAL_NAMES, FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law import density_scores_numba
+from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.pcd import log_pcd, pcd_posterior
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.stages.fit.fit import fit_tile
 
 Array = NDArray[np.float64]
@@ -120,42 +123,31 @@ def test_the_score_of_a_sample_is_the_slope_of_its_density(case: tuple[float, fl
             assert score[i] == pytest.approx(numeric, rel=1e-4, abs=1e-5)
 
 
-def test_loops_are_the_same_compiled_and_plain() -> None:
-    pixel, at, covariance = fitted(CASES[1])
-    at, covariance = at[None], covariance[None]
-    for kernel, arguments, shape in (
-        (ensemble_numba.curve_variance, (at, covariance, 90.0, 1.0), (40,)),
-        (
-            information_numba.grouped_trace,
-            (pixel.origin, pixel.origin + 150, np.array([float(N)]), at, covariance),
-            (1,),
-        ),
-    ):
-        compiled, plain = np.zeros(shape), np.zeros(shape)
-        kernel(*arguments, compiled)
-        kernel.py_func(*arguments, plain)
-        np.testing.assert_allclose(plain, compiled, rtol=1e-10)
-
-
-@pytest.mark.parametrize(("x0", "pitch"), [(85.0, 1.0), (101.3, 0.37)])
-def test_variance_of_a_curve_follows_from_its_slopes(x0: float, pitch: float) -> None:
+@pytest.mark.parametrize("law", [SampleLaw(), SampleLaw().with_noise([0.5, 0.5], shift_e=[0.0, 0.5])])
+def test_variance_of_a_curve_follows_from_its_slopes(law: SampleLaw) -> None:
     rng = np.random.default_rng(5)
     pixels = np.array([[0.3, 0.4, 100.2, 0.9], [6.0, 0.11, 99.0, 3.0]])
     roots = rng.standard_normal((2, 4, 4)) * (0.1 * pixels)[:, :, None]
     covariance = roots @ np.swapaxes(roots, 1, 2)
     covariance[1, 2] = covariance[1, :, 2] = np.nan  # the bias was held by a bound
-    found = np.zeros(60)
-    ensemble_numba.curve_variance(pixels, covariance, x0, pitch, found)
-    x, expected = x0 + pitch * np.arange(60), np.zeros(60)
+    dn, nuced = DnAxis(85, 60), NucedAxis(0.2, -3, 40)
+    found = curve_errors(law, UsablePixels(*np.ascontiguousarray(pixels.T)), covariance, dn, nuced)
+    expected = np.zeros(60), np.zeros(40)
     for at, known in zip(pixels, np.nan_to_num(covariance), strict=True):
         slopes = np.empty((4, 60))
         for i in range(4):
             up, down = at.copy(), at.copy()
             up[i] *= 1 + 1e-6
             down[i] *= 1 - 1e-6
-            slopes[i] = (np.exp(log_pcd(x, *up)) - np.exp(log_pcd(x, *down))) / (2e-6 * at[i])
-        expected += np.einsum("ix,ij,jx->x", slopes, known, slopes)
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-8 * expected.max())
+            masses = [sample_mass(law, each[:, None], dn.dn)[0] for each in (up, down)]
+            slopes[i] = (masses[0] - masses[1]) / (2e-6 * at[i])
+        place = np.floor((dn.dn - at[2]) * at[1] / nuced.width + 0.5).astype(int) + 3
+        inside = (place >= 0) & (place < 40)
+        in_bins = [np.bincount(place[inside], each[inside], 40) for each in slopes]
+        for sums, each in zip(expected, (slopes, np.array(in_bins)), strict=True):
+            sums += np.einsum("ix,ij,jx->x", each, known, each)
+    for sums, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(sums, wanted, rtol=1e-4, atol=1e-8 * wanted.max())
 
 
 def test_groups_of_single_dn_determine_all_four_parameters() -> None:
