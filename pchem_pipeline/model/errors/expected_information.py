@@ -52,8 +52,7 @@ def expected_information(
     if not (np.isfinite([quanta_exposure, read_noise_e]).all() and min(quanta_exposure, read_noise_e) > 0):
         raise ValueError("quanta exposure and read noise must be positive")
     if read_noise_e < _COARSE * conversion_gain:
-        parts = _of_cells(quanta_exposure, read_noise_e, conversion_gain)
-        bounds = np.stack([inverse_information(part) for part in parts])
+        bounds = inverse_information(_of_cells(quanta_exposure, read_noise_e, conversion_gain))
         known = np.isfinite(bounds[:, 0, 0])
         return inverse_information(bounds[known].mean(axis=0)) if known.any() else np.full((4, 4), np.nan)
     step, (low, high) = read_noise_e / _NODES_PER_SIGMA, _range(quanta_exposure, read_noise_e)
@@ -131,13 +130,15 @@ def inverse_information(information: ArrayLike) -> NDArray[np.float64]:
     """Return the smallest covariance, the inverse of an information matrix; NaN where it is singular.
 
     Args:
-        information: shape (n, n), of one frame or of a sum over frames.
+        information: shape (..., n, n), of one frame or of a sum over frames.
     """
     matrix = np.asarray(information, np.float64)
-    scale = np.sqrt(np.diagonal(matrix))
-    if not (scale > 0).all():
-        return np.full(matrix.shape, np.nan)
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    if values[0] <= 1e-12 * values[-1]:
-        return np.full(matrix.shape, np.nan)
-    return np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    known = np.asarray(np.isfinite(matrix).all(axis=(-2, -1)) & (diagonal > 0).all(axis=-1))
+    root = np.sqrt(np.where(known[..., None], diagonal, 1.0))
+    scale = root[..., :, None] * root[..., None, :]
+    values, vectors = np.linalg.eigh(np.where(known[..., None, None], matrix / scale, np.eye(root.shape[-1])))
+    known &= values[..., 0] > 1e-12 * values[..., -1]
+    values = np.where(known[..., None], values, 1.0)
+    inverse = (vectors / values[..., None, :]) @ vectors.swapaxes(-2, -1) / scale
+    return np.where(known[..., None, None], inverse, np.nan)

@@ -1,33 +1,52 @@
-"""Observed information of a histogram under the PCD, and covariances as correlations."""
+"""Expected information of pixels under the PCD, and covariances as correlations."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from pchem_pipeline.model.errors import information_numba
-from pchem_pipeline.model.law.likelihood import density_likelihood
+from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
+from pchem_pipeline.model.law.mass import parts_of_similar_width, sample_mass
+from pchem_pipeline.model.law.parameters import FloatArray, Parameters, columns_of
+from pchem_pipeline.model.law.pcd import pcd_posterior
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 #: Pairs of parameters, in the order of the axis ``parameter_pair``; numbers as in ``variables.PARAMETERS``.
 CORRELATION_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
 
-def observed_covariance(counts: ArrayLike, origin: int, parameters: ArrayLike) -> NDArray[np.float64]:
-    """Return the inverse of Louis' observed information of one histogram at a maximum of the likelihood.
+def expected_scores(parameters: Parameters) -> tuple[FloatArray, FloatArray]:
+    """Return mean and mean outer product of the density's score, the samples being rounded to whole DN.
+
+    The latter is the expected information of one frame; the former is 0 but for what rounding does.
 
     Args:
-        counts: histogram, shape (B,); need not be whole.
-        origin: DN of bin 0.
-        parameters: (H, g, mu, sigma).
+        parameters: (H, g, mu, sigma) of n pixels.
 
     Returns:
-        Covariance of (H, g, mu, sigma), shape (4, 4); NaN where the information is not positive definite.
+        In (H, g, mu, sigma), shape (n, 4) and (n, 4, 4); NaN without usable parameters.
     """
-    weights = np.asarray(counts, np.float64)
-    covariance = np.full((4, 4), np.nan)
-    values = np.asarray(parameters, np.float64)
-    information_numba.observed_covariance(weights, int(origin), values, density_likelihood(), covariance)
-    return covariance
+    columns = columns_of(parameters)
+    n = columns.shape[0]
+    mean, information = np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
+    for some, first, n_codes in parts_of_similar_width(SampleLaw(), list(columns.T)):
+        codes = first[:, None] + np.arange(n_codes)
+        own = columns[some]
+        exposure, gain, bias, sigma = (own[:, [i]] for i in range(4))
+        mass = sample_mass(SampleLaw(), list(own.T), codes, far_tails=False)
+        given, precision = pcd_posterior(codes, exposure, gain, bias, sigma), sigma**-2.0
+        score = np.stack(
+            [
+                given.k / np.maximum(exposure, SMALLEST_MASS) - 1.0,
+                -given.ke * precision / gain**2,
+                given.e * precision,
+                (given.ee * precision - 1.0) / sigma,
+            ],
+            axis=1,
+        )
+        weighted = score * mass[:, None]
+        mean[some], information[some] = weighted.sum(axis=2), weighted @ score.swapaxes(1, 2)
+    return mean, information
 
 
 def correlations(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

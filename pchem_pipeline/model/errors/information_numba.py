@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,30 +10,19 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import LEAST_EXPONENT
 from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
-from pchem_pipeline.model.errors.algebra_numba import invert_arrow, to_natural
 from pchem_pipeline.model.law.density_scores_numba import N_MEANS, density_scores, posterior
 from pchem_pipeline.model.law.pixel_numba import (
-    AT,
     BIAS,
     CENTRE,
     DAMPING,
     DARK,
-    DERIVATIVES,
     FIRST,
-    HELD,
-    HERE,
     LOG_VARIANCE,
     N_BINS,
-    N_SHARED,
-    SATELLITE,
-    SCORE,
     STEP,
     SUMS,
     WEIGHT,
     Pixel,
-    load,
-    make_pixel,
-    make_scratch,
 )
 
 
@@ -136,34 +124,3 @@ def _form(vector: NDArray[np.float64], matrix: NDArray[np.float64]) -> float:
             if math.isfinite(matrix[i, j]):
                 found += vector[i] * matrix[i, j] * vector[j]
     return found
-
-
-@kernel
-def observed_covariance(
-    counts: NDArray[np.float64],
-    origin: int,
-    parameters: NDArray[np.float64],
-    evaluate: Any,
-    covariance: NDArray[np.float64],
-) -> None:
-    """Fill the inverse of the observed information of one histogram; nothing unless that is regular.
-
-    Args:
-        counts: histogram, shape (B,).
-        origin: DN of bin 0.
-        parameters: (H, g, mu, sigma).
-        evaluate: the density.
-        covariance: out, of (H, g, mu, sigma).
-    """
-    pixel = make_pixel(np.zeros(1, np.bool_), counts.size, 0, 0)
-    scratch = make_scratch(1, counts.size, np.bool_(False))
-    centre = origin + load(counts, np.zeros(counts.size, np.uint8), pixel.bins[0], pixel.facts[0])
-    theta, at, held = scratch.small[HERE], scratch.evaluations[AT], scratch.flags[HELD]
-    theta[0], theta[1] = math.log(parameters[0]), 1.0 / parameters[1]
-    theta[2], theta[3] = parameters[2] - centre, 2.0 * math.log(parameters[3])
-    evaluate(pixel, theta, DERIVATIVES, scratch, at)
-    held[1 + SATELLITE] = True
-    full, found = np.empty((1 + N_SHARED, 1 + N_SHARED)), np.empty(4)
-    at[0, SCORE] = 0.0
-    if invert_arrow(at, theta, held, full):
-        to_natural(theta, held[:1], held, 0.0, full, found, covariance)

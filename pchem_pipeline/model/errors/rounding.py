@@ -12,8 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.errors import rounding_numba
-from pchem_pipeline.model.law.likelihood import density_likelihood
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.errors.expected_information import inverse_information
+from pchem_pipeline.model.errors.fisher import expected_scores
+from pchem_pipeline.model.law.parameters import columns_of
 
 FloatArray = NDArray[np.float64]
 
@@ -28,21 +30,24 @@ _SAFE = 20.0
 def rounding_bias(parameters: Sequence[FloatArray], n_frames: NDArray[np.generic]) -> FloatArray:
     """Return the bias that rounding to whole DN gives to estimates from the density, in standard errors.
 
-    To first order, ``I^-1 E[s]``: the score of the density under the exact masses, through the inverse of its
-    information, at the parameters given.
+    To first order, ``I^-1 E[s]``: the mean score of the density under the exact masses, through the inverse
+    of its information, at the parameters given.
 
     Args:
         parameters: (H, g, mu, sigma), each of shape (n,).
         n_frames: frames of each pixel, shape (n,).
 
     Returns:
-        Bias of (H, g, mu, sigma) over their standard errors, shape (n, 4): signs as of (H, 1/g, mu, sigma);
+        Bias of (H, g, mu, sigma) over their standard errors, shape (n, 4);
         infinite where there is no answer.
     """
-    columns = np.ascontiguousarray(np.stack([np.asarray(each, np.float64) for each in parameters], axis=1))
+    columns, frames = columns_of(parameters), np.asarray(n_frames, np.float64)
     out = np.full(columns.shape, np.inf)
-    frames = np.ascontiguousarray(n_frames, np.float64)
-    rounding_numba.rounding_tile(columns, frames, density_likelihood(), out)
+    told = (columns[:, 0] > 0.0) & (columns[:, 3] ** 2 > QUANTISATION_VARIANCE)
+    score, information = expected_scores(list(columns[told].T))
+    bound = inverse_information(information)
+    errors = np.sqrt(np.diagonal(bound, axis1=1, axis2=2) / frames[told, None])
+    out[told] = np.nan_to_num(np.einsum("nij,nj->ni", bound, score) / errors, nan=np.inf)
     return out
 
 

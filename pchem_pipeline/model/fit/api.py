@@ -12,7 +12,8 @@ from scipy.special import chdtrc, chdtri
 from pchem_pipeline.base.units import FEW_STEP
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.errors import information_numba
-from pchem_pipeline.model.errors.fisher import observed_covariance
+from pchem_pipeline.model.errors.expected_information import inverse_information
+from pchem_pipeline.model.errors.fisher import expected_scores
 from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_may_matter
 from pchem_pipeline.model.fit import engine, guard_numba, profile, profile_numba, search_numba, tile_numba
 from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, Limits
@@ -565,9 +566,8 @@ class _Batch:
         if few.size:
             own = covariance[few]
             if self.settings.errors == "sandwich":
-                kept = np.where(self.given.mask[pixels[few]] == LEFT_OUT, 0, self.given.counts[pixels[few]])
-                rows = zip(kept, self.given.origin[pixels[few], 0], parameters[few], strict=True)
-                own = np.stack([observed_covariance(counts, int(first), at) for counts, first, at in rows])
+                _, information = expected_scores(list(parameters[few].T))
+                own = inverse_information(frames[few, None, None] * information)
             known = np.empty(few.size)
             ends = (words[few, tile_numba.LOWEST_DN], words[few, tile_numba.HIGHEST_DN])
             information_numba.grouped_trace(*ends, frames[few], parameters[few], own, known)

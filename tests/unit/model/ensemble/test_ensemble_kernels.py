@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.model.arithmetic.normal_numba import add_mass
 from pchem_pipeline.model.electrons import electrons_numba
 from pchem_pipeline.model.electrons.electrons import KnownPixels
 from pchem_pipeline.model.ensemble import ensemble_numba
@@ -58,11 +57,10 @@ ELECTRONS: dict[str, tuple[Any, ...]] = {
 @pytest.mark.parametrize(
     ("kernel", "arguments"),
     [
-        (add_mass, (np.zeros(60), 3.0, 0.7, 20.2, 2.5)),
         *((getattr(ensemble_numba, name), arguments) for name, arguments in ENSEMBLE.items()),
         *((getattr(electrons_numba, name), arguments) for name, arguments in ELECTRONS.items()),
     ],
-    ids=["add_mass", *ENSEMBLE, *ELECTRONS],
+    ids=[*ENSEMBLE, *ELECTRONS],
 )
 def test_compiled_and_plain_agree(kernel: Any, arguments: tuple[Any, ...]) -> None:
     results = []

@@ -13,8 +13,8 @@ from pchem_pipeline.model.errors.expected_information import (
     inverse_information,
     shared_information,
 )
-from pchem_pipeline.model.errors.fisher import observed_covariance
-from pchem_pipeline.model.law.pcd import pcd, pcd_mass
+from pchem_pipeline.model.errors.fisher import expected_scores
+from pchem_pipeline.model.law.pcd import pcd_mass
 
 POINTS = [(2.0, 0.2), (0.1, 0.305), (2.0, 0.305), (10.0, 0.45), (2.0, 0.6), (1.0, 1.0)]
 
@@ -24,16 +24,6 @@ def density(y, theta):
     exposure, log_gain, bias, log_sigma = theta
     k = np.arange(60)
     return float(poisson.pmf(k, exposure) @ norm.pdf(y, bias + k * np.exp(-log_gain), np.exp(log_sigma)))
-
-
-@pytest.mark.parametrize(("exposure", "noise"), POINTS)
-def test_bound_agrees_with_louis_formula(exposure, noise):
-    gain = noise / 4.0  # a read noise of 4 DN: sums over whole DN are integrals
-    ours = inverse_information(expected_information(exposure, noise))
-    x = np.arange(-40, int((exposure + 12.0 * np.sqrt(exposure) + 12.0) / gain) + 40)
-    louis = observed_covariance(pcd(x, exposure, gain, 0.0, 4.0), -40, (exposure, gain, 0.0, 4.0))
-    scale = np.array([1.0, 1 / gain, gain, 0.25])
-    np.testing.assert_allclose(ours, louis * np.outer(scale, scale), rtol=2e-5, atol=2e-5 * ours.max())
 
 
 def test_information_agrees_with_a_plain_integral():
@@ -58,6 +48,19 @@ def test_information_agrees_with_a_plain_integral():
         edges = np.arange(-2.5, 11.6, 1.0)
         whole = sum(quad(integrand, a, b, epsabs=1e-9, epsrel=1e-7)[0] for a, b in itertools.pairwise(edges))
         assert found[i, j] == pytest.approx(whole, rel=2e-5, abs=2e-5)
+
+
+@pytest.mark.parametrize(("exposure", "noise"), POINTS)
+def test_scores_of_wide_peaks_have_mean_zero_and_the_information(exposure, noise):
+    gain = noise / 4.0  # a read noise of 4 DN: sums over whole DN are integrals
+    mean, information = expected_scores(([exposure], [gain], [100.3], [4.0]))
+    scale = np.array([1.0, gain, 1 / gain, 4.0])  # in H, ln g, g mu and ln sigma
+    expected = expected_information(exposure, noise)
+    np.testing.assert_allclose(
+        information[0] * np.outer(scale, scale), expected, rtol=1e-4, atol=1e-6 * expected.max()
+    )
+    assert np.abs(mean[0] * scale / np.sqrt(np.diagonal(expected))).max() < 1e-4
+    assert np.isnan(expected_scores(([np.nan], [gain], [100.3], [4.0]))[0]).all()
 
 
 def test_few_electrons_leave_one_gaussian():

@@ -43,7 +43,7 @@ def test_the_predicted_bias_is_where_the_density_goes_on_the_exact_masses():
     )
     shift = found.x - truth
     bound = cramer_rao(h, 1 / a, sigma, n)
-    scale = np.array([1 / h, a**2, 1.0, 2 / sigma])
+    scale = np.array([1 / h, -(a**2), 1.0, 2 / sigma])
     errors = np.sqrt(np.diagonal(bound)) * scale
     predicted = rounding_bias([np.array([v]) for v in (h, 1 / a, mu, sigma)], np.array([n]))[0]
     assert np.abs(predicted).max() > 0.3
