@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.methods import plain_em_numba
 from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Sample, Settings
 from pchem_pipeline.model.fit.starts import starting_points
-from pchem_pipeline.model.law.inputs import kernel_counts
+from pchem_pipeline.model.law.pcd import pcd_posterior
 
 
 class PlainEm(Method):
@@ -59,14 +58,57 @@ def run_em(
     Returns:
         (H, g, mu, sigma), NaN without a result, and the steps taken (negative: out of range; 0: no start).
     """
-    inner = start.copy()
-    inner[:, 1] = 1.0 / start[:, 1]
-    inner[:, 2] = start[:, 2] - sample.origin
-    steps = np.zeros(start.shape[0], np.int64)
-    plain_em_numba.em_tile(
-        kernel_counts(sample.counts), inner, only_light, settings.em_iterations, settings.em_tolerance, steps
-    )
-    found = inner.copy()
-    found[:, 1] = 1.0 / inner[:, 1]
-    found[:, 2] = inner[:, 2] + sample.origin
-    return found, steps
+    theta, steps = np.full(start.shape, np.nan), np.zeros(start.shape[0], np.int64)
+    total = sample.counts.sum(axis=1)
+    usable = np.isfinite(start).all(axis=1) & (start[:, [0, 1, 3]] > 0).all(axis=1)
+    going = np.flatnonzero(usable & (total > 0))
+    theta[going] = start[going]
+    pixel, place = np.nonzero(sample.counts[going])
+    share = sample.counts[going][pixel, place] / total[going][pixel]
+    x = np.asarray(sample.origin[going][pixel] + place, np.float64)
+    for step in range(1, settings.em_iterations + 1):
+        if going.size == 0:
+            break
+        before = theta[going]
+        after = _em_step(pixel, x, share, before, only_light)
+        inside = (after[:, [1, 3]] > 0).all(axis=1) & (after[:, 0] > 1e-9) & (after[:, 0] < 1e6)
+        inside &= after[:, 1] > 1e-6
+        unit = np.stack([before[:, 0], after[:, 1], after[:, 3], before[:, 3]], axis=1)
+        change = np.abs((after - before) / unit).max(axis=1)
+        theta[going] = np.where(inside[:, None], after, np.nan)
+        steps[going] = np.where(inside, step, -step)
+        left = inside & (change >= settings.em_tolerance)
+        kept, number = left[pixel], np.cumsum(left) - 1
+        pixel, x, share, going = number[pixel[kept]], x[kept], share[kept], going[left]
+    return theta, steps
+
+
+def _em_step(
+    pixel: NDArray[np.intp], x: FloatArray, share: FloatArray, theta: FloatArray, only_light: bool
+) -> FloatArray:
+    """Return (H, g, mu, sigma) after one EM step, eqs. (update_eqns); NaN where it is not defined.
+
+    Args:
+        pixel: number of the pixel of each occupied code.
+        x: the code, DN.
+        share: part of the pixel's samples at it.
+        theta: (H, g, mu, sigma) before, shape (n, 4).
+        only_light: H and g only.
+    """
+
+    def mean_of(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(pixel, share * values, len(theta)), np.float64)
+
+    given = pcd_posterior(x, *theta[pixel].T)  # eq. (gamma_nk)
+    mean = mean_of(x)
+    off = x - mean[pixel]
+    a, b, c = mean_of(given.k), mean_of(given.kk), mean_of(given.k * off)
+    bias, sigma = theta[:, 2], theta[:, 3]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if only_light:
+            step = (c + (mean - bias) * a) / b
+        else:
+            step = c / (b - a * a)
+            bias = mean - a * step
+            sigma = np.sqrt(mean_of(off**2) - (b - a * a) * step * step)
+        return np.stack([a, 1.0 / step, bias, sigma], axis=1)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 _AXES = ("frame", "row", "column")
 _LEAST_SCENE = 0.02  # e-
+_LEAST_INFORMATION = 0.05  # of that of a sample whose electron number is known
 _ROUNDS, _PRECISION = 5, 1e-6  # expansions in the offsets; relative, of their solution
 
 
@@ -240,12 +241,11 @@ def estimate_offsets(
         calibration: of the pixels, under a law without these offsets.
         modes: which offsets there are.
     """
-    from pchem_pipeline.use.common_modes_numba import Pixels, from_electrons  # loads compiled loops
+    from pchem_pipeline.model.law.pcd import pcd_posterior  # loads compiled loops
 
     design, sigma = _Design.of(modes), np.sqrt(calibration.noise_variance_dn2)
     known = np.ascontiguousarray(np.where(np.isfinite(sigma), scene, np.nan))
     step = 1.0 / calibration.conversion_gain
-    pixels = Pixels(known, calibration.conversion_gain, calibration.bias, sigma)
     found = []
     for frame in frames:
         # means tell offsets beyond half an electron apart, electron numbers the rest
@@ -253,7 +253,15 @@ def estimate_offsets(
         form = np.stack([weight * np.nan_to_num(frame - calibration.bias - known * step), weight])
         z = design.top(form, np.zeros_like(design.sums(weight)))
         for _ in range(_ROUNDS - 1):
-            from_electrons(frame, pixels, design.offsets(*design.unpacked(z)), form)
+            offset = design.offsets(*design.unpacked(z))
+            given = pcd_posterior(
+                frame - calibration.bias - offset, known, calibration.conversion_gain, 0.0, sigma
+            )
+            # what is left open of the electron number takes from what a sample tells of its offset
+            open_part = (given.ee - given.e**2) / sigma**2
+            information = np.maximum(1.0 - open_part, _LEAST_INFORMATION) / sigma**2
+            score = given.e / sigma**2 + information * offset  # of the offset itself, not of its change
+            form = np.nan_to_num(np.stack([score, information]))
             z = design.top(form, z)
         found.append((*design.unpacked(z), design.left(form[1])))
     return Offsets(*(np.stack(each) for each in zip(*found, strict=True)))

@@ -6,10 +6,11 @@ from helpers import reference_pchem
 from helpers.drawn_pixels import draw, samples
 from scipy.stats import kstat
 
-from pchem_pipeline.methods import base, plain_em_numba
+from pchem_pipeline.methods import base
 from pchem_pipeline.methods.base import Method, PixelSamples, Sample, Settings, sample_moments
 from pchem_pipeline.methods.compare import compare, errors_of, pixel_bounds, summarise_errors
 from pchem_pipeline.methods.peak_valley import comb, read_noise_of_valley
+from pchem_pipeline.methods.plain_em import run_em
 from pchem_pipeline.methods.registry import methods
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
@@ -110,13 +111,11 @@ def test_one_em_step_is_that_of_the_paper(noise):
     raw, origin = samples(drawn.counts[0], 0), int(drawn.origin[0])
     start = reference_pchem.Theta(1.2, 0.1, 100.0 - origin, 4.0)
     expected = reference_pchem.em_step(raw, start)
-    theta = np.array([start.exposure, 1 / start.gain, start.bias, start.sigma])
-    compiled = theta.copy()
-    assert plain_em_numba.em_pixel.py_func(drawn.counts[0], theta, False, 1, 1e-12) == 1
-    assert plain_em_numba.em_pixel(drawn.counts[0], compiled, False, 1, 1e-12) == 1
-    np.testing.assert_allclose(theta, compiled, rtol=1e-12)
-    found = (theta[0], 1 / theta[1], theta[2], theta[3])
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    at = np.array([[start.exposure, start.gain, start.bias, start.sigma]])
+    one_step = Settings(em_iterations=1, em_tolerance=1e-12)
+    found, steps = run_em(Sample(drawn.counts, np.zeros(1, int)), at, False, one_step)
+    assert steps.tolist() == [1]
+    np.testing.assert_allclose(found[0], expected, rtol=1e-9)
 
 
 def test_em_with_known_bias_and_noise_is_a_maximum():
