@@ -142,26 +142,6 @@ def fill_tables(
 
 
 @kernel
-def tally_numbers(
-    counts: NDArray[Any], origin: IntArray, tables: CodeTables, missing: int, out: IntArray
-) -> np.int64:
-    """Add the electron numbers of per-pixel histograms to ``out[k]``; return how many lie beyond it."""
-    first, start, number = tables.first, tables.start, tables.number
-    beyond = np.int64(0)
-    for p in range(counts.shape[0]):
-        for b in range(counts.shape[1]):
-            c = np.int64(counts[p, b])
-            i = start[p] + origin[p] + b - first[p]
-            if c == 0 or not start[p] <= i < start[p + 1] or number[i] == missing:
-                continue
-            if number[i] < out.size:
-                out[number[i]] += c
-            else:
-                beyond += c
-    return beyond
-
-
-@kernel
 def convert_frames(frames: NDArray[Any], tables: CodeTables, missing: int, out: SampleNumbers) -> None:
     """Look every sample up in the table of its pixel.
 
@@ -183,28 +163,3 @@ def convert_frames(frames: NDArray[Any], tables: CodeTables, missing: int, out: 
                 out.probability[t, p] = np.float32(right[i] / mass[i] if sure else math.nan)
             if with_expected:
                 out.expected[t, p] = expected[i] if known else np.float32(math.nan)
-
-
-@kernel
-def count_errors(
-    estimated: NDArray[np.uint16], true: NDArray[np.uint16], missing: int, errors: IntArray
-) -> tuple[np.int64, np.int64]:
-    """Count how often estimated and true electron numbers differ.
-
-    ``errors[min(|k - K|, last)]`` counts each difference.
-
-    Returns:
-        Samples compared, and the sum of (k - K).
-    """
-    compared = np.int64(0)
-    signed = np.int64(0)
-    last = errors.size - 1
-    a, b = estimated.ravel(), true.ravel()
-    for i in range(a.size):
-        if a[i] == missing:
-            continue
-        difference = np.int64(a[i]) - np.int64(b[i])
-        errors[abs(difference) if abs(difference) < last else last] += 1
-        compared += 1
-        signed += difference
-    return compared, signed

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.ensemble import ensemble_numba
+from pchem_pipeline.model.ensemble.ensemble import poisson_sums
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 
 #: Expected number of samples of k electrons, in one frame of all pixels, below which their tails decide.
@@ -203,13 +203,11 @@ def component_widths(pixels: UsablePixels, n_k: int, weight: FloatArray | None =
 def _weighted_moments(exposure: FloatArray, table: FloatArray, weight: FloatArray, n_k: int) -> FloatArray:
     """Return the means of the columns of a table of pixels, weighted with w P(K = k), (n_k, columns)."""
     columns = np.column_stack([weight, table * weight[:, None]])
-    sums = np.zeros((n_k, columns.shape[1] + 1))
-    room = np.zeros(max(n_k, int(ensemble_numba.capacity(exposure))))
-    ensemble_numba.sum_moments(exposure, columns, room, sums)
+    sums = poisson_sums(exposure, columns, n_k)
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = sums[:, 2:] / sums[:, 1:2]
+        found = sums[:, 1:] / sums[:, :1]
         log_exposure = np.log(exposure)
-    for k in np.flatnonzero(sums[:, 1] < _FEW_ELECTRONS):  # the ratios of the weights are left
+    for k in np.flatnonzero(sums[:, 0] < _FEW_ELECTRONS):  # the ratios of the weights are left
         log_weight = (k * log_exposure if k else 0.0) - exposure
         largest = log_weight[weight > 0.0].max(initial=-np.inf)
         if not np.isfinite(largest):

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaln
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
-from pchem_pipeline.model.ensemble import ensemble_numba
-from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.law.mass import parts_of_similar_width, sample_mass, sample_slopes
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -61,6 +60,11 @@ class NucedAxis:
     def electrons(self) -> FloatArray:
         """Centres of the bins, e-, shape (size,)."""
         return np.arange(self.start, self.start + self.size, dtype=np.float64) * self.width
+
+    def places(self, value: FloatArray) -> IntArray:
+        """Return the number of the bin of each value, e-; -1 and ``size`` for what lies beyond."""
+        place = np.floor(value / self.width + 0.5) - self.start
+        return np.asarray(np.clip(place, -1, self.size), np.int64)
 
 
 @dataclass(frozen=True)
@@ -150,12 +154,25 @@ def mass_sums(
     Returns:
         The sums, and those of the means of the NUCed value (e-) and of its square (e-^2), shape (2,).
     """
-    raw = ensemble_numba.AxisSums(dn.start, 1.0, *np.zeros((2, dn.size)))
-    bins = ensemble_numba.AxisSums(nuced.start, nuced.width, *np.zeros((2, nuced.size)))
-    moments = np.zeros(2)
-    _, gain, bias, _ = pixels.maps
-    ensemble_numba.sort_masses(mass, first, start, gain, bias, raw, bins, moments)
-    return EnsembleSums(raw.total, raw.square, bins.total, bins.square), moments
+    pixel = np.repeat(np.arange(first.size), np.diff(start))
+    codes = first[pixel] + np.arange(mass.size) - start[pixel]
+    inside = _inside(dn, codes)
+    pixel, codes, mass = pixel[inside], codes[inside], mass[inside]
+    value = (codes - pixels.bias[pixel]) * pixels.conversion_gain[pixel]
+    place = nuced.places(value)
+    # the codes of a pixel that fall into one bin follow each other
+    begin = np.flatnonzero((np.diff(pixel, prepend=-1) != 0) | (np.diff(place, prepend=-2) != 0))
+    in_bin = np.add.reduceat(mass, begin) if begin.size else mass
+    sums = (
+        sum_at(of, values, size)
+        for of, values, size in (
+            (codes - dn.start, mass, dn.size),
+            (codes - dn.start, mass**2, dn.size),
+            (place[begin], in_bin, nuced.size),
+            (place[begin], in_bin**2, nuced.size),
+        )
+    )
+    return EnsembleSums(*sums), np.array([mass @ value, mass @ value**2])
 
 
 def weighted_mass(pixels: UsablePixels, dn: DnAxis, share: FloatArray) -> FloatArray:
@@ -174,7 +191,7 @@ def weighted_mass(pixels: UsablePixels, dn: DnAxis, share: FloatArray) -> FloatA
     for some, first, n_codes in parts_of_similar_width(law, pixels, (dn.start, dn.start + dn.size - 1)):
         codes = first[:, None] + np.arange(n_codes)
         mass = sample_mass(law, pixels.of(some), codes, far_tails=False)
-        out += _along(dn, codes, share[some, None] * mass)
+        out += sum_at(codes - dn.start, share[some, None] * mass, dn.size)
     return out
 
 
@@ -202,10 +219,9 @@ def curve_errors(
     for some, first, n_codes in parts_of_similar_width(law, pixels, (dn.start, dn.start + dn.size - 1)):
         part, codes = pixels.of(some), first[:, None] + np.arange(n_codes)
         slopes = _mass_slopes(law.of(some), part, first, n_codes) * _inside(dn, codes)[:, None]
-        raw += _along(dn, codes, _variance(slopes, known[some]))
-        value = (codes - part.bias[:, None]) * part.conversion_gain[:, None]
-        place = np.clip(np.floor(value / nuced.width + 0.5) - nuced.start, -1, nuced.size).astype(np.int64)
+        raw += sum_at(codes - dn.start, _variance(slopes, known[some]), dn.size)
         room = nuced.size + 2  # one more at either end, for what lies beyond
+        place = nuced.places((codes - part.bias[:, None]) * part.conversion_gain[:, None])
         place += 1 + room * np.arange(len(part))[:, None]
         held = (np.bincount(place.ravel(), each.ravel(), len(part) * room) for each in slopes.swapaxes(0, 1))
         in_bins = np.stack([each.reshape(-1, room)[:, 1:-1] for each in held], axis=1).astype(np.float64)
@@ -231,10 +247,10 @@ def _inside(dn: DnAxis, codes: IntArray) -> NDArray[np.bool_]:
     return np.asarray((codes >= dn.start) & (codes < dn.start + dn.size))
 
 
-def _along(dn: DnAxis, codes: IntArray, values: FloatArray) -> FloatArray:
-    """Return the sums of values at the same code of an axis."""
-    inside = _inside(dn, codes)
-    return np.asarray(np.bincount(codes[inside] - dn.start, values[inside], dn.size), np.float64)
+def sum_at(place: IntArray, values: NDArray[Any], size: int) -> FloatArray:
+    """Return the sums of the values at each place 0 ... size - 1; what lies beyond is left out."""
+    inside = (place >= 0) & (place < size)
+    return np.asarray(np.bincount(place[inside], values[inside], size), np.float64)
 
 
 def tally(
@@ -256,20 +272,18 @@ def tally(
     Returns:
         The tally; what falls beyond an axis is counted, not lost in silence.
     """
-    raw = np.zeros(dn.size, dtype=np.int64)
-    bins = np.zeros(nuced.size if nuced else 0, dtype=np.int64)
-    start, width = (nuced.start, nuced.width) if nuced else (0, 0.0)
-    sums = np.zeros((len(pixels), 2))
-    outside, nuced_outside = ensemble_numba.tally_counts(
-        kernel_counts(counts),
-        np.asarray(origin, dtype=np.int64),
-        pixels.conversion_gain,
-        pixels.bias,
-        ensemble_numba.AxisCounts(dn.start, 1.0, raw),
-        ensemble_numba.AxisCounts(start, width, bins),
-        sums,
-    )
-    return Tally(raw, bins, int(outside), int(nuced_outside), math.fsum(sums[:, 0]), math.fsum(sums[:, 1]))
+    pixel, place = np.nonzero(counts)
+    n = counts[pixel, place].astype(np.int64)
+    codes = np.asarray(origin, np.int64)[pixel] + place
+    value = (codes - pixels.bias[pixel]) * pixels.conversion_gain[pixel]
+    # whole numbers, exact in floats
+    raw = sum_at(codes - dn.start, n, dn.size).astype(np.int64)
+    bins = np.zeros(0, np.int64)
+    if nuced is not None:
+        bins = sum_at(nuced.places(value), n, nuced.size).astype(np.int64)
+    total = int(n.sum())
+    outside = total - int(raw.sum()), total - int(bins.sum())
+    return Tally(raw, bins, *outside, float(n @ value), float(n @ value**2))
 
 
 def electron_pmf(quanta_exposure: FloatArray, n_k: int, share: FloatArray | None = None) -> FloatArray:
@@ -283,8 +297,30 @@ def electron_pmf(quanta_exposure: FloatArray, n_k: int, share: FloatArray | None
     Returns:
         p_Ke(k), shape (n_k,).
     """
-    exposure = np.ascontiguousarray(quanta_exposure, dtype=np.float64)
+    exposure = np.asarray(quanta_exposure, np.float64)
     weights = np.full(exposure.size, 1.0 / exposure.size) if share is None else share
-    out = np.zeros(n_k)
-    ensemble_numba.sum_poisson(weights, exposure, out)
+    return poisson_sums(exposure, weights[:, None], n_k)[:, 0]
+
+
+def poisson_sums(exposure: FloatArray, columns: FloatArray, n_k: int) -> FloatArray:
+    """Compute the sums over pixels ``sum_i P(K = k; H_i) c_i`` of the columns c of a table.
+
+    Args:
+        exposure: H, e-, shape (n,).
+        columns: of the table, shape (n, m).
+        n_k: number of sums, k = 0 .. n_k - 1.
+
+    Returns:
+        Shape (n_k, m).
+    """
+    order = np.argsort(exposure)
+    sorted_h, table = exposure[order], columns[order]
+    log_h, reach = np.log(np.maximum(sorted_h, SMALLEST_MASS)), 12.0 * np.sqrt(sorted_h) + 40.0
+    k = np.arange(n_k)
+    begin = np.searchsorted(sorted_h + reach, k)
+    end = np.searchsorted(np.maximum.accumulate(sorted_h - reach), k, side="right")
+    out, log_factorial = np.zeros((n_k, table.shape[1])), gammaln(k + 1.0)
+    for i in np.flatnonzero(begin < end):
+        some = slice(begin[i], end[i])
+        out[i] = np.exp(i * log_h[some] - sorted_h[some] - log_factorial[i]) @ table[some]
     return out
