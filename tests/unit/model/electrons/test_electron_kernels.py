@@ -17,7 +17,7 @@ def test_compiled_and_plain_agree() -> None:
         np.array([20.0, 24.3, 21.8]),
         np.array([2.8, 3.1, 0.6]),
     ]
-    inputs = KnownPixels(parameters, SampleLaw()).kernel_inputs()
+    inputs = KnownPixels([exposure, *rest], SampleLaw()).kernel_inputs()
     results = []
     for function in (electrons_numba.fill_tables, electrons_numba.fill_tables.py_func):
         rows = np.zeros(120, np.uint16), *np.zeros((2, 120)), np.zeros(120, np.float32)
