@@ -11,12 +11,7 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 
 def test_compiled_and_plain_agree() -> None:
     exposure, first, start = np.array([0.0, 0.7, 2.4]), np.array([5, 10, 15]), np.arange(4) * 40
-    parameters = [
-        exposure,
-        np.array([0.1, 0.12, 0.6]),
-        np.array([20.0, 24.3, 21.8]),
-        np.array([2.8, 3.1, 0.6]),
-    ]
+    rest = np.array([[0.1, 0.12, 0.6], [20.0, 24.3, 21.8], [2.8, 3.1, 0.6]])
     inputs = KnownPixels([exposure, *rest], SampleLaw()).kernel_inputs()
     results = []
     for function in (electrons_numba.fill_tables, electrons_numba.fill_tables.py_func):
