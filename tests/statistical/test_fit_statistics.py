@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
-from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.pcd import log_pcd
 
@@ -84,19 +83,6 @@ def test_with_few_frames_no_answer_is_less_likely_than_the_truth() -> None:
     assert np.count_nonzero(gain[unflagged] < -1e-9) <= 1
 
 
-def test_plain_em_stays_at_a_bias_off_by_one_electron_and_the_fit_does_not() -> None:
-    pixels = draw(np.random.default_rng(34), 5.0, 11.0, 0.3)
-    h, g, mu, sigma = pixels.truth[0]
-    off = em_trace(pixels.counts[0], int(pixels.origin[0]), (h - 1, g, mu + 1 / g, sigma), 800)
-    right = em_trace(pixels.counts[0], int(pixels.origin[0]), (h, g, mu, sigma), 800)
-    assert abs(off.parameters[-1, 2] - mu) > 0.8 / g  # EM never leaves the wrong maximum
-    gap = right.log_likelihood[-1] - off.log_likelihood[-1]
-    assert gap > 20
-    result = fit_histograms(pixels.counts, pixels.origin)
-    assert result.bias[0] == pytest.approx(mu, abs=0.1 / g)
-    assert 30 < result.likelihood_gap[0] <= gap + 1
-
-
 def test_a_gap_below_thirty_is_that_to_the_polished_neighbour() -> None:
     pixels = draw(np.random.default_rng(35), 12.0, 11.0, 0.33)
     result = fit_histograms(pixels.counts, pixels.origin)
@@ -130,29 +116,6 @@ def test_a_large_expected_gap_is_that_to_the_polished_neighbour_but_for_some(
     assert result.n_iterations[0] < 8  # the neighbours were not visited
     assert gap > 80
     assert result.likelihood_gap[0] == pytest.approx(gap, rel=0.4)
-
-
-@pytest.mark.parametrize("case", [(2.0, 11.0, 0.3), (0.1, 9.0, 0.45), (6.0, 12.0, 0.6), (30.0, 9.0, 0.3)])
-def test_em_never_lowers_the_likelihood(case: tuple[float, float, float]) -> None:
-    pixels = draw(np.random.default_rng(36), *case)
-    rng = np.random.default_rng(37)
-    for _ in range(4):
-        start = pixels.truth[0] * np.exp(rng.normal(0, [0.4, 0.1, 0.01, 0.4]))
-        trace = em_trace(pixels.counts[0], int(pixels.origin[0]), start, 150).log_likelihood
-        slack = 1e-12 * np.abs(trace[0])
-        assert np.all(np.diff(trace) > -slack)
-        assert trace[-1] - trace[0] > 1e6 * slack  # a step that lowered it would be seen
-
-
-def test_plain_em_and_newton_agree() -> None:
-
-    pixels = drawn_in_range(38, 60, (0.2, 8), (0.2, 0.38))
-    newton = fit_histograms(pixels.counts, pixels.origin)
-    em = fit_histograms(pixels.counts, pixels.origin, settings=FitSettings(algorithm="em"))
-    stderr = np.sqrt(np.diagonal(newton.covariance, axis1=1, axis2=2))
-    np.testing.assert_allclose((em.columns - newton.columns) / stderr, 0, atol=3e-4)
-    np.testing.assert_array_equal(em.fit_status, newton.fit_status)
-    assert em.n_iterations.mean() > 2 * newton.n_iterations.mean()
 
 
 def test_starting_points_are_near_where_they_should_be() -> None:

@@ -144,3 +144,18 @@ def test_moment_errors_of_equal_poisson_pixels() -> None:
     assert errors.mean == pytest.approx(np.sqrt(4.0 / n))
     assert errors.variance == pytest.approx(np.sqrt((4.0 + 2 * 16.0) / n))
     assert errors.nuced_variance == pytest.approx(errors.variance)
+
+
+def test_moment_errors_are_those_of_repeated_captures() -> None:
+    pixels, rng, n = make_pixels(600), np.random.default_rng(14), 400
+    h, g, mu, sigma = pixels.maps
+    moments = []
+    for _ in range(n):
+        signal = rng.poisson(h, (20, 600)) / g
+        frames = np.rint(mu + signal + np.sqrt(sigma**2 - 1 / 12) * rng.standard_normal(signal.shape))
+        nuced = (frames - mu) * g
+        moments.append([frames.mean(), frames.var(), nuced.mean(), nuced.var()])
+    error = moment_errors(pixels, 20)
+    stated = [error.mean, error.variance, error.nuced_mean, error.nuced_variance]
+    # relative standard error of a standard deviation: 1/sqrt(2 (n - 1))
+    np.testing.assert_allclose(np.std(moments, axis=0, ddof=1) / stated, 1.0, atol=5.0 / np.sqrt(2 * (n - 1)))
