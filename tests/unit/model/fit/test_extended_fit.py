@@ -274,20 +274,6 @@ def test_telegraph_levels_are_found_where_the_plain_fit_is_astray() -> None:
     assert (abs(np.median(pulls, axis=0)) < 1.0).all()
 
 
-def test_pixels_without_levels_are_rarely_given_some() -> None:
-    n, alarm = 400, 1e-3
-    rng = np.random.default_rng(22)
-    noise = 12.0 * rng.uniform(0.25, 0.45, n)
-    truth = [rng.uniform(0.5, 3.5, n), np.full(n, 1 / 12), np.full(n, 100.0), noise]
-    counts = drawn(SampleLaw(), truth)
-    plain = fit_histograms(counts, origins(n))
-    law = SampleLaw().with_free_satellites([0.5, 0.7, 1.0, 1.4, 2.0], alarm=alarm)
-    extended = fit_histograms(counts, origins(n), law=law, start=plain)
-    false = int((extended.satellite_weight > 0).sum())
-    # Poisson: more than 5 of 0.4 expected have a probability below 1e-5
-    assert false <= 5
-
-
 def test_one_hit_does_not_move_a_fit_that_allows_for_outliers() -> None:
     counts = drawn(SampleLaw(), TRUTH)
     clean = fit_histograms(counts, origins(5))
@@ -303,13 +289,3 @@ def test_one_hit_does_not_move_a_fit_that_allows_for_outliers() -> None:
     assert moved[1].max() < 0.02
     assert moved[2].max() < 0.02
     np.testing.assert_allclose(guarded.outlier_share, 1 / (FRAMES + 1))
-
-
-def test_coarse_codes_no_longer_bias_the_read_noise() -> None:
-    truth = [np.full(60, 1.5), np.full(60, 1 / 3.2), np.linspace(99.5, 100.5, 60), np.full(60, 0.62)]
-    counts = drawn(SampleLaw(), truth)
-    plain = fit_histograms(counts, origins(60))
-    extended = fit_histograms(counts, origins(60), law=SampleLaw(), start=plain)
-    assert (extended.fit_status & int(FitStatus.COARSE_STEPS) == 0).all()
-    pulls = (columns(extended) - np.stack(truth, axis=1)) / stderr(extended)
-    assert (abs(pulls.mean(axis=0)) < 5 / np.sqrt(60)).all()

@@ -15,7 +15,7 @@ from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.fisher import correlations, covariance_from
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.result import INTERVAL_NAMES, FitResult, quantile_of
+from pchem_pipeline.model.fit.result import INTERVAL_NAMES, FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law import density_scores_numba
 from pchem_pipeline.model.law.pcd import log_pcd, pcd_posterior
@@ -94,14 +94,6 @@ def test_the_interval_of_the_noise_in_electrons_is_a_profile_too() -> None:
     np.testing.assert_allclose(ends - at[1] * at[3], (other.lower, other.upper), rtol=0.02)
     # and it is far from symmetric here: standard errors would not do
     assert (other.upper + other.lower) / (other.upper - other.lower) > 0.02
-
-
-def test_errors_are_those_of_a_parametric_bootstrap() -> None:
-    _, at, covariance = fitted(CASES[0])
-    again = draw(np.random.default_rng(8), np.full(500, at[0]), 1 / at[1], at[1] * at[3], at[2], n_frames=N)
-    scatter = estimates(fit_histograms(again.counts, again.origin)).std(axis=0)
-    # five standard errors of a standard deviation of 500, and 2 % of the pixel's own information
-    np.testing.assert_allclose(scatter / np.sqrt(np.diag(covariance)), 1.0, atol=5 / np.sqrt(1000) + 0.02)
 
 
 @pytest.mark.parametrize("case", [*CASES, (5.0, 10.0, 0.8)])
@@ -199,11 +191,6 @@ def test_the_poorest_come_first_even_where_p_is_zero() -> None:
     assert poorest(chi2, dof, 5) == [(0, 1), (1, 0), (0, 0)]
     assert np.isnan(misfit(chi2, dof)[1, 1])
     assert abs(misfit(np.array([49.33]), np.array([50.0]))[0]) < 0.01
-
-
-def test_quantiles() -> None:
-    assert quantile_of(0.682689492) == pytest.approx(1.0)
-    assert quantile_of(0.95) == pytest.approx(1.959964)
 
 
 def tile(n: int = 4) -> tuple[Drawn, dict[str, NDArray[np.generic]]]:

@@ -214,20 +214,6 @@ def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(
     assert not (folder / "run.zarr" / "report.html").exists()
 
 
-def test_four_pixels_lie_in_the_corners_of_noise_and_exposure() -> None:
-    rng = np.random.default_rng(1)
-    noise, exposure = rng.random((40, 50)), rng.random((40, 50))
-    fit_status = np.zeros((40, 50), dtype=np.uint16)
-    fit_status[:20] = int(FitStatus.POOR_FIT)
-    chosen = choose_pixels(noise, exposure, fit_status)
-    assert len({(y, x) for _, y, x in chosen}) == 4
-    for label, y, x in chosen:
-        assert y >= 20
-        assert (noise[y, x] > 0.5) == label.startswith("high read noise")
-        assert (exposure[y, x] > 0.5) == label.endswith("high exposure")
-        assert 0.02 < abs(noise[y, x] - 0.5) < 0.48
-
-
 def test_the_pixel_nearest_to_a_corner_of_all_is_chosen() -> None:
     rng = np.random.default_rng(2)
     noise = rng.standard_normal((60, 70))
