@@ -108,27 +108,6 @@ def test_neutral_fit_agrees_with_an_independent_likelihood_and_with_the_plain_on
     assert not extended.satellite_weight.any()
 
 
-def test_covariance_is_the_inverse_of_the_curvature() -> None:
-    model = LAWS["everything"]
-    counts = drawn(model, TRUTH)
-    plain = fit_histograms(counts, origins(5))
-    extended = fit_histograms(counts, origins(5), law=model, start=plain)
-    best, scale = columns(extended), stderr(extended)
-
-    def value(offset: NDArray[np.float64]) -> NDArray[np.float64]:
-        return log_likelihood(counts, origins(5), list((best + offset * scale).T), model)
-
-    h = 0.03
-    curvature = np.empty((5, 4, 4))
-    for i in range(4):
-        for j in range(4):
-            a, b = h * np.eye(4)[i], h * np.eye(4)[j]
-            curvature[:, i, j] = (value(a + b) - value(a - b) - value(b - a) + value(-a - b)) / (4 * h * h)
-    expected = np.linalg.inv(-curvature) * scale[:, :, None] * scale[:, None, :]
-    bound = 2e-3 * scale[:, :, None] * scale[:, None, :]
-    assert (abs(extended.covariance - expected) < bound).all()
-
-
 def test_pixels_do_not_influence_each_other() -> None:
     model = LAWS["variance"].with_free_satellites([1.0, 2.0])
     truth = [np.repeat(column, 2) for column in TRUTH]

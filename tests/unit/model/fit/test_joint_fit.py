@@ -20,7 +20,7 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law import cells_numba
 from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood
-from pchem_pipeline.model.law.pcd import pcd, pcd_mass
+from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
     CENTRE,
@@ -109,20 +109,6 @@ def test_score_and_information_are_the_derivatives(pixel, exact):
         np.testing.assert_allclose(
             information[i, free], slope[free], rtol=1e-4, atol=1e-3 * np.abs(slope).max()
         )
-
-
-def test_the_likelihood_is_that_of_the_samples(pixel):
-    theta = pixel.theta([0.8, 2.7, 0.0], 9.7, 100.9, np.log(13.0))
-    for exact in (False, True):
-        total = 0.0
-        for j, exposure in enumerate((0.8, 2.7, 0.0)):
-            x, c = pixel.codes(j)
-            if exact:
-                law = pcd_mass(x, exposure, 1 / 9.7, 100.9, np.sqrt(13.0) / 9.7)
-            else:
-                law = pcd(x, exposure, 1 / 9.7, 100.9, np.sqrt(13.0))
-            total += float(c[c > 0] @ np.log(law[c > 0]))
-        assert pixel(theta, exact) == pytest.approx(total, rel=1e-9)
 
 
 def test_the_plain_loop_does_what_the_compiled_one_does():

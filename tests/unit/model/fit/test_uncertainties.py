@@ -227,15 +227,3 @@ def test_settings_bring_intervals_and_sandwich_errors_into_the_store() -> None:
     assert (with_noise["bias_low"] < with_noise["bias"]).all()
     assert (with_noise["bias"] < with_noise["bias_high"]).all()
     assert (with_noise["read_noise_dn_high"] < full["read_noise_dn"]).all()
-
-
-def test_a_hit_pixel_goes_through_the_plain_loop_as_through_the_compiled() -> None:
-    pixel = draw(np.random.default_rng(12), *CASES[1], n_frames=500)
-    counts = np.zeros((1, 400), np.uint32)
-    counts[:, 100 : 100 + pixel.counts.shape[1]] = pixel.counts
-    counts[0, [2, 390]] = 1
-    fit = fit_histograms(counts, pixel.origin - 100)
-    clean = fit_histograms(pixel.counts, pixel.origin)
-    np.testing.assert_allclose(estimates(fit), estimates(clean), rtol=1e-6)
-    assert fit.outlier_share[0] == pytest.approx(2 / 502)
-    assert clean.outlier_share[0] == 0
