@@ -214,20 +214,24 @@ def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(
     assert not (folder / "run.zarr" / "report.html").exists()
 
 
-def test_the_pixel_nearest_to_a_corner_of_all_is_chosen() -> None:
+def test_the_good_pixel_nearest_to_a_corner_of_all_good_ones_is_chosen() -> None:
     rng = np.random.default_rng(2)
-    noise = rng.standard_normal((60, 70))
+    noise = rng.standard_normal((80, 70))
     exposure = np.exp(
-        3.0 * noise + 0.1 * rng.standard_normal((60, 70))
+        3.0 * noise + 0.1 * rng.standard_normal((80, 70))
     )  # no pixel is near two of the corners
-    ranks = [values.ravel().argsort().argsort() / values.size for values in (noise, exposure)]
-    for (_, y, x), (low, high) in zip(
-        choose_pixels(noise, exposure, np.zeros(noise.shape, np.uint16)),
+    fit_status = np.zeros(noise.shape, np.uint16)
+    fit_status[:20] = int(FitStatus.POOR_FIT)
+    ranks = [each[20:].ravel().argsort().argsort() / each[20:].size for each in (noise, exposure)]
+    for (label, y, x), (low, high) in zip(
+        choose_pixels(noise, exposure, fit_status),
         ((0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9)),
         strict=True,
     ):
-        distance = np.hypot(ranks[0] + 0.5 / noise.size - low, ranks[1] + 0.5 / noise.size - high)
-        assert distance[y * 70 + x] == pytest.approx(distance.min())
+        assert y >= 20
+        assert (label.startswith("high"), label.endswith("high exposure")) == (low > 0.5, high > 0.5)
+        distance = np.hypot(ranks[0] + 0.5 / ranks[0].size - low, ranks[1] + 0.5 / ranks[1].size - high)
+        assert distance[(y - 20) * 70 + x] == pytest.approx(distance.min())
 
 
 def test_few_or_no_pixels_to_choose_from() -> None:
