@@ -1,13 +1,13 @@
 """The joint fit against dense algebra, finite differences, plain numpy EM, iminuit and the single fit."""
 
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from helpers.bounds import cramer_rao
 from helpers.drawn_pixels import draw
 from helpers.em_trace import LIMITS, evaluated
-from helpers.joint_material import draw_series
 from helpers.reference_pchem import Theta, memberships
 from iminuit import Minuit
 
@@ -39,6 +39,31 @@ from pchem_pipeline.model.law.pixel_numba import (
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 EXACT = FitSettings(likelihood="exact")
+
+
+class Drawn(NamedTuple):
+    """Histograms of J samples, and which of them are dark."""
+
+    counts: list
+    origins: list
+    dark: list
+
+
+def draw_series(rng, exposures, noise_e, n_pixels, *, step=10.0, bias=100.3, n_frames=4000):
+    """Draw n pixels at each exposure; an exposure of 0 is a sample without electrons."""
+    counts, origins = [], []
+    for exposure in exposures:
+        if exposure > 0:
+            drawn = draw(rng, np.full(n_pixels, exposure), step, noise_e, bias, n_frames)
+            counts.append(drawn.counts)
+            origins.append(drawn.origin)
+            continue
+        sd = np.sqrt((noise_e * step) ** 2 - 1 / 12)
+        codes = np.rint(bias + sd * rng.standard_normal((n_pixels, n_frames))).astype(np.int64)
+        low, width = codes.min(), int(np.ptp(codes)) + 1
+        counts.append(np.stack([np.bincount(row - low, minlength=width) for row in codes]).astype(np.uint32))
+        origins.append(np.full(n_pixels, low))
+    return Drawn(counts, origins, [exposure == 0 for exposure in exposures])
 
 
 class Series:
