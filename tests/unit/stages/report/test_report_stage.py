@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.inspector_material import page_without_pictures
 from helpers.report_material import report_data
 from helpers.written_fit import write_fit
 
@@ -152,10 +153,9 @@ def test_a_report_is_the_same_whoever_works_on_it(folder: Path) -> None:
         config = context.config.model_copy(update={"compute": compute})
         with beside(workers) as hand:
             data = gather(context.store, config, 4.87, [], hand)
-            rendered = report.render_report(data, config.report)
-        pages.append((rendered.html, rendered.json))
-    assert 'id="inspector-app"' in pages[0][0]
-    assert [len(set(each)) for each in zip(*pages, strict=True)] == [1, 1]  # without pytest's comparison
+            pages.append(page_without_pictures(data))
+    assert 'id="inspector-app"' in pages[0]
+    assert len(set(pages)) == 1  # without pytest's comparison
 
 
 def test_figures_alone_pack_no_maps(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
