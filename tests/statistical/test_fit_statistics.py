@@ -1,10 +1,9 @@
-"""Estimates are unbiased, efficient, have honest errors, and sit at the right maximum."""
+"""Estimates sit at the right maximum, and gaps are those to the neighbours."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.bounds import cramer_rao
 from helpers.drawn_pixels import Drawn, draw
 from helpers.em_trace import em_trace
 from numpy.typing import NDArray
@@ -13,9 +12,6 @@ from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.pcd import log_pcd
-
-N_PIXELS = 1500
-FIVE = 5.0
 
 
 def wrong(result: FitResult, truth: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -30,30 +26,6 @@ def drawn_in_range(
     rng = np.random.default_rng(seed)
     h = np.exp(rng.uniform(*np.log(exposure), n))
     return draw(rng, h, rng.uniform(8, 14, n), rng.uniform(*noise, n), rng.uniform(95, 105, n), **k)
-
-
-@pytest.mark.parametrize("case", [(0.1, 11.0, 0.2), (2.0, 9.0, 0.3), (9.0, 11.0, 0.35)])
-def test_pulls_and_efficiency(case: tuple[float, float, float]) -> None:
-    h, step, noise = case
-    pixels = draw(
-        np.random.default_rng(31), np.full(N_PIXELS, h), step, noise, np.linspace(100, 101, N_PIXELS)
-    )
-    result = fit_histograms(pixels.counts, pixels.origin)
-    error = result.columns - pixels.truth
-    stderr = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
-    pulls = error / stderr
-    assert np.all(np.abs(pulls.mean(axis=0)) < FIVE / np.sqrt(N_PIXELS))
-    limit = FIVE * np.sqrt(2 / N_PIXELS)
-    assert np.all(np.abs(pulls.var(axis=0) - 1) < limit)
-    bound = np.sqrt(np.diagonal(cramer_rao(h, 1 / step, noise * step, 17_750)))
-    assert np.all(np.abs((error**2).mean(axis=0) / bound**2 - 1) < limit)
-    assert np.all(np.abs((pulls / 1.5).var(axis=0) - 1) > limit)  # standard errors off by half are seen
-    # correlations count: H/g, the signal in DN, is known better than H and g suggest
-    gradient = np.zeros((N_PIXELS, 4))
-    gradient[:, 0], gradient[:, 1] = 1 / pixels.truth[:, 1], -pixels.truth[:, 0] / pixels.truth[:, 1] ** 2
-    variance = np.einsum("ni,nij,nj->n", gradient, result.covariance, gradient)
-    signal_pull = (result.quanta_exposure / result.conversion_gain - h * step) / np.sqrt(variance)
-    assert abs(signal_pull.var() - 1) < limit
 
 
 def test_the_right_maximum_is_found_or_flagged() -> None:
