@@ -152,14 +152,6 @@ def test_electron_numbers_err_as_often_as_predicted(both) -> None:
     assert rate <= old["error_rate"] + stderr
 
 
-def test_report_names_the_model(both) -> None:
-    path, _ = both
-    words = "PCD + signal_dependent_noise + row_noise + nonlinearity"
-    html = (path.parent / "run.zarr/report.html").read_text()
-    assert f"model {words}" in html
-    assert words in (path.parent / "run.zarr/report.json").read_text()
-
-
 def test_the_inspector_holds_the_law_of_the_extended_model(both) -> None:
     store = RunStore.open(both[0].parent / "run.zarr")
     pixel = RunView(store).answer("GET", "/api/pixel?y=3&x=4", {"host": "127.0.0.1:1"}, 1)

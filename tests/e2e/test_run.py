@@ -4,7 +4,6 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 from helpers.commands import RUN, assert_same_results
 
@@ -75,16 +74,6 @@ def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, fi
     rows = dict(line.split(maxsplit=1) for line in shell.ok("status", "run.yaml").stdout.splitlines())
     assert rows["ensemble"] == "complete  (with model 1)"
     assert rows["report"].startswith("stale")
-
-
-def test_a_part_is_done_again_from_the_store_alone(shell, frames, finished):
-    shutil.copytree(finished, shell.folder / "run.zarr")
-    store = RunStore.open(shell.folder / "run.zarr", writable=True)
-    good = store.read("fit/bias")
-    store.write("fit/bias", (slice(0, 8), slice(8, 16)), np.zeros((8, 8)))
-    result = shell.ok("fit", "run.zarr", "--tiles", "0.1", "--force")
-    assert "fit: 12 of 12 units" in result.stderr
-    np.testing.assert_array_equal(store.read("fit/bias"), good)
 
 
 @pytest.mark.parametrize(
