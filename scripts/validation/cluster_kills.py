@@ -20,17 +20,43 @@ import sys
 import tempfile
 import threading
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 
 from kills import PCHEM, differences, results
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
-from helpers.cluster import bytes_read, cluster_processes, counting_reads, signal_group, wait_for_marks
+from helpers.cluster import cluster_processes, signal_group
 from running import STAGES, machine, write_stack
 
 from pchem_pipeline.compute.environment import prepare_environment
+
+#: writes down what a Python process reads of the frames: bytes, by `os.preadv` and by files that it opens
+_COUNTING = """
+import io, os
+open_, preadv = io.open, os.preadv
+log = os.open(os.environ["READS"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+frames = os.environ["READS_OF"]
+
+def note(name, count):
+    if str(name).endswith(frames):
+        os.write(log, f"{os.getpid()} {count}\\n".encode())
+    return count
+
+class Counted(io.FileIO):
+    def readinto(self, buffer):
+        return note(self.name, super().readinto(buffer))
+
+def opened(file, mode="r", buffering=-1, *more, **options):
+    if str(file).endswith(frames) and mode == "rb":
+        raw = Counted(file)
+        return raw if buffering == 0 else io.BufferedReader(raw)
+    return open_(file, mode, buffering, *more, **options)
+
+io.open = opened
+os.preadv = lambda file, *rest: note(os.readlink(f"/proc/self/fd/{file}"), preadv(file, *rest))
+"""
 
 
 class Watch:
@@ -68,6 +94,37 @@ def _group(root: int) -> list[int]:
         with contextlib.suppress(OSError, ValueError, IndexError):
             if int((entry / "stat").read_text().rpartition(")")[2].split()[2]) == root:
                 found.append(int(entry.name))
+    return found
+
+
+def wait_for_marks(store: Path, stage: str, many: int) -> None:
+    """Wait until a stage has set some markers."""
+    deadline = time.monotonic() + 300
+    while len(list((store / ".pchem" / "done" / stage).rglob("*.json"))) < many:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def counting_reads(folder: Path, log: Path, frames: str) -> dict[str, str]:
+    """Return the environment in which Python processes note in a file what they read of the frames.
+
+    Args:
+        folder: to be made, for the module that every process imports.
+        log: file.
+        frames: the end of the name of the camera file.
+    """
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(_COUNTING)
+    path = os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])
+    return {"READS": str(log), "READS_OF": frames, "PYTHONPATH": path}
+
+
+def bytes_read(log: Path) -> Counter[int]:
+    """Return the bytes of the frames that each process read, by its number."""
+    found: Counter[int] = Counter()
+    for line in log.read_text().splitlines():
+        process, count = map(int, line.split())
+        found[process] += count
     return found
 
 

@@ -127,13 +127,6 @@ def test_calibrated_frames_have_the_truth_within_their_errors(lab, night):
     assert "too_few_bins" in found.quality.attrs["flag_meanings"]
 
 
-def test_too_little_memory_is_refused_before_anything_is_written(lab):
-    refused = lab("apply", "run.zarr", "night.tif", "--output", "out.zarr", "--max-memory", "64")
-    assert refused.code == 2
-    assert "64 MiB, but the program needs 300 MiB" in refused.stderr
-    assert not (lab.folder / "out.zarr").exists()
-
-
 def test_nothing_is_overwritten_without_force(lab):
     lab.ok("apply", "run.zarr", "night.tif", "--output", "out.zarr", "--what", "exposure")
     again = lab.ok("apply", "run.zarr", "night.tif", "--output", "out.zarr", "--what", "exposure")
@@ -436,26 +429,6 @@ def test_a_sample_at_the_limit_less_its_offset_is_censored(striped, tmp_path, mo
     assert stated < 0.8
 
 
-def test_a_twin_is_the_camera_that_was_measured(lab, night):
-    """Fitted again, the twin's frames give the run's parameters within the errors of that fit."""
-    from pchem_pipeline import open_run
-
-    said = lab.ok("twin", "run.zarr", "--output", "camera.yaml", "--frames", "2000", "--seed", "9")
-    assert said.stdout.split() == ["camera.yaml", "camera_maps.npz"]
-    assert lab("twin", "run.zarr", "--output", "camera.yaml").code == 2
-    lab.ok("run", "camera.yaml", "--until", "maps", "--quiet")
-    first, again = (open_run(lab.folder / name) for name in ("run.zarr", "camera.zarr"))
-    good = (first.good & again.good).values
-    assert good.sum() > 0.9 * N
-    for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn"):
-        pulls = (again.maps[name] - first.maps[name]).values[good] / again.maps[f"{name}_stderr"].values[good]
-        assert abs(pulls.mean()) < 5 / np.sqrt(pulls.size) + 0.05
-        assert abs(pulls.std() - 1) < 5 / np.sqrt(2 * pulls.size) + 0.05
-        # the run's own errors are as large: other frames of the first camera would differ by more
-    with np.load(lab.folder / "camera_maps.npz") as maps:
-        assert maps["defect"][3, 5] == 3
-
-
 def test_a_twin_has_the_effects_of_the_run_in_its_model(striped, tmp_path, monkeypatch, capsys):
     """The run knew of row noise: the twin has it too, and the read noise of its pixels is without it."""
     monkeypatch.chdir(tmp_path)
@@ -464,15 +437,10 @@ def test_a_twin_has_the_effects_of_the_run_in_its_model(striped, tmp_path, monke
     content = yaml.safe_load((tmp_path / "twin.yaml").read_text())
     assert content["model"]["effects"] == content["simulate"]["effects"]
     assert "parameters" not in content["simulate"]
-    lab.ok("run", "twin.yaml", "--until", "fit", "--quiet")
-    noise = [
-        RunStore.open(each).read("fit/read_noise_dn")
-        for each in (striped / "run.zarr", tmp_path / "twin.zarr")
-    ]
-    errors = RunStore.open(tmp_path / "twin.zarr").read("fit/read_noise_dn_stderr")
-    pulls = (noise[1] - noise[0]) / errors
     # the noise of the rows is no part of the pixels': left out of the model it would widen each by a third
-    assert abs(np.nanmean(pulls)) < 0.5
+    fitted = RunStore.open(striped / "run.zarr").read("fit/read_noise_dn")
+    with np.load(tmp_path / "twin_maps.npz") as maps:
+        np.testing.assert_allclose(np.where(maps["defect"], fitted, maps["read_noise_dn"]), fitted)
 
 
 def test_a_twin_looks_at_a_scene_and_is_calibrated_again(lab, night):
@@ -481,7 +449,11 @@ def test_a_twin_looks_at_a_scene_and_is_calibrated_again(lab, night):
     run = open_run(lab.folder / "run.zarr")
     image = np.linspace(0.2, 1.5, N).reshape(SHAPE)
     np.save(lab.folder / "scene.npy", image)
-    lab.ok("twin", "run.zarr", "--output", "scene.yaml", "--scene", "scene.npy", "--frames", "600")
+    said = lab.ok("twin", "run.zarr", "--output", "scene.yaml", "--scene", "scene.npy", "--frames", "600")
+    assert said.stdout.split() == ["scene.yaml", "scene_maps.npz"]
+    assert lab("twin", "run.zarr", "--output", "scene.yaml").code == 2
+    with np.load(lab.folder / "scene_maps.npz") as maps:
+        assert maps["defect"][3, 5] == 3
     lab.ok("simulate", "scene.yaml", "--quiet")
     found = run.apply(lab.folder / "scene_frames", lab.folder / "scene_applied.zarr", what="exposure")
     good = found.quality.values == 0

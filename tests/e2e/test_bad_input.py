@@ -1,14 +1,11 @@
 """Bad input: one line with what, where and the cure, its exit code, and nothing lost."""
 
-import os
 import shutil
 import subprocess
 
-import h5py
 import numpy as np
 import pytest
 import tifffile
-from astropy.io import fits
 from helpers.commands import RUN
 
 from pchem_pipeline.model.fit.status import FitStatus
@@ -28,102 +25,28 @@ def _longer(frames):
     return np.random.default_rng(3).permuted(np.tile(frames, (10, 1, 1)), axis=0)
 
 
-def tiff(path, data=GOOD, **options):
-    tifffile.imwrite(path, data, photometric=options.pop("photometric", "minisblack"), **options)
-
-
-def truncated(path, write):
-    write(path)
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) * 2 // 3])
-
-
-def write_hdf5(path, data=GOOD):
-    with h5py.File(path, "w") as file:
-        file["data"] = data
+def tiff(path, data=GOOD):
+    tifffile.imwrite(path, data, photometric="minisblack")
 
 
 CASES = {
-    "missing folder": ("nowhere", lambda p: None, 4, "does not exist"),
-    "empty folder": ("d", lambda p: (p / "d").mkdir(), 4, ""),
-    "mixed shapes": ("*.tif", lambda p: (tiff(p / "a.tif"), tiff(p / "b.tif", GOOD[:, :4])), 4, "b.tif"),
-    "mixed types": ("*.tif", lambda p: (tiff(p / "a.tif"), tiff(p / "b.tif", GOOD.astype("u1"))), 4, "b.tif"),
-    "duplicates": ("*.tif", lambda p: (tiff(p / "a.tif"), tiff(p / "b.tif")), 4, "b.tif"),
-    "truncated tiff": ("a.tif", lambda p: truncated(p / "a.tif", tiff), 4, "a.tif"),
-    "truncated fits": (
-        "a.fits",
-        lambda p: truncated(p / "a.fits", lambda q: fits.writeto(q, GOOD)),
-        4,
-        "a.fits",
-    ),
-    "truncated hdf5": ("a.h5", lambda p: truncated(p / "a.h5", write_hdf5), 4, "a.h5"),
-    "truncated npy": ("a.npy", lambda p: truncated(p / "a.npy", lambda q: np.save(q, GOOD)), 4, "a.npy"),
-    "raw without shape": ("a.raw", lambda p: (p / "a.raw").write_bytes(bytes(100)), 4, "shape"),
-    "not an image": ("a.tif", lambda p: (p / "a.tif").write_bytes(b"hello"), 4, "a.tif"),
-    "empty file": ("a.tif", lambda p: (p / "a.tif").touch(), 4, "a.tif"),
-    "float": ("a.npy", lambda p: np.save(p / "a.npy", GOOD / 2), 4, "float64"),
-    "signed negative": ("a.npy", lambda p: np.save(p / "a.npy", GOOD.astype("i2") - 100), 4, "int16"),
-    "colour": (
-        "a.tif",
-        lambda p: tiff(p / "a.tif", np.zeros((40, 8, 9, 3), "u1"), photometric="rgb"),
-        4,
-        "a.tif",
-    ),
-    "pickle": (
-        "a.npy",
-        lambda p: np.save(p / "a.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True),
-        4,
-        "object",
-    ),
-    "one frame": ("a.npy", lambda p: np.save(p / "a.npy", GOOD[:1]), 4, "frame"),
-    "no frames": ("a.npy", lambda p: np.save(p / "a.npy", GOOD[:0]), 4, "frame"),
+    "missing folder": ("nowhere", lambda p: None, "does not exist"),
+    "mixed shapes": ("*.tif", lambda p: (tiff(p / "a.tif"), tiff(p / "b.tif", GOOD[:, :4])), "b.tif"),
+    "not an image": ("a.tif", lambda p: (p / "a.tif").write_bytes(b"hello"), "a.tif"),
 }
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.replace(" ", "-"))
 def test_bad_files_are_one_clear_line(shell, case):
-    name, make, code, word = CASES[case]
+    name, make, word = CASES[case]
     make(shell.folder)
     files = sorted(shell.folder.glob(name)) if "*" in name else [shell.folder / name]
     result = shell("run", *files, "--quiet")
-    assert result.code == code, result.stderr
+    assert result.code == 4, result.stderr
     assert word in result.last
     assert result.stderr.startswith("pchem: ")
     assert result.stderr.count("\n") == 1
     assert result.stdout == ""
-
-
-def test_bad_files_can_be_skipped(shell):
-    tiff(shell.folder / "a.tif", _longer(GOOD))
-    tiff(shell.folder / "b.tif", GOOD[:, :4])
-    (shell.folder / "c.tif").write_bytes(b"no image")
-    (shell.folder / "run.yaml").write_text("input: {files: ['*.tif'], on_bad_file: skip}\n")
-    result = shell("ingest", "run.yaml")
-    assert result.code == 0
-    assert "b.tif" in result.stderr
-    assert "c.tif" in result.stderr
-
-
-def test_degenerate_pixels_get_a_word_and_stop_nothing(shell):
-    rng = np.random.default_rng(8)
-    stack = np.rint(rng.poisson(2, (3000, 8, 8)) * 10 + rng.normal(100, 3, (3000, 8, 8))).astype(np.uint16)
-    stack[:, 0, 0] = 100
-    stack[:, 0, 1] = rng.integers(100, 102, 3000)
-    stack[:, 0, 2] = 16383
-    stack[:, 0, 3] = 0
-    stack[:, 0, 4] = np.minimum(stack[:, 0, 4], 120)
-    np.save(shell.folder / "a.npy", stack)
-    np.save(shell.folder / "mask.npy", np.arange(64).reshape(8, 8) // 8 == 7)
-    shell.ok("run", "a.npy", "--bit-depth", "14", "--until", "fit", "--mask", "mask.npy", "--frames", "5:")
-    store = RunStore.open(shell.folder / "run.zarr")
-    words, gain = store.read("fit/fit_status"), store.read("fit/conversion_gain")
-    assert (words[0, :5] != 0).all()
-    assert np.isnan(gain[0, [0, 1, 2, 3]]).all()
-    assert np.isfinite(gain[1:7]).all()
-    assert (words[1:7] == 0).mean() > 0.8
-    assert (words[7] == FitStatus.EXCLUDED).all()
-    assert np.isnan(gain[7]).all()
-    assert store.read("histogram/counts")[1, 1].sum() == 2995
 
 
 def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell):
@@ -132,7 +55,13 @@ def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell):
     stack[:, :3] = 100
     np.save(shell.folder / "a.npy", stack)
     np.save(shell.folder / "mask.npy", np.repeat([[1.0], [0.0]], [3, 5], axis=0).repeat(8, axis=1))
-    shell.ok("run", "a.npy", "--mask", "mask.npy", "--store", "masked.zarr", "--until", "fit")
+    options = ("--mask", "mask.npy", "--frames", "5:", "--store", "masked.zarr")
+    shell.ok("run", "a.npy", *options, "--until", "fit")
+    store = RunStore.open(shell.folder / "masked.zarr")
+    left_out = np.arange(8)[:, None] < 3
+    assert ((store.read("fit/fit_status") == FitStatus.EXCLUDED) == left_out).all()
+    assert (np.isnan(store.read("fit/conversion_gain")) == left_out).all()
+    assert store.read("histogram/counts")[4, 4].sum() == 1995
     (shell.folder / "run.yaml").write_text(OF_ONE_FILE)
     result = shell("run", "run.yaml")
     assert result.code == 3
@@ -150,30 +79,6 @@ def test_all_pixels_failed_is_exit_code_3_that_no_retry_is_asked_for(shell):
     assert "warning: no pixel has a value, so there is no ensemble" in result.stderr
     assert (shell.folder / "run.zarr" / "report.html").exists()
     assert {line.split()[1] for line in shell.ok("status", "run.yaml").stdout.splitlines()} == {"complete"}
-
-
-def test_a_corrupt_chunk_is_named_and_its_tile_made_again(shell, frames):
-    (shell.folder / "run.yaml").write_text(RUN)
-    shell.ok("ingest", "run.yaml")
-    shell.ok("histogram", "run.yaml")
-    chunk = shell.folder / "run.zarr" / "histogram" / "counts" / "c" / "1" / "1" / "0"
-    content = bytearray(chunk.read_bytes())
-    content[len(content) // 2] ^= 1
-    chunk.write_bytes(content)
-    result = shell("fit", "run.yaml")
-    assert result.code == 4
-    assert "histogram/counts is missing or has changed; run it again: pchem histogram" in result.last
-    shell.ok("histogram", "run.yaml", "--tiles", "1.1", "--force")
-    shell.ok("fit", "run.yaml")
-
-
-def test_another_schema_version_is_refused(shell, frames):
-    (shell.folder / "run.yaml").write_text(RUN)
-    shell.ok("ingest", "run.yaml")
-    RunStore.open(shell.folder / "run.zarr", writable=True)._root.attrs["pchem_schema"] = 7
-    result = shell("run", "run.yaml")
-    assert result.code == 4
-    assert "schema version 7" in result.last
 
 
 @pytest.mark.parametrize("bad", ["empty", "twice", "none"])
@@ -226,20 +131,6 @@ def test_a_stage_that_cannot_read_its_input_keeps_what_it_made(shell, frames):
     (shell.folder / "run.yaml").write_text(text)
     again = shell.ok("run", "run.yaml", "--until", "fit")
     assert "histogram: up to date" in again.stderr
-
-
-def test_changed_camera_files_make_the_run_stale(shell, frames):
-    (shell.folder / "run.yaml").write_text(RUN)
-    shell.ok("ingest", "run.yaml")
-    path = sorted(frames.glob("*.tif"))[0]
-    data = tifffile.imread(path)
-    data[0, 0, 0] += 1
-    tiff(path, data)
-    rows = shell.ok("status", "run.yaml").stdout
-    assert "ingest      stale - the input has changed" in rows
-    os.utime(sorted(frames.glob("*.tif"))[1])
-    shell.ok("ingest", "run.yaml")
-    assert "ingest      complete" in shell.ok("status", "run.yaml").stdout
 
 
 @pytest.fixture
@@ -355,5 +246,3 @@ def test_usage_errors_are_exit_code_2(shell):
     assert shell("fit").code == 2
     assert shell("no-such-command").code == 2
     assert shell("fit", "run.zarr", "--workers", "0").code == 2
-    (shell.folder / "c.yaml").write_text("input: {files: [a], integration_time: 0}")
-    assert shell("run", "c.yaml").code == 2

@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from helpers.cluster import bytes_read, cluster_processes, counting_reads, signal_group, wait_for_marks
+from helpers.cluster import cluster_processes
 from helpers.commands import assert_same_results
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
@@ -106,52 +106,6 @@ def test_a_worker_over_its_memory_is_one_line_and_the_run_goes_on_to_the_same_bi
     assert "Traceback" not in killed.stderr
     shell.ok("fit", "run.yaml")
     assert_same_results(store, finished)
-
-
-NIGHT = """
-run: {store: NAME.zarr, tile: 8}
-input: {files: [night.npy], integration_time: 1.0, bit_depth: 14, mode: reference}
-"""
-
-
-@pytest.mark.long
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize("by_bands", [False, True], ids=["one pass", "bands"])
-def test_four_workers_of_which_two_are_killed_and_one_is_paused(shell, tmp_path, by_bands):
-    rng = np.random.default_rng(14)
-    electrons = rng.poisson(1.5, (6000, 64, 64)) + 0.3 * rng.standard_normal((6000, 64, 64))
-    np.save(shell.folder / "night.npy", np.rint(100 + 8 * electrons).astype(np.uint16))
-    for name in ("quiet", "night"):
-        (shell.folder / f"{name}.yaml").write_text(NIGHT.replace("NAME", name))
-    shell.ok("run", "quiet.yaml", "--until", "ensemble")
-    reads = tmp_path / "reads"
-    shell.environment |= counting_reads(tmp_path / "counting", reads, "night.npy")
-    shell.environment["DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL"] = "20s"
-    limit = ("--memory-limit", "2GB")
-    store = shell.folder / "night.zarr"
-    with cluster_processes(tmp_path, 4, *limit, environment=shell.environment) as (file, started):
-        _, first, second, third, _ = started
-        text = (shell.folder / "night.yaml").read_text()
-        text += f"compute: {{backend: distributed, scheduler: '{file}', workers: 2}}\n"
-        (shell.folder / "night.yaml").write_text(text)
-        if by_bands:  # as without the memory for the histograms of the whole sensor
-            shell.ok("ingest", "night.yaml")
-        with shell.start("run", "night.yaml", "--until", "ensemble", "--quiet") as process:
-            wait_for_marks(store, "fit", 6)
-            signal_group(first, signal.SIGKILL)
-            signal_group(third, signal.SIGSTOP)
-            wait_for_marks(store, "fit", 30)
-            signal_group(second, signal.SIGKILL)
-            _, words = process.communicate(timeout=900)
-        assert process.returncode == 0, words
-        assert_same_results(shell.folder / "quiet.zarr", store)
-        signal_group(third, signal.SIGCONT)  # it may still do what it had begun
-        time.sleep(5)
-        assert_same_results(shell.folder / "quiet.zarr", store)
-    size = (shell.folder / "night.npy").stat().st_size
-    # once, hash and all; or for the hash, and by workers, each its own rows
-    times = sum(bytes_read(reads).values()) / size
-    assert abs(times - (2.0 if by_bands else 1.0)) < 0.15, times
 
 
 class Counted:

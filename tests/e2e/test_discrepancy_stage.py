@@ -96,42 +96,6 @@ def test_the_fit_runs_with_the_extended_model_and_loses_its_bias(searched):
     assert abs(bias_after) < bias_before / 5
 
 
-def test_going_back_to_an_older_model_and_forth_gives_the_same_bits(searched, tmp_path):
-    shell, _, before = searched
-    other = Shell(tmp_path / "copy", shell.environment)
-    shutil.copytree(shell.folder, other.folder)
-    status = [" ".join(line.split()) for line in other.ok("status", "run.yaml").stdout.splitlines()]
-    assert "fit complete (with model 2)" in status
-    assert "discrepancy complete (searched from model 1)" in status
-    listed = other.ok("model", "run.yaml").stdout.splitlines()
-    assert listed[1].split() == ["1", "config", "discrepancy", "plain", "model"]
-    assert listed[2].startswith("* 2 ")
-    assert "plain model + row_noise 1.2" in listed[2]
-    beside = other.folder / "run.effects.yaml"
-    after, text = read(other, "fit/read_noise_dn"), beside.read_text()
-    words = other.ok("model", "run.yaml", "--use", "1").stdout
-    assert "stale: fit; to update: pchem run" in words
-    assert not beside.exists()
-    assert "fit         stale - model 2 -> 1  (with model 2)" in other.ok("status", "run.yaml").stdout
-    other.ok("run", "run.yaml", "--until", "fit")
-    assert np.array_equal(read(other, "fit/read_noise_dn"), before, equal_nan=True)
-    # a search that is up to date is asked for what it named, and nothing is searched again
-    again = other.ok("discrepancy", "run.yaml")
-    assert "discrepancy: up to date" in again.stderr
-    assert "model 2 is now in use" in again.stderr
-    assert beside.read_text() == text
-    assert np.array_equal(read(other, "fit/read_noise_dn"), after, equal_nan=True)
-
-
-def test_a_second_search_has_nothing_to_do(searched):
-    shell, _, _ = searched
-    again = shell.ok("discrepancy", "run.yaml", "--no-refit")
-    assert "up to date" in again.stderr
-    assert "discrepancy complete" in " ".join(shell.ok("status", "run.yaml").stdout.split())
-    dry = shell.ok("discrepancy", "run.yaml", "--dry-run")
-    assert "nothing to do" in dry.stderr
-
-
 def test_a_search_ends_at_its_limit_and_goes_further_with_a_higher_one(fitted, tmp_path):
     shell = copy_of(fitted, tmp_path)
     result = shell.ok("discrepancy", "run.yaml", "--no-refit", "--effort", "0.0001")
@@ -169,44 +133,6 @@ def test_a_killed_search_goes_on_to_the_same_verdict(searched, fitted, tmp_path,
     other.ok("discrepancy", "run.yaml", "--no-refit")
     assert verdict(other) == verdict(shell)
     assert (tmp_path / "run.yaml").read_text() == CAMERA  # --no-refit leaves the model alone
-
-
-def test_effects_beside_one_that_is_no_candidate_are_named_in_part_and_a_killed_search_goes_on(
-    kernels, tmp_path
-):
-    """Sets of effects, and what is measured beside them: stacks of many models, each under its own name."""
-    hidden = "{tag: row_noise, row_noise_dn: 1.2}"
-    others = "{tag: frame_noise, frame_noise_dn: 0.8}, {tag: exposure_flicker, rms: 0.05}"
-    text = CAMERA.replace(hidden, f"{hidden}, {others}").replace("[16, 16]", "[12, 12]")
-    shell = Shell(tmp_path / "whole", {**os.environ, "NUMBA_CACHE_DIR": kernels})
-    shell.folder.mkdir()
-    # a third one, that is not there, to be asked for beside the others
-    text = text.replace("[row_noise, frame_noise]", "[row_noise, frame_noise, column_noise]")
-    (shell.folder / "run.yaml").write_text(text.replace("1800", "1000"))
-    shell.ok("simulate", "run.yaml")
-    shell.ok("run", "run.yaml", "--until", "fit")
-    other = copy_of(shell, tmp_path / "killed")
-    shell.ok("discrepancy", "run.yaml", "--no-refit")
-    found = verdict(shell)
-    # what flickers is no candidate: noise of frames may be named, or described with it
-    assert found["verdict"] in ("named_in_part", "described")
-    assert {"row_noise"} <= set(found["effects"]) <= {"row_noise", "frame_noise"}
-    noise = next(s["parameters"]["row_noise_dn"] for s in found["steps"] if s["effect"] == "row_noise")
-    assert abs(noise["value"] - 1.2) < 5 * noise["stderr"] + 0.05 * 1.2
-
-    markers = other.folder / "run.zarr" / ".pchem" / "done" / "discrepancy"
-
-    def several_sets():
-        return len({path.name.split("-")[2] for path in markers.glob("*/grown-null-*")}) > 4
-
-    with other.start("discrepancy", "run.yaml", "--no-refit") as process:
-        while process.poll() is None and not several_sets():
-            time.sleep(0.02)
-        process.kill()
-    assert several_sets()
-    assert not (other.folder / "run.zarr" / "discrepancy.json").exists()
-    other.ok("discrepancy", "run.yaml", "--no-refit")
-    assert verdict(other) == found
 
 
 @pytest.mark.parametrize(

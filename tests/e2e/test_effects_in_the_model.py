@@ -88,15 +88,6 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     return path, before
 
 
-def test_a_change_of_the_model_makes_the_fit_stale_and_nothing_before_it(both) -> None:
-    path, before = both
-    assert before["states"]["histogram"] == "complete"
-    assert before["states"]["fit"] == "stale - model 1 -> 2"
-    for stage in ("maps", "ensemble"):
-        assert before["states"][stage].startswith("stale")
-    assert set(states(path).values()) == {"complete"}
-
-
 def test_bias_is_cut_at_least_five_times_where_it_was_significant(both) -> None:
     path, before = both
     after = mean_pulls(RunStore.open(path.parent / "run.zarr"))
@@ -161,14 +152,6 @@ def test_electron_numbers_err_as_often_as_predicted(both) -> None:
     assert rate <= old["error_rate"] + stderr
 
 
-def test_report_names_the_model(both) -> None:
-    path, _ = both
-    words = "PCD + signal_dependent_noise + row_noise + nonlinearity"
-    html = (path.parent / "run.zarr/report.html").read_text()
-    assert f"model {words}" in html
-    assert words in (path.parent / "run.zarr/report.json").read_text()
-
-
 def test_the_inspector_holds_the_law_of_the_extended_model(both) -> None:
     store = RunStore.open(both[0].parent / "run.zarr")
     pixel = RunView(store).answer("GET", "/api/pixel?y=3&x=4", {"host": "127.0.0.1:1"}, 1)
@@ -187,16 +170,6 @@ def test_the_inspector_holds_the_law_of_the_extended_model(both) -> None:
     assert facts["model"].startswith("PCD + ")
     assert facts["sample"]["deciding"]
     assert facts["sample"]["masses"] == 300
-
-
-def test_tiles_do_not_change_the_extended_fit(both, tmp_path: Path) -> None:
-    path, _ = both
-    store = RunStore.open(path.parent / "run.zarr")
-    other = configured(tmp_path, EFFECTS, tile=32)
-    run_stages(find_run(other), ["simulate", "ingest", "histogram", "fit"], QUIET)
-    again = RunStore.open(tmp_path / "run.zarr")
-    for name in (*PARAMETERS, "correlation", "fit_status", *FREE_SATELLITES):
-        np.testing.assert_array_equal(again.read(f"fit/{name}"), store.read(f"fit/{name}"), err_msg=name)
 
 
 def test_back_to_the_plain_model_is_back_to_the_plain_fit(both) -> None:

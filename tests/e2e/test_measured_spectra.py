@@ -92,10 +92,3 @@ def test_the_search_names_what_physics_says_and_describes_the_rest(measured):
     shell.ok("fit", "sipm.yaml")
     after = store.read("fit/read_noise_dn")
     assert (after < 0.9 * before).all()
-
-
-def test_electron_numbers_need_frames(shell):
-    shell.ok("run", SPECTRA[0], "--store", "sipm.zarr", "--until", "ensemble", "--quiet")
-    result = shell("electrons", "sipm.zarr")
-    assert result.code in (2, 4)
-    assert "histograms" in result.last

@@ -90,20 +90,3 @@ def test_samples_of_other_pixels_or_the_same_frames_are_refused(exposures):
     refused = exposures("methods", "bright.zarr", "--with", "again.zarr", "--quiet")
     assert refused.code == 4
     assert "has the same frames as bright.zarr" in refused.last
-
-
-def test_plan_answers_at_once_and_checks_itself(shell):
-    options = ("--read-noise", "0.3", "--exposure", "2", "--target", "conversion_gain=1%")
-    result = shell.ok(
-        "plan", *options, "--json", "plan.json", "--figure", "plan.png", "--verify", "--pixels", "200"
-    )
-    content = json.loads((shell.folder / "plan.json").read_text())
-    assert f"{content['frames']:,.0f} frames" in result.stdout
-    assert "charge_rate" in result.stdout
-    assert "dark_current" not in result.stdout  # the same number
-    assert content["verified"][0]["checks"][0]["rmse"] == pytest.approx(0.01, rel=5 / np.sqrt(400))
-    assert (shell.folder / "plan.png").read_bytes().startswith(b"\x89PNG")
-    refused = shell("plan", "--read-noise", "2", "--exposure", "0.1", "--target", "conversion_gain=1%")
-    assert refused.code == 2
-    assert "not reached with" in refused.last
-    assert refused.stdout == ""

@@ -86,14 +86,3 @@ def test_a_plug_in_is_found_named_and_added_and_broken_ones_are_left_out(with_pl
     # from now on the fit knows it
     with_plugin.ok("histogram", "run.yaml")
     with_plugin.ok("fit", "run.yaml")
-
-
-def test_without_the_plug_in_nobody_else_is_blamed(shell, stack):
-    shutil.copytree(stack / "stack", shell.folder / "stack")
-    (shell.folder / "run.yaml").write_text(RUN.replace("CANDIDATES", RIVALS))
-    shell.ok("ingest", "run.yaml")
-    shell.ok("discrepancy", "run.yaml")
-    found = json.loads((shell.folder / "run.zarr" / "discrepancy.json").read_text())
-    assert found["effects"] == []
-    assert found["verdict"] == "described"
-    assert "alternating from frame to frame, from row to row, from column to column" in found["sentence"]

@@ -97,14 +97,3 @@ def test_the_shipped_demo_config_runs(shell):
     (shell.folder / "demo.yaml").write_text((ROOT / "configs" / "demo.yaml").read_text())
     shell.ok("run", "demo.yaml", "--quiet")
     assert (shell.folder / "demo.zarr" / "report.html").exists()
-
-
-def test_help_imports_nothing_heavy():
-    code = (
-        "import sys; sys.argv=['pchem','--help']\n"
-        "from pchem_pipeline.cli.app import main\n"
-        "try: main()\nexcept SystemExit: pass\n"
-        "heavy={'numpy','zarr','dask','numba','pydantic','scipy','matplotlib'} & set(sys.modules)\n"
-        "assert not heavy, heavy"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)

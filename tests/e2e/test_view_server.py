@@ -18,7 +18,6 @@ from helpers.packed_maps import unpack_map
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.commands.view import make_server
-from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.report.inspector.packing import PackedMap, Scale
 from pchem_pipeline.store.run_store import RunStore
 
@@ -272,17 +271,3 @@ def test_the_command_ends_well_with_ctrl_c(shell, finished):
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
     assert (process.returncode, out, err) == (0, "", "")
-
-
-def test_a_pixel_is_enough_to_draw_its_fit(client):
-    """The parameters predict the histogram: counts within five standard errors where many are expected."""
-    pixel = client.json("/api/pixel?y=5&x=5")
-    theta = [
-        pixel["values"][f"maps/{name}"]
-        for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
-    ]
-    counts = np.array(pixel["counts"])
-    expected = counts.sum() * pcd(pixel["origin"] + np.arange(counts.size), *theta)
-    pull = (counts - expected)[expected > 20] / np.sqrt(expected[expected > 20])
-    assert pull.size > 5
-    assert np.abs(pull).max() < 5

@@ -53,9 +53,9 @@ class Shell:
     environment: dict[str, str]
 
     @contextmanager
-    def start(self, *arguments, hears_ctrl_c: bool = True) -> Iterator[subprocess.Popen[str]]:
-        """Start the command as on a terminal, or as in the background of a script; leave none behind."""
-        with sigint(signal.default_int_handler if hears_ctrl_c else signal.SIG_IGN):
+    def start(self, *arguments) -> Iterator[subprocess.Popen[str]]:
+        """Start the command as on a terminal; leave none behind."""
+        with sigint(signal.default_int_handler):
             process = subprocess.Popen(
                 [PCHEM, *map(str, arguments)],
                 cwd=self.folder,

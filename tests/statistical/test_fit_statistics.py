@@ -1,22 +1,17 @@
-"""Estimates are unbiased, efficient, have honest errors, and sit at the right maximum."""
+"""Estimates sit at the right maximum, and gaps are those to the neighbours."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.bounds import cramer_rao
 from helpers.drawn_pixels import Drawn, draw
 from helpers.em_trace import em_trace
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
-from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.pcd import log_pcd
-
-N_PIXELS = 1500
-FIVE = 5.0
 
 
 def wrong(result: FitResult, truth: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -31,30 +26,6 @@ def drawn_in_range(
     rng = np.random.default_rng(seed)
     h = np.exp(rng.uniform(*np.log(exposure), n))
     return draw(rng, h, rng.uniform(8, 14, n), rng.uniform(*noise, n), rng.uniform(95, 105, n), **k)
-
-
-@pytest.mark.parametrize("case", [(0.1, 11.0, 0.2), (2.0, 9.0, 0.3), (9.0, 11.0, 0.35)])
-def test_pulls_and_efficiency(case: tuple[float, float, float]) -> None:
-    h, step, noise = case
-    pixels = draw(
-        np.random.default_rng(31), np.full(N_PIXELS, h), step, noise, np.linspace(100, 101, N_PIXELS)
-    )
-    result = fit_histograms(pixels.counts, pixels.origin)
-    error = result.columns - pixels.truth
-    stderr = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))
-    pulls = error / stderr
-    assert np.all(np.abs(pulls.mean(axis=0)) < FIVE / np.sqrt(N_PIXELS))
-    limit = FIVE * np.sqrt(2 / N_PIXELS)
-    assert np.all(np.abs(pulls.var(axis=0) - 1) < limit)
-    bound = np.sqrt(np.diagonal(cramer_rao(h, 1 / step, noise * step, 17_750)))
-    assert np.all(np.abs((error**2).mean(axis=0) / bound**2 - 1) < limit)
-    assert np.all(np.abs((pulls / 1.5).var(axis=0) - 1) > limit)  # standard errors off by half are seen
-    # correlations count: H/g, the signal in DN, is known better than H and g suggest
-    gradient = np.zeros((N_PIXELS, 4))
-    gradient[:, 0], gradient[:, 1] = 1 / pixels.truth[:, 1], -pixels.truth[:, 0] / pixels.truth[:, 1] ** 2
-    variance = np.einsum("ni,nij,nj->n", gradient, result.covariance, gradient)
-    signal_pull = (result.quanta_exposure / result.conversion_gain - h * step) / np.sqrt(variance)
-    assert abs(signal_pull.var() - 1) < limit
 
 
 def test_the_right_maximum_is_found_or_flagged() -> None:
@@ -82,19 +53,6 @@ def test_with_few_frames_no_answer_is_less_likely_than_the_truth() -> None:
     assert unflagged.mean() > 0.3
     # with the first starting point alone it happens to 8 of these pixels
     assert np.count_nonzero(gain[unflagged] < -1e-9) <= 1
-
-
-def test_plain_em_stays_at_a_bias_off_by_one_electron_and_the_fit_does_not() -> None:
-    pixels = draw(np.random.default_rng(34), 5.0, 11.0, 0.3)
-    h, g, mu, sigma = pixels.truth[0]
-    off = em_trace(pixels.counts[0], int(pixels.origin[0]), (h - 1, g, mu + 1 / g, sigma), 800)
-    right = em_trace(pixels.counts[0], int(pixels.origin[0]), (h, g, mu, sigma), 800)
-    assert abs(off.parameters[-1, 2] - mu) > 0.8 / g  # EM never leaves the wrong maximum
-    gap = right.log_likelihood[-1] - off.log_likelihood[-1]
-    assert gap > 20
-    result = fit_histograms(pixels.counts, pixels.origin)
-    assert result.bias[0] == pytest.approx(mu, abs=0.1 / g)
-    assert 30 < result.likelihood_gap[0] <= gap + 1
 
 
 def test_a_gap_below_thirty_is_that_to_the_polished_neighbour() -> None:
@@ -130,29 +88,6 @@ def test_a_large_expected_gap_is_that_to_the_polished_neighbour_but_for_some(
     assert result.n_iterations[0] < 8  # the neighbours were not visited
     assert gap > 80
     assert result.likelihood_gap[0] == pytest.approx(gap, rel=0.4)
-
-
-@pytest.mark.parametrize("case", [(2.0, 11.0, 0.3), (0.1, 9.0, 0.45), (6.0, 12.0, 0.6), (30.0, 9.0, 0.3)])
-def test_em_never_lowers_the_likelihood(case: tuple[float, float, float]) -> None:
-    pixels = draw(np.random.default_rng(36), *case)
-    rng = np.random.default_rng(37)
-    for _ in range(4):
-        start = pixels.truth[0] * np.exp(rng.normal(0, [0.4, 0.1, 0.01, 0.4]))
-        trace = em_trace(pixels.counts[0], int(pixels.origin[0]), start, 150).log_likelihood
-        slack = 1e-12 * np.abs(trace[0])
-        assert np.all(np.diff(trace) > -slack)
-        assert trace[-1] - trace[0] > 1e6 * slack  # a step that lowered it would be seen
-
-
-def test_plain_em_and_newton_agree() -> None:
-
-    pixels = drawn_in_range(38, 60, (0.2, 8), (0.2, 0.38))
-    newton = fit_histograms(pixels.counts, pixels.origin)
-    em = fit_histograms(pixels.counts, pixels.origin, settings=FitSettings(algorithm="em"))
-    stderr = np.sqrt(np.diagonal(newton.covariance, axis1=1, axis2=2))
-    np.testing.assert_allclose((em.columns - newton.columns) / stderr, 0, atol=3e-4)
-    np.testing.assert_array_equal(em.fit_status, newton.fit_status)
-    assert em.n_iterations.mean() > 2 * newton.n_iterations.mean()
 
 
 def test_starting_points_are_near_where_they_should_be() -> None:

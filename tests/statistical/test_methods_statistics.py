@@ -9,7 +9,6 @@ import pytest
 from pchem_pipeline.methods.base import PixelSamples, Sample, Settings
 from pchem_pipeline.methods.photon_transfer import gain_variance
 from pchem_pipeline.methods.registry import methods
-from pchem_pipeline.methods.study import StudyPoint, study_point
 from pchem_pipeline.model.errors.expected_information import (
     expected_information,
     inverse_information,
@@ -57,20 +56,6 @@ def test_photon_transfer_errs_as_the_delta_method_says(noise):
     assert_sd(sigma, np.sqrt(1 / (2 * N)))
 
 
-def test_photon_transfer_takes_electrons_in_the_dark_sample_for_noise():
-    """The gain stays right, the read noise takes up the variance of the dark sample's electrons."""
-    given, truth = pixels((4.0, 0.5), 0.3, 500)
-    errors, found = log_errors("photon_transfer", given, truth)
-    variance = gain_variance(4.0, 0.5, 0.3, N, N)
-    assert_sd(errors, np.sqrt(variance))
-    assert_mean_zero(errors, variance)
-    ratio = found[:, 3] / truth[:, 3]
-    expected = np.sqrt(1 + 0.5 / 0.3**2)
-    spread = ratio.std(ddof=1) / np.sqrt(ratio.size)
-    assert abs(ratio.mean() - expected) < 5 * spread + 1e-3
-    assert ratio.mean() - 1 > 20 * spread
-
-
 def test_a_series_knows_the_gain_at_least_as_well_as_its_ends():
     lights = (6.0, 0.0, 1.5, 3.0)
     given, truth = pixels(lights, 0.6, 1500)
@@ -110,38 +95,11 @@ def test_likelihood_with_a_dark_sample_beats_photon_transfer_and_no_bound(exposu
         assert errors.std(ddof=1) < 0.5 * transfer
 
 
-def test_electrons_in_the_dark_sample_spoil_its_likelihood():
-    """With half an electron in it, mu is half an electron too high and every electron is placed wrong."""
-    given, truth = pixels((2.0, 0.5), 0.3, 200)
-    _, found = log_errors("dark_and_bright_mle", given, truth)
-    shift = (found[:, 2] - truth[:, 2]) * GAIN
-    spread = shift.std(ddof=1) / np.sqrt(shift.size)
-    assert abs(shift.mean() - 0.5) < 5 * spread
-    assert shift.mean() > 20 * spread
-
-
-def test_joint_likelihood_reaches_the_joint_bound():
-    given, truth = pixels((4.0, 0.0), 0.6, 400)
-    errors, _ = log_errors("pchem_em_joint", given, truth)
-    shared = N * (shared_information(4.0, 0.6) + shared_information(0.0, 0.6))
-    assert errors.size == 400
-    assert_sd(errors, np.sqrt(inverse_information(shared)[0, 0]))
-    assert_mean_zero(errors, errors.var())
-
-
-def test_plain_em_is_the_maximum_below_and_short_of_it_above():
+def test_plain_em_ends_at_the_maximum():
     given, truth = pixels((2.0,), 0.25, 200)
     plain, _ = log_errors("plain_em", given, truth, Settings(em_tolerance=1e-9))
     full, _ = log_errors("pchem_em", given, truth)
     np.testing.assert_allclose(plain, full, atol=1e-5)
-    given, truth = pixels((2.0,), 0.5, 200, n_frames=20_000)
-    plain, _ = log_errors("plain_em", given, truth, Settings(em_iterations=200))
-    full, _ = log_errors("pchem_em", given, truth)
-    bound = np.sqrt(inverse_information(20_000 * expected_information(2.0, 0.5))[1, 1])
-    root = np.sqrt(np.mean(plain**2))
-    # 200 steps leave most of the way: the error falls by 1e6 in 5,000 of them
-    assert root > 2 * np.sqrt(np.mean(full**2))
-    assert abs(plain.mean()) > 20 * bound / np.sqrt(plain.size)
 
 
 def expected_sample(exposure, noise, total=4_000_000_000):
@@ -171,16 +129,6 @@ def test_peaks_give_gain_and_noise_where_they_are_resolved():
     assert abs(errors.mean() - limits[0.2][0]) < 5 * errors.std(ddof=1) / np.sqrt(400) + 1e-3
     bound = np.sqrt(inverse_information(N * expected_information(2.0, 0.2))[1, 1])
     assert errors.std(ddof=1) > bound
-
-
-def test_the_lowest_peak_seen_need_not_be_that_of_no_electron():
-    """At H = 10 empty frames are one in 22,000: gain right, bias off by whole electrons."""
-    given, truth = pixels((10.0,), 0.2, 100)
-    errors, found = log_errors("peak_valley", given, truth)
-    off = (found[:, 2] - truth[:, 2]) * GAIN
-    assert np.abs(errors).max() < 0.01
-    assert (off > 0.8).all()
-    assert np.abs(off - np.rint(off)).max() < 0.1
 
 
 def cumulant_sd(exposure, noise, n_frames):
@@ -215,17 +163,3 @@ def test_cumulants_are_for_few_electrons():
     errors, _ = log_errors("cumulants", given, truth)
     bound = np.sqrt(inverse_information(N * expected_information(8.0, 0.3))[1, 1])
     assert np.sqrt(np.mean(errors**2)) > 50 * bound
-
-
-def test_one_sample_wins_below_half_an_electron_and_loses_above():
-    """The figure's message, by the bound and by the methods themselves, with as many frames for both."""
-    for noise, better in ((0.4, "pchem_em"), (0.65, "photon_transfer")):
-        found = study_point(StudyPoint(noise, 2.0, GAIN, N, 200, 7), Settings(em_iterations=50))
-        rmse = {n: m["errors"]["conversion_gain"]["rmse"] for n, m in found["methods"].items()}
-        worse = {"pchem_em": "photon_transfer", "photon_transfer": "pchem_em"}[better]
-        # rms errors of 200 pixels are known to 5 %; the difference sought is more than five of these
-        assert rmse[worse] > 1.35 * rmse[better]
-        bounds = found["bounds"]
-        assert (bounds["one sample"] < bounds["photon_transfer"]) == (better == "pchem_em")
-        assert rmse["pchem_em"] > bounds["one sample"] * (1 - 5 / np.sqrt(400))
-        assert "emva1288" not in rmse

@@ -15,7 +15,6 @@ from scipy import stats
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.streams import make_key, to_words, uniform_pair
 from pchem_pipeline.simulate.truth import TruthMaps
 
 FALSE_ALARM = 6e-7
@@ -63,68 +62,6 @@ def test_frames_have_the_exact_mass_of_the_model(h, dn_per_electron, mu, sigma, 
     full = expected >= 20
     chi2 = ((counts - expected)[full] ** 2 / expected[full]).sum()
     assert stats.chi2.sf(chi2, full.sum()) > FALSE_ALARM
-
-
-def test_uniforms_are_uniform():
-    words = (to_words(np.arange(n)) for n in (64, 128, 128))
-    for numbers in uniform_pair(make_key(33, "check"), *words):
-        assert stats.kstest(numbers.ravel(), "uniform").pvalue > FALSE_ALARM
-        assert stats.kstest(numbers.ravel() ** 1.02, "uniform").pvalue < 1e-20
-
-
-def pairs() -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Pairs of uniforms that have to be independent, a million each."""
-    words = [to_words(np.arange(n)) for n in (65, 128, 128)]
-    u, v = uniform_pair(make_key(34, "check"), *words)
-    other = uniform_pair(make_key(34, "other"), *words)[0]
-    seed = uniform_pair(make_key(35, "check"), *words)[0]
-    draw = uniform_pair(make_key(34, "check"), *words, draw=1)[0]
-    return {
-        "frames": (u[1:], u[:-1]),
-        "rows": (u[:, 1:], u[:, :-1]),
-        "columns": (u[:, :, 1:], u[:, :, :-1]),
-        "halves": (u, v),
-        "purposes": (u, other),
-        "seeds": (u, seed),
-        "draws": (u, draw),
-        "a number and itself": (u, u),
-        "a number and a slightly mixed one": (u, np.where(v < 0.06, u, other)),
-    }
-
-
-def test_numbers_are_independent_across_all_that_they_are_keyed_on():
-    for name, (a, b) in pairs().items():
-        cells = np.bincount((np.floor(16 * a) * 16 + np.floor(16 * b)).astype(int).ravel(), minlength=256)
-        expected = a.size / 256
-        p_cells = stats.chi2.sf(((cells - expected) ** 2 / expected).sum(), 255)
-        z = np.corrcoef(a.ravel(), b.ravel())[0, 1] * np.sqrt(a.size)
-        if name.startswith("a number"):
-            assert abs(z) > 20, name
-            assert p_cells < 1e-30, name
-        else:
-            assert abs(z) < 5, name
-            assert p_cells > FALSE_ALARM, name
-
-
-def correlation_z(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1] * np.sqrt(a.size))
-
-
-def test_samples_are_independent_in_time_and_space_and_row_noise_is_seen():
-    def residual(effects):
-        settings = SimulateSettings(shape=(40, 64), n_frames=200, seed=5, effects=effects)
-        truth = identical_pixels(settings.shape, 1.0, 0.1, 100.0, 0.3)
-        return simulate_block(truth, settings, (0, 200))[0] - (100.0 + 10.0)
-
-    r = residual([])
-    noisy = residual([{"tag": "row_noise", "row_noise_dn": 3.0}])
-    for a, b in ((r[1:], r[:-1]), (r[:, 1:], r[:, :-1]), (r[..., 1:], r[..., :-1])):
-        assert abs(correlation_z(a, b)) < 5
-    assert correlation_z(noisy[..., 1:], noisy[..., :-1]) > 20
-    assert abs(correlation_z(noisy[1:], noisy[:-1])) < 5
-    # rows of a frame are drawn independently; pixels of a row share one number, so it counts once
-    means = noisy.mean(axis=2)
-    assert abs(correlation_z(means[:, 1:], means[:, :-1])) < 5
 
 
 def test_maps_have_the_distributions_and_rank_correlations_asked_for():

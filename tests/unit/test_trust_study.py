@@ -83,13 +83,3 @@ def test_runs_are_compared_with_what_was_simulated(tmp_path, monkeypatch):
     assert [each.split()[0] for each in bad["wrong"]] == ["quanta_exposure"]
     assert "| nothing | 2 | 0 | 0 | 1 |" in trust_study.run_table([good, bad])
     assert "| 0 | none | 0 |" in trust_study.odd_runs([good, bad])
-
-
-def test_the_block_of_a_page_is_replaced(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("a\n" + "\nold\n".join(trust_study.MARKS) + "\nb\n")
-    trust_study.write_docs(page, "new\n")
-    assert page.read_text() == "a\n" + "\nnew\n".join(trust_study.MARKS) + "\nb\n"
-    page.write_text("nothing")
-    with pytest.raises(SystemExit, match="no block"):
-        trust_study.write_docs(page, "new\n")

@@ -96,13 +96,6 @@ def test_run_from_camera_files_writes_the_yaml_that_it_uses(tmp_path, monkeypatc
         find_or_start(files, Path("out/my run.zarr"), {"integration_time": 2})
 
 
-def test_a_whole_folder_is_written_as_a_pattern(tmp_path):
-    for number in range(30):
-        (tmp_path / f"f{number}.tif").touch()
-    target, _ = find_or_start(sorted(tmp_path.glob("*.tif")), tmp_path / "run.zarr", {})
-    assert target.config.input.files == ("*.tif",)
-
-
 def test_options_for_camera_files_do_not_fit_a_yaml(tmp_path):
     with pytest.raises(ConfigError, match="--integration-time: only with camera files"):
         find_or_start([tmp_path / "c.yaml"], None, {"integration_time": 1})

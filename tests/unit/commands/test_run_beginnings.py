@@ -52,12 +52,6 @@ def test_what_files_do_not_say_of_themselves_has_an_option(tmp_path, monkeypatch
     assert RunStore.open(tmp_path / "run.zarr").read("histogram/origin").min() < 140
 
 
-def test_the_region_is_written_into_the_yaml(tmp_path, file):
-    target, _ = find_or_start([file], tmp_path / "run.zarr", {}, (0, 8, 8, 16))
-    assert load_config(tmp_path / "run.yaml") == target.config
-    assert target.config.input.roi == (0, 8, 8, 16)
-
-
 def test_a_dry_run_writes_no_yaml(tmp_path, file, monkeypatch):
     tifffile.imwrite(file, np.full((9, 8, 8), 100, np.uint16), photometric="minisblack")
     monkeypatch.chdir(tmp_path)
@@ -98,17 +92,6 @@ def test_a_folder_of_files_is_one_pattern_wherever_the_store_is(tmp_path, monkey
     with pytest.raises(ConfigError, match=r"input\.files .* in the file, .* here") as refused:
         find_or_start(files, Path("new/run.zarr"), {})
     assert len(str(refused.value)) < 700  # twice the path of the test
-
-
-def test_an_edited_yaml_is_never_replaced(tmp_path, file):
-    place = tmp_path / "run.zarr"
-    target, _ = find_or_start([file], place, {})
-    RunStore.create(place).write_config(dump_config(target.config))
-    edited = (tmp_path / "run.yaml").read_text().replace("bit_shift: null", "bit_shift: 4")
-    (tmp_path / "run.yaml").write_text(edited)
-    with pytest.raises(ConfigError, match="exists with other settings"):
-        find_or_start([file], place, {"bit_depth": 12})
-    assert (tmp_path / "run.yaml").read_text() == edited
 
 
 def test_the_same_command_goes_on_with_a_yaml_that_says_more(tmp_path, file, monkeypatch):

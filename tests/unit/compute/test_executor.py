@@ -12,7 +12,6 @@ import pytest
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
 from pchem_pipeline.compute import executor as executor_module
-from pchem_pipeline.compute.environment import available_workers, peak_rss_bytes
 from pchem_pipeline.compute.executor import SerialExecutor, Stop, beside, make_executor
 from pchem_pipeline.compute.memory import BASE_BYTES, affordable, keep_to_limit, resident_bytes
 from pchem_pipeline.compute.settings import ComputeSettings
@@ -224,11 +223,6 @@ def test_a_configuration_of_dask_that_is_malformed_is_one_line(tmp_path):
 def test_zero_workers_are_refused():
     with pytest.raises(ConfigError, match="workers"):
         make_executor(ComputeSettings(workers=0))
-
-
-def test_environment_is_measured():
-    assert 1 <= available_workers() <= (os.cpu_count() or 1)
-    assert peak_rss_bytes() > 10_000_000
 
 
 def take_too_much(number):

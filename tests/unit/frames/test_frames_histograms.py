@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.places import SIPM
 
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.histogram_files import HistogramInput, is_histogram_input, read_histograms
@@ -171,19 +170,6 @@ def test_what_is_a_histogram_input(tmp_path: Path) -> None:
     assert not kind(".")
     with pytest.raises(InputError, match="mixed"):
         kind("a.csv", "a.npy")
-
-
-def test_measured_spectra() -> None:
-    found = read(SIPM, "*.csv")
-    currents = ("1muA", "10muA", "25muA", "50muA", "100nA", "dark")
-    assert found.names == tuple(f"M11_LED_{current}" for current in currents)
-    for i, name in enumerate(found.names):
-        table = np.loadtxt(SIPM / f"{name}.csv", delimiter=",", skiprows=1, dtype=np.int64)
-        total = int(found.counts[0, i].sum())
-        assert total == table[:, 1].sum()
-        assert 9e6 < total < 2e7
-        dn = found.origin[0, i] + np.arange(found.counts.shape[2])
-        assert int((dn * found.counts[0, i].astype(np.int64)).sum()) == (table[:, 0] * table[:, 1]).sum()
 
 
 def test_tables_that_are_none(tmp_path: Path) -> None:

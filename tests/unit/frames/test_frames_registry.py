@@ -7,10 +7,7 @@ import bz2
 import gzip
 import importlib
 import lzma
-import os
 import re
-import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
@@ -157,28 +154,3 @@ def test_missing_library_is_named_with_what_installs_it(
         with pytest.raises(MissingDependencyError) as caught:
             action()
         assert re.search(rf"pip install '{library}>=[\d.]+'", str(caught.value))
-
-
-def test_a_real_package_beside_ours(tmp_path: Path) -> None:
-    """Another distribution, found on the path of a fresh process by its metadata alone."""
-    info = tmp_path / "site" / "textframes-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: textframes\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(
-        f"[{registry.ENTRY_POINT_GROUP}]\ntextframes = textframes_package:TextReader\n"
-    )
-    shutil.copy(__file__, tmp_path / "site" / "textframes_package.py")
-    (tmp_path / "a.txf").write_text("TEXTFRAMES\n1 2|3 4\n5 6|7 8\n")
-    code = (
-        "from pathlib import Path\n"
-        "from pchem_pipeline.frames.open import open_frames\n"
-        "from pchem_pipeline.frames.settings import InputSettings\n"
-        f"reader = open_frames(InputSettings(files=('a.txf',)), Path({str(tmp_path)!r}))\n"
-        "print(reader.read().ravel().tolist())"
-    )
-    paths = [str(tmp_path / "site"), *sys.path]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in paths if path)}
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
-    )
-    assert done.stdout.strip() == "[1, 2, 3, 4, 5, 6, 7, 8]"

@@ -216,11 +216,6 @@ def test_tiles_of_a_new_stage_leave_it_partial(make):
     assert execute("fit", make()).state == "complete"
 
 
-def test_unknown_tiles_are_refused(make):
-    with pytest.raises(ConfigError, match="no tile 9"):
-        execute("fit", make(tiles="9.9"))
-
-
 def test_unknown_tiles_are_refused_even_where_nothing_is_to_be_done(make):
     assert execute("fit", make()).state == "complete"
     for wrong in ({"tiles": "9.9"}, {"roi": (0, 9, 90, 99)}):
@@ -426,9 +421,3 @@ def test_record_keeps_what_was_used(make):
     assert record.peak_rss_bytes > 0
     text = json.dumps(record.content)
     assert str(context.store.path) not in text
-
-
-def test_json_log_has_one_object_a_line(make, tmp_path):
-    execute("fit", make())
-    events = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert {"start", "progress", "info"} <= {event["event"] for event in events}

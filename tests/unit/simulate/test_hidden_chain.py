@@ -1,8 +1,5 @@
 """The chain that hides effects: a plain stack obeys the PCD, each effect has the size that its key states."""
 
-import json
-import subprocess
-import sys
 from functools import cache
 
 import numpy as np
@@ -410,23 +407,6 @@ def test_lines_are_repeated_as_they_were_converted_in_whatever_order_they_are_hi
         share = hiding.effects[-1].strength
         assert seen[-1] == pytest.approx(share, abs=5 * np.sqrt(share / (100 * 19)))
     assert seen[0] == seen[1]
-
-
-def test_a_process_of_its_own_writes_the_stack_and_seals_the_key_elsewhere(tmp_path):
-    out = tmp_path / "stack"
-    small = ["--shape", "6", "5", "--frames", "30", "--seed", "3"]
-    command = [sys.executable, HIDDEN / "make.py", "--effect", "row_noise,clipping", "--out", out, *small]
-    subprocess.run([str(part) for part in command], check=True)
-    frames = np.load(out / "frames.npy")
-    assert frames.dtype == np.uint16
-    assert frames.shape == (30, 6, 5)
-    assert [path.name for path in out.iterdir()] == ["frames.npy"]
-    key = json.loads((tmp_path / "sealed" / "stack.json").read_text())
-    assert [effect["tag"] for effect in key["effects"]] == ["row_noise", "clipping"]
-    maps = np.load(tmp_path / "sealed" / "stack.npz")
-    assert maps["quanta_exposure"].shape == (6, 5)
-    again = hide(("row_noise", "clipping"), 4.0, 3, (6, 5), 30).frames
-    np.testing.assert_array_equal(frames, again)
 
 
 def test_the_chain_shares_no_code_with_the_package():

@@ -18,20 +18,6 @@ def test_giving_the_second_way_replaces_the_first():
     assert ParameterSettings.model_validate_json(parameters.model_dump_json()) == parameters
 
 
-def test_every_field_says_what_it_is():
-    def check(model):
-        for name, field in model.model_fields.items():
-            assert field.description, f"{model.__name__}.{name}"
-
-    from pchem_pipeline.simulate import distributions, settings
-
-    for module in (distributions, settings):
-        for name in dir(module):
-            found = getattr(module, name)
-            if isinstance(found, type) and hasattr(found, "model_fields"):
-                check(found)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [

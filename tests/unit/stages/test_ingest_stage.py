@@ -90,13 +90,6 @@ def test_copy(tmp_path: Path, small_chunks: None, backend: str) -> None:
     assert run(context).state == "complete"
 
 
-def test_copy_by_processes(tmp_path: Path) -> None:
-    write_stack(tmp_path / "cam")
-    context = make_context(tmp_path, executor=make_executor(ComputeSettings(backend="processes", workers=1)))
-    assert run(context).state == "complete"
-    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
-
-
 def test_copy_applies_region_range_and_shift(tmp_path: Path) -> None:
     (tmp_path / "cam").mkdir()
     np.save(tmp_path / "cam" / "a.npy", STACK << 4)

@@ -8,7 +8,6 @@ import pytest
 import xarray as xr
 
 from pchem_pipeline.base.errors import LockedError, StoreError
-from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.store.files import is_fatal, read_json, storage_error, write_json
 from pchem_pipeline.store.records import Records, StageRecord, fingerprint_of
 from pchem_pipeline.store.run_store import RunStore
@@ -240,10 +239,3 @@ def test_stage_record_survives_the_disk(tmp_path):
     assert records.read("fit") == record
     records.forget("fit")
     assert records.read("fit") is None
-
-
-def test_every_variable_is_described():
-    for path, variable in VARIABLES.items():
-        assert variable.path == path
-        assert variable.unit, path
-        assert len(variable.long_name) > 8, path

@@ -60,17 +60,6 @@ def test_the_expectation_is_unbiased_and_nearer_than_the_number(night):
     assert ((found.number[:, noisy].astype(int) - electrons[:, noisy]) ** 2).mean() > 1.15 * square
 
 
-def test_a_wrong_prior_errs_more_often(night):
-    camera, exposure, electrons, frames, found = night
-    calibration = camera.calibration()
-    noisy = camera.read_noise_e > 0.4
-    best = (found.number != electrons)[:, noisy].mean()
-    flat = converted(frames, None, calibration)
-    wrong = converted(frames, 20.0 * exposure, calibration)
-    assert (flat.number != electrons)[:, noisy].mean() > best
-    assert (wrong.number != electrons)[:, noisy].mean() > 1.2 * best
-
-
 def test_pixels_without_calibration_have_no_number():
     rng = np.random.default_rng(31)
     camera = KnownCamera.drawn(rng, (3, 4))

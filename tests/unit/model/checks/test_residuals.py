@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.counting_noise import counting_variance
 
 from pchem_pipeline.model.checks.residuals import (
     central_window,
@@ -29,15 +28,6 @@ def test_rmse_and_floor_use_the_window() -> None:
     data, model = np.array([9.0, 1.0, 2.0]), np.array([0.0, 1.0, 4.0])
     assert rmse(data, model, slice(1, 3)) == pytest.approx(np.sqrt(2.0))
     assert noise_floor(np.array([100.0, 1.0, 3.0]), slice(1, 3)) == pytest.approx(np.sqrt(2.0))
-
-
-def test_counting_variance_of_two_pixels() -> None:
-    p = np.array([[0.2, 0.8], [0.5, 0.5]])
-    variance = counting_variance(p.sum(axis=0), (p**2).sum(axis=0), 2, 10, width=0.5)
-    expected = [10 * (0.2 * 0.8 + 0.25) / (10 * 2 * 0.5) ** 2] * 2
-    np.testing.assert_allclose(variance, expected)
-    # a pixel that always gives the same DN adds no noise
-    np.testing.assert_allclose(counting_variance(np.ones(1), np.ones(1), 1, 10), [0.0])
 
 
 def test_normalised_residuals() -> None:

@@ -128,28 +128,6 @@ def test_moments_are_those_of_the_likelihood_of_each_pixel():
     assert (density[1] != exact[1]).all()
 
 
-def test_the_exact_maximum_is_that_of_scipy():
-    drawn = draw(np.random.default_rng(7), [1.5], 2.2, 0.33)
-    plain = fit_histograms(drawn.counts, drawn.origin)
-    mine = fit_histograms(drawn.counts, drawn.origin, settings=EXACT, start=plain)
-    c = drawn.counts[0]
-    x = drawn.origin[0] + np.flatnonzero(c)
-
-    def cost(p):
-        h, a, mu, noise = np.exp(p[0]), p[1], p[2], np.exp(p[3])
-        return -float(c[c > 0] @ np.log(pcd_mass(x, h, 1 / a, mu, noise)))
-
-    h, g, mu, sigma = drawn.truth[0]
-    start = [np.log(h), 1 / g, mu, np.log(g * np.sqrt(sigma**2 - 1 / 12))]
-    found = minimize(
-        cost, start, method="Nelder-Mead", options={"xatol": 1e-8, "fatol": 1e-8, "maxiter": 3000}
-    )
-    errors = np.sqrt(np.diagonal(mine.covariance[0]))
-    wanted = [np.exp(found.x[0]), 1 / found.x[1], found.x[2]]
-    assert (np.abs(stack(mine)[0, :3] - wanted) < 0.01 * errors[:3]).all()
-    assert mine.log_likelihood[0] == pytest.approx(-found.fun, abs=1e-3)
-
-
 def test_few_dn_per_electron_have_their_own_starts():
     drawn = draw(np.random.default_rng(1), np.full(8, 2.0), 1.2, 0.384)
     plain = fit_histograms(drawn.counts, drawn.origin, settings=DENSITY)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import pytest
 from helpers.drawn_pixels import draw, samples
@@ -16,7 +15,6 @@ from scipy.special import logsumexp
 from scipy.stats import norm, poisson
 
 from pchem_pipeline.model.arithmetic import simd_math_numba
-from pchem_pipeline.model.arithmetic.simd_numba import counting, least, most, simd_load, simd_store
 from pchem_pipeline.model.errors import algebra_numba
 from pchem_pipeline.model.fit import (
     climb_numba,
@@ -251,28 +249,6 @@ def test_far_values_have_the_density_of_the_nearest_component() -> None:
         k = np.arange(60)
         terms = poisson.logpmf(k, 1.0) + norm.logpdf(x[:, None], theta.bias + 11.0 * k, sigma)
         assert loglik == pytest.approx(logsumexp(terms, axis=1).sum(), rel=1e-10)
-
-
-def test_simd_are_the_functions_that_they_are_named_after(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(1)
-    table, plain = np.zeros((4, 2000)), np.zeros((4, 2000))
-
-    def fill(table: NDArray[np.float64]) -> None:
-        for i in range(0, table.shape[1], 8):
-            x = simd_load(table, 0, i)
-            simd_store(table, 1, i, simd_math_numba.simd_exp(x))
-            simd_store(table, 2, i, simd_math_numba.simd_log(simd_load(table, 1, i)))
-            simd_store(table, 3, i, most(least(x, 1.0), -2.0) - counting())
-
-    table[0] = rng.uniform(-690, 690, 2000)
-    plain[0] = table[0]
-    nb.njit(fill)(table)
-    take_plain_simd(monkeypatch)
-    fill(plain)
-    np.testing.assert_allclose(table[1], np.exp(table[0]), rtol=3e-15)
-    np.testing.assert_allclose(table[2], np.log(table[1]), rtol=1e-15, atol=1e-15)
-    np.testing.assert_array_equal(table[3], np.clip(table[0], -2, 1) - np.arange(2000) % 8)
-    np.testing.assert_allclose(plain, table, rtol=1e-14)
 
 
 def test_compiled_steps_equal_plain() -> None:

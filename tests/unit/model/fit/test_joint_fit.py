@@ -1,13 +1,13 @@
 """The joint fit against dense algebra, finite differences, plain numpy EM, iminuit and the single fit."""
 
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from helpers.bounds import cramer_rao
 from helpers.drawn_pixels import draw
 from helpers.em_trace import LIMITS, evaluated
-from helpers.joint_material import draw_series
 from helpers.reference_pchem import Theta, memberships
 from iminuit import Minuit
 
@@ -20,7 +20,7 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law import cells_numba
 from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood
-from pchem_pipeline.model.law.pcd import pcd, pcd_mass
+from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
     CENTRE,
@@ -39,6 +39,31 @@ from pchem_pipeline.model.law.pixel_numba import (
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 EXACT = FitSettings(likelihood="exact")
+
+
+class Drawn(NamedTuple):
+    """Histograms of J samples, and which of them are dark."""
+
+    counts: list
+    origins: list
+    dark: list
+
+
+def draw_series(rng, exposures, noise_e, n_pixels, *, step=10.0, bias=100.3, n_frames=4000):
+    """Draw n pixels at each exposure; an exposure of 0 is a sample without electrons."""
+    counts, origins = [], []
+    for exposure in exposures:
+        if exposure > 0:
+            drawn = draw(rng, np.full(n_pixels, exposure), step, noise_e, bias, n_frames)
+            counts.append(drawn.counts)
+            origins.append(drawn.origin)
+            continue
+        sd = np.sqrt((noise_e * step) ** 2 - 1 / 12)
+        codes = np.rint(bias + sd * rng.standard_normal((n_pixels, n_frames))).astype(np.int64)
+        low, width = codes.min(), int(np.ptp(codes)) + 1
+        counts.append(np.stack([np.bincount(row - low, minlength=width) for row in codes]).astype(np.uint32))
+        origins.append(np.full(n_pixels, low))
+    return Drawn(counts, origins, [exposure == 0 for exposure in exposures])
 
 
 class Series:
@@ -109,20 +134,6 @@ def test_score_and_information_are_the_derivatives(pixel, exact):
         np.testing.assert_allclose(
             information[i, free], slope[free], rtol=1e-4, atol=1e-3 * np.abs(slope).max()
         )
-
-
-def test_the_likelihood_is_that_of_the_samples(pixel):
-    theta = pixel.theta([0.8, 2.7, 0.0], 9.7, 100.9, np.log(13.0))
-    for exact in (False, True):
-        total = 0.0
-        for j, exposure in enumerate((0.8, 2.7, 0.0)):
-            x, c = pixel.codes(j)
-            if exact:
-                law = pcd_mass(x, exposure, 1 / 9.7, 100.9, np.sqrt(13.0) / 9.7)
-            else:
-                law = pcd(x, exposure, 1 / 9.7, 100.9, np.sqrt(13.0))
-            total += float(c[c > 0] @ np.log(law[c > 0]))
-        assert pixel(theta, exact) == pytest.approx(total, rel=1e-9)
 
 
 def test_the_plain_loop_does_what_the_compiled_one_does():
@@ -287,22 +298,6 @@ def test_what_does_not_fit_together_is_refused():
         fit_histograms(series.counts, series.origins[:1])
     with pytest.raises(ValueError, match=r"different numbers of pixels: \[2, 3\]"):
         fit_histograms([series.counts[0], series.counts[1][:2]], series.origins)
-
-
-def test_more_samples_only_help():
-    one = cramer_rao(2.0, 0.1, 5.0, 1000)
-    more = cramer_rao([2.0, 0.0], 0.1, 5.0, [1000, 1000])
-    assert (np.diagonal(more)[[0, 2, 3, 4]] < np.diagonal(one)).all()
-    assert (more[1] == 0).all()
-
-
-def test_plain_em_climbs_to_the_same_place():
-    series = draw_series(np.random.default_rng(4), [0.6, 2.5], 0.3, 2)
-    newton = fit_histograms(series.counts, series.origins)
-    em = fit_histograms(series.counts, series.origins, settings=FitSettings(algorithm="em"))
-    errors = np.sqrt(newton.covariance[:, 2, 2])
-    assert (np.abs(em.conversion_gain - newton.conversion_gain) < 0.01 * errors).all()
-    assert (em.n_iterations > newton.n_iterations).all()
 
 
 def test_a_few_glitches_do_not_move_the_estimates():

@@ -15,7 +15,7 @@ from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_erro
 from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.fisher import correlations, covariance_from
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.result import INTERVAL_NAMES, FitResult, quantile_of
+from pchem_pipeline.model.fit.result import INTERVAL_NAMES, FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law import density_scores_numba
 from pchem_pipeline.model.law.mass import sample_mass
@@ -97,14 +97,6 @@ def test_the_interval_of_the_noise_in_electrons_is_a_profile_too() -> None:
     np.testing.assert_allclose(ends - at[1] * at[3], (other.lower, other.upper), rtol=0.02)
     # and it is far from symmetric here: standard errors would not do
     assert (other.upper + other.lower) / (other.upper - other.lower) > 0.02
-
-
-def test_errors_are_those_of_a_parametric_bootstrap() -> None:
-    _, at, covariance = fitted(CASES[0])
-    again = draw(np.random.default_rng(8), np.full(500, at[0]), 1 / at[1], at[1] * at[3], at[2], n_frames=N)
-    scatter = estimates(fit_histograms(again.counts, again.origin)).std(axis=0)
-    # five standard errors of a standard deviation of 500, and 2 % of the pixel's own information
-    np.testing.assert_allclose(scatter / np.sqrt(np.diag(covariance)), 1.0, atol=5 / np.sqrt(1000) + 0.02)
 
 
 @pytest.mark.parametrize("case", [*CASES, (5.0, 10.0, 0.8)])
@@ -193,11 +185,6 @@ def test_the_poorest_come_first_even_where_p_is_zero() -> None:
     assert abs(misfit(np.array([49.33]), np.array([50.0]))[0]) < 0.01
 
 
-def test_quantiles() -> None:
-    assert quantile_of(0.682689492) == pytest.approx(1.0)
-    assert quantile_of(0.95) == pytest.approx(1.959964)
-
-
 def tile(n: int = 4) -> tuple[Drawn, dict[str, NDArray[np.generic]]]:
     pixels = draw(np.random.default_rng(9), np.full(n, 1.5), 11.0, 0.3, n_frames=N)
     flat = {name: np.zeros((1, n), np.uint32) for name in ("under", "over")}
@@ -232,15 +219,3 @@ def test_settings_bring_intervals_and_sandwich_errors_into_the_store() -> None:
     assert (with_noise["bias_low"] < with_noise["bias"]).all()
     assert (with_noise["bias"] < with_noise["bias_high"]).all()
     assert (with_noise["read_noise_dn_high"] < full["read_noise_dn"]).all()
-
-
-def test_a_hit_pixel_goes_through_the_plain_loop_as_through_the_compiled() -> None:
-    pixel = draw(np.random.default_rng(12), *CASES[1], n_frames=500)
-    counts = np.zeros((1, 400), np.uint32)
-    counts[:, 100 : 100 + pixel.counts.shape[1]] = pixel.counts
-    counts[0, [2, 390]] = 1
-    fit = fit_histograms(counts, pixel.origin - 100)
-    clean = fit_histograms(pixel.counts, pixel.origin)
-    np.testing.assert_allclose(estimates(fit), estimates(clean), rtol=1e-6)
-    assert fit.outlier_share[0] == pytest.approx(2 / 502)
-    assert clean.outlier_share[0] == 0

@@ -143,6 +143,15 @@ def test_limits_decide(limits: Criteria, word: str) -> None:
     assert all(f"{each.found} (limit" in sensor.text for each in sensor.criteria if not each.met)
 
 
+def test_a_third_failed_and_noise_that_hides_the_electrons_are_not_all_right() -> None:
+    sensor, belief = answers(report_data((40, 40), failed=0.34))
+    assert (sensor.level, sensor.word) == ("serious", "No")
+    assert (belief.level, belief.word) == ("caution", "For the pixels with a value")
+    data = report_data((40, 40), failed=0.0)
+    noisy = {**data.maps, "read_noise_e": data.maps["read_noise_e"] + 0.4}
+    assert answers(replace(data, maps=noisy))[0].word == "Too noisy to count electrons"
+
+
 @pytest.mark.parametrize("limits", [Criteria(), Criteria(gain_nonuniformity=1e-6)])
 def test_where_results_are_not_reliable_no_limit_is_known_to_be_kept_or_missed(limits: Criteria) -> None:
     """It was 'Mostly' where a limit is missed, and 'Unknown' where none is."""
@@ -236,6 +245,9 @@ def test_nothing_found_is_a_check_that_passed_with_its_limit(data: ReportData) -
         "run pchem discrepancy run.zarr."
     )
     assert any("row noise above 0.12 DN is excluded" in flag.text for flag in flags(looked(data, 0.4, 0.0)))
+    sensor, belief = answers(data)
+    assert sensor.text == "All 1,600 pixels have a value; all 6 criteria pass."
+    assert belief.text.endswith("Missing effects were not searched for.")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.html_page import HOSTILE, Page, harmless
 from helpers.quick_stacks import stack, sums_of
-from helpers.report_material import pixel_fit, report_data, true_maps
+from helpers.report_material import report_data
 
 from pchem_pipeline import __version__
 from pchem_pipeline.model.fit.status import FitStatus
@@ -26,7 +26,7 @@ from pchem_pipeline.report.pages.cite import citation
 from pchem_pipeline.report.pages.glossary import GLOSSARY, explained
 from pchem_pipeline.report.pages.page import chart_script, figure_tables, page_script
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
-from pchem_pipeline.report.pages.summary import flags, key_numbers, sentence
+from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, sentence
 from pchem_pipeline.report.pages.tables import result_tables
 from pchem_pipeline.report.settings import ReportSettings
 
@@ -279,6 +279,7 @@ def test_all_pixels_failed() -> None:
     assert "None of the 64 pixels could be fitted" in page.text
     assert "no pixel has a value" in page.text
     assert "not known" not in sentence(all_failed())
+    assert [answer.level for answer in answers(all_failed())] == ["serious", "serious"]
     assert {str(a["id"]) for a in page.of("figure")} == {
         "figure-pixel_fits",
         "figure-fit_status",
@@ -389,10 +390,3 @@ def test_unfinished_stages_high_read_noise_and_coarse_steps_are_said(data: Repor
     assert "above 0.5 e⁻" in words
     assert "set fit.likelihood: auto" in words
     assert "fit.likelihood" not in " ".join(flag.text for flag in flags(data))
-
-
-def test_a_pixel_beside_its_numbers() -> None:
-    pixel = pixel_fit(true_maps((4, 4)), 1, 2, "mine")
-    data = replace(report_data((4, 4)), pixels=[pixel])
-    alt = next(e.alt for e in report_figures(data, QUICK) if e.name == "pixel_fits")
-    assert f"quanta exposure {pixel.parameters['quanta_exposure']:.3f} ± 0.012 e⁻" in alt

@@ -137,15 +137,6 @@ def test_the_shown_sample_stands_where_a_run_of_one_has_its_own():
     assert (arrays["samples/quanta_exposure"][3] == 0).all()
 
 
-def test_one_sample_is_the_fit_of_a_run_of_one():
-    one = tile()[1]
-    alone = fit_tile(one, FitSettings(), None)
-    arrays = fit_samples_tile([one], SampleFit([False], 0, FitSettings()))
-    for name in PARAMETERS:
-        error = alone[f"{name}_stderr"]
-        assert (np.abs(arrays[f"fit/{name}"] - alone[name]) < 1e-3 * error).all(), name
-
-
 @pytest.mark.parametrize(
     "settings",
     [

@@ -15,7 +15,6 @@ from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.stages.bands import plan_bands
 from pchem_pipeline.stages.histogram import counting
 from pchem_pipeline.stages.histogram.arrays import row_frames
-from pchem_pipeline.stages.histogram.memory import bytes_per_row
 from pchem_pipeline.store.tiles import tile_grid
 
 
@@ -69,12 +68,6 @@ def test_rows_that_are_decoded_together_stay_together():
     assert len(plan_bands(tiles, everything, 10_000, 2, rows_per_read=500)) == 1
     # unless memory forbids
     assert len(plan_bands(tiles, everything, 64, 8, rows_per_read=512)) == 8
-
-
-def test_memory_does_not_grow_with_frames():
-    settings = HistogramSettings()
-    known = [bytes_per_row(512, n, 2, 160, settings) for n in (4096, 17_750, 60_000)]
-    assert known[0] == known[1] == known[2]
 
 
 def test_row_sums_of_tall_sensors_are_read_in_smaller_pieces():

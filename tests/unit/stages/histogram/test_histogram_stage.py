@@ -9,7 +9,7 @@ import pytest
 from helpers.pickled_tasks import PickledTasks
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import InputError, StoreError
+from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.tree import RunConfig
@@ -212,13 +212,6 @@ def test_too_little_memory_is_said(tmp_path, frames):
     context = make_context(tmp_path, wide, band_memory=16, window_frames=70)
     assert execute("histogram", context).state == "complete"
     assert any("more than histogram.band_memory" in note for note in context.notes)
-
-
-def test_changed_camera_files_are_refused(tmp_path, frames):
-    context = make_context(tmp_path, frames)
-    np.save(tmp_path / "frames.npy", frames[:200])
-    with pytest.raises(InputError, match="changed since they were ingested"):
-        execute("histogram", context)
 
 
 def test_incomplete_input_is_refused(tmp_path, frames):

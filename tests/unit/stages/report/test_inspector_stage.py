@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +11,11 @@ from helpers.report_material import report_data
 
 from pchem_pipeline.base import variables
 from pchem_pipeline.base.variables import Variable
-from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
+from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.inspector.inspector import embedded, map_facts
+from pchem_pipeline.report.inspector.inspector import map_facts
 from pchem_pipeline.report.pages import sections
 from pchem_pipeline.report.pages.sections import Section
-from pchem_pipeline.report.pages.summary import answers
 from pchem_pipeline.stages.report import inspector
 from pchem_pipeline.stages.report.inspector import listed_maps, map_entry, read_maps
 from pchem_pipeline.stages.report.pixels import choose_inspected
@@ -131,33 +129,6 @@ def test_the_charge_rate_costs_nothing(store: RunStore, data: ReportData) -> Non
     assert entry.same_as == ("maps/quanta_exposure", pytest.approx(1 / 4.87))
 
 
-def test_a_sensor_of_the_papers_size_takes_three_to_four_megabytes(tmp_path: Path) -> None:
-    rng = np.random.default_rng(7)
-    base = report_data((8, 8))
-    store = write_run(tmp_path, base, n_frames=20)
-    shape, maps = (512, 512), {}
-    for name in base.maps:
-        middle = float(np.nanmedian(base.maps[name]))
-        spread = 0.15 if name.endswith("_stderr") else 0.1
-        maps[name] = middle * (1.0 + spread * rng.standard_normal(shape))
-        store.write_array(f"maps/{name}", maps[name])
-    fit = {"fit_status": np.zeros(shape, np.uint16), "goodness_p": rng.random(shape)}
-    for name, values in fit.items():
-        store.write_array(f"fit/{name}", values)
-    store.write_array("histogram/origin", np.full(shape, 90, np.int32))
-    counts = np.tile(rng.poisson(120, 128).astype(np.uint16), (8, 8, 1))
-    store.create_array("histogram/counts", (*shape, 128), chunks=(64, 64, 128), dtype=np.uint16)
-    for y, x in ((0, 0), (256, 320)):
-        store.write("histogram/counts", (slice(y, y + 64), slice(x, x + 64)), np.tile(counts, (8, 8, 1)))
-    store.fill("histogram/counts")
-    shown = inspector_of(store, maps, fit, [(1, 1)])
-    size = sum(len(text) for _, text in embedded(replace(base, shape=shape, inspector=lambda: shown)).blobs)  # type: ignore[union-attr]
-    assert 2.5e6 < size < 4.2e6
-    assert shown.sample.index.size == 2400
-    at = (1, 1)
-    assert shown.sample.counts[0].tolist() == counts[at].tolist()
-
-
 # -- which pixels ----------------------------------------------------------------------------
 
 
@@ -207,38 +178,6 @@ def test_the_choice_repeats() -> None:
 
 
 # -- the first screen and the sections -------------------------------------------------------
-
-
-def test_all_right_and_to_be_believed(data: ReportData) -> None:
-    clean = replace(report_data((40, 40), failed=0.0), fit={"fit_status": np.zeros((40, 40), np.uint16)})
-    sensor, belief = answers(clean)
-    assert (sensor.level, sensor.question) == ("good", "Is the sensor within limits?")
-    assert sensor.text == "All 1,600 pixels have a value; all 6 criteria pass."
-    assert [each.found for each in sensor.criteria if each.setting == "read_noise_e"] == ["0.299 e⁻"]
-    assert (belief.level, belief.word) == ("good", "No problem found by the quick checks")
-    assert belief.text == (
-        "2 checks of the model against the data passed. Missing effects were not searched for."
-    )
-
-
-def test_a_third_failed_is_not_all_right() -> None:
-    sensor, belief = answers(report_data((40, 40), failed=0.34))
-    assert (sensor.level, sensor.word) == ("serious", "No")
-    assert (belief.level, belief.word) == ("caution", "For the pixels with a value")
-
-
-def test_a_noisy_sensor_counts_no_electrons() -> None:
-    data = report_data((40, 40), failed=0.0)
-    noisy = {**data.maps, "read_noise_e": data.maps["read_noise_e"] + 0.4}
-    assert answers(replace(data, maps=noisy))[0].word == "Too noisy to count electrons"
-
-
-def test_no_fit_at_all() -> None:
-    data = report_data((8, 8))
-    status = np.full((8, 8), int(FitStatus.TOO_FEW_BINS), np.uint16)
-    assert int(FitStatus.TOO_FEW_BINS) & int(FAILED)
-    lost = replace(data, fit={"fit_status": status}, maps=dict.fromkeys(data.maps, np.full((8, 8), np.nan)))
-    assert [answer.level for answer in answers(lost)] == ["serious", "serious"]
 
 
 def test_a_new_section_is_one_entry_in_one_list(data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.inspector_material import page_without_pictures
 from helpers.report_material import report_data
 from helpers.written_fit import write_fit
 
@@ -152,10 +153,9 @@ def test_a_report_is_the_same_whoever_works_on_it(folder: Path) -> None:
         config = context.config.model_copy(update={"compute": compute})
         with beside(workers) as hand:
             data = gather(context.store, config, 4.87, [], hand)
-            rendered = report.render_report(data, config.report)
-        pages.append((rendered.html, rendered.json))
-    assert 'id="inspector-app"' in pages[0][0]
-    assert [len(set(each)) for each in zip(*pages, strict=True)] == [1, 1]  # without pytest's comparison
+            pages.append(page_without_pictures(data))
+    assert 'id="inspector-app"' in pages[0]
+    assert len(set(pages)) == 1  # without pytest's comparison
 
 
 def test_figures_alone_pack_no_maps(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -214,34 +214,24 @@ def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(
     assert not (folder / "run.zarr" / "report.html").exists()
 
 
-def test_four_pixels_lie_in_the_corners_of_noise_and_exposure() -> None:
-    rng = np.random.default_rng(1)
-    noise, exposure = rng.random((40, 50)), rng.random((40, 50))
-    fit_status = np.zeros((40, 50), dtype=np.uint16)
-    fit_status[:20] = int(FitStatus.POOR_FIT)
-    chosen = choose_pixels(noise, exposure, fit_status)
-    assert len({(y, x) for _, y, x in chosen}) == 4
-    for label, y, x in chosen:
-        assert y >= 20
-        assert (noise[y, x] > 0.5) == label.startswith("high read noise")
-        assert (exposure[y, x] > 0.5) == label.endswith("high exposure")
-        assert 0.02 < abs(noise[y, x] - 0.5) < 0.48
-
-
-def test_the_pixel_nearest_to_a_corner_of_all_is_chosen() -> None:
+def test_the_good_pixel_nearest_to_a_corner_of_all_good_ones_is_chosen() -> None:
     rng = np.random.default_rng(2)
-    noise = rng.standard_normal((60, 70))
+    noise = rng.standard_normal((80, 70))
     exposure = np.exp(
-        3.0 * noise + 0.1 * rng.standard_normal((60, 70))
+        3.0 * noise + 0.1 * rng.standard_normal((80, 70))
     )  # no pixel is near two of the corners
-    ranks = [values.ravel().argsort().argsort() / values.size for values in (noise, exposure)]
-    for (_, y, x), (low, high) in zip(
-        choose_pixels(noise, exposure, np.zeros(noise.shape, np.uint16)),
+    fit_status = np.zeros(noise.shape, np.uint16)
+    fit_status[:20] = int(FitStatus.POOR_FIT)
+    ranks = [each[20:].ravel().argsort().argsort() / each[20:].size for each in (noise, exposure)]
+    for (label, y, x), (low, high) in zip(
+        choose_pixels(noise, exposure, fit_status),
         ((0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9)),
         strict=True,
     ):
-        distance = np.hypot(ranks[0] + 0.5 / noise.size - low, ranks[1] + 0.5 / noise.size - high)
-        assert distance[y * 70 + x] == pytest.approx(distance.min())
+        assert y >= 20
+        assert (label.startswith("high"), label.endswith("high exposure")) == (low > 0.5, high > 0.5)
+        distance = np.hypot(ranks[0] + 0.5 / ranks[0].size - low, ranks[1] + 0.5 / ranks[1].size - high)
+        assert distance[(y - 20) * 70 + x] == pytest.approx(distance.min())
 
 
 def test_few_or_no_pixels_to_choose_from() -> None:
