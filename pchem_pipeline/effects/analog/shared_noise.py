@@ -8,23 +8,16 @@ are part of the bias map and not this effect.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.common_modes import (
-    line_excess,
-    mean_variance,
-    responsivity,
-    successive,
-)
 from pchem_pipeline.effects.families.offsets import OffsetEffect
 from pchem_pipeline.effects.framework.context import DIMS
 from pchem_pipeline.effects.framework.effect import Dn, SharedOffset, register_effect
-from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray, TimeSeries
-from pchem_pipeline.model.arithmetic.significance import POSSIBLE
+from pchem_pipeline.effects.types import EffectContext, FloatArray
 
 
 class SharedNoise(OffsetEffect):
@@ -42,18 +35,6 @@ class SharedNoise(OffsetEffect):
     def offsets(self, context: EffectContext) -> FloatArray:
         """Return one offset for each frame, or for each row or column of a frame, DN."""
         return np.asarray(getattr(self, self.strength) * context.random.normal(DIMS[self.shared_by]))
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the excess variance of the means of rows (columns) within their frames (moment estimate)."""
-        if evidence.time is None:
-            return ()
-        rows = cls.shared_by == "row"
-        means = evidence.time.row_readout if rows else evidence.time.column_readout
-        excess, error = line_excess(means, mean_variance(evidence, axis=1 if rows else 0))
-        if excess < POSSIBLE * error:
-            return ()
-        return (cls.model_validate({cls.strength: excess**0.5 / responsivity(evidence)}),)
 
     def shared_offset(self) -> SharedOffset:
         """Return its offset."""
@@ -149,43 +130,3 @@ class FrameNoise(SharedNoise):
 
     #: at 0.12 DN
     typical_values = ({"frame_noise_dn": 0.12},)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the excess variance of successive frames, so that a slow drift does not count.
-
-        Half the mean squared difference of successive frame means, even and odd frames centred apart, less
-        what the noise of pixels, rows and columns gives.
-        """
-        if evidence.time is None:
-            return ()
-        expected = _expected(evidence, evidence.time)
-        steps = _steps(evidence.time)
-        if steps.size < 8 or not expected > 0:
-            return ()
-        excess = float((steps**2).mean() / 2.0 - expected)
-        # successive differences share a frame: their squares are correlated by 1/4
-        error = expected * np.sqrt(3.0 / steps.size)
-        if excess < POSSIBLE * error:
-            return ()
-        return (cls(frame_noise_dn=float(np.sqrt(excess)) / responsivity(evidence)),)
-
-
-def _expected(evidence: Evidence, time: TimeSeries) -> float:
-    """Return the variance, DN^2, that pixels, rows and columns by themselves give to frame means."""
-    expected = float(mean_variance(evidence))
-    for means, axis in ((time.row_readout, 1), (time.column_readout, 0)):
-        excess, error = line_excess(means, mean_variance(evidence, axis))
-        if excess > 2.0 * error:
-            expected += excess / means.shape[1]
-    return expected
-
-
-def _steps(time: TimeSeries) -> FloatArray:
-    """Return differences of the frame means of successive frames, DN, without even-odd contrast."""
-    means = time.frame_readout.astype(np.float64).copy()
-    for parity in (0, 1):
-        chosen = time.frames % 2 == parity
-        if chosen.any():
-            means[chosen] -= means[chosen].mean()
-    return np.asarray(np.diff(means)[successive(time.frames)], np.float64)
