@@ -9,14 +9,17 @@ imagers with such tails are attributed to random telegraph noise of the source f
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-from pchem_pipeline.effects.types import AnyArray, EffectContext, PixelMaps, SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
+
+# factor less 1 of noisy samples that move the tail and He4 by as many standard deviations
+_WIDTH = 0.4
 
 
 @register_effect
@@ -67,6 +70,13 @@ class HeavyTailedNoise(Effect):
         if context.read_noise is not None:
             result[noisy] += (self.factor - 1.0) * context.read_noise[noisy]
         return result
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return what is typical; the wider the noisy samples, the more the tail shows them than He4 does."""
+        tail, kurtosis = (max(evidence.z.get(name, 0.0), 1.0) for name in cls.signature[:2])
+        width = 1.0 + _WIDTH * tail / kurtosis
+        return sorted(super().estimate(evidence), key=lambda one: abs(np.log(one.factor / width)))
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with noise of two widths."""
