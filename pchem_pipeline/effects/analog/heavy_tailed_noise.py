@@ -19,7 +19,7 @@ from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, regist
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
 # factor less 1 of noisy samples that move the tail and He4 by as many standard deviations
-_WIDTH = 0.4
+_WIDTH = 0.7
 
 
 @register_effect
@@ -56,11 +56,11 @@ class HeavyTailedNoise(Effect):
         description="noise of such a sample relative to others, no unit",
     )
 
-    #: few noisy samples, and more but less noisy ones; the last is near a Student law of many degrees of
+    #: few noisy samples, and more but less noisy ones; the last are near a Student law of many degrees of
     #: freedom: kurtosis almost without tails
     typical_values = tuple(
         {"share": share, "factor": factor}
-        for share, factor in ((2.4e-4, 3.0), (3e-3, 2.0), (6e-5, 5.0), (5e-2, 1.25))
+        for share, factor in ((2.4e-4, 3.0), (3e-3, 2.0), (6e-5, 5.0), (5e-2, 1.25), (3e-2, 1.5))
     )
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:

@@ -8,16 +8,18 @@ are part of the bias map and not this effect.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
+from pchem_pipeline.effects.estimators.common_modes import responsivity
 from pchem_pipeline.effects.families.offsets import OffsetEffect
 from pchem_pipeline.effects.framework.context import DIMS
 from pchem_pipeline.effects.framework.effect import Dn, SharedOffset, register_effect
-from pchem_pipeline.effects.types import EffectContext, FloatArray
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray
+from pchem_pipeline.model.arithmetic.significance import CLEAR
 
 
 class SharedNoise(OffsetEffect):
@@ -35,6 +37,26 @@ class SharedNoise(OffsetEffect):
     def offsets(self, context: EffectContext) -> FloatArray:
         """Return one offset for each frame, or for each row or column of a frame, DN."""
         return np.asarray(getattr(self, self.strength) * context.random.normal(DIMS[self.shared_by]))
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return by how much the means of frames, rows or columns scatter beyond what their pixels give."""
+        time, good = evidence.time, evidence.maps.usable & np.isfinite(evidence.readout_std)
+        if time is None or not evidence.z.get(cls.signature[0], 0.0) > CLEAR:
+            return ()
+        series: dict[str, tuple[tuple[int, ...], AnyArray]] = {
+            "frame": ((0, 1), time.frame_readout),
+            "row": ((1,), time.row_readout),
+            "column": ((0,), time.column_readout),
+        }
+        axis, means = series[cls.shared_by]
+        with np.errstate(invalid="ignore"):  # lines without a usable pixel are NaN
+            own = np.where(good, evidence.readout_std**2, 0.0).sum(axis) / good.sum(axis) ** 2.0
+        means = means - means.mean(axis=0)
+        if means.ndim > 1:
+            means -= np.nanmean(means, axis=1, keepdims=True)
+        excess = float(np.nanvar(means) - np.nanmean(own))
+        return (cls.model_validate({cls.strength: max(excess, 0.0) ** 0.5 / responsivity(evidence)}),)
 
     def shared_offset(self) -> SharedOffset:
         """Return its offset."""

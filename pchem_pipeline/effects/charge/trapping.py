@@ -37,7 +37,7 @@ from pchem_pipeline.effects.types import (
     PixelMaps,
     SampleLaw,
 )
-from pchem_pipeline.model.arithmetic.significance import POSSIBLE
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, POSSIBLE
 
 # probability that the state of a trap goes back farther than the frames that are simulated for it
 _RARE = 1e-6
@@ -115,9 +115,36 @@ class Trapping(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return what is typical, as strong as the counts scatter, where successive ones are opposite."""
-        opposite = evidence.z.get("time.lag1.charge.mean", 0.0) < -POSSIBLE
-        return cls.typical_as_seen(evidence, "shape.C2.mean") if opposite else ()
+        """Return the trap of which the autocovariances of the electron numbers are, in some pixels or in all.
+
+        The squares of the first one tell in how many. Two traps of which one catches as often as the other
+        releases have the same moments: that which is more often empty is meant.
+        """
+        time, maps = evidence.time, evidence.maps
+        if time is None or not evidence.z.get("time.lag1.charge.mean", 0.0) < -POSSIBLE:
+            return ()
+        good = maps.usable & (maps.quanta_exposure > 0) & np.isfinite(time.lag_charge[:2]).all(axis=0)
+        exposure, first = maps.quanta_exposure[good], time.lag_charge[0][good].astype(np.float64)
+        some = -np.expm1(-exposure)
+        # the expected electron number answers to the electrons by Var(k) / H
+        answer = (some - exposure * np.exp(-exposure)) * (evidence.charge_std[good] / exposure) ** 2
+        mean = -float(answer @ first / (answer @ answer))
+        if not mean > 0.0:
+            return ()
+        left = float(np.clip(-(answer @ time.lag_charge[1][good]) / (answer @ answer) / mean, 0.0, 0.95))
+        weight = answer**2 / float((answer**4).sum())
+        squares = float(weight @ (first**2 - 1.0 / time.n_pairs))
+        beyond = squares - mean**2 > CERTAIN * (2.0 * float(weight @ weight)) ** 0.5 / time.n_pairs
+        shares = (mean**2 / squares, 1.0) if beyond else (1.0,)
+        return [cls._with(mean / share, 1.0 - left, float(some.mean()), share) for share in shares]
+
+    @classmethod
+    def _with(cls, product: float, total: float, some: float, fraction: float) -> Self:
+        """Return it with the product ``r c`` of its chances and their sum ``r + c P(K >= 1)``."""
+        low, high = _LIMITS
+        release = 0.5 * (total + max(total**2 - 4.0 * product * some, 0.0) ** 0.5)
+        capture = min((total - release) / some, high)
+        return cls(capture=capture, release=min(max(release, low), high), fraction=fraction)
 
     def details(self) -> tuple[str, ...]:
         """Return the chance of a release, and the share of the pixels where not all have a trap."""
