@@ -9,8 +9,8 @@ sum of three of them with tau spaced by factors of 8, nearly 1/f in between (McW
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -18,12 +18,8 @@ from pydantic import Field
 from pchem_pipeline.effects.estimators.long_memory import between_grid_points, frame_key
 from pchem_pipeline.effects.framework.context import RandomSource
 from pchem_pipeline.effects.framework.effect import Effect, Frames, Plane, Ratio, register_effect
-from pchem_pipeline.effects.types import (
-    AnyArray,
-    EffectContext,
-    FloatArray,
-    IntArray,
-)
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, IntArray
+from pchem_pipeline.model.arithmetic.significance import POSSIBLE
 
 _SPACING = (1.0, 1 / 8, 1 / 64)
 
@@ -82,6 +78,12 @@ class FlickerNoise(Effect):
             noise -= (1.0 - np.sqrt(1.0 - self.share)) * context.read_noise
         noise += values
         return noise
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return what is typical where residuals of successive frames are alike."""
+        alike = evidence.z.get("time.lag1.readout.mean", 0.0) > POSSIBLE
+        return super().estimate(evidence) if alike else ()
 
     def details(self) -> tuple[str, ...]:
         """Return the correlation time."""

@@ -60,7 +60,7 @@ class HeavyTailedNoise(Effect):
     #: freedom: kurtosis almost without tails
     typical_values = tuple(
         {"share": share, "factor": factor}
-        for share, factor in ((2.4e-4, 3.0), (3e-3, 2.0), (6e-5, 5.0), (5e-2, 1.25), (3e-2, 1.5))
+        for share, factor in ((2.4e-4, 3.0), (3e-3, 2.0), (6e-5, 5.0), (5e-2, 1.25), (2e-2, 1.6))
     )
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:

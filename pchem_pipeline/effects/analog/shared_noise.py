@@ -18,8 +18,8 @@ from pchem_pipeline.effects.estimators.common_modes import responsivity
 from pchem_pipeline.effects.families.offsets import OffsetEffect
 from pchem_pipeline.effects.framework.context import DIMS
 from pchem_pipeline.effects.framework.effect import Dn, SharedOffset, register_effect
-from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray
-from pchem_pipeline.model.arithmetic.significance import CLEAR
+from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
+from pchem_pipeline.model.arithmetic.significance import POSSIBLE
 
 
 class SharedNoise(OffsetEffect):
@@ -40,23 +40,27 @@ class SharedNoise(OffsetEffect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return by how much the means of frames, rows or columns scatter beyond what their pixels give."""
-        time, good = evidence.time, evidence.maps.usable & np.isfinite(evidence.readout_std)
-        if time is None or not evidence.z.get(cls.signature[0], 0.0) > CLEAR:
+        """Return by how much means of successive frames, or of their lines, differ beyond what chance makes.
+
+        That is told by the pixels of a line; of a frame by its rows or columns, which may have noise, too.
+        """
+        if evidence.time is None or not evidence.maps.usable.any():
             return ()
-        series: dict[str, tuple[tuple[int, ...], AnyArray]] = {
-            "frame": ((0, 1), time.frame_readout),
-            "row": ((1,), time.row_readout),
-            "column": ((0,), time.column_readout),
-        }
-        axis, means = series[cls.shared_by]
-        with np.errstate(invalid="ignore"):  # lines without a usable pixel are NaN
-            own = np.where(good, evidence.readout_std**2, 0.0).sum(axis) / good.sum(axis) ** 2.0
-        means = means - means.mean(axis=0)
-        if means.ndim > 1:
-            means -= np.nanmean(means, axis=1, keepdims=True)
-        excess = float(np.nanvar(means) - np.nanmean(own))
-        return (cls.model_validate({cls.strength: max(excess, 0.0) ** 0.5 / responsivity(evidence)}),)
+        rows, columns = evidence.time.row_readout, evidence.time.column_readout
+        if cls.shared_by == "frame":
+            means = evidence.time.frame_readout[:, None]
+            own = max(float(np.nanvar(lines, axis=1).mean()) / lines.shape[1] for lines in (rows, columns))
+        else:
+            lines, axis = (rows, 1) if cls.shared_by == "row" else (columns, 0)
+            means = np.asarray(lines - np.nanmean(lines, axis=1, keepdims=True), np.float64)
+            variance = np.where(evidence.maps.usable, np.nan_to_num(evidence.readout_std) ** 2, 0.0)
+            number = evidence.maps.usable.sum(axis)
+            own = float((variance.sum(axis) / np.maximum(number, 1) ** 2.0)[number > 0].mean())
+            own *= 1.0 - 1.0 / (number > 0).sum()
+        excess = 0.5 * float(np.nanmean(np.diff(means, axis=0) ** 2)) - own
+        if not excess > POSSIBLE * own * (2.0 / np.isfinite(means).sum()) ** 0.5:
+            return ()
+        return (cls.model_validate({cls.strength: excess**0.5 / responsivity(evidence)}),)
 
     def shared_offset(self) -> SharedOffset:
         """Return its offset."""
