@@ -18,12 +18,13 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.observe import tables_numba as kernel
 from pchem_pipeline.discrepancy.observe.law_numba import N_TESTS, supports
 from pchem_pipeline.discrepancy.observe.tables_numba import CodeSums, Fitted, PixelLaws
-from pchem_pipeline.effects.estimators.pixel_law import ALLOWED, SMALLEST_WIDTH
 from pchem_pipeline.model.histogram.count import histogram_frames
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+_SMALLEST_WIDTH = 0.1  # DN: below it peaks are single codes
+_ALLOWED = 1e-2  # samples expected beyond the codes of a pixel, on either side, at most
 #: Pixels whose law covers more codes than this are not looked at.
 _LONGEST_SUPPORT = 8192
 _NEGLIGIBLE = 1e-5  # samples expected beyond the electron numbers considered, in all pixels
@@ -115,7 +116,7 @@ def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np
         codes=codes,
     )
     fitted = Fitted(seen.counts, seen.origin, seen.outside, natural, electrons, window)
-    kernel.summarise_pixels(fitted, ALLOWED, ALLOWED / max(int(good.sum()), 1), laws)
+    kernel.summarise_pixels(fitted, _ALLOWED, _ALLOWED / max(int(good.sum()), 1), laws)
     for covariance in (codes.fold_covariance, codes.bin_covariance):
         covariance += np.tril(covariance, -1).T
     return laws
@@ -129,7 +130,7 @@ def _natural(parameters: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
 
 def analog_width(sigma: FloatArray) -> FloatArray:
     """Return the analog read noise of a read noise with quantisation, DN; not below that of single codes."""
-    return np.asarray(np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, SMALLEST_WIDTH**2)))
+    return np.asarray(np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, _SMALLEST_WIDTH**2)))
 
 
 def _code_axis(window: IntArray) -> tuple[int, int]:

@@ -10,23 +10,16 @@ cannot show.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 from scipy import special
 
 from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, Ratio, register_effect
-from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
-from pchem_pipeline.model.arithmetic.significance import CERTAIN
-
-_LINEAR = 0.15  # e- of a bright sample before, up to which a correlation is in proportion to the memory
-_NODES = 40  # of a quadrature over the pixels' memories
-_FAR = 30.0  # standard deviations: what lies farther is as unlikely
-_USUAL = 0.5  # spread from which a fit begins
+from pchem_pipeline.effects.types import AnyArray, EffectContext, FloatArray, PixelMaps, SampleLaw
 
 
 @register_effect
@@ -72,8 +65,14 @@ class AnalogMemory(Effect):
         description="previous charge at which the memory saturates, e-; none: proportional",
     )
 
-    #: residue, overshoot, and a residue that differs
-    typical_values = ({"memory": 0.0024}, {"memory": -0.0024}, {"memory": 0.0024, "spread": 1.0})
+    #: residue and overshoot, alike in all pixels and not
+    typical_values = tuple(
+        {"memory": memory, "spread": spread} for spread in (0.0, 1.0) for memory in (0.0024, -0.0024)
+    )
+
+    def details(self) -> tuple[str, ...]:
+        """Return how much pixels differ, where they do."""
+        return ("spread",) if self.spread > 0.0 else ()
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with that of the frame before.
@@ -106,73 +105,9 @@ class AnalogMemory(Effect):
         once, twice = (np.exp(exposure * np.expm1(-n / self.saturation_e)) for n in (1.0, 2.0))
         return self.saturation_e * (1.0 - once), self.saturation_e**2 * (1.0 - 2.0 * once + twice)
 
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the regression of the residual on the charge of the frame before, alike or by pixel.
-
-        A shift by d changes ``E[R | x]`` by ``d Var(r) / sigma^2`` on average, so that the correlation of r
-        with the k before is ``a sd(r) sd(k) / sigma^2``, all in electrons.
-        """
-        if evidence.time is None:
-            return ()
-        maps, pairs = evidence.maps, evidence.time.n_pairs
-        seen = np.asarray(evidence.time.lag_readout_charge, np.float64)
-        response = evidence.readout_std * evidence.charge_std / maps.read_noise_dn**2 / maps.conversion_gain
-        good = maps.usable & np.isfinite(seen) & np.isfinite(response)
-        seen, response = seen[good], response[good]
-        found = multiple_of(response, seen, pairs)
-        if not abs(found.sigmas) > SIGNIFICANT:
-            return ()
-        memory = float(np.clip(found.value, -0.5, 0.5))
-        k = maps.quanta_exposure[good] + evidence.charge_std[good]
-        differing = _lognormal(seen, response, _LINEAR / k * response, pairs, memory)
-        if differing is None:
-            return (cls(memory=memory),)
-        mean, spread = differing
-        return cls(memory=memory), cls(memory=float(np.clip(mean, -0.5, 0.5)), spread=min(spread, 2.0))
-
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the mean of what is left of the frame before, and its variance."""
         mean, square = self._left_of(np.nan_to_num(maps.quanta_exposure))
         # the mean of a pixel's own memory is not told from its bias
         variance = (square - mean**2) * np.exp(self.spread**2)
         return model.with_levels(shift_e=self.memory * mean).with_variance(e2=self.memory**2 * variance)
-
-
-def _lognormal(
-    seen: FloatArray, response: FloatArray, limit: FloatArray, pairs: int, memory: float
-) -> tuple[float, float] | None:
-    """Return the likeliest mean and spread of lognormal memories of pixels; None where they may be alike.
-
-    Args:
-        seen: correlation of each pixel, shape (n,).
-        response: what a memory of 1 makes of it in proportion, shape (n,).
-        limit: size beyond which a correlation only tells that the memory is large, shape (n,).
-        pairs: of frames, the inverse of the variance of a correlation.
-        memory: of all pixels alike.
-    """
-    from scipy import optimize  # not for every command that knows of effects
-
-    nodes, weights = np.polynomial.hermite_e.hermegauss(_NODES)
-    weights = weights / weights.sum()
-    sign, root = np.sign(memory), np.sqrt(pairs)
-    seen = sign * seen
-    beyond = (seen > limit)[:, None]
-
-    def misfit(log_mean: float, spread: float) -> float:
-        foreseen = response[:, None] * np.exp(log_mean + spread * nodes - spread**2 / 2.0)
-        density = np.exp(-(((seen[:, None] - foreseen) * root).clip(-_FAR, _FAR) ** 2) / 2.0)
-        large = special.ndtr((foreseen - limit[:, None]) * root)
-        return float(-np.log(np.where(beyond, large, density) @ weights).sum())
-
-    start = float(np.log(np.abs(memory)))
-    alike = optimize.minimize_scalar(misfit, (start, start + 0.2), args=(0.0,), options={"xtol": 0.01})
-    one = optimize.minimize(
-        lambda x: misfit(x[0], float(np.exp(x[1]))),
-        (alike.x, np.log(_USUAL)),
-        method="Nelder-Mead",
-        options={"xatol": 0.01, "fatol": 0.1},
-    )
-    if alike.fun - one.fun < CERTAIN**2 / 2.0:
-        return None
-    return float(sign * np.exp(one.x[0])), float(np.exp(one.x[1]))

@@ -14,12 +14,11 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.common_modes import responsivity, run_position
-from pchem_pipeline.effects.estimators.time_profiles import likely_profiles, time_profiles
+from pchem_pipeline.effects.estimators.common_modes import responsivity
 from pchem_pipeline.effects.families.drifts import Drift
 from pchem_pipeline.effects.families.offsets import OffsetEffect, quantile_means
 from pchem_pipeline.effects.framework.effect import Dn, SharedOffset, register_effect
-from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
+from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw, TimeSeries
 
 
 @register_effect
@@ -77,21 +76,17 @@ class BiasDrift(Drift, OffsetEffect):
         )
 
     @classmethod
+    def series(cls, evidence: Evidence, time: TimeSeries) -> FloatArray:
+        """Return the offsets of the frames, DN."""
+        return np.asarray(time.frame_readout / responsivity(evidence))
+
+    @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the time profiles that the frames' means follow, and a random walk like the best path."""
-        if evidence.time is None or evidence.time.frames.size < 8:
-            return ()
-        time, alpha = evidence.time, responsivity(evidence)
-        means, position = time.frame_readout / alpha, run_position(time.frames, time.n_run)
-        likely = likely_profiles(means, position)
-        found = [cls.of(profile) for profile in likely]
-        path = next((profile for profile in likely if profile.shape == "path"), None)
-        if path is None and not found and evidence.strongest("frame.readout.slow") > 3.0:
-            path = time_profiles(means, position)[2]
-        if path is not None:
-            # a random walk of variance s^2 u has steps of variance s^2 / (nodes - 1) between nodes
-            found.append(cls(drift_dn=path.size * float(np.linalg.norm(np.diff(path.path))), shape="walk"))
-        return found
+        """Return the time profiles that the frames' means follow, and a random walk like the path."""
+        found = list(super().estimate(evidence))
+        # a random walk of variance s^2 u has steps of variance s^2 / (nodes - 1) between nodes
+        sizes = [one.drift_dn * float(np.linalg.norm(np.diff(one.path))) for one in found if one.path]
+        return [*found, *(cls(drift_dn=size, shape="walk") for size in sizes)]
 
     def shared_offset(self) -> SharedOffset:
         """Return the offset of a frame: others may be at any place of the drift."""

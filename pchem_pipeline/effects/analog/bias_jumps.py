@@ -14,20 +14,18 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from pchem_pipeline.effects.estimators.change_points import likeliest_parts
 from pchem_pipeline.effects.estimators.common_modes import responsivity
-from pchem_pipeline.effects.estimators.levels.change_points import noise_variance
-from pchem_pipeline.effects.estimators.levels.two_levels import likeliest_parts
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.families.offsets import OffsetEffect, quantile_means
 from pchem_pipeline.effects.framework.effect import Count, Dn, PerFrame, SharedOffset, register_effect
 from pchem_pipeline.effects.types import (
-    BoolArray,
     EffectContext,
     Evidence,
     FloatArray,
     IntArray,
     TimeSeries,
 )
+from pchem_pipeline.model.arithmetic.significance import CLEAR
 
 Path = tuple[tuple[int, float], ...]
 
@@ -38,7 +36,6 @@ _PARTS: dict[Parts, FloatArray] = {
     "top_bottom": np.array([[0.5, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.5]]),
     "left_right": np.array([[0.5, 0.0, 0.5, 0.0], [0.0, 0.5, 0.0, 0.5]]),
 }
-_LAGS = 40
 
 
 @register_effect
@@ -81,8 +78,13 @@ class BiasJumps(OffsetEffect):
         "in units of amplitude_dn]",
     )
 
-    #: at 0.085 DN, with rare and with frequent jumps
-    typical_values = ({"amplitude_dn": 0.085, "rate": 1e-3}, {"amplitude_dn": 0.085, "rate": 1e-2})
+    #: at 0.085 DN, with rare and with frequent jumps, and those of halves
+    typical_values = (
+        {"amplitude_dn": 0.085, "rate": 1e-3},
+        {"amplitude_dn": 0.085, "rate": 1e-2},
+        {"amplitude_dn": 0.085, "rate": 1e-2, "parts": "top_bottom"},
+        {"amplitude_dn": 0.085, "rate": 1e-2, "parts": "left_right"},
+    )
 
     @model_validator(mode="after")
     def _path_for_each_part(self) -> Self:
@@ -141,35 +143,27 @@ class BiasJumps(OffsetEffect):
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return change points of the means of quadrants or halves, and random jumps of like size and rate.
 
-        What is common to all is taken out first, so that neither a drift nor frame noise is taken for jumps;
-        where each sits on one of two levels, that tells short visits and jumps of several at once. Jumps too
-        many or too small to be told apart still leave a correlation in time.
+        What is common to all is taken out first, so that neither a drift nor frame noise is taken for jumps.
+        Jumps too many or too small to be told apart still leave a correlation in time: what is typical.
         """
         if evidence.time is None or evidence.time.frames.size < 16:
             return ()
-        time, alpha = evidence.time, responsivity(evidence)
-        means = time.quadrant_readout.astype(np.float64)
-        drawn = [(*_correlated(time.frames, means @ mix.T), name) for name, mix in _PARTS.items()]
-        drawn = sorted((d for d in drawn if d[0] > SIGNIFICANT), reverse=True)
-        random = [cls(amplitude_dn=a / alpha, rate=rate, parts=name) for _, a, rate, name in drawn[:2]]
+        time = evidence.time
+        means = time.quadrant_readout / responsivity(evidence)
         gaps = np.diff(time.frames, prepend=-1).astype(np.float64)
         parts, found = likeliest_parts(means, gaps, _PARTS)
-        # more light blurs what the samples say of the offset, and parts may differ in it
-        shown = _PARTS[parts] @ [
-            responsivity(evidence, inside) for inside in _quadrants(evidence.maps.usable.shape)
-        ]
-        levels = [steps.levels / share for steps, share in zip(found, shown, strict=True)]
-        jumps = np.concatenate([np.diff(each) for each in levels])
+        jumps = np.concatenate([np.diff(steps.levels) for steps in found])
+        slow = evidence.strongest(*cls.signature[1:]) > CLEAR
+        typical = cls.typical_as_seen(evidence, cls.signature[0]) if slow else []
         if not jumps.size:
-            return random
+            return typical
         size = float(np.sqrt((jumps**2).mean()))
         covered = len(found) * (int(time.frames[-1]) - int(time.frames[0]) + 1)
         rate = min(max(jumps.size / covered, 1e-6), 0.5)
-        path = tuple(
-            _as_path(time, steps.starts, each / size) for steps, each in zip(found, levels, strict=True)
-        )
+        path = tuple(_as_path(time, steps.starts, steps.levels / size) for steps in found)
         as_seen = cls(amplitude_dn=size, rate=rate, parts=parts, path=path)
-        return [as_seen, as_seen.model_copy(update={"path": ()}), *random]
+        faster = [one for one in typical if one.parts == parts and one.rate > rate]
+        return [as_seen, as_seen.model_copy(update={"path": ()}), *faster]
 
     def shared_offset(self) -> SharedOffset:
         """Return that frames have one: at which level others are is not known."""
@@ -201,47 +195,6 @@ def _values(paths: tuple[Path, ...]) -> FloatArray:
             lasting = np.diff(np.concatenate([[0], starts[1:], [end]]))
             found.append(np.repeat(levels, np.maximum(lasting * 512 // end, 1)))
     return np.concatenate(found)
-
-
-def _correlated(frames: IntArray, means: FloatArray) -> tuple[float, float, float]:
-    """Return significance, amplitude (DN) and rate of two-level jumps that best explain the correlation.
-
-    The autocovariance of a level that jumps at rate q between ``-a/2`` and ``a/2`` is ``a^2 / 4 (1 - 2 q)^l``
-    at lag l; the deviation from the mean of m such parts has ``1 - 1 / m`` of that.
-    """
-    n_parts = means.shape[1]
-    contrast = means - means.mean(axis=1, keepdims=True)
-    contrast = contrast - contrast.mean(axis=0)
-    terms: list[tuple[float, float, float]] = []
-    for lag in range(1, min(_LAGS, frames.size // 4) + 1):
-        together = frames[lag:] - frames[:-lag] == lag
-        if together.sum() >= 8:
-            products = (contrast[lag:] * contrast[:-lag])[together]
-            terms.append((lag, float(products.mean()), float(products.shape[0])))
-    if not terms:
-        return 0.0, 0.0, 0.0
-    lags, covariance, weight = np.array(terms).T
-    variance = float(np.mean([noise_variance(one) for one in contrast.T]))
-    # of the contrasts of m parts only m - 1 are independent
-    error = variance / np.sqrt(n_parts - 1.0)
-    best = (0.0, 0.0, 0.0)
-    for rate in np.geomspace(1e-3, 0.25, 12):
-        shape = (1.0 - 2.0 * rate) ** lags
-        size = multiple_of(shape, covariance, weight / error**2)
-        if size.value > 0:
-            amplitude = 2.0 * float(np.sqrt(size.value / (1.0 - 1.0 / n_parts)))
-            best = max(best, (size.sigmas, amplitude, float(rate)))
-    return best
-
-
-def _quadrants(shape: tuple[int, ...]) -> list[BoolArray]:
-    """Return which pixels are in each quadrant, (y, x): top left, top right, bottom left, bottom right."""
-    bottom, right = (np.arange(n) >= n // 2 for n in shape)
-    return [
-        np.asarray((bottom == below)[:, None] & (right == beside))
-        for below in (False, True)
-        for beside in (False, True)
-    ]
 
 
 def _as_path(time: TimeSeries, starts: IntArray, levels: FloatArray) -> Path:

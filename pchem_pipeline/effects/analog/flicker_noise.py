@@ -10,29 +10,17 @@ sum of three of them with tau spaced by factors of 8, nearly 1/f in between (McW
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, Self, TypeVar
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.long_memory import between_grid_points, frame_key
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
 from pchem_pipeline.effects.framework.context import RandomSource
 from pchem_pipeline.effects.framework.effect import Effect, Frames, Plane, Ratio, register_effect
-from pchem_pipeline.effects.types import (
-    AnyArray,
-    BoolArray,
-    EffectContext,
-    Evidence,
-    FloatArray,
-    IntArray,
-    TimeSeries,
-)
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, IntArray
+from pchem_pipeline.model.arithmetic.significance import POSSIBLE
 
-_Flicker = TypeVar("_Flicker", bound="FlickerNoise")
-
-# correlation times, frames, among which the estimator looks
-_TIMES = np.array([0.7, 1.5, 3.0, 6.0, 12.0, 25.0, 50.0, 100.0, 200.0, 400.0, 1000.0])
 _SPACING = (1.0, 1 / 8, 1 / 64)
 
 
@@ -91,95 +79,20 @@ class FlickerNoise(Effect):
         noise += values
         return noise
 
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return what is typical where residuals of successive frames are alike."""
+        alike = evidence.z.get("time.lag1.readout.mean", 0.0) > POSSIBLE
+        return super().estimate(evidence) if alike else ()
+
+    def details(self) -> tuple[str, ...]:
+        """Return the correlation time."""
+        return ("correlation_frames",)
+
     def _times(self) -> tuple[float, ...]:
         """Return the correlation times, frames."""
         factors = (1.0,) if self.spectrum == "lorentzian" else _SPACING
         return tuple(self.correlation_frames * factor for factor in factors)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the least-squares fit of lag correlations and variance of block means, over a grid of tau.
-
-        A shift by d changes ``E[R | x]`` by ``d Var(r) / sigma^2`` on average (a), so that residuals l frames
-        apart are correlated by ``a share exp(-l / tau)``.
-        """
-        if evidence.time is None or not _good(evidence).any():
-            return ()
-        seen, error, response = _correlations(evidence, evidence.time)
-        best: list[tuple[float, Self]] = []
-        for spectrum in ("lorentzian", "one_over_f"):
-            for tau in _TIMES if spectrum == "lorentzian" else _TIMES[_TIMES >= 25.0]:
-                unit = cls(share=1.0, correlation_frames=float(tau), spectrum=spectrum)
-                shape = response * _shape(evidence.time, unit._times())
-                share = multiple_of(shape, seen, error**-2.0)
-                if np.isfinite(share.error):
-                    best.append((share.sigmas, unit.scaled(share.value)))
-        best.sort(key=lambda item: item[0], reverse=True)
-        return [effect for _, effect in _spread_out(best)] if best and best[0][0] > SIGNIFICANT else ()
-
-
-def _spread_out(ranked: list[tuple[float, _Flicker]]) -> list[tuple[float, _Flicker]]:
-    """Return the best of (sigmas, effect) and up to three others, nearly as good but far off in tau."""
-    kept = [ranked[0]]
-    for sigmas, effect in ranked[1:]:
-        far = all(
-            effect.spectrum != other.spectrum
-            or abs(np.log(effect.correlation_frames / other.correlation_frames)) > 1.2
-            for _, other in kept
-        )
-        if far and sigmas > 0.6 * ranked[0][0] and len(kept) < 4:
-            kept.append((sigmas, effect))
-    return kept
-
-
-def _good(evidence: Evidence) -> BoolArray:
-    """Return the pixels whose residuals vary, (y, x)."""
-    return evidence.maps.usable & np.isfinite(evidence.readout_std) & (evidence.readout_std > 0)
-
-
-def _correlations(evidence: Evidence, time: TimeSeries) -> tuple[FloatArray, FloatArray, float]:
-    """Return lags 1 to 3 and the relative excess of block means, their standard errors, and the response."""
-    maps = evidence.maps
-    response = (evidence.readout_std / maps.read_noise_dn) ** 2
-    good = _good(evidence)
-    lags = np.asarray(time.lag_readout, np.float64)[:, good]
-    n = max(good.sum(), 1)
-    pairs = np.maximum(time.n_pairs * (1.0 - np.arange(3) / max(time.block_frames - 1, 1)), 1.0)
-    seen, error = [np.nanmean(lags, axis=1)], [1.0 / np.sqrt(n * pairs)]
-    means = np.asarray(time.block_readout, np.float64)[:, good] / evidence.readout_std[good]
-    if means.shape[0] >= 2:
-        # what all pixels share is another effect's
-        means = means - np.nanmean(means, axis=1, keepdims=True)
-        degrees = means.shape[0] - 1
-        variance = float(np.nanmean(np.nanvar(means, axis=0, ddof=1))) * _frames_of_block(time)
-        seen.append(np.array([variance * n / max(n - 1, 1) - 1.0]))
-        error.append(np.array([np.sqrt(2.0 / (degrees * n))]))
-    return np.concatenate(seen), np.concatenate(error), float(response[good].mean())
-
-
-def _frames_of_block(time: TimeSeries) -> float:
-    return float(time.frames.size / max(time.block_start.size, 1))
-
-
-def _shape(time: TimeSeries, times: Sequence[float]) -> FloatArray:
-    """Return what a share of 1 gives: correlations at lags 1 to 3, excess of the block means' variance."""
-    found: FloatArray = np.mean([_lorentzian_shape(time, tau) for tau in times], axis=0)
-    return found
-
-
-def _lorentzian_shape(time: TimeSeries, tau: float) -> FloatArray:
-    lags = np.exp(-np.arange(1, 4) / tau)
-    if time.block_readout.shape[0] < 2:
-        return lags
-    frames = _frames_of_block(time)
-    inside = np.arange(1, max(int(frames), 2))
-    excess = 2.0 * np.sum((1.0 - inside / frames) * np.exp(-inside / tau))
-    # blocks are compared with one another: what is common to all of them does not show
-    starts = time.block_start / tau
-    between = np.exp(-np.abs(starts[:, None] - starts[None, :]))
-    np.fill_diagonal(between, 0.0)
-    common = (excess + 1.0) * between.sum() / max(starts.size * (starts.size - 1), 1)
-    return np.append(lags, max(excess - common, 0.0))
 
 
 def _ornstein_uhlenbeck(

@@ -15,15 +15,11 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, typical_pixels
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of
-from pchem_pipeline.effects.estimators.response import first_order
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
 
-_TAIL_PIXELS, _TAIL_DOUBT = 40, 0.15
-# widths that are guessed, at a share so small that samples and moments go in proportion to it
-_FACTORS, _SMALL, _MOST = (1.25, 1.4, 1.6, 2.0, 2.5, 3.0, 5.0, 8.0, 13.0), 1e-3, 4
+# factor less 1 of noisy samples that move the tail and He4 by as many standard deviations
+_WIDTH = 0.7
 
 
 @register_effect
@@ -60,11 +56,11 @@ class HeavyTailedNoise(Effect):
         description="noise of such a sample relative to others, no unit",
     )
 
-    #: few noisy samples, and more but less noisy ones; the last is near a Student law of many degrees of
+    #: few noisy samples, and more but less noisy ones; the last are near a Student law of many degrees of
     #: freedom: kurtosis almost without tails
     typical_values = tuple(
         {"share": share, "factor": factor}
-        for share, factor in ((2.4e-4, 3.0), (3e-3, 2.0), (6e-5, 5.0), (5e-2, 1.25))
+        for share, factor in ((2.4e-4, 3.0), (3e-3, 2.0), (6e-5, 5.0), (5e-2, 1.25), (2e-2, 1.6))
     )
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
@@ -77,51 +73,11 @@ class HeavyTailedNoise(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return mixtures with the samples below the codes and the He4 that are seen.
-
-        The share is the weighted mean of what either says; the factors for which they agree best, the best
-        first.
-        """
-        tail = _TailBelow(evidence)
-        found: list[tuple[float, Self]] = []
-        for width in _FACTORS:
-            effect = cls(share=_SMALL, factor=width)
-            factor, error = first_order(evidence, effect, "He4", cut=8.0)
-            other, other_error = tail.first_order(effect)
-            errors = np.array([error, other_error])
-            mean = multiple_of(np.ones(2), np.array([factor, other]), errors**-2.0)
-            if mean.sigmas > SIGNIFICANT:
-                disagreement = (factor - other) ** 2 / (error**2 + other_error**2)
-                found.append((disagreement, effect.scaled(mean.value)))
-        return [effect for _, effect in sorted(found, key=lambda item: item[0])[:_MOST]]
+        """Return what is typical; the wider the noisy samples, the more the tail shows them than He4 does."""
+        tail, kurtosis = (max(evidence.z.get(name, 0.0), 1.0) for name in cls.signature[:2])
+        width = 1.0 + _WIDTH * tail / kurtosis
+        return sorted(super().estimate(evidence), key=lambda one: abs(np.log(one.factor / width)))
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with noise of two widths."""
         return model.with_noise(np.array([1.0 - self.share, self.share]), width=np.array([1.0, self.factor]))
-
-
-class _TailBelow:
-    """The samples below the codes of the pixels: how many are seen, and how many there should be."""
-
-    def __init__(self, evidence: Evidence):
-        self.n_frames = evidence.n_frames
-        seen = evidence.tail_low[evidence.maps.usable].astype(np.float64)
-        # single pixels with very many are another effect's: they count for a few more than the others
-        self.seen = float(np.minimum(seen, 3.0 + 5.0 * float(seen.mean())).sum()) if seen.size else 0.0
-        # what is expected differs much between pixels, since codes are whole
-        chosen, groups = typical_pixels(evidence.maps, _TAIL_PIXELS)
-        self.numbers = np.array([group.size for group in groups])
-        self.laws = [PixelLaw(evidence.maps, int(pixel), evidence.n_frames) for pixel in chosen]
-        self.expected = self._number(SampleLaw())
-
-    def _number(self, law: SampleLaw) -> float:
-        below = np.array([pixel.below(law) for pixel in self.laws])
-        return float((self.numbers * below).sum()) * self.n_frames
-
-    def first_order(self, effect: HeavyTailedNoise) -> tuple[float, float]:
-        """Return how many times an effect's share explains the samples, and the standard error."""
-        more = self._number(SampleLaw().with_noise([1.0], width=effect.factor)) * effect.share
-        if not more > 0:
-            return 0.0, np.inf
-        variance = max(self.seen, self.expected) + 1.0 + (_TAIL_DOUBT * self.expected) ** 2
-        return (self.seen - self.expected) / more, float(np.sqrt(variance)) / more

@@ -14,7 +14,6 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of, neighbour_mean
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -22,8 +21,8 @@ from pchem_pipeline.effects.types import (
     Evidence,
     PixelMaps,
     SampleLaw,
-    TimeSeries,
 )
+from pchem_pipeline.model.arithmetic.significance import CLEAR
 
 
 @register_effect
@@ -86,18 +85,13 @@ class InterpixelCapacitance(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the regression of the residual on the charge of the neighbour, anisotropic if that shows."""
-        if evidence.time is None:
-            return ()
-        (x, x_error), (y, y_error) = (_coupling(evidence, evidence.time, axis) for axis in ("x", "y"))
-        mean = multiple_of(np.ones(2), np.array([x, y]), np.array([x_error, y_error]) ** -2.0)
-        if not mean.sigmas > SIGNIFICANT:
-            return ()
-        found = [cls(coupling=min(mean.value, 0.2))]
-        if abs(x - y) > 3.0 * np.hypot(x_error, y_error):
-            x, y = max(x, 0.0), max(y, 0.0)
-            found.insert(0, cls(coupling=min((x + y) / 2.0, 0.2), anisotropy=(x - y) / (x + y)))
-        return found
+        """Return what is typical, as strong as the residual follows neighbours; anisotropic if that shows."""
+        x, y = (max(evidence.z.get(f"space.{axis}.rk", 0.0), 0.0) for axis in "xy")
+        found = super().estimate(evidence)
+        if not abs(x - y) > CLEAR * 2.0**0.5:
+            return found
+        differing = {"anisotropy": (x - y) / (x + y)}
+        return [*(one.model_copy(update=differing) for one in found), *found]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with a smaller step, the neighbours' mean charge and its variance.
@@ -109,26 +103,3 @@ class InterpixelCapacitance(Effect):
         return model.with_levels(
             scale=1.0 - 4.0 * self.coupling, shift_e=4.0 * self.coupling * exposure
         ).with_variance(e2=squares * exposure)
-
-
-def _coupling(evidence: Evidence, time: TimeSeries, axis: str) -> tuple[float, float]:
-    """Return the coupling along an axis and its standard error, which is infinite where nothing shows it.
-
-    A shift of i by ``a K_j`` changes ``E[R_i | x]`` by ``a K_j Var(r_i) / sigma_i^2`` on average, and that
-    of j by ``a K_i`` changes ``E[K_j | x]`` by ``a K_i c_j / sigma_j^2`` with ``c = Cov(k, R) = Cov(r, K)``,
-    part of the shift being taken for charge. So ``Cov(r_i, k_j) = a [Var(r_i) Var(k_j) / sigma_i^2 + c_i
-    c_j / sigma_j^2]``, all in electrons.
-    """
-    maps, name = evidence.maps, f"{axis}.rk"
-    gain = np.where(maps.usable, maps.conversion_gain, np.nan)
-    noise = (maps.read_noise_dn * gain) ** 2
-    readout, charge = (evidence.readout_std * gain) ** 2, evidence.charge_std**2
-    mixed = (maps.quanta_exposure + noise - readout - charge) / 2.0
-    pairs = time.neighbour_pairs.get(name, 0)
-    # of the correlation, so each divided by the standard deviations of r_i and k_j
-    first = neighbour_mean(np.sqrt(readout) / noise, np.sqrt(charge), axis)
-    second = neighbour_mean(mixed / np.sqrt(readout), mixed / np.sqrt(charge) / noise, axis)
-    response = first + second
-    if not (pairs and np.isfinite(response) and response > 0):
-        return 0.0, np.inf
-    return time.neighbours[name] / response, 1.0 / (response * np.sqrt(pairs))

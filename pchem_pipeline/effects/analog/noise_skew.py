@@ -8,15 +8,14 @@ variance 1, so that ``R`` has mean 0, variance ``sigma^2`` and skewness ``2 shar
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.response import strength_of
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, FloatArray, PixelMaps, SampleLaw
 
 #: Parts of the exponential up to a share of 0.6 (0.75 of the Gaussian part), and at most.
 _LOBES, _ENOUGH_FOR, _MOST_LOBES = 8, 0.75, 16
@@ -66,11 +65,6 @@ class NoiseSkew(Effect):
             exponential -= (1.0 - self._gaussian) * context.read_noise
         exponential += values
         return exponential
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the share whose third Hermite score is that seen."""
-        return strength_of(evidence, cls(share=0.3), "He3", signed=True)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the exponential cut into parts, each a Gaussian of its mean and variance.

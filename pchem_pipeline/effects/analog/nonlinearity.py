@@ -9,16 +9,15 @@ large at ``k`` electrons.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.effects.estimators.response import strength_of
 from pchem_pipeline.effects.framework.effect import Effect, PerElectron, Plane, register_effect
-from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, PixelMaps, SampleLaw
 
 Noise = Literal["kept", "bent"]
 
@@ -56,8 +55,10 @@ class Nonlinearity(Effect):
         description="kept: nonlinearity before the read noise (sense node); bent: after it (amplifiers)",
     )
 
-    #: steps that grow and steps that shrink
-    typical_values = ({"step_change": 2e-3}, {"step_change": -2e-3})
+    #: steps that grow and steps that shrink, before the read noise and after
+    typical_values = tuple(
+        {"step_change": change, "noise": noise} for noise in ("kept", "bent") for change in (2e-3, -2e-3)
+    )
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, on a bent comb; draws nothing."""
@@ -69,13 +70,6 @@ class Nonlinearity(Effect):
         bend *= 0.5 * self.step_change
         bend += values
         return bend
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the change whose bend of the comb (He1C2) is that seen, before the read noise and after."""
-        kinds: tuple[Noise, ...] = "kept", "bent"
-        each = [strength_of(evidence, cls(step_change=1e-3, noise=n), "He1C2", signed=True) for n in kinds]
-        return [effect for found in each for effect in found]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the comb bent, and the noise around it where that is."""

@@ -14,11 +14,13 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.read_order import RECORD, pink_amplitudes, pink_noise_of
 from pchem_pipeline.effects.families.offsets import OffsetEffect
 from pchem_pipeline.effects.framework.effect import Count, Dn, register_effect
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
+
+# frames in a record of noise, of which one is used: what is cut from a longer one has no period
+_RECORD = 4
 
 
 @register_effect
@@ -53,8 +55,8 @@ class ReadOrderNoise(OffsetEffect):
         default=1, ge=1, le=4096, description="column blocks read in parallel, with independent noise"
     )
 
-    #: at 0.5 DN, of one tap and of four
-    typical_values = ({"noise_dn": 0.5}, {"noise_dn": 0.5, "taps": 4})
+    #: at 0.5 DN, of one tap and of several
+    typical_values = tuple({"noise_dn": 0.5, "taps": taps} for taps in (1, 4, 2, 8))
 
     def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with as many taps as these columns have of its width."""
@@ -74,12 +76,12 @@ class ReadOrderNoise(OffsetEffect):
         rows, columns = context.shape
         taps = min(self.taps, columns)
         width = -(-columns // taps)
-        amplitudes = pink_amplitudes(rows * width)
+        amplitudes = _pink_amplitudes(rows * width)
         noise = np.empty((context.frames.size, context.rows.size, columns))
         for t, frame in enumerate(context.frames):
             random = context.random.generator(frame=int(frame))
-            white = np.fft.rfft(random.standard_normal((taps, RECORD * rows * width)))
-            record = np.fft.irfft(amplitudes * white, RECORD * rows * width)
+            white = np.fft.rfft(random.standard_normal((taps, _RECORD * rows * width)))
+            record = np.fft.irfft(amplitudes * white, _RECORD * rows * width)
             series = record[:, : rows * width].reshape(taps, rows, width)
             noise[t] = series.transpose(1, 0, 2).reshape(rows, taps * width)[context.rows, :columns]
         noise *= self.noise_dn
@@ -87,6 +89,21 @@ class ReadOrderNoise(OffsetEffect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the noise that the covariances of rows and of neighbours show, for the likeliest taps."""
-        found = pink_noise_of(evidence)
-        return [cls(noise_dn=noise, taps=taps) for noise, taps in found]
+        """Return it with few taps, as strong as adjacent rows are alike: noise of rows makes none alike."""
+        columns = evidence.maps.usable.shape[1]
+        return [one for one in cls.typical_as_seen(evidence, cls.signature[0]) if columns % one.taps == 0]
+
+
+def _pink_amplitudes(n: int) -> FloatArray:
+    """Return factors of the spectrum that make white noise of a record 1/f, of variance 1.
+
+    Args:
+        n: samples of a frame; there is nothing slower than one cycle in so many.
+
+    Returns:
+        (_RECORD n // 2 + 1,), real.
+    """
+    cycles = np.arange(_RECORD * n // 2 + 1)
+    amplitudes = np.where(cycles >= min(_RECORD, cycles[-1]), np.maximum(cycles, 1) ** -0.5, 0.0)
+    weight = np.where((cycles == 0) | (2 * cycles == _RECORD * n), 1.0, 2.0)
+    return np.asarray(amplitudes / np.sqrt((weight * amplitudes**2).sum() / (_RECORD * n)))

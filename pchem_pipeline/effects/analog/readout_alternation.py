@@ -7,17 +7,15 @@ the bias map.)
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.common_modes import mean_variance, responsivity
 from pchem_pipeline.effects.families.offsets import OffsetEffect
 from pchem_pipeline.effects.framework.effect import Dn, SharedOffset, register_effect
-from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
-from pchem_pipeline.model.arithmetic.significance import POSSIBLE
+from pchem_pipeline.effects.types import EffectContext, FloatArray
 
 
 @register_effect
@@ -55,23 +53,6 @@ class ReadoutAlternation(OffsetEffect):
     def offset_values(self) -> FloatArray:
         """Return the offsets of even and of odd frames, DN."""
         return self.alternation_dn * np.array([-1.0, 1.0])
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return half the difference of the means of even and odd frames."""
-        if evidence.time is None:
-            return ()
-        means = evidence.time.frame_readout
-        even = evidence.time.frames % 2 == 0
-        n_even, n_odd = int(even.sum()), int((~even).sum())
-        if min(n_even, n_odd) < 4:
-            return ()
-        size = float(means[even].mean() - means[~even].mean()) / 2.0
-        scatter = float((means[even].var() * n_even + means[~even].var() * n_odd) / (n_even + n_odd))
-        error = np.sqrt(max(scatter, float(mean_variance(evidence))) * (1.0 / n_even + 1.0 / n_odd)) / 2.0
-        if abs(size) < POSSIBLE * error:
-            return ()
-        return (cls(alternation_dn=size / responsivity(evidence)),)
 
     def shared_offset(self) -> SharedOffset:
         """Return the offset of a frame, either of two."""

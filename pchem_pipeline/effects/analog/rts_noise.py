@@ -18,8 +18,6 @@ from pydantic import Field
 from scipy import special
 
 from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL, frame_key, two_states
-from pchem_pipeline.effects.estimators.pixel_law import PixelLaw, refitted, typical_pixels
-from pchem_pipeline.effects.estimators.regression import FEW_PIXELS
 from pchem_pipeline.effects.framework.effect import (
     Count,
     Effect,
@@ -31,7 +29,6 @@ from pchem_pipeline.effects.framework.effect import (
 )
 from pchem_pipeline.effects.types import (
     AnyArray,
-    BoolArray,
     EffectContext,
     Evidence,
     FloatArray,
@@ -42,26 +39,8 @@ from pchem_pipeline.effects.types import (
 _WHERE, _SIZE, _FULL, _EMPTY = OF_PIXEL
 # standard deviation of the logarithms of lognormal steps
 _LOGNORMAL = 0.4
-# steps, e-, and samples averaged that the estimator looks for, with probabilities
-_STEPS = (
-    (0.5, 1), (0.7, 1), (1.0, 1), (1.5, 1), (2.5, 1), (4.0, 1), (1.3, 2), (2.0, 2), (1.5, 4), (3.0, 4),
-)  # fmt: skip
-# pixels that must stand out: most with strong traps are led so far astray that their fit is not usable
-_FEWEST = 2
-# share of the pixels guessed at least: what moves no statistic clearly cannot be scaled to what is there
-_LEAST_FRACTION = 0.04
-_PROBABILITIES = (0.01, 0.03, 0.08, 0.2, 0.4)
-# what outlying pixels are compared by, with the form of the peaks before, and how far they must stand out
-_PROFILE = ("He4", "C2", "He2C1", "He2C2", "He3C1")
-_LIMITS = np.array([4.2, 6.0, 4.2, 4.5, 4.5, 5.0])
-# standard deviations of a correlation in time beyond which a pixel has a slow trap
-_SLOW = 5.0
-# median step of slow traps that differ, over that of those which stand out
-_OF_THE_LARGEST = (0.8, 0.55)
 # standard deviations of the logarithms of its times by which hardly a trap is slower
 _FARTHEST = 4.0
-# spread of the times of real traps: those of one oxide differ by more than the frames of a run show
-_USUAL_TIMES_SPREAD = 0.8
 # amplitudes tried in every pixel, in units of that of the effect
 _EQUAL, _EXPONENTIAL = (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0), (0.35, 0.5, 0.7, 1.0, 1.35, 1.8, 2.5, 3.4)
 _ALARM = 0.1  # pixels wrongly given levels, of those that have some
@@ -133,14 +112,16 @@ class RtsNoise(Effect):
         "differ from trap to trap; 0: alike in all",
     )
 
-    #: double sampling at two steps, multiple sampling, and a slow trap
+    #: double sampling at two steps, multiple sampling, slow traps that are alike, and real ones
     typical_values = (
         {"fraction": 0.014, "amplitude_e": 1.0},
         {"fraction": 0.014, "amplitude_e": 2.5, "probability": 0.1},
         {"fraction": 0.014, "amplitude_e": 1.0, "spread": "exponential"},
         {"fraction": 0.014, "amplitude_e": 1.5, "samples": 4},
         {"fraction": 0.014, "amplitude_e": 0.5, "probability": 0.5, "sampling": "single"},
-    )
+        {"fraction": 0.014, "amplitude_e": 0.5, "probability": 0.5, "sampling": "single",
+         "spread": "lognormal", "times_spread": 0.8},
+    )  # fmt: skip
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, with the steps of the pixels that have a trap."""
@@ -197,87 +178,12 @@ class RtsNoise(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return steps of several sizes, each with the probability and share that outlying pixels ask for.
-
-        Probability and order are those whose form of the peaks and scores resemble the outlying pixels'; the
-        number of these gives the share.
-        """
-        found = cls._correlated(evidence)
-        slow = cls._single(evidence)
-        return [*found[: 5 - len(slow)], *slow]
-
-    @classmethod
-    def _correlated(cls, evidence: Evidence) -> list[Self]:
-        outlying = _outlying(evidence)
-        n, count = int(evidence.maps.usable.sum()), int(outlying.sum())
-        # where most pixels stand out something else is wrong
-        if count < _FEWEST or count > FEW_PIXELS * n:
-            return []
-        seen = np.array([np.median(values[outlying]) for values in _profile(evidence)])
-        chosen = typical_pixels(evidence.maps, 3)[0]
-        laws = [PixelLaw(evidence.maps, int(pixel), evidence.n_frames) for pixel in chosen]
-        kinds = [
-            cls(fraction=count / n, amplitude_e=amplitude, samples=samples, probability=q)
-            for amplitude, samples in _STEPS
-            for q in _PROBABILITIES
+        """Return what is typical, in as many pixels as stand out: slow traps by what they do in time."""
+        slow = cls.typical_as_seen(evidence, "time.block.readout.cnt")
+        return [
+            *(one for one in super().estimate(evidence) if one.sampling == "correlated"),
+            *(one for one in slow if one.sampling == "single"),
         ]
-        profiles = _expected_profiles([kind._as_noise() for kind in kinds], laws, evidence.n_frames)
-        misfit = ((np.arcsinh(profiles / 3.0) - np.arcsinh(seen / 3.0)) ** 2).sum(axis=1)
-        best = []
-        for step in np.split(np.arange(len(kinds)), len(_STEPS)):
-            at = step[np.argmin(misfit[step])]
-            # those too weak to stand out count too
-            power = max(_survival(float((_LIMITS - _departure(profiles[at])).min())), 0.3)
-            share = min(max(count / n / power, _LEAST_FRACTION), 1.0)
-            best.append((misfit[at], kinds[at].model_copy(update={"fraction": share})))
-        ranked = [effect for _, effect in sorted(best, key=lambda item: float(item[0]))]
-        # real traps differ; the mean of those that stand out is well above that of all
-        spread = ranked[0].model_copy(
-            update={"spread": "exponential", "amplitude_e": 0.7 * ranked[0].amplitude_e}
-        )
-        # how many samples are averaged shows little in these profiles: the best of each is a guess
-        likeliest = {effect.samples: effect for effect in reversed(ranked)}
-        first = sorted(likeliest.values(), key=ranked.index)
-        return [*first, spread, *(effect for effect in ranked if effect not in first)]
-
-    @classmethod
-    def _single(cls, evidence: Evidence) -> list[Self]:
-        """Return a slow trap where the few pixels are strongly correlated in time."""
-        time, maps = evidence.time, evidence.maps
-        if time is None or time.n_pairs < 10:
-            return []
-        charge, readout = (
-            np.asarray(lags, np.float64)[:, maps.usable] for lags in (time.lag_charge, time.lag_readout)
-        )
-        outlying = np.fmax(charge[0], readout[0]) * np.sqrt(time.n_pairs) > _SLOW
-        if outlying.sum() < 3 or outlying.sum() > FEW_PIXELS * outlying.size:
-            return []
-        sd_k = evidence.charge_std[maps.usable][outlying]
-        sd_r = (evidence.readout_std * maps.conversion_gain)[maps.usable][outlying]
-        # k + r g is the sample itself, so its autocovariance is A^2 p (1 - p) rho
-        both = (time.lag_readout_charge + time.lag_charge_readout)[maps.usable][outlying]
-        near, _, far = (charge[:, outlying] * sd_k**2 + readout[:, outlying] * sd_r**2).mean(axis=1)
-        rho = float(np.clip(max(far / near, 0.0) ** 0.5, 0.05, 0.995))
-        amplitude = 2.0 * float(np.sqrt(max(near + float((both * sd_k * sd_r).mean()), 1e-6) / rho))
-        alike = cls(
-            fraction=float(outlying.mean()),
-            amplitude_e=min(amplitude, 1e4),
-            probability=0.5,
-            sampling="single",
-            correlation_frames=-1.0 / float(np.log(rho)),
-        )
-        # where traps differ, those that stand out have larger steps than most
-        differing = [
-            alike.model_copy(
-                update={
-                    "spread": "lognormal",
-                    "times_spread": _USUAL_TIMES_SPREAD,
-                    "amplitude_e": alike.amplitude_e * share,
-                }
-            )
-            for share in _OF_THE_LARGEST
-        ]
-        return [alike, *differing]
 
     def details(self) -> tuple[str, ...]:
         """Return the step, how often it comes, and how long a slow trap takes."""
@@ -304,53 +210,3 @@ class RtsNoise(Effect):
         heights = np.arange(1, self.samples + 1) / self.samples
         weights = np.where(heights < 1.0, 1.0, 0.5) / self._places()
         return [(float(s * h), float(w)) for h, w in zip(heights, weights, strict=True) for s in (-1, 1)]
-
-    def _as_noise(self) -> SampleLaw:
-        """Return the law of a pixel with a trap."""
-        shifts, weights = np.array(self._pattern()).T
-        return SampleLaw().with_noise(
-            np.append(1.0 - self.probability, self.probability * weights),
-            shift_e=np.append(0.0, self.amplitude_e * shifts),
-        )
-
-
-def _profile(evidence: Evidence) -> list[FloatArray]:
-    """Return what outlying pixels are compared by: form of the peaks and some scores of the usable pixels."""
-    usable = evidence.maps.usable
-    return [
-        np.nan_to_num(values[usable].astype(np.float64))
-        for values in (evidence.peaks, *(evidence.scores[name] for name in _PROFILE))
-    ]
-
-
-def _departure(profile: FloatArray) -> FloatArray:
-    """Return how far a profile departs from none: upwards in peaks and He4, either way in the others."""
-    return np.concatenate([profile[:2], np.abs(profile[2:])])
-
-
-def _outlying(evidence: Evidence) -> BoolArray:
-    """Return which usable pixels stand out in something."""
-    return np.asarray((_departure(np.array(_profile(evidence))) > _LIMITS[:, None]).any(axis=0))
-
-
-def _expected_profiles(kinds: Sequence[SampleLaw], laws: Sequence[PixelLaw], n_frames: int) -> FloatArray:
-    """Return the same for pixels of other laws, the median over the pixels: (kind, profile).
-
-    The PCD is fitted to the exact law of such pixels, since it takes up much of the steps.
-    """
-    masses = [law.mass_of(kind) for kind in kinds for law in laws]
-    fits = refitted(list(laws) * len(kinds), masses, n_frames)
-    rows = []
-    for fit, mass in zip(fits, masses, strict=True):
-        change = fit.on_codes(*mass) - fit.mass
-        scores = [fit.score_shift(name, change) * np.sqrt(n_frames) for name in _PROFILE]
-        rows.append([fit.goodness(change, n_frames), *scores])
-    found: FloatArray = np.median(np.array(rows).reshape(len(kinds), len(laws), -1), axis=1)
-    return found
-
-
-def _survival(z: float) -> float:
-    """Return the probability that a standard normal number is above z."""
-    from math import erfc, sqrt
-
-    return 0.5 * erfc(z / sqrt(2.0))

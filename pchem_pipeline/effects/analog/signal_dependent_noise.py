@@ -7,15 +7,14 @@ et al. 2010). A gain that differs from sample to sample is common to the sample'
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.response import strength_of
 from pchem_pipeline.effects.framework.effect import Effect, Electrons, Plane, register_effect
-from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, PixelMaps, SampleLaw
 
 
 @register_effect
@@ -62,14 +61,6 @@ class SignalDependentNoise(Effect):
         noise *= self.noise_e
         noise += values
         return noise
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the noise of either growth whose widening of the peaks is that seen."""
-        found: list[Self] = []
-        for effect in cls.typical():
-            found += strength_of(evidence, effect, "He2C1")
-        return found
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with variance growing along the peaks."""

@@ -10,20 +10,17 @@ and variance ``q / (1 - l)^3``.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.count_scores import count_excess
 from pchem_pipeline.effects.estimators.electrons import regrouped
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
     EffectContext,
-    Evidence,
     FloatArray,
     IntArray,
     PixelMaps,
@@ -72,13 +69,6 @@ class BranchingCounts(Effect):
             return 1 + np.searchsorted(below, v)
 
         return regrouped(values, u, self.branching, lambda index: (self.branching, grow), extra)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return l from the scores of the second Charlier polynomial, where they exceed 2.5 sigma."""
-        c, stderr = count_excess(evidence, power=-1.0)
-        # Var K = H + 2 l H + ... against H + c H
-        return (cls(branching=min(1.0 - (1.0 + c) ** -0.5, 0.5)),) if c > SIGNIFICANT * stderr else ()
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with generalised Poisson electron numbers."""

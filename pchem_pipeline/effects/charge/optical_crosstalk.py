@@ -9,16 +9,15 @@ readout.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.electrons import sent_to_neighbours
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT, multiple_of, neighbour_mean
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
-from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, PixelMaps, SampleLaw
+from pchem_pipeline.effects.types import AnyArray, EffectContext, PixelMaps, SampleLaw
 
 
 @register_effect
@@ -62,27 +61,6 @@ class OpticalCrosstalk(Effect):
         np.add.at(result, (frame[inside], y[inside], x[inside]), 1)
         return result
 
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return p from the correlations of neighbours' electron numbers, where these are above 2.5 sigma."""
-        if evidence.time is None:
-            return ()
-        pairs = np.array([evidence.time.neighbour_pairs.get(f"{axis}.kk", 0) for axis in "xy"], np.float64)
-        seen = np.array([evidence.time.neighbours.get(f"{axis}.kk", 0.0) for axis in "xy"])
-        response = np.array([_response(evidence, axis) for axis in "xy"])
-        found = multiple_of(np.nan_to_num(response), seen, pairs)
-        return (cls(probability=min(found.value, 0.5)),) if found.sigmas > SIGNIFICANT else ()
-
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with a Poisson mean that holds what neighbours as bright as the pixel send."""
         return model.with_exposures([1.0], [1.0 + self.probability])
-
-
-def _response(evidence: Evidence, axis: str) -> float:
-    """Return the mean correlation of neighbours along an axis per unit of p, NaN without such pairs.
-
-    The expected electron number answers to the true one with the slope Var(k) / H.
-    """
-    exposure = evidence.maps.quanta_exposure
-    std = np.where(evidence.maps.usable & (exposure > 0), evidence.charge_std, np.nan)
-    return 0.5 * neighbour_mean(std / exposure, std, axis)

@@ -15,9 +15,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.count_scores import count_excess
 from pchem_pipeline.effects.estimators.electrons import binomial_upper, regrouped
-from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -108,19 +106,16 @@ class OverdispersedCounts(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return a from the scores of the second Charlier polynomial, where they exceed 2.5 sigma.
+        """Return what is typical, as strong as the second Charlier polynomial has it.
 
         Both kinds of exposures where the third polynomial, in which they differ by ``a^2 H^3`` in all, would
         tell them apart.
         """
-        a, stderr = count_excess(evidence, power=0.0)
-        if not a > SIGNIFICANT * stderr:
-            return ()
-        a = min(a, 1.0)
+        found = super().estimate(evidence)
         exposure = evidence.maps.quanta_exposure[evidence.maps.usable]
-        apart = a**2 * np.sqrt(evidence.n_frames * np.nansum(exposure**3.0) / 6.0)
-        kinds: tuple[Literal["gamma", "lognormal"], ...] = ("gamma", "lognormal")
-        return tuple(cls(relative_variance=a, exposures=kind) for kind in kinds[: 2 if apart > CLEAR else 1])
+        differ = np.sqrt(evidence.n_frames * np.nansum(exposure**3.0) / 6.0)
+        apart = [one for one in found if one.relative_variance**2 * differ > CLEAR]
+        return [*found, *(one.model_copy(update={"exposures": "lognormal"}) for one in apart)]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with negative binomial electron numbers, or mixed over log-normal exposures."""

@@ -20,15 +20,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, NamedTuple, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.count_scores import charlier_information
 from pchem_pipeline.effects.estimators.long_memory import OF_PIXEL
-from pchem_pipeline.effects.estimators.pixel_law import SMALL_CHANGE, PixelLaw, typical_pixels
-from pchem_pipeline.effects.estimators.regression import NEARLY_ALL, SIGNIFICANT
 from pchem_pipeline.effects.framework.effect import Effect, Plane, Ratio, register_effect
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -40,14 +37,10 @@ from pchem_pipeline.effects.types import (
     PixelMaps,
     SampleLaw,
 )
-from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, CERTAIN, OUTLYING
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, POSSIBLE
 
 # probability that the state of a trap goes back farther than the frames that are simulated for it
 _RARE = 1e-6
-# chances, and shares of the pixels, among which the estimator looks first
-_CAPTURES = np.geomspace(0.002, 0.9, 12)
-_RELEASES = np.geomspace(0.02, 0.9, 9)
-_FRACTIONS = (0.03, 0.1, 0.3)
 _LIMITS = (0.02, 0.95)  # of a release, and the largest of a capture
 
 
@@ -122,25 +115,36 @@ class Trapping(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the likeliest chances by autocovariances and variances of the electron numbers, by pixel.
+        """Return the trap of which the autocovariances of the electron numbers are, in some pixels or in all.
 
-        Two traps of which one catches as often as the other releases have nearly the same moments: that which
-        is more often empty is meant, unless the other is clearly likelier. Where it is far likelier that only
-        some pixels have a trap, that is the first hypothesis.
+        The squares of the first one tell in how many. Two traps of which one catches as often as the other
+        releases have the same moments: that which is more often empty is meant.
         """
-        pixels = _observed(evidence)
-        if pixels is None:
+        time, maps = evidence.time, evidence.maps
+        if time is None or not evidence.z.get("time.lag1.charge.mean", 0.0) < -POSSIBLE:
             return ()
-        starts = _starts(pixels)
-        alike, found = _refined(pixels, starts[1.0]), []
-        if alike.seen:
-            other = _refined(pixels, alike.opposite(float(pixels.some.mean())))
-            found = [_first_of(alike, other)]
-        some = _refined(pixels, max((starts[f] for f in _FRACTIONS), key=lambda one: one.height))
-        clear = some.height - max(alike.height, 0.0) > CERTAIN**2 / 2.0
-        if clear and some.seen and some.fraction < NEARLY_ALL:
-            found.insert(0, some)
-        return [cls(capture=one.capture, release=one.release, fraction=one.fraction) for one in found]
+        good = maps.usable & (maps.quanta_exposure > 0) & np.isfinite(time.lag_charge[:2]).all(axis=0)
+        exposure, first = maps.quanta_exposure[good], time.lag_charge[0][good].astype(np.float64)
+        some = -np.expm1(-exposure)
+        # the expected electron number answers to the electrons by Var(k) / H
+        answer = (some - exposure * np.exp(-exposure)) * (evidence.charge_std[good] / exposure) ** 2
+        mean = -float(answer @ first / (answer @ answer))
+        if not mean > 0.0:
+            return ()
+        left = float(np.clip(-(answer @ time.lag_charge[1][good]) / (answer @ answer) / mean, 0.0, 0.95))
+        weight = answer**2 / float((answer**4).sum())
+        squares = float(weight @ (first**2 - 1.0 / time.n_pairs))
+        beyond = squares - mean**2 > CERTAIN * (2.0 * float(weight @ weight)) ** 0.5 / time.n_pairs
+        shares = (mean**2 / squares, 1.0) if beyond else (1.0,)
+        return [cls._with(mean / share, 1.0 - left, float(some.mean()), share) for share in shares]
+
+    @classmethod
+    def _with(cls, product: float, total: float, some: float, fraction: float) -> Self:
+        """Return it with the product ``r c`` of its chances and their sum ``r + c P(K >= 1)``."""
+        low, high = _LIMITS
+        release = 0.5 * (total + max(total**2 - 4.0 * product * some, 0.0) ** 0.5)
+        capture = min((total - release) / some, high)
+        return cls(capture=capture, release=min(max(release, low), high), fraction=fraction)
 
     def details(self) -> tuple[str, ...]:
         """Return the chance of a release, and the share of the pixels where not all have a trap."""
@@ -179,153 +183,3 @@ def _states(filled: BoolArray, emptied: BoolArray, history: int) -> IntArray:
     then = np.take_along_axis(np.concatenate([start, filled]) ^ changes, last, axis=0)
     full = (then ^ changes) & (last > 0) & (frame - last < history)
     return np.asarray(full, np.int64)
-
-
-class _Pixels(NamedTuple):
-    """What pixels with electrons show, in standard deviations of chance, and what they would show.
-
-    Attributes:
-        some: P(K >= 1), shape (n,).
-        lags: autocorrelations of the electron number at lags 1, 2, 3, shape (3, n).
-        score: of the second Charlier polynomial, shape (n,).
-        of_lags: what covariances of P(K >= 2) make of ``lags``, (3, n).
-        of_score: what a small chance m makes of ``score``, over m, shape (n,).
-        excess: by what part the variance of the expected electrons grows, over m, shape (n,).
-    """
-
-    some: FloatArray
-    lags: FloatArray
-    score: FloatArray
-    of_lags: FloatArray
-    of_score: FloatArray
-    excess: FloatArray
-
-    def likelihood(self, capture: float, release: float) -> tuple[FloatArray, FloatArray]:
-        """Return logarithms of the likelihood that pixels have such a trap over that of none, (n,) each.
-
-        By all that they show, and by the autocorrelations alone.
-        """
-        chance = _chance(capture, release, self.some)
-        left = (1.0 - release - capture * self.some) ** np.arange(3)[:, None]
-        covariance = -release * capture * left
-        in_time = _rise(self.lags, covariance * self.of_lags / (1.0 + chance * self.excess)).sum(axis=0)
-        return in_time + _rise(self.score, chance * self.of_score), in_time
-
-
-class _Trap(NamedTuple):
-    """Chances of a trap, and how much likelier it makes what the pixels show, nats: all, and in time."""
-
-    capture: float
-    release: float
-    fraction: float
-    height: float = -math.inf
-    in_time: float = -math.inf
-
-    @property
-    def seen(self) -> bool:
-        """Whether it is worth a hypothesis."""
-        return self.height > OUTLYING**2 / 2.0 and self.in_time > SIGNIFICANT**2 / 2.0
-
-    def opposite(self, some: float) -> _Trap:
-        """Return the trap that catches as often as this one releases, and releases as this one catches."""
-        low, high = _LIMITS
-        return _Trap(min(self.release / some, high), min(max(self.capture * some, low), high), self.fraction)
-
-
-def _first_of(one: _Trap, other: _Trap) -> _Trap:
-    """Return of two traps with nearly the same moments the emptier one, unless it is clearly less likely."""
-    empty, full = sorted((one, other), key=lambda each: each.capture / each.release)
-    return full if full.height - empty.height > OUTLYING**2 / 2.0 else empty
-
-
-def _observed(evidence: Evidence) -> _Pixels | None:
-    """Return what pixels with electrons show; None where the frames have no order, or no pixel is usable."""
-    time, maps, score = evidence.time, evidence.maps, evidence.scores.get("C2")
-    if time is None or score is None or time.n_pairs < 1:
-        return None
-    lags = np.asarray(time.lag_charge, np.float64)
-    good = maps.usable & np.isfinite(score) & np.isfinite(lags).all(axis=0) & (maps.quanta_exposure > 0)
-    good &= evidence.charge_std > 0
-    if not good.any():
-        return None
-    exposure = maps.quanta_exposure[good]
-    # pairs of frames of a block
-    pairs = time.n_pairs * (1.0 - np.arange(3.0) / max(time.block_frames - 1, 3))
-    root = np.sqrt(pairs)[:, None]
-    some = -np.expm1(-exposure)
-    several = some - exposure * np.exp(-exposure)
-    # the expected electron number answers to the electrons by Var(k) / H
-    answer = several * evidence.charge_std[good] ** 2 / exposure**2
-    seen = np.asarray(score[good], np.float64)
-    return _Pixels(some, lags[:, good] * root, seen, answer * root, _of_score(evidence)[good], 2.0 * answer)
-
-
-def _of_score(evidence: Evidence) -> FloatArray:
-    """Return what a small chance m makes of the score of the second Charlier polynomial, over m, (y, x).
-
-    That of an excess of the variance, corrected for the other moments by pixels that stand for the others.
-    """
-    from pchem_pipeline.model.law.sample_law import SampleLaw
-
-    maps = evidence.maps
-    exposure, noise = maps.quanta_exposure.ravel(), (maps.read_noise_dn * maps.conversion_gain).ravel()
-    found = np.zeros(exposure.size)
-    for pixel, group in zip(*typical_pixels(maps), strict=True):
-        law = PixelLaw(maps, int(pixel), evidence.n_frames)
-        exact = (
-            law.score_shift("C2", law.change(SampleLaw().with_counts("trapped", SMALL_CHANGE))) / SMALL_CHANGE
-        )
-        several = -np.expm1(-exposure[group]) - exposure[group] * np.exp(-exposure[group])
-        by_variance = 2.0 * several * np.sqrt(charlier_information(exposure[group], noise[group]))
-        by_variance /= exposure[group] ** 2
-        found[group] = by_variance * exact / by_variance[group == pixel]
-    return np.asarray(np.sqrt(evidence.n_frames) * found.reshape(maps.bias.shape))
-
-
-def _rise(seen: FloatArray, expected: FloatArray) -> FloatArray:
-    """Return the logarithm of the likelihood of normal numbers of variance 1 over that of mean 0."""
-    kept = expected + np.clip(seen - expected, -BEYOND_DOUBT, BEYOND_DOUBT)
-    return np.asarray(kept * expected - expected**2 / 2.0)
-
-
-def _mixed(rises: FloatArray, fraction: float) -> float:
-    """Return the same of all pixels of which a share has the mean."""
-    if fraction >= 1.0:
-        return float(rises.sum())
-    return float(np.logaddexp(math.log1p(-fraction), math.log(fraction) + rises).sum())
-
-
-def _starts(pixels: _Pixels) -> dict[float, _Trap]:
-    """Return the likeliest trap of a grid by the share of the pixels that have one."""
-    best = {fraction: _Trap(0.0, 0.0, fraction) for fraction in (1.0, *_FRACTIONS)}
-    for capture in _CAPTURES:
-        for release in _RELEASES:
-            rises, in_time = pixels.likelihood(capture, release)
-            for fraction, known in best.items():
-                height = _mixed(rises, fraction)
-                if height > known.height:
-                    best[fraction] = _Trap(
-                        float(capture), float(release), fraction, height, _mixed(in_time, fraction)
-                    )
-    return best
-
-
-def _refined(pixels: _Pixels, start: _Trap) -> _Trap:
-    """Return the likeliest trap near another; if all pixels have one, that stays so."""
-    from scipy import optimize  # not for every command that knows of effects
-
-    free = [start.capture, start.release, *([start.fraction] if start.fraction < 1.0 else [])]
-    highest = [_LIMITS[1], _LIMITS[1], 1.0][: len(free)]
-    lowest = [1e-5, _LIMITS[0], 1e-3][: len(free)]
-
-    def trap(logarithms: FloatArray) -> _Trap:
-        values = [float(v) for v in np.clip(np.exp(logarithms), lowest, highest)]
-        capture, release, fraction = values if len(values) == 3 else (*values, 1.0)
-        rises, in_time = pixels.likelihood(capture, release)
-        return _Trap(capture, release, fraction, _mixed(rises, fraction), _mixed(in_time, fraction))
-
-    options = {"xatol": 0.01, "fatol": 0.05, "maxfev": 200}
-    found = optimize.minimize(
-        lambda at: -trap(at).height, np.log(free), method="Nelder-Mead", options=options
-    )
-    return trap(found.x)

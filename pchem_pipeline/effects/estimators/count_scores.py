@@ -12,42 +12,13 @@ import functools
 
 import numpy as np
 
-from pchem_pipeline.effects.estimators.regression import CUT, CUT_ROUNDS
-from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray
+from pchem_pipeline.effects.types import FloatArray, IntArray
 from pchem_pipeline.model.law.pcd import pcd_posterior
 
 # the information is smooth in both: nodes of its table, e-
 _EXPOSURES = np.geomspace(0.02, 60.0, 25)
 _NOISES = np.geomspace(0.08, 1.6, 14)
 _POINTS_PER_SIGMA = 4
-
-
-def count_excess(evidence: Evidence, power: float) -> tuple[float, float]:
-    """Return c and its standard error for ``Var K = H + c H^(2 + power)``, from the scores of C2.
-
-    Every pixel gives ``score = c H^power sqrt(N I) + noise of variance 1``; this is their least squares, with
-    pixels that are far off (another effect's) cut back.
-
-    Args:
-        evidence: what a split of the frames shows.
-        power: 0 for a relative variance of the exposure, -1 for an excess proportional to H.
-    """
-    maps, score = evidence.maps, evidence.scores.get("C2")
-    if score is None:
-        return 0.0, np.inf
-    good = maps.usable & np.isfinite(score) & (maps.quanta_exposure > 0)
-    exposure = maps.quanta_exposure[good]
-    noise = maps.read_noise_dn[good] * maps.conversion_gain[good]
-    slope = np.sqrt(evidence.n_frames * charlier_information(exposure, noise)) * exposure**power
-    weight = float(slope @ slope)
-    if not weight > 0:
-        return 0.0, np.inf
-    seen = np.asarray(score[good], np.float64)
-    excess = float(np.median(seen) / np.median(slope))
-    for _ in range(CUT_ROUNDS):
-        expected = excess * slope
-        excess = float(slope @ (expected + np.clip(seen - expected, -CUT, CUT))) / weight
-    return excess, weight**-0.5
 
 
 def charlier_information(exposure: FloatArray, noise: FloatArray) -> FloatArray:

@@ -8,9 +8,11 @@ import numpy as np
 from scipy import ndimage
 
 from pchem_pipeline.effects.estimators.charge_sums import BlockCharge
-from pchem_pipeline.effects.estimators.regression import CUT, CUT_ROUNDS
 from pchem_pipeline.effects.types import FloatArray, IntArray
 
+# standard deviations up to which a pixel's deviation counts, and times that a mean is taken anew about which
+# they are cut: by then it stays
+_CUT, _CUT_ROUNDS = 4.0, 4
 # a cell must explain this chi-square to tell the time constant, and the differences of four cells that one
 _PRICE_OF_CELL = 6.0
 _PRICE_OF_DETAIL = 9.0
@@ -58,10 +60,10 @@ class FadingCells:
         inverse = stderr**-2
         # from the middle of each cell: from 0 on a bright image would be cut at so many steps
         amplitude = np.nan_to_num(ndimage.median(found, cell, np.arange(n)))
-        for _ in range(CUT_ROUNDS):
+        for _ in range(_CUT_ROUNDS):
             # single pixels that jump are another effect
             middle = amplitude[cell]
-            amplitude = mean_of(np.clip(found, middle - CUT * stderr, middle + CUT * stderr), inverse)
+            amplitude = mean_of(np.clip(found, middle - _CUT * stderr, middle + _CUT * stderr), inverse)
         held = np.bincount(cell, inverse, n)
         noise = np.where(held > 0, np.maximum(held, 1e-300) ** -0.5, np.inf)
         freedom = max(int((held > 0).sum()) - 1, 1)

@@ -130,15 +130,14 @@ def _without_slow(field: FloatArray, frames: IntArray) -> FloatArray:
 def _level(power: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the noise power around each place, so that broad humps of the spectrum are no lines.
 
-    Stretches of frequencies along frames: long ones at each of the lowest frequencies along lines, where
-    jumps and noise of frames are, and shorter ones for all the others together. The median of exponentially
-    distributed powers is log 2 of their mean.
+    By stretches of frequencies along frames: at each of the lowest frequencies along lines, where jumps and
+    noise of frames are, and at all the others together. The median of exponentially distributed powers is
+    log 2 of their mean.
     """
     level = np.empty_like(power)
     length = power.shape[0]
-    for piece in np.array_split(np.arange(length), max(length // (4 * _STRETCH), 1)):
-        level[piece, :_FRAME_LIKE] = np.median(power[piece, :_FRAME_LIKE], axis=0)
     for piece in np.array_split(np.arange(length), max(length // _STRETCH, 1)):
+        level[piece, :_FRAME_LIKE] = np.median(power[piece, :_FRAME_LIKE], axis=0)
         if power.shape[1] > _FRAME_LIKE:
             level[piece, _FRAME_LIKE:] = np.median(power[piece, _FRAME_LIKE:])
     # what was fitted and taken away leaves holes: never less than half the typical level

@@ -6,20 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 
 from pchem_pipeline.effects.estimators.charge_sums import against_usual_gain
 from pchem_pipeline.effects.framework.spot import Falloff, spot_image
 from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray
+from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 
 _RADII = (0.04, 0.06, 0.09, 0.13, 0.19, 0.28, 0.4, 0.6)
 _CENTRES = 17  # along either side
 _LEAST_SEEN = 0.05  # of a spot's peak, in a cell as well known as the best one
 _CELLS = 32  # groups of lines along either side
-# of a mixture of frames with and without a burst: shares, and heights in standard deviations
-_SHARES = np.array([0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4])
-_HEIGHTS = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 14.0])
-_CLOSER = 12  # spots whose mixture is looked at
-_LEAST_GAIN = 12.0  # of the log-likelihood, best of some 1,000 spots with two parameters
 _FEWEST_BURSTS = 3.0  # a single one may be a particle's
 _MOST = 0.6  # share of the frames beyond which a burst is the rule
 
@@ -158,20 +155,26 @@ def best_bursts(evidence: Evidence) -> Bursts | None:
     """Return the spot whose light comes in some frames only; None where none stands out.
 
     A spot's light in a frame shows in its rows and columns. For each spot of a family the frames' light,
-    less what all pixels have in proportion to H, is compared with a mixture of two normal laws of unit
-    variance; the frames that the best mixture takes for bursts then give the spot's form.
+    less what all pixels have in proportion to H, has moments; those of the spot whose light is the least
+    like a normal number tell how often it is there, and how bright, and then in which frames.
     """
     lines = _lines(evidence)
     if lines is None:
         return None
     shape = evidence.maps.usable.shape
-    weights = _weights(lines, shape)
-    heights = lines.charge @ weights.T
-    sharp = np.maximum((heights**3).mean(axis=0) / np.sqrt(15.0), ((heights**2).mean(axis=0) - 1.0) / 2**0.5)
-    chosen = np.argsort(-sharp)[:_CLOSER]
-    found = [_mixture(heights[:, i]) for i in chosen]
-    gain, share, burst = max(found, key=lambda each: each[0])
-    if gain < _LEAST_GAIN or share > _MOST or burst.sum() < _FEWEST_BURSTS:
+    heights = lines.charge @ _weights(lines, shape).T
+    more, skewed = (heights**2).mean(axis=0) - 1.0, (heights**3).mean(axis=0)
+    sharp = np.maximum(skewed / 15.0**0.5, more / 2.0**0.5) * len(heights) ** 0.5
+    best = int(sharp.argmax())
+    if sharp[best] < BEYOND_DOUBT or not more[best] > 0.0:
+        return None
+    # moments of two values h apart, the upper one of a share p: p (1 - p) h^2, and (1 - 2 p) h times that
+    skew = float(skewed[best] / more[best] ** 1.5)
+    share = 0.5 - 0.5 * skew / (4.0 + skew**2) ** 0.5
+    height = float((more[best] / (share * (1.0 - share))) ** 0.5)
+    odds = np.log(share / (1.0 - share)) + height * (heights[:, best] + (share - 0.5) * height)
+    burst = special.expit(odds)
+    if share > _MOST or burst.sum() < _FEWEST_BURSTS:
         return None
     spot = _form(lines, burst, shape)
     return None if spot is None else Bursts(spot, share)
@@ -225,34 +228,6 @@ def _weights(lines: _Lines, shape: tuple[int, ...]) -> FloatArray:
                 row = cells.mean(axis=1) - 0.5 * cells.mean()
                 found.append(np.append(row, cells.mean(axis=0) - 0.5 * cells.mean()) / scale)
     return np.array(found)
-
-
-def _mixture(height: FloatArray) -> tuple[float, float, FloatArray]:
-    """Return the gain in log-likelihood, the share, and the probability of a burst of each frame.
-
-    From the best of a grid by expectation and maximisation; the part without bursts stays standard normal.
-    """
-
-    def log_odds(share: float, top: float, middle: float = 0.0) -> FloatArray:
-        return np.asarray(np.log(share) + top * (height - middle) - top**2 / 2)
-
-    def log_mean(share: float, odds: FloatArray) -> FloatArray:
-        return np.asarray(np.logaddexp(np.log1p(-share), odds))
-
-    share, top = max(
-        ((float(share), float(top)) for share in _SHARES for top in _HEIGHTS),
-        key=lambda each: float(log_mean(each[0], log_odds(*each)).sum()),
-    )
-    middle = 0.0
-    for _ in range(60):
-        odds = log_odds(share, top, middle)
-        burst = np.exp(odds - log_mean(share, odds))
-        share = float(np.clip(burst.mean(), 1e-6, 1.0 - 1e-6))
-        middle = float((height * (1.0 - burst)).sum() / max((1.0 - burst).sum(), 1e-9))
-        top = float((height * burst).sum() / max(burst.sum(), 1e-9)) - middle
-    log = log_mean(share, log_odds(share, top, middle))
-    gain = float((log - 0.5 * (height - middle) ** 2 + 0.5 * height**2).sum())
-    return gain, share, burst
 
 
 def _form(lines: _Lines, burst: FloatArray, shape: tuple[int, ...]) -> Spot | None:

@@ -74,41 +74,34 @@ def hats(position: FloatArray, nodes: int) -> FloatArray:
     return np.asarray(np.clip(1.0 - np.abs(position[:, None] - knots) * (nodes - 1), 0.0, None))
 
 
-def likely_profiles(
-    series: FloatArray, position: FloatArray, error: FloatArray | float | None = None
-) -> list[TimeProfile]:
+def likely_profiles(series: FloatArray, position: FloatArray) -> list[TimeProfile]:
     """Return the time profiles that a series may follow, the likeliest first; none if it may be constant.
 
     Of the best line, exponential approach and broken line those that explain more than chance and, with more
-    freedom than the line, more than it by the Bayesian information criterion. Arguments as below.
+    freedom than the line, more than it by the Bayesian information criterion.
+
+    Args:
+        series: with white noise, shape (n,).
+        position: times from 0 (first frame of the run) to 1 (last frame), shape (n,).
     """
-    line, *curves = time_profiles(series, position, error)
+    line, *curves = _time_profiles(series, position)
     kept = [line, *(curve for curve in curves if curve.criterion < line.criterion)]
     found = sorted((p for p in kept if p.exceeds_chance()), key=lambda p: p.criterion)
     return [profile for profile in found if profile.criterion < found[0].criterion + _FAR_BELOW]
 
 
-def time_profiles(
-    series: FloatArray, position: FloatArray, error: FloatArray | float | None = None
-) -> tuple[TimeProfile, TimeProfile, TimeProfile]:
-    """Return the line, the exponential approach and the broken line that fit a series best.
-
-    Args:
-        series: shape (n,).
-        position: times from 0 (first frame of the run) to 1 (last frame), shape (n,).
-        error: standard errors, of all or of each; None: unknown, and alike.
-    """
+def _time_profiles(series: FloatArray, position: FloatArray) -> tuple[TimeProfile, TimeProfile, TimeProfile]:
+    """Return the line, the exponential approach and the broken line that fit a series best."""
     n = series.size
-    weight = 1.0 / np.broadcast_to(1.0 if error is None else error, series.shape)
 
     def fit(basis: FloatArray, stiff: float = 0.0) -> tuple[FloatArray, float]:
         """Return the coefficients of a basis (n, k), and the deviance."""
-        k, scaled = basis.shape[1], basis * weight[:, None]
-        rows = stiff * float(np.sqrt((weight**2).sum() / k)) * np.diff(np.eye(k), 2, axis=0)
-        wanted = np.append(series * weight, np.zeros(len(rows)))
-        values = np.linalg.lstsq(np.concatenate([scaled, rows]), wanted, rcond=1e-6)[0]
-        chi2 = float(((series * weight - scaled @ values) ** 2).sum())
-        return values, chi2 if error is not None else n * float(np.log(max(chi2, 1e-300) / n))
+        k = basis.shape[1]
+        rows = stiff * float(np.sqrt(n / k)) * np.diff(np.eye(k), 2, axis=0)
+        wanted = np.append(series, np.zeros(len(rows)))
+        values = np.linalg.lstsq(np.concatenate([basis, rows]), wanted, rcond=1e-6)[0]
+        chi2 = float(((series - basis @ values) ** 2).sum())
+        return values, n * float(np.log(max(chi2, 1e-300) / n))
 
     constant = fit(np.ones((n, 1)))[1]
 

@@ -8,18 +8,24 @@ drifts by 1 %.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from pchem_pipeline.effects.estimators.charge_sums import exposure_nodes, exposure_profile
-from pchem_pipeline.effects.estimators.common_modes import run_position
-from pchem_pipeline.effects.estimators.time_profiles import likely_profiles
+from pchem_pipeline.effects.estimators.charge_sums import exposure_nodes
 from pchem_pipeline.effects.families.drifts import Drift
 from pchem_pipeline.effects.framework.effect import Plane, Ratio, register_effect
-from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    EffectContext,
+    Evidence,
+    FloatArray,
+    PixelMaps,
+    SampleLaw,
+    TimeSeries,
+)
 
 
 @register_effect
@@ -98,15 +104,9 @@ class ExposureDrift(Drift):
         return result
 
     @classmethod
-    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the time profiles that the frames' exposures follow."""
-        profile = exposure_profile(evidence)
-        if profile is None or evidence.time is None:
-            return ()
-        # what flickers from frame to frame is noise to a drift
-        noise = max(profile.variance, 0.5 * float(np.mean(np.diff(profile.deviation) ** 2)))
-        position = run_position(evidence.time.frames, evidence.time.n_run)
-        return [cls.of(found) for found in likely_profiles(profile.deviation, position, noise**0.5)]
+    def series(cls, evidence: Evidence, time: TimeSeries) -> FloatArray:
+        """Return the relative exposures of the frames."""
+        return time.frame_charge
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law mixed over the exposures of the run."""

@@ -17,16 +17,14 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, exposure_nodes, exposure_profile
 from pchem_pipeline.effects.estimators.common_modes import successive
-from pchem_pipeline.effects.estimators.levels.level_mixtures import Levels, few_levels
+from pchem_pipeline.effects.estimators.level_mixtures import Levels, few_levels
+from pchem_pipeline.effects.estimators.lines import coherent_line
 from pchem_pipeline.effects.estimators.regression import SIGNIFICANT
-from pchem_pipeline.effects.estimators.time_profiles import hats
 from pchem_pipeline.effects.framework.effect import Effect, Frames, Plane, Ratio, Turns, register_effect
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 
 # cycles in the run below which a change is a drift
 _SLOWEST = 20
-# frequencies on either side of a line that say what is there without it
-_AROUND = 100
 
 _T = TypeVar("_T", bound="ExposureFlicker")
 
@@ -155,7 +153,7 @@ class ExposureFlicker(Effect):
         profile = exposure_profile(evidence)
         if profile is None or evidence.time is None:
             return ()
-        return [*_sine(cls, profile), *_random(cls, profile)][:4]
+        return [*_sine(cls, profile, evidence.time.n_run), *_random(cls, profile)][:4]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law mixed over the exposures of the frames."""
@@ -206,45 +204,11 @@ def _random(cls: type[_T], profile: ExposureProfile) -> list[_T]:
     return [*(cls(**{**one.model_dump(), "rms": min(levels.rms, 1.0), **rounded}) for one in found), *found]
 
 
-def _sine(cls: type[_T], profile: ExposureProfile) -> list[_T]:
-    """Return a sine at the highest line of the spectrum that stands out of shot noise and of the rest."""
-    first, n = int(profile.frames[0]), int(profile.frames[-1] - profile.frames[0]) + 1
-    place = profile.frames.astype(np.int64) - first
-    series = np.zeros(n)
-    series[place] = profile.deviation - _slow(place / n, profile.deviation)
-    # padded to twice the length, so that a line between two frequencies keeps most of its height
-    spectrum = np.fft.rfft(series, 2 * n)
-    power = np.abs(spectrum) ** 2 / profile.deviation.size
-    power[: 2 * _SLOWEST] = 0.0
-    peak = int(np.argmax(power))
-    # the median of exponentially distributed powers is ln 2 of their mean; a memory raises it nearby
-    around = power[max(peak - _AROUND, 0) : peak + _AROUND]
-    floor = max(profile.variance, float(np.median(around)) / np.log(2.0))
-    if power[peak] < 16.0 * floor:
+def _sine(cls: type[_T], profile: ExposureProfile, n_run: int) -> list[_T]:
+    """Return a sine at the highest line of the spectrum, if one stands out."""
+    line = coherent_line(profile.deviation[:, None], profile.frames.astype(np.int64), n_run)
+    if line is None or not 0.0 < line.per_frame < 1.0:
         return []
-    frequency = _refined(series, peak / (2 * n))
-    phase = np.exp(-2j * np.pi * frequency * np.arange(n))
-    line = complex(np.sum(series * phase)) * 2.0 / profile.deviation.size
-    rms = abs(line) / np.sqrt(2.0)
-    # a sine that rises through the mean at frame 0 has the phase of -i
-    cycles = (np.angle(line * 1j) / (2.0 * np.pi) - frequency * first) % 1.0
-    if not 0 < frequency < 0.999:
-        return []
-    return [cls(rms=min(float(rms), 1.0), period_frames=float(1.0 / frequency), phase_cycles=float(cycles))]
-
-
-def _slow(position: FloatArray, deviation: FloatArray) -> FloatArray:
-    """Return the least squares broken line of ``_SLOWEST`` pieces: the gaps between blocks would alias it."""
-    basis = hats(position, _SLOWEST + 1)
-    return np.asarray(basis @ np.linalg.lstsq(basis, deviation, rcond=1e-6)[0])
-
-
-def _refined(series: FloatArray, frequency: float) -> float:
-    """Return the frequency (cycles per frame) of the highest power next to a peak of the spectrum."""
-    t = np.arange(series.size)
-    width = 0.5 / series.size
-    for _ in range(4):
-        tried = np.clip(frequency + width * np.linspace(-1.0, 1.0, 9), 1e-6, 0.5)
-        power = [abs(np.sum(series * np.exp(-2j * np.pi * f * t))) for f in tried]
-        frequency, width = float(tried[int(np.argmax(power))]), width / 3.0
-    return frequency
+    rms = min(line.amplitude / 2.0**0.5, 1.0)
+    cycles = line.phase / (2.0 * np.pi) % 1.0
+    return [cls(rms=rms, period_frames=1.0 / line.per_frame, phase_cycles=cycles)]

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.effects.estimators.common_modes import run_position
-from pchem_pipeline.effects.estimators.time_profiles import TimeProfile, along_path, settling
+from pchem_pipeline.effects.estimators.time_profiles import TimeProfile, along_path, likely_profiles, settling
 from pchem_pipeline.effects.framework.effect import Effect, Ratio
-from pchem_pipeline.effects.types import EffectContext, FloatArray
+from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray, TimeSeries
 
+_FEWEST = 8  # frames
 _POSITIONS = 1001  # evenly spaced along the run, that stand for all
 
 
@@ -72,6 +75,20 @@ class Drift(Effect):
         else:
             profile = self.profile(position)
         return np.asarray(getattr(self, self.strength) * profile)
+
+    @classmethod
+    @abstractmethod
+    def series(cls, evidence: Evidence, time: TimeSeries) -> FloatArray:
+        """Return for each frame what follows the profile, about in the unit of the strength, shape (n,)."""
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the time profiles that the series of the frames may follow."""
+        time = evidence.time
+        if time is None or time.frames.size < _FEWEST or not evidence.maps.usable.any():
+            return ()
+        position = run_position(time.frames, time.n_run)
+        return [cls.of(profile) for profile in likely_profiles(cls.series(evidence, time), position)]
 
     @classmethod
     def of(cls, found: TimeProfile) -> Self:

@@ -33,6 +33,7 @@ frames (:meth:`~Effect.added_exposure`). What many pixels share is taken from ca
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar, get_args
@@ -43,6 +44,7 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.plane import Plane as Plane
 from pchem_pipeline.effects.framework.region import Region, Span, When
+from pchem_pipeline.model.arithmetic.significance import CLEAR
 
 if TYPE_CHECKING:
     import numpy as np
@@ -57,6 +59,8 @@ if TYPE_CHECKING:
 DEPTH = 4
 #: Parts of such an effect that are told in words.
 MOST_TOLD = 4
+# standard deviations by which an effect of typical strength moves its leading statistic, in so many samples
+_USUAL, _USUAL_SAMPLES = 7.0, 1e6
 #: Events in a simulation that shows what they do, where fewer are to be expected.
 FEWEST_SHOWN = 8
 
@@ -246,13 +250,33 @@ class Effect(Section):
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return hypotheses about its parameters, the likeliest first; none where nothing speaks for it.
 
-        A hypothesis is only a guess: its strength is refined and its fingerprint compared with the evidence
-        afterwards, so a false one costs time and nothing else. The default is :meth:`typical` where the
-        leading statistics of the signature stand out; none where no statistic depends on the effect.
+        A hypothesis is only a guess: its strength is found by simulation and its fingerprint compared with
+        the evidence afterwards, so a false one costs time and nothing else. It says what the effect is like,
+        and its strength to a factor of some three. The default is :meth:`typical_as_seen` by the two leading
+        statistics of the signature; none where no statistic depends on the effect.
         """
-        if cls.untestable or not evidence.strongest(*cls.signature[:2]) > 3.0:
-            return ()
-        return cls.typical()
+        return () if cls.untestable else cls.typical_as_seen(evidence, *cls.signature[:2])
+
+    @classmethod
+    def typical_as_seen(cls, evidence: Evidence, *names: str) -> list[Self]:
+        """Return what is typical, as strong as statistics stand out; none where they do not.
+
+        Args:
+            evidence: of one split.
+            names: of statistics that the effect raises; if its typical strengths have either sign, the first
+                of them has that of the strength and is the one that counts.
+        """
+        found = []
+        typical = cls.typical()
+        signs = [-1.0 if cls.strength and getattr(one, cls.strength) < 0 else 1.0 for one in typical]
+        counted = names[:1] if -1.0 in signs else names
+        samples = evidence.n_frames * max(int(evidence.maps.usable.sum()), 1)
+        for one, sign in zip(typical, signs, strict=True):
+            seen = max((sign * evidence.z.get(name, 0.0) for name in counted), default=0.0)
+            if seen > CLEAR:
+                times = seen / _USUAL * math.sqrt(_USUAL_SAMPLES / samples)
+                found.append(one.scaled(times ** (1.0 / cls.power)) if cls.strength else one)
+        return found
 
     def representative(self, frames: NDArray[np.int64]) -> tuple[Self, float]:
         """Return the effect as one simulation shows it best, and by what to multiply what it then shows.

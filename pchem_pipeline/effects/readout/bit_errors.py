@@ -13,8 +13,9 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.bends import moved_shares
+from pchem_pipeline.effects.estimators.regression import Multiple, multiple_of
 from pchem_pipeline.effects.framework.effect import Count, Effect, Plane, Ratio, register_effect
+from pchem_pipeline.effects.framework.evidence import CodeResiduals
 from pchem_pipeline.effects.types import (
     AnyArray,
     EffectContext,
@@ -24,13 +25,11 @@ from pchem_pipeline.effects.types import (
     PixelMaps,
     SampleLaw,
 )
-from pchem_pipeline.model.arithmetic.significance import CLEAR
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
 
 Fault = Literal["zero", "one", "flip"]
 _FAULTS: tuple[Fault, ...] = ("zero", "one", "flip")
 _MOST_BITS = 24
-# fall of chi2 that the best of some 30 faults must bring: by chance once in 1e4 stacks
-_LEAST_GAIN = 22.0
 _FEWEST_PERIODS = 4  # of a bit, that codes must span for it to be stuck
 
 
@@ -102,15 +101,11 @@ class BitErrors(Effect):
             return (cls(share=1.0, bit=broken[0], fault=broken[1]),)
         bits = range(min(int(codes[-1]).bit_length(), _MOST_BITS))
         faults = [cls(share=1.0, bit=bit, fault=fault) for bit in bits for fault in _FAULTS]
-        targets = np.array([fault.faulty(codes) - code.first for fault in faults])
-        targets = np.where((targets >= 0) & (targets < codes.size), targets, -1)
-        seen = moved_shares(evidence, targets)
-        best = max(range(len(seen)), key=lambda i: seen[i].gain, default=None)
-        if best is None or seen[best].gain < _LEAST_GAIN:
-            return ()
+        seen = [_moved(code, fault.faulty(codes)) for fault in faults]
+        best = max(range(len(seen)), key=lambda i: seen[i].sigmas)
         same = [i for i, fault in enumerate(faults) if fault.bit == faults[best].bit]
-        likely = sorted((i for i in same if seen[i].gain > _LEAST_GAIN / 2), key=lambda i: -seen[i].gain)
-        return [faults[i].model_copy(update={"share": min(seen[i].share, 1.0)}) for i in likely]
+        likely = sorted((i for i in same if seen[i].sigmas > CERTAIN), key=lambda i: -seen[i].sigmas)
+        return [faults[i].model_copy(update={"share": min(seen[i].value, 1.0)}) for i in likely]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with satellites at the weight of the bit, of the share that each pixel has there.
@@ -135,6 +130,16 @@ class BitErrors(Effect):
         is_set = (codes >> self.bit & 1).astype(np.float64)
         up, down = mass @ (1.0 - is_set), mass @ is_set
         return (up * (self.fault != "zero"), down * (self.fault != "one"))
+
+
+def _moved(code: CodeResiduals, to: IntArray) -> Multiple:
+    """Return the share of the samples that come out as other codes, as the counts have it."""
+    leaves = to != code.first + np.arange(to.size)
+    at = to - code.first
+    arrives = leaves & (at >= 0) & (at < to.size)
+    change = np.where(leaves, -code.expected, 0.0)
+    change += np.bincount(at[arrives], code.expected[arrives], to.size)
+    return multiple_of(change, code.observed - code.expected, 1.0 / np.maximum(code.observed, 1.0))
 
 
 def _never_seen(codes: IntArray, observed: FloatArray) -> tuple[int, Literal["zero", "one"]] | None:

@@ -15,12 +15,12 @@ import numpy as np
 from pydantic import Field
 
 from pchem_pipeline.effects.estimators.prediction import PREDICTORS, Predictor, predicted
-from pchem_pipeline.effects.estimators.regression import NEARLY_ALL
 from pchem_pipeline.effects.framework.effect import Code, Effect, Plane, Ratio, Replacement, register_effect
 from pchem_pipeline.effects.framework.evidence import PredictedSamples
 from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
 
+_NEARLY_ALL = 0.8  # share of the samples beyond which what some have is taken for all
 _FEWEST = 20.0  # samples above the threshold by chance
 
 
@@ -96,7 +96,7 @@ class PixelCorrection(Effect):
         found = _threshold(kinds[best])
         if found is None:
             return ()
-        shares = (1.0, found[1]) if NEARLY_ALL <= found[1] < 1.0 else (found[1],)
+        shares = (1.0, found[1]) if _NEARLY_ALL <= found[1] < 1.0 else (found[1],)
         return [cls(threshold_dn=found[0], share=share, predictor=best) for share in shares]
 
 

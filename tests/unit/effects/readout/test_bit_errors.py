@@ -101,8 +101,8 @@ def test_bit_fault_and_share_are_found(effect, shape, seed):
     guesses = BitErrors.estimate(seen(taken(truth, effect, n_frames=2000, seed=seed)))
     assert {guess.bit for guess in guesses} == {effect.bit}
     found = next(guess for guess in guesses if guess.fault == effect.fault)
-    # a tenth by chance at the weakest of these; half of the pixels have no fit where a high bit is lost
-    assert found.share == pytest.approx(effect.share, rel=0.35)
+    # half of the pixels have no fit where a high bit is lost
+    assert 0.4 < found.share / effect.share < 2.5
 
 
 @pytest.mark.parametrize(("bit", "fault"), [(0, "zero"), (1, "one"), (3, "zero")])

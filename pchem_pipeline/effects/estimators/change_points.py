@@ -1,24 +1,29 @@
 """Sudden changes of level in several noisy series that share a common mode.
 
 Each series is piecewise constant in white noise; whatever is added to all of them alike (drift, noise of the
-whole frame) is projected out. Cuts are added one at a time, that which lowers the sum of squares the most
-(binary segmentation: Scott and Knott 1974; Fryzlewicz 2014), with all levels fitted anew after each, so that
-a jump in one series is not taken for jumps in the others. At the end each cut is moved to its best place
-between its neighbours and dropped if it no longer pays.
+whole frame) is projected out. The levels of all series are cut at one time after the other, that which lowers
+the sum of squares the most (binary segmentation: Scott and Knott 1974; Fryzlewicz 2014); at the end each cut
+is moved to its best place between its neighbours and dropped if it no longer pays.
 
 Contrasts do not tell a jump of one series from the opposite jump of all the others. So the levels are those
-of the series themselves: wherever one was cut all may jump, beside a smooth common mode, and what is no jump
-against its error is taken out again.
+of the series themselves: at every cut all may jump, beside a smooth common mode, and what is no jump against
+its error is taken out again.
 """
 
 from __future__ import annotations
 
+import bisect
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
 from pchem_pipeline.effects.types import FloatArray, IntArray
 from pchem_pipeline.model.arithmetic.significance import CERTAIN
+
+Layout = TypeVar("Layout", bound=str)
 
 # cosines of the common mode, where it wanders
 _WAVES = (0, 12)
@@ -37,15 +42,30 @@ class Steps:
     levels: FloatArray
 
 
-def noise_variance(series: FloatArray) -> float:
-    """Return the variance of the white part: half the mean squared difference of successive values.
+def likeliest_parts(
+    series: FloatArray, gaps: FloatArray, layouts: Mapping[Layout, FloatArray]
+) -> tuple[Layout, list[Steps]]:
+    """Return which groups of series jump together, and the jumps of each.
 
-    Sudden steps are so few that leaving out the largest twentieth of the differences takes care of them
-    (the rest of a Gaussian's squares is 0.774 of its mean square).
+    By the squares of what is left in all series, and Schwarz's price for each level and jump.
+
+    Args:
+        series: shape (n, m).
+        gaps: time between each value and the one before, in units of the shortest, shape (n,).
+        layouts: weights of the series in the mean of each group, shape (p, m), p of 2 or more.
     """
-    squares = np.sort(np.diff(series) ** 2)
-    kept = squares[: max(int(0.95 * squares.size), 1)]
-    return float(kept.mean() / 2.0 / 0.774)
+    n, own = len(series), _own_variance(series)
+    found: list[tuple[float, Layout, list[Steps]]] = []
+    for layout, weights in layouts.items():
+        steps = find_steps(series @ weights.T, gaps)
+        rest = series - np.stack([_profile(each, n) for each in steps], axis=1) @ (weights > 0)
+        rest -= rest.mean(axis=1, keepdims=True) + rest.mean(axis=0)
+        levels = sum(each.levels.size for each in steps)
+        price = np.log(n) * (3 * levels - 2 * len(steps))
+        squares = float((rest**2).sum() / own) if own > 0 else 0.0
+        found.append((squares + float(price), layout, steps))
+    _, layout, steps = min(found, key=lambda each: each[0])
+    return layout, steps
 
 
 def find_steps(series: FloatArray, gaps: FloatArray | None = None, *, largest: int = 100) -> list[Steps]:
@@ -61,41 +81,56 @@ def find_steps(series: FloatArray, gaps: FloatArray | None = None, *, largest: i
         largest: most cuts.
     """
     n, m = series.shape
-    contrast = series - series.mean(axis=1, keepdims=True)
-    contrast = contrast - contrast.mean(axis=0)
-    variance = float(np.mean([noise_variance(one) for one in contrast.T])) if n > 3 else 0.0
-    starts = [[0] for _ in range(m)]
+    variance = _own_variance(series)
     if n < 4 or not variance > 0:
         return [Steps(np.zeros(1, np.int64), np.zeros(1)) for _ in range(m)]
-    bonus = 2.0 * variance * np.log(np.ones(n) if gaps is None else np.maximum(gaps, 1.0))
-    least = (4.0 * np.log(n * m) + 6.0) * variance
-    for _ in range(largest):
-        rest = contrast - _fitted(contrast, starts)[1]
-        found = max(
-            (*_best_cut(rest[:, q], first, last, bonus), q)
-            for q in range(m)
-            for first, last in zip(starts[q], [*starts[q][1:], n], strict=True)
-        )
-        if found[0] <= least:
+    contrast = (series - series.mean(axis=1, keepdims=True)) / np.sqrt(variance)
+    bonus = 2.0 * np.log(np.ones(n) if gaps is None else np.maximum(gaps, 1.0))
+    least = 4.0 * np.log(n * m) + 6.0
+    cuts = [0, n]
+    while len(cuts) < largest + 2:
+        gain, cut = max(_best_cut(contrast, first, last, bonus) for first, last in pairwise(cuts))
+        if gain <= least:
             break
-        starts[found[2]] = sorted([*starts[found[2]], found[1]])
-    for _ in range(2):
-        _refine(contrast, starts, bonus, least)
-    if sum(len(s) for s in starts) == m:
-        return [Steps(np.zeros(1, np.int64), np.zeros(1)) for _ in range(m)]
+        bisect.insort(cuts, cut)
+    for cut in cuts[1:-1]:
+        i = cuts.index(cut)
+        gain, place = _best_cut(contrast, cuts[i - 1], cuts[i + 1], bonus)
+        cuts[i : i + 1] = [place] if gain > least else []
     # where the common mode may wander, only its edge tells a step of one series: no more freedom than seen
-    own = variance * m / (m - 1.0)
     _, starts, levels = min(
-        (_with_common(series, starts, own, waves) for waves in _WAVES), key=lambda one: one[0]
+        (_with_common(series, cuts[1:-1], variance, waves) for waves in _WAVES), key=lambda one: one[0]
     )
     return [
-        Steps(np.array(begins, np.int64), centred(level, begins, n))
+        Steps(np.array(begins, np.int64), _centred(level, begins, n))
         for level, begins in zip(levels, starts, strict=True)
     ]
 
 
+def _own_variance(series: FloatArray) -> float:
+    """Return the variance of the white noise of each series by itself."""
+    n, m = series.shape
+    contrast = series - series.mean(axis=1, keepdims=True)
+    return float(np.mean([_noise_variance(one) for one in contrast.T])) * m / (m - 1.0) if n > 3 else 0.0
+
+
+def _noise_variance(series: FloatArray) -> float:
+    """Return the variance of the white part: half the mean squared difference of successive values.
+
+    Sudden steps are so few that leaving out the largest twentieth of the differences takes care of them
+    (the rest of a Gaussian's squares is 0.774 of its mean square).
+    """
+    squares = np.sort(np.diff(series) ** 2)
+    kept = squares[: max(int(0.95 * squares.size), 1)]
+    return float(kept.mean() / 2.0 / 0.774)
+
+
+def _profile(steps: Steps, n: int) -> FloatArray:
+    return np.repeat(steps.levels, np.diff([*steps.starts, n]))
+
+
 def _with_common(
-    series: FloatArray, starts: list[list[int]], variance: float, n_waves: int
+    series: FloatArray, cuts: list[int], variance: float, n_waves: int
 ) -> tuple[float, list[list[int]], list[FloatArray]]:
     """Return which series jump at the cuts, and the levels of all, the common mode included.
 
@@ -104,12 +139,11 @@ def _with_common(
     number.
     """
     n, m = series.shape
-    noise = noise_variance(series.mean(axis=1))
+    noise = _noise_variance(series.mean(axis=1))
     weight = min(1.0, float(np.sqrt(variance / m / noise))) if noise > 0 else 1.0
     metric = np.eye(m) - (1.0 - weight) / m
     waves = np.cos(np.pi * np.outer(np.arange(n) + 0.5, np.arange(1, n_waves + 1)) / n)
     common = np.concatenate([waves[:, None, :] * row.sum() for row in metric], axis=1).reshape(n * m, n_waves)
-    cuts = _together(sorted({cut for begins in starts for cut in begins[1:]}))
     starts = [[0, *cuts] for _ in range(m)]
     while True:
         segments = np.concatenate(
@@ -139,71 +173,26 @@ def _with_common(
         starts = [[cut for cut in begins if (cut, q) not in dropped] for q, begins in enumerate(starts)]
 
 
-def _together(cuts: list[int]) -> list[int]:
-    """Return the cuts with one in place of those that are next to each other."""
-    groups: list[list[int]] = []
-    for cut in cuts:
-        if groups and cut - groups[-1][-1] <= 1:
-            groups[-1].append(cut)
-        else:
-            groups.append([cut])
-    return [group[len(group) // 2] for group in groups]
-
-
 def _indicators(begins: list[int], n: int, row: FloatArray) -> FloatArray:
     """Return the columns of a design that one series' levels have, (n * m, levels)."""
     inside = np.repeat(np.eye(len(begins)), np.diff([*begins, n]), axis=0)
     return (inside[:, None, :] * row[:, None]).reshape(n * row.size, len(begins))
 
 
-def centred(levels: FloatArray, starts: list[int], n: int) -> FloatArray:
+def _centred(levels: FloatArray, starts: list[int], n: int) -> FloatArray:
     """Return levels less their mean over n values, each from its start on."""
     lengths = np.diff([*starts, n])
     return np.asarray(levels - (levels * lengths).sum() / n)
 
 
-def _fitted(contrast: FloatArray, starts: list[list[int]]) -> tuple[list[FloatArray], FloatArray]:
-    """Return the least-squares levels of all series, and their contrast at each time, (n, m).
-
-    Normal equations of the contrasts: the length of a segment on the diagonal, less its overlap in time with
-    every other over m.
-    """
-    n, m = contrast.shape
-    owner = np.repeat(np.arange(m), [len(s) for s in starts])
-    first = np.concatenate([np.array(s) for s in starts])
-    last = np.concatenate([np.array([*s[1:], n]) for s in starts])
-    overlap = np.minimum(last[:, None], last) - np.maximum(first[:, None], first)
-    system = np.diag((last - first).astype(np.float64)) - overlap.clip(0) / m
-    sums = np.concatenate([np.zeros((1, m)), np.cumsum(contrast, axis=0)])
-    levels = np.linalg.lstsq(system, sums[last, owner] - sums[first, owner], rcond=1e-10)[0]
-    found = [levels[owner == q] for q in range(m)]
-    profile = np.stack([np.repeat(v, np.diff([*s, n])) for v, s in zip(found, starts, strict=True)], axis=1)
-    return found, profile - profile.mean(axis=1, keepdims=True)
-
-
 def _best_cut(series: FloatArray, first: int, last: int, bonus: FloatArray) -> tuple[float, int]:
-    """Return by how much the best cut of a part lowers the sum of squares, and its place."""
+    """Return by how much the best cut of a part of all series lowers the sum of squares, and its place."""
     n = last - first
     if n < 2:
         return 0.0, first
     left = np.arange(1, n)
-    sums = np.cumsum(series[first:last])
-    mean = sums[-1] / n
-    gains = (sums[:-1] - left * mean) ** 2 * n / (left * (n - left)) + bonus[first + 1 : last]
+    sums = np.cumsum(series[first:last], axis=0)
+    squares = ((sums[:-1] - left[:, None] * sums[-1] / n) ** 2).sum(axis=1)
+    gains = squares * n / (left * (n - left)) + bonus[first + 1 : last]
     best = int(gains.argmax())
     return float(gains[best]), first + 1 + best
-
-
-def _refine(contrast: FloatArray, starts: list[list[int]], bonus: FloatArray, least: float) -> None:
-    """Move each cut to its best place between its neighbours; take out those that do not pay."""
-    n, m = contrast.shape
-    for q in range(m):
-        for begin in starts[q][1:]:
-            levels, profile = _fitted(contrast, starts)
-            i = starts[q].index(begin)
-            first, last = starts[q][i - 1], [*starts[q], n][i + 1]
-            part = contrast[:, q] - profile[:, q]
-            # the cut's own step comes back: a step in one of m series is this large in their contrast
-            part[begin:last] += (levels[q][i] - levels[q][i - 1]) * (1.0 - 1.0 / m)
-            gain, place = _best_cut(part, first, last, bonus)
-            starts[q] = starts[q][:i] + ([place] if gain > least else []) + starts[q][i + 1 :]

@@ -11,7 +11,6 @@ from pchem_pipeline.effects.types import FloatArray
 
 _MOST_LEVELS = 6
 _STEPS = 200  # of EM; levels that are as far apart as the noise is wide take some fifty
-_NODES = 201  # of the integral over a log-normal law, between -5 and 5 standard deviations
 
 
 class Levels(NamedTuple):
@@ -36,17 +35,18 @@ class Levels(NamedTuple):
 
 
 def few_levels(seen: FloatArray, variance: float) -> Levels | None:
-    """Return the fewest values that explain what is seen; None where a log-normal law does so as well.
+    """Return the fewest values that explain what is seen; None where a normal law does so as well.
 
-    Mixtures of normal laws of known variance by EM, two values and more as long as Schwarz's criterion falls;
-    a log-normal law of the same mean and variance stands against them.
+    Mixtures of normal laws of known variance by EM, two values and more as long as Schwarz's criterion falls.
 
     Args:
         seen: relative deviations, each with noise, shape (n,).
         variance: of that noise.
     """
     price = math.log(seen.size)  # of a value and its share: twice half a logarithm
-    best, criterion = None, _log_normal(seen, variance).loglik(seen, variance) - 0.5 * price
+    whole = float(seen.var())
+    total = max(whole, variance)
+    best, criterion = None, -0.5 * seen.size * (math.log(2.0 * math.pi * total) + whole / total) - 0.5 * price
     for k in range(2, _MOST_LEVELS + 1):
         levels = _fitted(seen, variance, k)
         now = levels.loglik(seen, variance) - (k - 0.5) * price
@@ -55,14 +55,6 @@ def few_levels(seen: FloatArray, variance: float) -> Levels | None:
         if now > criterion:
             best, criterion = levels, now
     return best
-
-
-def _log_normal(seen: FloatArray, variance: float) -> Levels:
-    """Return the law of ``exp(w z - w^2 / 2) - 1`` for a normal z, as a fine mixture."""
-    width = math.sqrt(math.log1p(max(float(seen.var()) - variance, 0.0)))
-    z = np.linspace(-5.0, 5.0, _NODES)
-    weights = np.exp(-0.5 * z**2)
-    return Levels(seen.mean() + np.expm1(width * z - 0.5 * width**2), weights / weights.sum())
 
 
 def _fitted(seen: FloatArray, variance: float, k: int) -> Levels:
