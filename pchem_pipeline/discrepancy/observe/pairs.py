@@ -225,10 +225,19 @@ class Pairs:
         return self.rows if self.mode == "column" else self.columns
 
 
-def pairs_of(samples: Samples) -> list[dict[str, Pairs]]:
-    """Sum the products of all pairs in one pass over the frames; by channel, and by what the pixels share."""
-    shape = samples.usable.shape
-    counted, gathered = _Gathered(*shape), [_Gathered(*shape) for _ in CHANNELS]
+def pairs_of(samples: Samples, edges: tuple[IntArray, IntArray] | None = None) -> list[dict[str, Pairs]]:
+    """Sum the products of all pairs in one pass over the frames; by channel, and by what the pixels share.
+
+    Args:
+        samples: standardised frames.
+        edges: of the cells of rows and of columns, pixels; None: cells of equal size.
+    """
+    if edges is None:
+        rows, columns = (
+            np.unique(np.linspace(0, n, min(n, _CELLS) + 1).astype(np.int64)) for n in samples.usable.shape
+        )
+        edges = rows, columns
+    counted, gathered = _Gathered(*edges), [_Gathered(*edges) for _ in CHANNELS]
     counted.add(samples.usable[None].astype(np.float32))
     for chunk in samples.chunks():
         for each, u in zip(gathered, chunk, strict=True):
@@ -297,11 +306,10 @@ class _Gathered:
         squares: of all pixels, (y', x').
     """
 
-    def __init__(self, ny: int, nx: int) -> None:
-        """Begin with nothing, for a sensor of ny rows and nx columns."""
-        rows, columns = (np.unique(np.linspace(0, n, min(n, _CELLS) + 1).astype(np.int64)) for n in (ny, nx))
+    def __init__(self, rows: IntArray, columns: IntArray) -> None:
+        """Begin with nothing, for cells of rows and columns with these edges."""
         self.rows, self.columns = _Lines(rows, columns), _Lines(columns, rows)
-        self.stride = tuple(2 if n > _CELLS // 2 else 1 for n in (ny, nx))
+        self.stride = tuple(2 if each.size - 1 > _CELLS // 2 else 1 for each in (rows, columns))
         self.squares = np.zeros([each.size - 1 for each in self.edges("frame")])
         self.of_frames = np.zeros((self.squares.size, self.squares.size))
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.discrepancy.null import free_of_parameters
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.scan import Suspect
+from pchem_pipeline.discrepancy.scan import Suspect, integral
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
@@ -203,7 +203,7 @@ def _corner(
         np.unique(np.linspace(first, last - length, _TRIED).astype(np.int64))
         for first, last, length in ((y0, y1, size[0]), (x0, x1, size[1]))
     )
-    total = np.pad(np.cumsum(np.cumsum(place, axis=0, dtype=np.int64), axis=1), ((1, 0), (1, 0)))
+    total = integral(place.astype(np.int64))
     inside = (
         total[np.ix_(ys + size[0], xs + size[1])]
         - total[np.ix_(ys, xs + size[1])]
