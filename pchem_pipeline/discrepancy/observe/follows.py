@@ -22,7 +22,7 @@ from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.digital.groups import GROUP, MOST_SAMPLES, groups_of
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
 from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.analog.empirical_response import Source
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS, code_ranges, pixel_statistics
-from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 FloatArray = NDArray[np.float64]

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import sums_numba as kernel
-from pchem_pipeline.discrepancy.observe import tables_numba as columns_of
 from pchem_pipeline.discrepancy.observe.sums_numba import FrameSums
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import MOST_HITS, PixelMaps
 
 FloatArray = NDArray[np.float64]
@@ -76,7 +75,7 @@ def pixel_statistics(laws: PixelLaws, maps: PixelMaps) -> PixelStatistics:
     """Collect the moments of the channels; pixels in which one of them is constant do not count."""
     moments, shape = laws.moments, maps.usable.shape
     exposure, gain = maps.quanta_exposure.ravel(), maps.conversion_gain.ravel()
-    kk, rr, kr = (moments[:, c] for c in (columns_of.MEAN_KK, columns_of.MEAN_RR, columns_of.MEAN_KR))
+    kk, rr, kr, krr, kkrr, rrrr = (moments[name] for name in ("kk", "rr", "kr", "krr", "kkrr", "rrrr"))
     usable = laws.good & (kk > 1e-12) & (rr > 1e-12)
 
     def masked(values: FloatArray) -> FloatArray:
@@ -88,9 +87,8 @@ def pixel_statistics(laws: PixelLaws, maps: PixelMaps) -> PixelStatistics:
     factor = step * weight
     pattern = masked(h * step - (h * step * weight).sum() / max(weight.sum(), 1e-300))
     shift = pattern * weight
-    krr, kkrr = moments[:, columns_of.MEAN_KRR], moments[:, columns_of.MEAN_KKRR]
     spread = factor**2 * (kkrr - kr**2) + 2.0 * factor * shift * krr + shift**2 * rr
-    noise = masked(np.maximum(moments[:, columns_of.MEAN_RRRR] * weight**2 - 1.0, 0.0))
+    noise = masked(np.maximum(rrrr * weight**2 - 1.0, 0.0))
     h, step, kk, rr, kr, factor, shift = (
         values.reshape(shape) for values in (h, step, masked(kk), masked(rr), masked(kr), factor, shift)
     )
@@ -155,8 +153,7 @@ def samples_beyond(
     frames: NDArray[Any], laws: PixelLaws, usable: NDArray[np.bool_], *, above: bool
 ) -> IntArray:
     """Return the samples above or below the support of their pixel, by frame: position, y, x, DN."""
-    column = columns_of.SEEN_HIGH if above else columns_of.SEEN_LOW
-    seen = (laws.moments[:, column] > 0).reshape(usable.shape) & usable
+    seen = (laws.moments["high" if above else "low"][:, 0] > 0).reshape(usable.shape) & usable
     first, length = laws.support[seen.ravel(), 0], laws.support[seen.ravel(), 1]
     ends = np.stack(
         [np.full_like(first, -1), first + length - 1] if above else [first, np.full_like(first, _NO_CODE)], 1

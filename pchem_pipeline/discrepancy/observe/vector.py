@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe import laws
-from pchem_pipeline.discrepancy.observe import tables_numba as column
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS, PixelStatistics, pairs_at_lags
 from pchem_pipeline.discrepancy.observe.sums_numba import FrameSums
-from pchem_pipeline.discrepancy.observe.tables_numba import CodeSums, PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import FOLD, CodeSums, PixelLaws
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals
 from pchem_pipeline.model.arithmetic.significance import OUTLYING
 from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
@@ -32,11 +31,6 @@ FloatArray = NDArray[np.float64]
 
 _TAIL = float(special.ndtr(-OUTLYING))
 _ENOUGH = 25.0  # samples expected of a code or bin that is judged by itself
-#: Columns of samples seen and expected beyond the support, and far beyond it.
-_TAILS = {
-    "low": ((column.SEEN_LOW, column.EXPECTED_LOW), (column.SEEN_FAR_LOW, column.EXPECTED_FAR_LOW)),
-    "high": ((column.SEEN_HIGH, column.EXPECTED_HIGH), (column.SEEN_FAR_HIGH, column.EXPECTED_FAR_HIGH)),
-}
 _SMALLEST_EIGENVALUE = 0.02  # of residuals, relative to Poisson counts: below it the fits have absorbed them
 _Slices = tuple[slice, slice]
 
@@ -76,16 +70,15 @@ def named(start: str, forms: Mapping[str, float]) -> dict[str, float]:
     return {f"{start}.{form}": value for form, value in forms.items()}
 
 
-def goodness_of(moments: FloatArray, chi_square: int = column.CHI2) -> FloatArray:
+def goodness_of(chi_square: FloatArray) -> FloatArray:
     """Return the goodness of fit of each pixel as a normal quantile, 0 without degrees of freedom, (n,).
 
     Args:
-        moments: of the pixels.
-        chi_square: column of the chi-square; its mean and variance follow it.
+        chi_square: of the pixels, its mean and its variance, (n, 3).
     """
-    mean, variance = moments[:, chi_square + 1], moments[:, chi_square + 2]
+    value, mean, variance = chi_square.T
     some = mean > 0.5
-    z = laws.chi_square(moments[:, chi_square], np.where(some, mean, 1.0), np.where(some, variance, 2.0))
+    z = laws.chi_square(value, np.where(some, mean, 1.0), np.where(some, variance, 2.0))
     return np.where(some, z, 0.0)
 
 
@@ -100,11 +93,10 @@ def sample_statistics(pixels: PixelLaws, exposure: FloatArray, residuals: CodeRe
     good = pixels.good
     found = _score_statistics(pixels.scores[good], np.log(exposure[good]))
     moments = pixels.moments[good]
-    for name, chi_square in (("goodness", column.CHI2), ("peaks", column.PEAKS_CHI2)):
-        z = goodness_of(moments, chi_square)
-        found |= named(f"shape.{name}", pixel_forms(z, two_sided=False))
-    for side, tails in _TAILS.items():
-        near, far = (moments[:, list(columns)] for columns in tails)
+    for name in ("goodness", "peaks"):
+        found |= named(f"shape.{name}", pixel_forms(goodness_of(moments[name]), two_sided=False))
+    for side in ("low", "high"):
+        near, far = moments[side], moments[f"far_{side}"]
         found[f"tail.{side}.count"] = _beyond(near.sum(axis=0), far.sum(axis=0))
         pixels_with = [
             np.array([np.count_nonzero(seen), -np.expm1(-expected).sum()])
@@ -182,7 +174,7 @@ def period_statistics(fold: FloatArray, covariance: FloatArray) -> dict[str, flo
         fold: sums of the residuals, (16,).
         covariance: of these, (16, 16).
     """
-    code = np.arange(column.FOLD)
+    code = np.arange(FOLD)
     sign = (-1.0) ** code
     found = {"code.alternating": float(sign @ fold / np.sqrt(max(float(sign @ covariance @ sign), 1e-300)))}
     scale = np.diag(covariance).clip(1e-300)

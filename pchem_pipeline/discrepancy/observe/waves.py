@@ -20,7 +20,7 @@ from scipy import fft, ndimage
 from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
 from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps, Wave
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, FALSE_ALARM
 from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES

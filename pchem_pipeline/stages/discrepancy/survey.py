@@ -23,8 +23,7 @@ from pchem_pipeline.compute.memory import resident_bytes
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
 from pchem_pipeline.discrepancy.observe.pairs import Samples, pairs_bytes
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
-from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
 from pchem_pipeline.discrepancy.quick.places import CellMap, sensor_cells, sensor_place
 from pchem_pipeline.discrepancy.scan import Suspect
@@ -309,7 +308,7 @@ def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]
 def _shapes(laws: PixelLaws, shape: tuple[int, ...]) -> dict[str, FloatArray]:
     """Return the scores and the goodness of fit of each pixel, NaN without a law."""
     found = {f"score.{name}": laws.scores[:, 0, j] for j, name in enumerate(SCORES)}
-    found["goodness"] = goodness_of(laws.moments)
+    found["goodness"] = goodness_of(laws.moments["goodness"])
     return {name: np.where(laws.good, values, np.nan).reshape(shape) for name, values in found.items()}
 
 

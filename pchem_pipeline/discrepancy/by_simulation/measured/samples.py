@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack, laws_of_frames
 from pchem_pipeline.discrepancy.observe.places import Part
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
