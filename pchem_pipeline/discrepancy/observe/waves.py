@@ -29,7 +29,7 @@ Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
-_MOST_SAMPLES = 1 << 22
+_MOST_SAMPLES, _FRAMES_AT_ONCE = 1 << 22, 32
 _ALL_OF_IT = 0.7  # of the amplitude of a wave at any phase, for one whose phase runs on
 _ROUNDS, _STEPS = 8, 9
 _NARROWER = 2.5  # from round to round
@@ -93,10 +93,11 @@ def waves_across(
 def _spectrum(u: Float32Array, numbers: IntArray, pixels: int) -> tuple[Float32Array, Float32Array]:
     """Return powers over the noise's: the mean of the frames', (y, x), and along these, (frame, y, x)."""
     _, ny, nx = u.shape
-    # spectra are larger than the frames: no more than these are kept at a time
+    # spectra are larger than the frames: those of a few are made at a time
     over_time = np.zeros((int(numbers[-1] - numbers[0]) + 1, ny - 1, nx // 2), np.complex64)
-    for at, frame in zip(numbers - numbers[0], u, strict=True):
-        over_time[at] = fft.rfft2(frame)[1:, 1:]
+    for first in range(0, len(u), _FRAMES_AT_ONCE):
+        some = slice(first, first + _FRAMES_AT_ONCE)
+        over_time[numbers[some] - numbers[0]] = fft.rfft2(u[some])[:, 1:, 1:]
     power = _squared(over_time)
     mean = _halved(power.sum(axis=0) / (pixels * numbers.size), nx)
     for row in range(ny - 1):
