@@ -20,7 +20,7 @@ from scipy import fft
 
 from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.digital.groups import GROUP, MOST_SAMPLES, groups_of
-from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
+from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.analog.empirical_response import Source
@@ -114,7 +114,7 @@ class FollowingSamples:
         first = groups_of(edges, maps.usable.size, frames.size if most is None else most)
         if not first.size:
             return None
-        stack = Stack(frames, (first[:, None] + np.arange(GROUP)).ravel(), GROUP)
+        stack = FrameBlocks.of(frames, (first[:, None] + np.arange(GROUP)).ravel(), GROUP)
         samples = replace(Samples.by_laws(stack, laws, maps), most=MOST_SAMPLES)
         inside = samples.usable if inside is None else samples.usable & inside
         return cls(samples, inside, *_charge_of(laws, maps))

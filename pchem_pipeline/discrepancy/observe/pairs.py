@@ -9,10 +9,10 @@ deviation ``sqrt(N)`` exactly.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,48 +37,37 @@ _CELLS = 64
 _COPIES = 9
 
 
-class FrameBlocks(Protocol):
+@dataclass(frozen=True)
+class FrameBlocks:
     """Frames of some rows that come by blocks.
 
     Attributes:
         n_frames: number of them.
+        blocks: yields about so many successive frames at a time, (frame, y, x), DN.
     """
 
-    @property
-    def n_frames(self) -> int:
-        """Number of frames."""
-        ...
+    n_frames: int
+    blocks: Callable[[int], Iterable[NDArray[np.unsignedinteger[Any]]]]
 
-    def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
-        """Yield at most so many successive frames at a time, (frame, y, x), DN."""
-        ...
+    @classmethod
+    def of(
+        cls, frames: NDArray[np.unsignedinteger[Any]], chosen: IntArray | None = None, together: int = 1
+    ) -> FrameBlocks:
+        """Take frames in memory.
 
+        Args:
+            frames: codes (n, y, x), DN.
+            chosen: positions of those that are meant; None: all.
+            together: successive ones of these that come in the same block.
+        """
+        n_frames = frames.shape[0] if chosen is None else chosen.size
 
-@dataclass(frozen=True)
-class Stack:
-    """Frames in memory, or some of them.
+        def blocks(size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
+            size = together * max(size // together, 1)
+            for some in (slice(begin, begin + size) for begin in range(0, n_frames, size)):
+                yield frames[some if chosen is None else chosen[some]]
 
-    Attributes:
-        frames: codes (n, y, x), DN.
-        chosen: positions of those that are meant; None: all.
-        together: successive ones of these that come in the same block.
-    """
-
-    frames: NDArray[np.unsignedinteger[Any]]
-    chosen: IntArray | None = None
-    together: int = 1
-
-    @property
-    def n_frames(self) -> int:
-        """Number of frames."""
-        return int(self.frames.shape[0] if self.chosen is None else self.chosen.size)
-
-    def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
-        """Yield about so many successive frames at a time, (frame, y, x), DN."""
-        size = self.together * max(size // self.together, 1)
-        for begin in range(0, self.n_frames, size):
-            some = slice(begin, begin + size)
-            yield self.frames[some if self.chosen is None else self.chosen[some]]
+        return cls(n_frames, blocks)
 
 
 def laws_of_frames(frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> PixelLaws:
@@ -110,7 +99,7 @@ class Samples:
     @classmethod
     def of(cls, frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> Samples:
         """Prepare frames by the fit of their pixels."""
-        return cls.by_laws(Stack(frames), laws_of_frames(frames, maps), maps)
+        return cls.by_laws(FrameBlocks.of(frames), laws_of_frames(frames, maps), maps)
 
     @classmethod
     def by_laws(cls, frames: FrameBlocks, laws: PixelLaws, maps: PixelMaps) -> Samples:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from pchem_pipeline.discrepancy.observe import laws as laws_of
-from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
+from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps, Wave
@@ -73,7 +73,7 @@ def waves_across(
     ny, nx = maps.usable.shape
     some = numbers - numbers[0] < max(_MOST_SAMPLES // maps.usable.size, 1)
     numbers = numbers[some]
-    samples = Samples.by_laws(Stack(frames[: numbers.size]), laws, maps)
+    samples = Samples.by_laws(FrameBlocks.of(frames[: numbers.size]), laws, maps)
     samples = samples if inside is None else samples.without(~inside)
     pixels = int(np.count_nonzero(samples.usable))
     if numbers.size < FEWEST_FRAMES or min(ny, nx) < FEWEST_LINES or not pixels:

@@ -10,8 +10,9 @@ pixels and a block of frames take the memory that the run may have, or no more t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.compute.memory import resident_bytes
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
-from pchem_pipeline.discrepancy.observe.pairs import Samples, pairs_bytes
+from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples, pairs_bytes
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
@@ -209,7 +210,8 @@ def places_of_bands(
             maps[name].add(values, first)
         if not laws.good.any():
             continue
-        samples = Samples.by_laws(_Band(source, (first, last), numbers), laws, fitted)
+        blocks = partial(frame_blocks, source, numbers, (first, last))
+        samples = Samples.by_laws(FrameBlocks(numbers.size, blocks), laws, fitted)
         samples = replace(samples, most=at_once)
         del laws
         for each in scan_pairs(samples, significance=SIGNIFICANCE / len(bands), most=1):
@@ -310,28 +312,3 @@ def _shapes(laws: PixelLaws, shape: tuple[int, ...]) -> dict[str, FloatArray]:
     found = {f"score.{name}": laws.scores[:, 0, j] for j, name in enumerate(SCORES)}
     found["goodness"] = goodness_of(laws.moments["goodness"])
     return {name: np.where(laws.good, values, np.nan).reshape(shape) for name, values in found.items()}
-
-
-@dataclass(frozen=True)
-class _Band:
-    """Frames of a band of rows, read by blocks.
-
-    Attributes:
-        source: frames of the sensor.
-        rows: first, and end.
-        numbers: of the frames, increasing.
-    """
-
-    source: FrameSource
-    rows: tuple[int, int]
-    numbers: IntArray
-
-    @property
-    def n_frames(self) -> int:
-        """Number of frames."""
-        return int(self.numbers.size)
-
-    def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
-        """Yield at most so many successive frames at a time, (frame, y, x), DN."""
-        for _, block in frame_blocks(self.source, self.numbers, self.rows, size):
-            yield block

@@ -223,15 +223,17 @@ def read_window(source: FrameSource, window: Window) -> NDArray[np.unsignedinteg
     stack = np.empty((window.numbers.size, y1 - y0, x1 - x0), source.dtype)
     # not more at once than a few dozen megabytes, whatever the width of the sensor
     step = max(1, (1 << 23) // ((y1 - y0) * source.shape[2]))
-    for at, block in frame_blocks(source, window.numbers, window.rows, step):
-        stack[at : at + block.shape[0]] = block[:, :, x0:x1]
+    done = 0
+    for block in frame_blocks(source, window.numbers, window.rows, step):
+        stack[done : done + block.shape[0]] = block[:, :, x0:x1]
+        done += block.shape[0]
     return stack
 
 
 def frame_blocks(
     source: FrameSource, numbers: NDArray[np.int64], rows: tuple[int, int], size: int
-) -> Iterator[tuple[int, NDArray[np.unsignedinteger]]]:
-    """Yield at most so many successive frames of some rows at a time, (frame, y, x), DN, with their place.
+) -> Iterator[NDArray[np.unsignedinteger]]:
+    """Yield at most so many successive frames of some rows at a time, (frame, y, x), DN.
 
     Args:
         source: the frames.
@@ -242,8 +244,8 @@ def frame_blocks(
     for part in np.split(np.arange(numbers.size), np.flatnonzero(np.diff(numbers) != 1) + 1):
         frames = int(numbers[part[0]]), int(numbers[part[-1]]) + 1
         with FrameStream(source, [rows], size, frames=frames) as stream:
-            for first, (block,) in stream:
-                yield int(part[0]) + first - frames[0], block
+            for _, (block,) in stream:
+                yield block
 
 
 def fewer_samples(
