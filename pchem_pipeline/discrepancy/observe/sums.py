@@ -106,7 +106,7 @@ def sum_frames(frames: NDArray[Any], edges: IntArray, laws: PixelLaws, pixels: P
     """Sum over the frames (n, y, x) of a split whose blocks begin at ``edges``."""
     n, ny, nx = frames.shape
     size = max(1, min(n, _CHUNK_SAMPLES // (ny * nx)))
-    charge, readout = np.zeros((2, kernel.LAGS + size, ny, nx), np.float32)
+    samples = np.zeros((2, kernel.LAGS + size, ny, nx), np.float32)
     sums = FrameSums(
         rows=np.zeros((4, n, ny)),
         columns=np.zeros((2, n, nx), np.float32),
@@ -126,7 +126,7 @@ def sum_frames(frames: NDArray[Any], edges: IntArray, laws: PixelLaws, pixels: P
         norms=np.array([pixels.exposure.sum(), pixels.usable.sum()], np.float64),
     )
     for number, (first, last) in enumerate(pairwise(edges.tolist())):
-        kernel.sum_block(frames, (number, first, last), channels, charge, readout, sums)
+        kernel.sum_block(frames, (number, first, last), channels, samples, sums)
     return sums._replace(
         gain=(sums.gain - pixels.gain_offset) / max(pixels.gain_norm, 1e-300),
         lags=sums.lags / np.maximum(pairs_at_lags(edges), 1)[:, None, None],
