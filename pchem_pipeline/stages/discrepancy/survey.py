@@ -26,7 +26,7 @@ from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples, pairs
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
-from pchem_pipeline.discrepancy.quick.places import CellMap, sensor_cells, sensor_place
+from pchem_pipeline.discrepancy.quick.places import CellMap, sensor_cells, sensor_places
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
 from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
@@ -170,12 +170,7 @@ def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, 
     """
     if sums is None or sums.shape != shape or sums.freedom <= 0:
         return None
-    return _places(sensor_cells(sums), SIGNIFICANCE)
-
-
-def _places(maps: Mapping[str, CellMap], significance: float) -> dict[str, Suspect]:
-    found = {name: sensor_place(name, cells, significance / len(maps)) for name, cells in maps.items()}
-    return {name: place for name, place in found.items() if place is not None}
+    return sensor_places(sensor_cells(sums), SIGNIFICANCE)
 
 
 def places_of_bands(
@@ -231,7 +226,7 @@ def places_of_bands(
     shares = {PAIRS: numbers.size / n}
     if plain:
         # maps of shapes rest on fits, whose errors are not quite normal
-        places |= _places(maps, NO_CHANCE)
+        places |= sensor_places(maps, NO_CHANCE)
         shares[SHAPES] = 1.0
     return places, shares
 
