@@ -250,16 +250,12 @@ def _band_size(store: RunStore, shape: tuple[int, int], memory: int | None) -> t
         return rows, _MOST_AT_ONCE
     codes = mean_codes(store)
     pixel = counts.shape[2] * counts.dtype.itemsize + codes * _CODE_BYTES + _PIXEL_BYTES + _SAMPLE_BYTES
-    while True:
-        left = memory - pairs_bytes((rows, nx))
+    left = 0
+    for lower in range(rows, fewest - 1, -1):
+        left = memory - pairs_bytes((lower, nx))
         at_once = min(_MOST_AT_ONCE, max(left, 0) // 4 // _SAMPLE_BYTES)
-        affordable = int((left - at_once * _SAMPLE_BYTES) / (nx * pixel))
-        if affordable >= rows:
-            return rows, at_once
-        if rows == fewest:
-            break
-        # lower bands have smaller tables of pairs, too
-        rows = max(fewest, min(affordable, rows * 3 // 4))
+        if lower * nx * pixel <= left - at_once * _SAMPLE_BYTES:
+            return lower, at_once
     lacking = math.ceil((fewest * nx * pixel * 4 / 3 - left) / 2**20)
     raise ConfigError(
         f"discrepancy needs {lacking} MiB more for {fewest} rows of the sensor; raise compute.max_memory "
