@@ -230,12 +230,12 @@ def _charge_of(
     """Return the correlation of charge and residual, the scale of what it leaves, mean and spread, (y, x)."""
     pixels = pixel_statistics(laws, maps)
     usable = pixels.usable
-    correlation = pixels.cross / np.sqrt(np.where(usable, pixels.charge * pixels.readout, 1.0))
+    correlation = pixels.cross / np.sqrt(np.where(usable, pixels.variance.prod(axis=0), 1.0))
     left = 1.0 - correlation**2
     resolved = usable & (left > _RESOLVED)
     scale = np.where(resolved, 1.0 / np.sqrt(np.where(resolved, left, 1.0)), 0.0)
     mean = np.where(usable, maps.quanta_exposure, 0.0)
-    spread = np.sqrt(np.where(usable, pixels.charge, 0.0))
+    spread = np.sqrt(np.where(usable, pixels.variance[0], 0.0))
     single = np.float32
     return correlation.astype(single), scale.astype(single), mean.astype(single), spread.astype(single)
 

@@ -319,7 +319,7 @@ def _time_series(view: FrameView, lags: FloatArray, n_run: int, **others: Any) -
     """Return what is kept along time; ``others``: its fields that are not of the view."""
     sums, pixels = view.sums, view.pixels
     usable = pixels.usable
-    exposure, number = pixels.exposure, usable.astype(np.float64)
+    exposure, number = pixels.mode
 
     def over(values: FloatArray, count: FloatArray) -> FloatArray:
         return np.asarray(values / np.maximum(count, 1e-300) * (count > 0))

@@ -108,7 +108,7 @@ class Samples:
         usable = pixels.usable
         codes = np.where(laws.good, laws.support[:, 1], 0)
         tables = laws.tables[: 1 + codes.sum()].T.copy()
-        for channel, variance in enumerate((pixels.charge, pixels.readout)):
+        for channel, variance in enumerate(pixels.variance):
             deviation = np.sqrt(np.where(usable, variance, 1.0)).ravel().astype(np.float32)
             tables[channel, 1:] /= np.repeat(deviation, codes)
         # a track of a particle is no common mode

@@ -37,9 +37,9 @@ class PixelStatistics:
 
     Attributes:
         usable: pixels that count.
-        exposure: H, e-.
-        step: 1/g, DN.
-        charge, readout: variances of k (e-^2) and r (DN^2).
+        mode: patterns of what is common to all pixels: H for a change of the exposure, 1 for one of the bias,
+            (2, y, x).
+        variance: of k (e-^2) and r (DN^2), (2, y, x).
         cross: covariance of k and r, e- DN.
         factor, shift: weights ``r (factor k + shift)`` whose sum over a frame, less ``gain_offset``, is
             ``gain_norm`` times the relative deviation of the gain: least squares of r on k / g, what is
@@ -50,10 +50,8 @@ class PixelStatistics:
     """
 
     usable: NDArray[np.bool_]
-    exposure: FloatArray
-    step: FloatArray
-    charge: FloatArray
-    readout: FloatArray
+    mode: FloatArray
+    variance: FloatArray
     cross: FloatArray
     factor: FloatArray
     shift: FloatArray
@@ -89,17 +87,20 @@ def pixel_statistics(laws: PixelLaws, maps: PixelMaps) -> PixelStatistics:
     shift = pattern * weight
     spread = factor**2 * (kkrr - kr**2) + 2.0 * factor * shift * krr + shift**2 * rr
     noise = masked(np.maximum(rrrr * weight**2 - 1.0, 0.0))
-    h, step, kk, rr, kr, factor, shift = (
-        values.reshape(shape) for values in (h, step, masked(kk), masked(rr), masked(kr), factor, shift)
-    )
+    kk, rr, kr = masked(kk), masked(rr), masked(kr)
     return PixelStatistics(
-        usable.reshape(shape), h, step, kk, rr, kr, factor, shift,
+        usable=usable.reshape(shape),
+        mode=np.stack([h, usable]).reshape(2, *shape),
+        variance=np.stack([kk, rr]).reshape(2, *shape),
+        cross=kr.reshape(shape),
+        factor=factor.reshape(shape),
+        shift=shift.reshape(shape),
         gain_offset=float((factor * kr).sum()),
-        gain_norm=float((factor * step * kk).sum() + shift.ravel() @ pattern),
+        gain_norm=float((factor * step * kk).sum() + shift @ pattern),
         gain_variance=float(masked(spread).sum()),
         noise=noise.reshape(shape),
         square=masked(weight / np.maximum(noise, _LEAST_NOISE)).reshape(shape),
-    )  # fmt: skip
+    )
 
 
 def sum_frames(frames: NDArray[Any], edges: IntArray, laws: PixelLaws, pixels: PixelStatistics) -> FrameSums:
@@ -121,9 +122,9 @@ def sum_frames(frames: NDArray[Any], edges: IntArray, laws: PixelLaws, pixels: P
     channels = kernel.Channels(
         support=np.ascontiguousarray(code_ranges(laws, pixels.usable).transpose(1, 0, 2)),
         tables=laws.tables,
-        modes=np.stack([pixels.exposure, pixels.usable]).astype(np.float32),
+        modes=pixels.mode.astype(np.float32),
         weights=np.stack([pixels.factor, pixels.shift, pixels.square]).astype(np.float32),
-        norms=np.array([pixels.exposure.sum(), pixels.usable.sum()], np.float64),
+        norms=pixels.mode.sum(axis=(1, 2)),
     )
     for number, (first, last) in enumerate(pairwise(edges.tolist())):
         kernel.sum_block(frames, (number, first, last), channels, samples, sums)

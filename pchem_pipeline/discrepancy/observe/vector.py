@@ -253,14 +253,6 @@ class FrameView:
         b = self.edges.size - 1
         return b - (self.n - b) / (self.n - 1.0)
 
-    def variance(self, channel: int) -> FloatArray:
-        """Variance of k or r in each pixel, (y, x)."""
-        return self.pixels.readout if channel else self.pixels.charge
-
-    def mode(self, channel: int) -> FloatArray:
-        """Pattern of what is common to all pixels: H for a change of the exposure, 1 for one of the bias."""
-        return self.pixels.usable.astype(np.float64) if channel else self.pixels.exposure
-
     def lines(self, channel: int, axis: int) -> FloatArray:
         """Sums of k or r of each row (axis 1) or column (axis 0), (n, lines)."""
         if axis == 0:
@@ -269,7 +261,7 @@ class FrameView:
 
     def remaining(self, channel: int) -> FloatArray:
         """Variance of each pixel after the frame's common mode was removed, 1 in unusable pixels, (y, x)."""
-        v, h = self.variance(channel), self.mode(channel)
+        v, h = self.pixels.variance[channel], self.pixels.mode[channel]
         share = h / h.sum()
         left = v * (1.0 - 2.0 * share) + share**2 * v.sum()
         return np.where(self.pixels.usable, np.maximum(left, 1e-3 * np.where(v > 0, v, 1.0)), 1.0)
@@ -277,7 +269,7 @@ class FrameView:
     @property
     def noise_variance(self) -> FloatArray:
         """Variance of the weighted squares of r in each pixel, (y, x)."""
-        return np.asarray((self.pixels.square * self.pixels.readout) ** 2 * self.pixels.noise)
+        return np.asarray((self.pixels.square * self.pixels.variance[1]) ** 2 * self.pixels.noise)
 
     @cached_property
     def series(self) -> dict[str, FloatArray]:
@@ -287,7 +279,7 @@ class FrameView:
         """
         sums, pixels = self.sums, self.pixels
         found = {
-            name: self.lines(channel, 1).sum(axis=1) / np.sqrt(self.variance(channel).sum())
+            name: self.lines(channel, 1).sum(axis=1) / np.sqrt(pixels.variance[channel].sum())
             for channel, name in enumerate(CHANNELS)
         }
         found["gain"] = sums.gain * pixels.gain_norm / np.sqrt(max(pixels.gain_variance, 1e-300))
@@ -378,7 +370,7 @@ def frame_statistics(view: FrameView) -> dict[str, float]:
         found |= named(f"frame.{name}", _series_forms(view, u))
     for channel, name in enumerate(CHANNELS):
         found[f"frame.{name}.quadrants"] = _quadrants(view, channel)
-    rho = float(pixels.cross.sum() / np.sqrt(pixels.charge.sum() * pixels.readout.sum()))
+    rho = float(pixels.cross.sum() / np.sqrt(pixels.variance[0].sum() * pixels.variance[1].sum()))
     product = float(series["charge"] @ series["readout"])
     found["frame.covariance"] = (product - view.n * rho) / np.sqrt(view.n * (1.0 + rho**2))
     return found
@@ -406,13 +398,13 @@ def without_mode(values: FloatArray, pattern: FloatArray) -> FloatArray:
 
 
 def _quadrants(view: FrameView, channel: int) -> float:
-    variance = quadrant_sums(view.variance(channel))
+    variance = quadrant_sums(view.pixels.variance[channel])
     some = variance > 0
     if some.sum() < 2:
         return float("nan")
     scale = np.sqrt(variance[some])
     u = quadrant_series(view.sums.rows[2 * channel : 2 * channel + 2])[:, some] / scale
-    rest = without_mode(view.block_sums(u), quadrant_sums(view.mode(channel))[some] / scale)
+    rest = without_mode(view.block_sums(u), quadrant_sums(view.pixels.mode[channel])[some] / scale)
     return view.slow(rest, int(some.sum()) - 1)
 
 
@@ -439,7 +431,7 @@ def time_statistics(view: FrameView, lags: FloatArray) -> dict[str, float]:
             forms = pixel_forms(values[usable] * np.sqrt(pairs))
             found |= {name: forms["mean"], **named(name, forms)}
     for channel, name in enumerate(CHANNELS):
-        sums, mode = view.sums.blocks[:, channel], view.mode(channel)
+        sums, mode = view.sums.blocks[:, channel], view.pixels.mode[channel]
         rest = sums - (sums.sum(axis=(1, 2)) / mode.sum())[:, None, None] * mode
         lengths = np.diff(view.edges)[:, None]
         u = rest[:, usable] / np.sqrt(lengths * view.remaining(channel)[usable])
@@ -455,13 +447,13 @@ def space_statistics(view: FrameView) -> dict[str, float]:
     sums, pixels = view.sums, view.pixels
     for line, axis in (("row", 1), ("column", 0)):
         for channel, name in enumerate(CHANNELS):
-            variance, mode = view.variance(channel).sum(axis), view.mode(channel).sum(axis)
+            variance, mode = (each[channel].sum(axis) for each in (pixels.variance, pixels.mode))
             values = view.lines(channel, axis)
             forms = _line_forms(view, values, variance, mode, waves=name == "readout")
             found |= named(f"space.{line}.{name}", forms)
         noise = sums.column_noise if axis == 0 else sums.row_noise
         # of a common relative change of the noise
-        mode = (pixels.square * pixels.readout).sum(axis)
+        mode = (pixels.square * pixels.variance[1]).sum(axis)
         found |= named(f"space.{line}.noise", _line_forms(view, noise, view.noise_variance.sum(axis), mode))
     return found | {f"space.{name}": seen.z for name, seen in view.neighbours.items()}
 
@@ -557,7 +549,7 @@ def _after_removal(view: FrameView, a: int, b: int, one: _Slices, two: _Slices) 
     With ``a' = a - s sum(a)`` and ``b' = b - t sum(b)``, s and t the shares of the pixels in the modes.
     """
     pixels = view.pixels
-    covariance = (pixels.charge, pixels.cross, pixels.readout)[a + b]
-    share_a, share_b = view.mode(a) / view.mode(a).sum(), view.mode(b) / view.mode(b).sum()
+    covariance = (pixels.variance[0], pixels.cross, pixels.variance[1])[a + b]
+    share_a, share_b = (pixels.mode[each] / pixels.mode[each].sum() for each in (a, b))
     left = share_a[one] * share_b[two] * covariance.sum()
     return np.asarray(left - share_b[two] * covariance[one] - share_a[one] * covariance[two])

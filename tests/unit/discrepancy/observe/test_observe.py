@@ -279,14 +279,6 @@ def test_noise_that_is_larger_in_some_frames_or_rows_stands_out_where_it_is() ->
     assert slow["frame.noise.slow"] > 6
 
 
-def test_statistics_of_the_noise_are_normal_where_it_is_the_same() -> None:
-    found = [list(_noise_statistics(1.0, seed).values()) for seed in range(10, 30)]
-    assert len(found[0]) == 4
-    # 20 stacks: the mean to 5 / sqrt(20), the spread to 5 / sqrt(40)
-    assert np.abs(np.mean(found, axis=0)).max() < 5 / np.sqrt(20)
-    assert 0.4 < np.std(found, axis=0).min() <= np.std(found, axis=0).max() < 1.8
-
-
 def test_a_pixel_whose_residuals_hardly_vary_does_not_speak_for_all() -> None:
     """In sensors of which the fits go astray some pixels have next to no readout noise left."""
     rng = np.random.default_rng(6)
