@@ -26,7 +26,6 @@ IntArray = NDArray[np.int64]
 CHANNELS = ("charge", "readout")
 #: Blocks whose means are compared, and frames whose course along time is looked at, at least.
 MINIMUM_BLOCKS, FEWEST_FRAMES = 4, 64
-_NO_CODE = np.iinfo(np.int64).max  # above all
 _CHUNK_SAMPLES = 1 << 16
 _LEAST_NOISE = 0.5  # of the variance of r^2: residuals of hardly two values tell nothing of their size
 
@@ -155,11 +154,9 @@ def samples_beyond(
 ) -> IntArray:
     """Return the samples above or below the support of their pixel, by frame: position, y, x, DN."""
     seen = (laws.moments["high" if above else "low"][:, 0] > 0).reshape(usable.shape) & usable
-    first, length = laws.support[seen.ravel(), 0], laws.support[seen.ravel(), 1]
-    ends = np.stack(
-        [np.full_like(first, -1), first + length - 1] if above else [first, np.full_like(first, _NO_CODE)], 1
-    )
-    hits = np.zeros((MOST_HITS, 4), np.int64)
-    found = kernel.find_hits(frames, np.ascontiguousarray(np.argwhere(seen)), ends, hits)
-    hits = hits[: min(found, MOST_HITS)]
+    samples, (first, length) = frames[:, seen].T, laws.support[seen.ravel(), :2].T[:, :, None]
+    pixel, frame = np.nonzero(samples > first + length - 1 if above else samples < first)
+    pixel, frame = pixel[:MOST_HITS], frame[:MOST_HITS]
+    y, x = np.nonzero(seen)
+    hits = np.stack([frame, y[pixel], x[pixel], samples[pixel, frame]], axis=1).astype(np.int64)
     return hits[np.lexsort((hits[:, 2], hits[:, 1], hits[:, 0]))]

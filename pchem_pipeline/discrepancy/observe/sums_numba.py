@@ -230,19 +230,3 @@ def sum_block(
                 _add_neighbours(samples, y, 1, 0, size, sums.next_row)
         at += size
         _keep_last(samples, size)
-
-
-@kernel
-def find_hits(frames: NDArray[Any], pixels: IntArray, ends: IntArray, hits: IntArray) -> int:
-    """Fill ``hits`` (frame, y, x, DN) with samples of m pixels beyond ``ends``, (m, 2); return how many."""
-    found = 0
-    for i in range(pixels.shape[0]):
-        y, x = pixels[i]
-        for t in range(frames.shape[0]):
-            code = np.int64(frames[t, y, x])
-            if code < ends[i, 0] or code > ends[i, 1]:
-                if found < hits.shape[0]:
-                    hits[found, 0], hits[found, 1], hits[found, 2] = t, y, x
-                    hits[found, 3] = code
-                found += 1
-    return found
