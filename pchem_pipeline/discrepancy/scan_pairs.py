@@ -119,9 +119,10 @@ def shared_elsewhere(samples: Samples, place: Shared, *, significance: float = S
 
 def _most_significant(samples: Samples, log_limit: float) -> Shared | None:
     """Return the place of the smallest probability that holds against the scatter of the frames, too."""
+    # the tables of pairs are large, and what is guessed from them is all that is kept
     guesses = sorted(
         (
-            (_log_p(best.z, best.places), channel, pairs, best)
+            (_log_p(best.z, best.places), channel, pairs.mode, (pairs.rows, pairs.columns), best)
             for channel, modes in enumerate(pairs_of(samples))
             for pairs in modes.values()
             for best in (
@@ -132,12 +133,12 @@ def _most_significant(samples: Samples, log_limit: float) -> Shared | None:
         ),
         key=lambda guess: guess[0],
     )
-    for log_p, channel, pairs, best in guesses[:_MEASURED]:
+    for log_p, channel, mode, edges, best in guesses[:_MEASURED]:
         if log_p > log_limit:
             break
-        place = _measured(samples, channel, pairs.mode, best)
+        place = _measured(samples, channel, mode, best)
         if _holds(place, log_limit):
-            sharper = _with_ends(samples, channel, pairs, best)
+            sharper = _with_ends(samples, channel, mode, edges, best)
             return sharper if sharper is not None and _holds(sharper, log_limit) else place
     return None
 
@@ -184,10 +185,11 @@ def _measured(samples: Samples, channel: int, mode: str, best: _Best) -> Shared:
     )
 
 
-def _with_ends(samples: Samples, channel: int, pairs: Pairs, best: _Best) -> Shared | None:
+def _with_ends(
+    samples: Samples, channel: int, mode: str, edges: tuple[IntArray, IntArray], best: _Best
+) -> Shared | None:
     """Return the place of a box with its ends told line by line; None where the scan knows as much."""
-    shape, mode = (samples.usable.shape[0], samples.usable.shape[1]), pairs.mode
-    edges, tried = (pairs.rows, pairs.columns), best.places
+    shape, given, tried = (samples.usable.shape[0], samples.usable.shape[1]), best, best.places
     for _ in range(_ROUNDS if best.family in _BOXES else 0):
         inside = best.region.mask(shape)
         ends = [
@@ -202,7 +204,7 @@ def _with_ends(samples: Samples, channel: int, pairs: Pairs, best: _Best) -> Sha
             return None
         tried += box.places
         best = box._replace(places=tried)
-    if edges[0] is pairs.rows:
+    if best is given:
         return None
     # of lines without samples nothing is known
     inside = best.region.mask(shape) & samples.usable
