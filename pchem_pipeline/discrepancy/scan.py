@@ -440,7 +440,7 @@ def _rectangle(contrast: Contrast) -> Found:
     """Return the best rectangle: of all made of coarse cells, its edges moved to where they fit best."""
     ny, nx = contrast.values.shape
     tops, lefts = (np.unique(np.linspace(0, size, min(_CELLS, size) + 1).astype(int)) for size in (ny, nx))
-    sums, counts = (_integral(values)[np.ix_(tops, lefts)] for values in (contrast.values, contrast.some))
+    sums, counts = (integral(values)[np.ix_(tops, lefts)] for values in (contrast.values, contrast.some))
     best, rows, columns = 0.0, (0, ny), (0, nx)
     for height in range(1, tops.size):
         band, number = sums[height:] - sums[:-height], counts[height:] - counts[:-height]
@@ -463,7 +463,8 @@ def _rectangle(contrast: Contrast) -> Found:
     return Found("rectangle", mask, z_best, _log_p(z_best, (ny * nx) ** 2 / 4.0))
 
 
-def _integral(values: FloatArray) -> FloatArray:
+def integral(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the sums of a map before each row and column, (y + 1, x + 1)."""
     return np.pad(np.cumsum(np.cumsum(values, axis=0), axis=1), ((1, 0), (1, 0)))
 
 

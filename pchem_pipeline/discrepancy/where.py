@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.null import NullModel
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
 from pchem_pipeline.discrepancy.scan import Stretch, Suspect, scan_event_map, scan_map, scan_series
 from pchem_pipeline.discrepancy.verdict import Place
-from pchem_pipeline.effects.framework.evidence import SCORES, Evidence, TimeSeries
+from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import parse_place
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
@@ -164,60 +165,10 @@ def frame_series(evidence: Evidence) -> dict[str, FloatArray]:
     return found
 
 
-#: The map in which a statistic would show where it is, by the beginning of its name; likewise the series. {c}
-#: stands for the charge or the readout, {p} for pairs of samples of these.
-_MAP_OF = {
-    "shape.goodness": "goodness",
-    "shape.peaks": "peaks",
-    "time.lag1.{c}": "lag.{c}",
-    "time.lag2.{c}": "lag.{c}",
-    "time.cross.readout_charge": "lag.cross",
-    "time.block.{c}": "spread.{c}",
-    "frame.{c}.quadrants": "trend.{c}",
-    "frame.{c}.trend": "trend.{c}",
-    "frame.{c}.slow": "spread.{c}",
-    "frame.{c}.variance": "x.{p}",
-    "space.row.{c}": "x.{p}",
-    "space.column.{c}": "y.{p}",
-}
-_SERIES_OF = {
-    "frame.{c}": "frame.{c}",
-    "frame.{c}.variance": "scatter.{c}",
-    "frame.covariance": "scatter.charge",
-    "frame.noise": "frame.noise",
-    "space.row.noise": "frame.noise",
-    "space.column.noise": "frame.noise",
-    "space.row.{c}": "row.{c}",
-    "space.x.{p}": "row.{c}",
-    "space.column.{c}": "column.{c}",
-    "space.y.{p}": "column.{c}",
-}
-_PAIR_OF = {"charge": "kk", "readout": "rr"}
-
-
-def map_of(statistic: str) -> str | None:
-    """Return the map (of :func:`pixel_maps`) in which a statistic shows its place; None without any."""
-    parts = statistic.split(".")
-    if parts[0] == "shape" and parts[1] in SCORES:
-        return f"score.{parts[1]}"
-    if parts[0] == "space" and parts[1] in ("x", "y") and parts[2] != "bits":
-        return statistic.removeprefix("space.")
-    return _longest(_MAP_OF, statistic)
-
-
-def series_of(statistic: str) -> str | None:
-    """Return the series (of :func:`frame_series`) in which a statistic shows its frames, or None."""
-    return _longest(_SERIES_OF, statistic)
-
-
-def _longest(table: Mapping[str, str], name: str) -> str | None:
-    filled = {
-        start.format(c=channel, p=pair): shown.format(c=channel, p=pair)
-        for start, shown in table.items()
-        for channel, pair in _PAIR_OF.items()
-    }
-    found = [start for start in filled if name.startswith(start)]
-    return filled[max(found, key=len)] if found else None
+def map_of(statistic: str) -> str:
+    """Return the map (of :func:`pixel_maps`) in which a statistic shows its place; empty without any."""
+    known = STATISTICS.get(statistic.partition("@")[0])
+    return "" if known is None else known.map
 
 
 def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: float) -> list[Place]:
@@ -237,17 +188,17 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
     found = {index: p for index, p in chance.items() if p <= significance}
     names = [null.names[index] for index in found]
     # histograms alone are in no order
-    wanted = {m for n in names if (m := map_of(n)) is not None and evidence.time is not None}
+    wanted = {map_of(name) for name in names} if evidence.time is not None else ()
     regions = suspected_regions(evidence, significance, wanted)
-    frames = suspected_frames(evidence, significance, {s for n in names if (s := series_of(n)) is not None})
+    frames = suspected_frames(evidence, significance, {STATISTICS[name].series for name in names})
     maps, places = pixel_maps(evidence), []
     for index, p in found.items():
         name = null.names[index]
         spots: dict[str, Any] = {}
-        for suspect in regions.get(map_of(name) or "", ())[:1]:
+        for suspect in regions.get(map_of(name), ())[:1]:
             spots |= {"region": suspect.region.numbers(), "region_p": suspect.p}
             spots["region_share"] = suspect.share
-        for stretch in frames.get(series_of(name) or "", ())[:1]:
+        for stretch in frames.get(STATISTICS[name].series, ())[:1]:
             spots |= {"when": stretch.when.numbers(), "when_p": stretch.p}
         if (
             "@" in name
@@ -279,7 +230,7 @@ def _pixels(name: str, evidence: Evidence, maps: Mapping[str, FloatArray]) -> tu
     elif name.startswith("time.block.") and evidence.time is not None:
         values = _block_variance(evidence, evidence.time, parts[2])
     else:
-        values = maps[map_of(name) or ""]
+        values = maps[map_of(name)]
     deviations = np.abs(np.where(evidence.maps.usable, values, 0.0)).ravel()
     p = 2.0 * special.ndtr(-deviations)
     order = np.argsort(p, kind="stable")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
+from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -18,4 +18,4 @@ def samples_of(values: Floats, usable: np.ndarray[Any, np.dtype[np.bool_]] | Non
     table = np.tile(((np.arange(1201) - 600) / 100.0).astype(np.float32), (2, 1))
     codes = np.rint(100.0 * values + 600.0).astype(np.uint16)
     every = np.ones(shape, np.bool_) if usable is None else usable
-    return Samples(Stack(codes), zero, zero + 1200, zero, table, every)
+    return Samples(FrameBlocks.of(codes), zero, zero + 1200, zero, table, every)

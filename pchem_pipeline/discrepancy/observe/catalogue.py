@@ -1,4 +1,4 @@
-"""The statistics: every name, its family, its channel, and a sentence.
+"""The statistics: every name, its family, its channel, where it shows, and a sentence.
 
 Each is approximately N(0, 1) under the PCD; the order is that of the vector. ``VERSION`` is raised when a
 statistic changes its definition, since vectors of different versions are not comparable.
@@ -30,12 +30,16 @@ class Statistic:
         channel: charge (electron numbers), readout (residuals), cross (their products) or digital (codes).
         sentence: meaning of a large positive value.
         opposite: meaning of a large negative value; empty: ``sentence``, less than the model predicts.
+        map, series: of the evidence in which it shows its place and its frames (:mod:`~..where`); empty:
+            none.
     """
 
     name: str
     channel: Channel
     sentence: str
     opposite: str = ""
+    map: str = ""
+    series: str = ""
 
     @property
     def family(self) -> str:
@@ -68,22 +72,25 @@ _SCORES: dict[str, tuple[str, str, str]] = {
               "peak skewness changes with electron number"),
 }  # fmt: skip
 _OF_A_SCORE = """
-{channel} shape.{score}.mean {says} (mean over pixels)
-{channel} shape.{score}.chi {either}, differently in each pixel
-{channel} shape.{score}.cnt {either} in a few pixels
-{channel} shape.{score}.slope {says}, increasingly with exposure
+{channel} shape.{score}.mean map=score.{score} {says} (mean over pixels)
+{channel} shape.{score}.chi map=score.{score} {either}, differently in each pixel
+{channel} shape.{score}.cnt map=score.{score} {either} in a few pixels
+{channel} shape.{score}.slope map=score.{score} {says}, increasingly with exposure
 """
-#: All others: channel, name, and the meaning of a large positive [or negative] value. Those of ``both`` are
-#: one for each of the charge and the readout, whose name and subject take the places of ``{}`` and ``{of}``.
+#: All others: channel, name, map and series, and the meaning of a large positive [or negative] value. Those
+#: of ``both`` are one for each of the charge and the readout, whose name, pairs and subject take the places
+#: of ``{c}``, ``{p}`` and ``{of}``.
 _OTHERS = """
-digital shape.goodness.mean histograms [deviate from the model|are closer to the model than sampling noise]
-        (mean over pixels)
-digital shape.goodness.chi histograms deviate from the model, differently in each pixel
-digital shape.goodness.cnt histograms deviate strongly from the model in a few pixels
-readout shape.peaks.mean the peaks of the histograms [deviate from the model|are closer to the model than
+digital shape.goodness.mean map=goodness histograms [deviate from the model|are closer to the model than
         sampling noise] (mean over pixels)
-readout shape.peaks.chi the peaks of the histograms deviate from the model, differently in each pixel
-readout shape.peaks.cnt the peaks of the histograms deviate strongly from the model in a few pixels
+digital shape.goodness.chi map=goodness histograms deviate from the model, differently in each pixel
+digital shape.goodness.cnt map=goodness histograms deviate strongly from the model in a few pixels
+readout shape.peaks.mean map=peaks the peaks of the histograms [deviate from the model|are closer to the
+        model than sampling noise] (mean over pixels)
+readout shape.peaks.chi map=peaks the peaks of the histograms deviate from the model, differently in each
+        pixel
+readout shape.peaks.cnt map=peaks the peaks of the histograms deviate strongly from the model in a few
+        pixels
 digital code.rough counts deviate from the model from code to code
 digital code.alternating counts of adjacent codes deviate from the model with [opposite signs|the same sign]
 digital code.smooth counts deviate from the model smoothly along DN
@@ -99,52 +106,68 @@ readout tail.low.pixels too many pixels with samples below the range of the mode
 charge  tail.high.count too [many samples above the range|few samples at the high end] of the model
 charge  tail.high.pixels too many pixels with samples above the range of the model
 charge  tail.high.clusters samples above the range of the model are adjacent in a frame
-both    time.lag1.{}.mean {of} of successive frames are [correlated|anticorrelated] (mean over pixels)
-both    time.lag2.{}.mean {of} of frames two apart are [correlated|anticorrelated] (mean over pixels)
-both    time.lag3.{}.mean {of} of frames three apart are [correlated|anticorrelated] (mean over pixels)
-both    time.lag1.{}.chi {of} of successive frames are correlated, differently in each pixel
-both    time.lag1.{}.cnt {of} of successive frames are strongly correlated in a few pixels
-cross   time.cross.readout_charge residuals [rise|fall] with the charge of the frame before
-cross   time.cross.readout_charge.chi residuals change with the charge of the frame before, differently in
-        each pixel
+both    time.lag1.{c}.mean map=lag.{c} {of} of successive frames are [correlated|anticorrelated] (mean over
+        pixels)
+both    time.lag2.{c}.mean map=lag.{c} {of} of frames two apart are [correlated|anticorrelated] (mean over
+        pixels)
+both    time.lag3.{c}.mean {of} of frames three apart are [correlated|anticorrelated] (mean over pixels)
+both    time.lag1.{c}.chi map=lag.{c} {of} of successive frames are correlated, differently in each pixel
+both    time.lag1.{c}.cnt map=lag.{c} {of} of successive frames are strongly correlated in a few pixels
+cross   time.cross.readout_charge map=lag.cross residuals [rise|fall] with the charge of the frame before
+cross   time.cross.readout_charge.chi map=lag.cross residuals change with the charge of the frame before,
+        differently in each pixel
 cross   time.cross.charge_readout charge [rises|falls] with the residual of the frame before
 digital time.nearer samples are [closer to|farther from] the previous sample than [to|from] others
 cross   time.follows.sample residuals change with the charge of another pixel one frame before
 cross   time.follows.line residuals change with the charge of a row, column or frame one frame before
-both    time.block.{}.chi block means of the {of} vary, differently in each pixel
-both    time.block.{}.cnt block means of the {of} vary strongly in a few pixels
-both    frame.{}.variance frame means of the {of} scatter [more|less] than independent pixels
-both    frame.{}.lag1 frame means of the {of} are [correlated|anticorrelated] with the frame before
-both    frame.{}.slow frame means of the {of} drift
-both    frame.{}.trend frame means of the {of} [rise|fall] along the run
-both    frame.{}.line frame means of the {of} are periodic
-both    frame.{}.alternating frame means of the {of} are higher in [even|odd] frames
-both    frame.{}.largest one frame mean of the {of} is an outlier
-both    frame.{}.quadrants quadrants drift apart in the {of}
-cross   frame.covariance frame means of charge and residual are [correlated|anticorrelated]
+both    time.block.{c}.chi map=spread.{c} block means of the {of} vary, differently in each pixel
+both    time.block.{c}.cnt map=spread.{c} block means of the {of} vary strongly in a few pixels
+both    frame.{c}.variance map=x.{p} series=scatter.{c} frame means of the {of} scatter [more|less] than
+        independent pixels
+both    frame.{c}.lag1 series=frame.{c} frame means of the {of} are [correlated|anticorrelated] with the frame
+        before
+both    frame.{c}.slow map=spread.{c} series=frame.{c} frame means of the {of} drift
+both    frame.{c}.trend map=trend.{c} series=frame.{c} frame means of the {of} [rise|fall] along the run
+both    frame.{c}.line series=frame.{c} frame means of the {of} are periodic
+both    frame.{c}.alternating series=frame.{c} frame means of the {of} are higher in [even|odd] frames
+both    frame.{c}.largest series=frame.{c} one frame mean of the {of} is an outlier
+both    frame.{c}.quadrants map=trend.{c} series=frame.{c} quadrants drift apart in the {of}
+cross   frame.covariance series=scatter.charge frame means of charge and residual are
+        [correlated|anticorrelated]
 cross   frame.gain.slow the gain drifts
 cross   frame.gain.trend the gain [rises|falls] along the run
-readout frame.noise.variance read noise varies [more|less] from frame to frame than sampling noise
-readout frame.noise.slow the read noise drifts
+readout frame.noise.variance series=frame.noise read noise varies [more|less] from frame to frame than
+        sampling noise
+readout frame.noise.slow series=frame.noise the read noise drifts
 digital frame.repeated frames are exact copies of the frame before
 digital frame.repeated_rows rows are exact copies of the frame before
-both    space.row.{}.variance row means of the {of} scatter [more|less] than independent pixels
-both    space.row.{}.lag1 row means of the {of} are [correlated|anticorrelated] with the adjacent row
-both    space.column.{}.variance column means of the {of} scatter [more|less] than independent pixels
-both    space.column.{}.lag1 column means of the {of} are [correlated|anticorrelated] with the adjacent column
-readout space.row.readout.line row means of the readout residuals are periodic
-readout space.column.readout.line column means of the readout residuals are periodic
+both    space.row.{c}.variance map=x.{p} series=row.{c} row means of the {of} scatter [more|less] than
+        independent pixels
+both    space.row.{c}.lag1 map=x.{p} series=row.{c} row means of the {of} are [correlated|anticorrelated]
+        with the adjacent row
+both    space.column.{c}.variance map=y.{p} series=column.{c} column means of the {of} scatter [more|less]
+        than independent pixels
+both    space.column.{c}.lag1 map=y.{p} series=column.{c} column means of the {of} are
+        [correlated|anticorrelated] with the adjacent column
+readout space.row.readout.line map=x.rr series=row.readout row means of the readout residuals are periodic
+readout space.column.readout.line map=y.rr series=column.readout column means of the readout residuals are
+        periodic
 readout space.sample.readout.line readout residuals are periodic along rows, columns or frames
 readout space.sample.readout.spectrum readout residuals of a frame are correlated at some distance
-charge  space.x.kk electron numbers of neighbours are [correlated|anticorrelated], along x
-readout space.x.rr residuals of neighbours are [correlated|anticorrelated], along x
-cross   space.x.rk residuals [rise|fall] with the charge of the neighbour, along x
-charge  space.y.kk electron numbers of neighbours are [correlated|anticorrelated], along y
-readout space.y.rr residuals of neighbours are [correlated|anticorrelated], along y
-cross   space.y.rk residuals [rise|fall] with the charge of the neighbour, along y
-readout space.row.noise.variance read noise varies [more|less] between the rows of a frame than sampling noise
-readout space.column.noise.variance read noise varies [more|less] between the columns of a frame than sampling
-        noise
+charge  space.x.kk map=x.kk series=row.charge electron numbers of neighbours are
+        [correlated|anticorrelated], along x
+readout space.x.rr map=x.rr series=row.readout residuals of neighbours are [correlated|anticorrelated],
+        along x
+cross   space.x.rk map=x.rk residuals [rise|fall] with the charge of the neighbour, along x
+charge  space.y.kk map=y.kk series=column.charge electron numbers of neighbours are
+        [correlated|anticorrelated], along y
+readout space.y.rr map=y.rr series=column.readout residuals of neighbours are [correlated|anticorrelated],
+        along y
+cross   space.y.rk map=y.rk residuals [rise|fall] with the charge of the neighbour, along y
+readout space.row.noise.variance series=frame.noise read noise varies [more|less] between the rows of a
+        frame than sampling noise
+readout space.column.noise.variance series=frame.noise read noise varies [more|less] between the columns of
+        a frame than sampling noise
 digital space.predicted.equal too [many|few] samples equal the prediction from their neighbours
 digital space.predicted.above too [many|few] samples far exceed the prediction from their neighbours
 digital space.equal.squares samples of squares of 2 x 2 pixels are all equal
@@ -156,7 +179,7 @@ digital space.misplaced.columns columns contain samples of other pixels
 digital space.repeated.rows rows are exact copies of the row above
 digital space.repeated.columns columns are exact copies of the column on the left
 """
-_SUBJECTS = {"charge": "electron numbers", "readout": "readout residuals"}
+_SUBJECTS = {"charge": ("electron numbers", "kk"), "readout": ("readout residuals", "rr")}
 
 
 def _records() -> Iterator[str]:
@@ -168,8 +191,8 @@ def _records() -> Iterator[str]:
     # indented lines go on with the one above
     for record in re.split(r"\n(?=\S)", _OTHERS.strip()):
         if record.startswith("both"):
-            for channel, subject in _SUBJECTS.items():
-                yield record.replace("both", channel, 1).format(channel, of=subject)
+            for channel, (subject, pair) in _SUBJECTS.items():
+                yield record.replace("both", channel, 1).format(c=channel, of=subject, p=pair)
         else:
             yield record
 
@@ -177,8 +200,9 @@ def _records() -> Iterator[str]:
 def _statistic(record: str) -> Statistic:
     """Make a statistic from its record; without brackets its opposite is empty."""
     channel, name, *words = record.split()
+    shown = dict(words.pop(0).split("=") for _ in range(2) if words[0].startswith(("map=", "series=")))
     more, less = (re.sub(r"\[(.*?)\|(.*?)\]", rf"\{sign}", " ".join(words)) for sign in (1, 2))
-    return Statistic(name, cast(Channel, channel), more, "" if more == less else less)
+    return Statistic(name, cast(Channel, channel), more, "" if more == less else less, **shown)
 
 
 class _Catalogue(dict[str, Statistic]):

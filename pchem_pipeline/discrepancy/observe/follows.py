@@ -9,7 +9,6 @@ variance N. The largest of all distances counts, by how many there are.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, get_args
@@ -20,9 +19,9 @@ from scipy import fft
 
 from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.digital.groups import GROUP, MOST_SAMPLES, groups_of
-from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
+from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.analog.empirical_response import Source
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
@@ -34,7 +33,6 @@ Spectra = NDArray[np.complexfloating]
 Axes = tuple[int, ...]  # of (frame, y, x)
 
 SOURCES: tuple[Source, ...] = get_args(Source)
-_COLUMNS = 2  # the axis whose spectrum has one half only
 STEPS = 2  # the same frame, and the one before
 _FEWEST = 3000  # products of a distance
 _RESOLVED = 0.05  # of the variance of the charge, at least, that its residual does not hold
@@ -114,7 +112,7 @@ class FollowingSamples:
         first = groups_of(edges, maps.usable.size, frames.size if most is None else most)
         if not first.size:
             return None
-        stack = Stack(frames, (first[:, None] + np.arange(GROUP)).ravel(), GROUP)
+        stack = FrameBlocks.of(frames, (first[:, None] + np.arange(GROUP)).ravel(), GROUP)
         samples = replace(Samples.by_laws(stack, laws, maps), most=MOST_SAMPLES)
         inside = samples.usable if inside is None else samples.usable & inside
         return cls(samples, inside, *_charge_of(laws, maps))
@@ -139,21 +137,18 @@ class FollowingSamples:
             yield residual * self.inside, self.turned((charge - self.mixed * residual) * self.scale)
 
     def by_distance(self, views: Sequence[Axes] = ((),)) -> list[Follows]:
-        """Sum the products of residuals with the charge of other samples, mirrored along some axes.
-
-        All views come of the same transforms: that of what is mirrored is the one of opposite frequency.
-        """
+        """Sum the products of residuals with the charge of others, mirrored along the axes of each view."""
         ny, nx = self.inside.shape
         size = fft.next_fast_len(2 * ny - 1, real=True), fft.next_fast_len(2 * nx - 1, real=True)
         sums = np.zeros((len(views), STEPS, size[0], size[1] // 2 + 1), np.complex128)
         scatter = np.zeros((2, len(SOURCES)))
-        for chunk in self.chunks():
-            scatter += [_scatter(u) for u in chunk]
-            one, two = (fft.rfftn(u, size, axes=(1, 2)).reshape(-1, GROUP, *sums.shape[2:]) for u in chunk)
-            for view, axes in enumerate(views):
-                this, other = _of_view(one, two, axes)
+        for residual, charge in self.chunks():
+            scatter += [_scatter(u) for u in (residual, charge)]
+            one = fft.rfftn(residual, size, axes=(1, 2)).reshape(-1, GROUP, *sums.shape[2:]).conj()
+            for total, axes in zip(sums, views, strict=True):
+                two = fft.rfftn(np.flip(charge, axes), size, axes=(1, 2)).reshape(one.shape)
                 for step in range(STEPS):
-                    sums[view, step] += np.einsum("gtyx,gtyx->yx", this[:, step:], other[:, : GROUP - step])
+                    total[step] += np.einsum("gtyx,gtyx->yx", one[:, step:], two[:, : GROUP - step])
         ratio = scatter / np.maximum(scatter[:, :1], 1e-300)
         wider = np.sqrt(np.maximum(ratio.prod(axis=0), 1e-300))
         number = (self.groups * (GROUP - np.arange(STEPS))).astype(np.float64)
@@ -161,7 +156,7 @@ class FollowingSamples:
         for axes, total in zip(views, sums, strict=True):
             told = np.flip(self.scale > 0.0, tuple(axis - 1 for axis in axes))
             to, source = (fft.rfftn(mask.astype(np.float64), size) for mask in (self.inside, told))
-            products = _centred(_seen_in_view(total, axes, size, (ny, nx)), size, (ny, nx))
+            products = _centred(total, size, (ny, nx))
             pairs = np.rint(_centred((to.conj() * source)[None], size, (ny, nx))) * number[:, None, None]
             if not axes:
                 products[0, ny - 1, nx - 1] = pairs[0, ny - 1, nx - 1] = 0.0
@@ -235,12 +230,12 @@ def _charge_of(
     """Return the correlation of charge and residual, the scale of what it leaves, mean and spread, (y, x)."""
     pixels = pixel_statistics(laws, maps)
     usable = pixels.usable
-    correlation = pixels.cross / np.sqrt(np.where(usable, pixels.charge * pixels.readout, 1.0))
+    correlation = pixels.cross / np.sqrt(np.where(usable, pixels.variance.prod(axis=0), 1.0))
     left = 1.0 - correlation**2
     resolved = usable & (left > _RESOLVED)
     scale = np.where(resolved, 1.0 / np.sqrt(np.where(resolved, left, 1.0)), 0.0)
     mean = np.where(usable, maps.quanta_exposure, 0.0)
-    spread = np.sqrt(np.where(usable, pixels.charge, 0.0))
+    spread = np.sqrt(np.where(usable, pixels.variance[0], 0.0))
     single = np.float32
     return correlation.astype(single), scale.astype(single), mean.astype(single), spread.astype(single)
 
@@ -254,26 +249,6 @@ def _scatter(u: Float32Array) -> FloatArray:
             *(float((s**2).sum()) for s in (rows, columns, rows.sum(axis=1))),
         ]
     )
-
-
-def _of_view(residual: Spectra, charge: Spectra, axes: Axes) -> tuple[Spectra, Spectra]:
-    """Return factors whose product is that with mirrored charge but for `_seen_in_view`, (..., y, x half).
-
-    The spectrum of what is mirrored is that of the opposite frequency, up to where it begins, and with
-    real values the conjugate where both are.
-    """
-    if len(axes) == 1:
-        charge = charge[..., -np.arange(charge.shape[-2]), :]
-    return residual if _COLUMNS in axes else residual.conj(), charge
-
-
-def _seen_in_view(products: Spectra, axes: Axes, size: tuple[int, int], shape: tuple[int, int]) -> Spectra:
-    """Return sums of products of `_of_view` as those with the mirrored charge, (n, y, x half)."""
-    found = products.conj() if _COLUMNS in axes else products
-    for axis in axes:
-        turns = np.arange(found.shape[axis]) * (shape[axis - 1] - 1) / size[axis - 1]
-        found = found * np.exp(-2j * math.pi * (turns if axis == _COLUMNS else turns[:, None]))
-    return found
 
 
 def _centred(spectra: Spectra, size: tuple[int, int], shape: tuple[int, int]) -> FloatArray:

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError, PchEmError
-from pchem_pipeline.discrepancy.observe import tables_numba as column
 from pchem_pipeline.discrepancy.observe.digital.groups import (
     bit_statistics,
     nearer_statistics,
@@ -39,8 +38,7 @@ from pchem_pipeline.discrepancy.observe.sums import (
     samples_beyond,
     sum_frames,
 )
-from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import (
     FrameView,
     frame_statistics,
@@ -210,30 +208,31 @@ def _compared(
         raise PchEmError(
             f"none of the {good.size} pixels has a fit that can be relied upon; see the flags of the fit"
         )
-    moments = np.where(good[:, None], laws.moments, np.nan)
-    codes = laws.codes
+    moments, codes = laws.moments, laws.codes
     residuals = CodeResiduals(codes.first, codes.single[0], codes.single[1], *seen.extremes(good))
 
-    def tail(moment: int) -> NDArray[np.uint32]:
-        return np.where(good, laws.moments[:, moment], 0.0).reshape(shape).astype(np.uint32)
+    def known(values: FloatArray) -> FloatArray:
+        return np.where(good, values, np.nan).reshape(shape)
 
     def mapped(values: FloatArray) -> NDArray[np.float32]:
-        return np.where(good, values, np.nan).reshape(shape).astype(np.float32)
+        return known(values).astype(np.float32)
+
+    low, high = (np.where(good[:, None], moments[side], 0.0) for side in ("low", "high"))
 
     evidence = Evidence(
         maps=PixelMaps.known(parameters.T, good.reshape(shape)),
         n_frames=int(seen.samples.max()),
-        charge_std=moments[:, column.MODEL_STD_K].reshape(shape),
-        readout_std=moments[:, column.MODEL_STD_R].reshape(shape),
+        charge_std=known(moments["charge_std"]),
+        readout_std=known(moments["readout_std"]),
         scores={name: mapped(laws.scores[:, 0, j]) for j, name in enumerate(SCORES)},
-        goodness=mapped(goodness_of(laws.moments)),
-        peaks=mapped(goodness_of(laws.moments, column.PEAKS_CHI2)),
-        tail_low=tail(column.SEEN_LOW),
-        tail_high=tail(column.SEEN_HIGH),
+        goodness=mapped(goodness_of(moments["goodness"])),
+        peaks=mapped(goodness_of(moments["peaks"])),
+        tail_low=low[:, 0].reshape(shape).astype(np.uint32),
+        tail_high=high[:, 0].reshape(shape).astype(np.uint32),
         code=residuals,
         time=None,
         z=in_order(sample_statistics(laws, parameters[:, 0], residuals)),
-        tail_expected=np.stack([mapped(moments[:, c]) for c in (column.EXPECTED_LOW, column.EXPECTED_HIGH)]),
+        tail_expected=np.stack([mapped(low[:, 1]), mapped(high[:, 1])]),
     )
     return evidence, laws
 
@@ -306,7 +305,7 @@ def _clusters(hits: IntArray, laws: PixelLaws, shape: tuple[int, ...]) -> float:
     """Return the statistic of hits next to each other in the same frame, chance coincidences expected."""
     n, ny, nx = shape
     expected = np.zeros((ny + 2, nx + 2))
-    expected[1:-1, 1:-1] = np.where(laws.good, laws.moments[:, column.EXPECTED_HIGH], 0.0).reshape(ny, nx)
+    expected[1:-1, 1:-1] = np.where(laws.good, laws.moments["high"][:, 1], 0.0).reshape(ny, nx)
     neighbours = expected[1:-1, 2:] + expected[2:, 2:] + expected[2:, 1:-1] + expected[2:, :-2]
     chance = float((expected[1:-1, 1:-1] * neighbours).sum() / n)
     keys = {(int(t), int(y), int(x)) for t, y, x in hits[:, :3]}
@@ -320,7 +319,7 @@ def _time_series(view: FrameView, lags: FloatArray, n_run: int, **others: Any) -
     """Return what is kept along time; ``others``: its fields that are not of the view."""
     sums, pixels = view.sums, view.pixels
     usable = pixels.usable
-    exposure, number = pixels.exposure, usable.astype(np.float64)
+    exposure, number = pixels.mode
 
     def over(values: FloatArray, count: FloatArray) -> FloatArray:
         return np.asarray(values / np.maximum(count, 1e-300) * (count > 0))

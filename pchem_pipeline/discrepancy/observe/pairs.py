@@ -9,18 +9,17 @@ deviation ``sqrt(N)`` exactly.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS, code_ranges, pixel_statistics
-from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 FloatArray = NDArray[np.float64]
@@ -38,48 +37,37 @@ _CELLS = 64
 _COPIES = 9
 
 
-class FrameBlocks(Protocol):
+@dataclass(frozen=True)
+class FrameBlocks:
     """Frames of some rows that come by blocks.
 
     Attributes:
         n_frames: number of them.
+        blocks: yields about so many successive frames at a time, (frame, y, x), DN.
     """
 
-    @property
-    def n_frames(self) -> int:
-        """Number of frames."""
-        ...
+    n_frames: int
+    blocks: Callable[[int], Iterable[NDArray[np.unsignedinteger[Any]]]]
 
-    def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
-        """Yield at most so many successive frames at a time, (frame, y, x), DN."""
-        ...
+    @classmethod
+    def of(
+        cls, frames: NDArray[np.unsignedinteger[Any]], chosen: IntArray | None = None, together: int = 1
+    ) -> FrameBlocks:
+        """Take frames in memory.
 
+        Args:
+            frames: codes (n, y, x), DN.
+            chosen: positions of those that are meant; None: all.
+            together: successive ones of these that come in the same block.
+        """
+        n_frames = frames.shape[0] if chosen is None else chosen.size
 
-@dataclass(frozen=True)
-class Stack:
-    """Frames in memory, or some of them.
+        def blocks(size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
+            size = together * max(size // together, 1)
+            for some in (slice(begin, begin + size) for begin in range(0, n_frames, size)):
+                yield frames[some if chosen is None else chosen[some]]
 
-    Attributes:
-        frames: codes (n, y, x), DN.
-        chosen: positions of those that are meant; None: all.
-        together: successive ones of these that come in the same block.
-    """
-
-    frames: NDArray[np.unsignedinteger[Any]]
-    chosen: IntArray | None = None
-    together: int = 1
-
-    @property
-    def n_frames(self) -> int:
-        """Number of frames."""
-        return int(self.frames.shape[0] if self.chosen is None else self.chosen.size)
-
-    def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
-        """Yield about so many successive frames at a time, (frame, y, x), DN."""
-        size = self.together * max(size // self.together, 1)
-        for begin in range(0, self.n_frames, size):
-            some = slice(begin, begin + size)
-            yield self.frames[some if self.chosen is None else self.chosen[some]]
+        return cls(n_frames, blocks)
 
 
 def laws_of_frames(frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> PixelLaws:
@@ -111,7 +99,7 @@ class Samples:
     @classmethod
     def of(cls, frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> Samples:
         """Prepare frames by the fit of their pixels."""
-        return cls.by_laws(Stack(frames), laws_of_frames(frames, maps), maps)
+        return cls.by_laws(FrameBlocks.of(frames), laws_of_frames(frames, maps), maps)
 
     @classmethod
     def by_laws(cls, frames: FrameBlocks, laws: PixelLaws, maps: PixelMaps) -> Samples:
@@ -120,7 +108,7 @@ class Samples:
         usable = pixels.usable
         codes = np.where(laws.good, laws.support[:, 1], 0)
         tables = laws.tables[: 1 + codes.sum()].T.copy()
-        for channel, variance in enumerate((pixels.charge, pixels.readout)):
+        for channel, variance in enumerate(pixels.variance):
             deviation = np.sqrt(np.where(usable, variance, 1.0)).ravel().astype(np.float32)
             tables[channel, 1:] /= np.repeat(deviation, codes)
         # a track of a particle is no common mode
@@ -225,10 +213,19 @@ class Pairs:
         return self.rows if self.mode == "column" else self.columns
 
 
-def pairs_of(samples: Samples) -> list[dict[str, Pairs]]:
-    """Sum the products of all pairs in one pass over the frames; by channel, and by what the pixels share."""
-    shape = samples.usable.shape
-    counted, gathered = _Gathered(*shape), [_Gathered(*shape) for _ in CHANNELS]
+def pairs_of(samples: Samples, edges: tuple[IntArray, IntArray] | None = None) -> list[dict[str, Pairs]]:
+    """Sum the products of all pairs in one pass over the frames; by channel, and by what the pixels share.
+
+    Args:
+        samples: standardised frames.
+        edges: of the cells of rows and of columns, pixels; None: cells of equal size.
+    """
+    if edges is None:
+        rows, columns = (
+            np.unique(np.linspace(0, n, min(n, _CELLS) + 1).astype(np.int64)) for n in samples.usable.shape
+        )
+        edges = rows, columns
+    counted, gathered = _Gathered(*edges), [_Gathered(*edges) for _ in CHANNELS]
     counted.add(samples.usable[None].astype(np.float32))
     for chunk in samples.chunks():
         for each, u in zip(gathered, chunk, strict=True):
@@ -297,11 +294,10 @@ class _Gathered:
         squares: of all pixels, (y', x').
     """
 
-    def __init__(self, ny: int, nx: int) -> None:
-        """Begin with nothing, for a sensor of ny rows and nx columns."""
-        rows, columns = (np.unique(np.linspace(0, n, min(n, _CELLS) + 1).astype(np.int64)) for n in (ny, nx))
+    def __init__(self, rows: IntArray, columns: IntArray) -> None:
+        """Begin with nothing, for cells of rows and columns with these edges."""
         self.rows, self.columns = _Lines(rows, columns), _Lines(columns, rows)
-        self.stride = tuple(2 if n > _CELLS // 2 else 1 for n in (ny, nx))
+        self.stride = tuple(2 if each.size - 1 > _CELLS // 2 else 1 for each in (rows, columns))
         self.squares = np.zeros([each.size - 1 for each in self.edges("frame")])
         self.of_frames = np.zeros((self.squares.size, self.squares.size))
 

@@ -194,7 +194,6 @@ def part_statistics(
     maps: PixelMaps,
     parts: Sequence[Part],
     *,
-    n_run: int,
     block_frames: int,
     window: SensorWindow | None = None,
 ) -> dict[str, float]:
@@ -211,15 +210,10 @@ def part_statistics(
         own = maps.of(np.ix_(rows, columns))
         own = replace(own, usable=own.usable & mask[np.ix_(rows, columns)])
         small = frames if mask.all() else frames[:, rows[:, None], columns]
+        in_time, n_run = Part(None, part.when), int(numbers[-1]) + 1  # on which no statistic depends
         try:
             evidence = part_evidence(
-                small,
-                numbers,
-                own,
-                Part(None, part.when),
-                n_run=n_run,
-                block_frames=block_frames,
-                fitted=False,
+                small, numbers, own, in_time, n_run=n_run, block_frames=block_frames, fitted=False
             )
         except (PchEmError, ConfigError):
             continue

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import sums_numba as kernel
-from pchem_pipeline.discrepancy.observe import tables_numba as columns_of
 from pchem_pipeline.discrepancy.observe.sums_numba import FrameSums
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import MOST_HITS, PixelMaps
 
 FloatArray = NDArray[np.float64]
@@ -27,7 +26,6 @@ IntArray = NDArray[np.int64]
 CHANNELS = ("charge", "readout")
 #: Blocks whose means are compared, and frames whose course along time is looked at, at least.
 MINIMUM_BLOCKS, FEWEST_FRAMES = 4, 64
-_NO_CODE = np.iinfo(np.int64).max  # above all
 _CHUNK_SAMPLES = 1 << 16
 _LEAST_NOISE = 0.5  # of the variance of r^2: residuals of hardly two values tell nothing of their size
 
@@ -38,9 +36,9 @@ class PixelStatistics:
 
     Attributes:
         usable: pixels that count.
-        exposure: H, e-.
-        step: 1/g, DN.
-        charge, readout: variances of k (e-^2) and r (DN^2).
+        mode: patterns of what is common to all pixels: H for a change of the exposure, 1 for one of the bias,
+            (2, y, x).
+        variance: of k (e-^2) and r (DN^2), (2, y, x).
         cross: covariance of k and r, e- DN.
         factor, shift: weights ``r (factor k + shift)`` whose sum over a frame, less ``gain_offset``, is
             ``gain_norm`` times the relative deviation of the gain: least squares of r on k / g, what is
@@ -51,10 +49,8 @@ class PixelStatistics:
     """
 
     usable: NDArray[np.bool_]
-    exposure: FloatArray
-    step: FloatArray
-    charge: FloatArray
-    readout: FloatArray
+    mode: FloatArray
+    variance: FloatArray
     cross: FloatArray
     factor: FloatArray
     shift: FloatArray
@@ -76,7 +72,7 @@ def pixel_statistics(laws: PixelLaws, maps: PixelMaps) -> PixelStatistics:
     """Collect the moments of the channels; pixels in which one of them is constant do not count."""
     moments, shape = laws.moments, maps.usable.shape
     exposure, gain = maps.quanta_exposure.ravel(), maps.conversion_gain.ravel()
-    kk, rr, kr = (moments[:, c] for c in (columns_of.MEAN_KK, columns_of.MEAN_RR, columns_of.MEAN_KR))
+    kk, rr, kr, krr, kkrr, rrrr = (moments[name] for name in ("kk", "rr", "kr", "krr", "kkrr", "rrrr"))
     usable = laws.good & (kk > 1e-12) & (rr > 1e-12)
 
     def masked(values: FloatArray) -> FloatArray:
@@ -88,27 +84,29 @@ def pixel_statistics(laws: PixelLaws, maps: PixelMaps) -> PixelStatistics:
     factor = step * weight
     pattern = masked(h * step - (h * step * weight).sum() / max(weight.sum(), 1e-300))
     shift = pattern * weight
-    krr, kkrr = moments[:, columns_of.MEAN_KRR], moments[:, columns_of.MEAN_KKRR]
     spread = factor**2 * (kkrr - kr**2) + 2.0 * factor * shift * krr + shift**2 * rr
-    noise = masked(np.maximum(moments[:, columns_of.MEAN_RRRR] * weight**2 - 1.0, 0.0))
-    h, step, kk, rr, kr, factor, shift = (
-        values.reshape(shape) for values in (h, step, masked(kk), masked(rr), masked(kr), factor, shift)
-    )
+    noise = masked(np.maximum(rrrr * weight**2 - 1.0, 0.0))
+    kk, rr, kr = masked(kk), masked(rr), masked(kr)
     return PixelStatistics(
-        usable.reshape(shape), h, step, kk, rr, kr, factor, shift,
+        usable=usable.reshape(shape),
+        mode=np.stack([h, usable]).reshape(2, *shape),
+        variance=np.stack([kk, rr]).reshape(2, *shape),
+        cross=kr.reshape(shape),
+        factor=factor.reshape(shape),
+        shift=shift.reshape(shape),
         gain_offset=float((factor * kr).sum()),
-        gain_norm=float((factor * step * kk).sum() + shift.ravel() @ pattern),
+        gain_norm=float((factor * step * kk).sum() + shift @ pattern),
         gain_variance=float(masked(spread).sum()),
         noise=noise.reshape(shape),
         square=masked(weight / np.maximum(noise, _LEAST_NOISE)).reshape(shape),
-    )  # fmt: skip
+    )
 
 
 def sum_frames(frames: NDArray[Any], edges: IntArray, laws: PixelLaws, pixels: PixelStatistics) -> FrameSums:
     """Sum over the frames (n, y, x) of a split whose blocks begin at ``edges``."""
     n, ny, nx = frames.shape
     size = max(1, min(n, _CHUNK_SAMPLES // (ny * nx)))
-    charge, readout = np.zeros((2, kernel.LAGS + size, ny, nx), np.float32)
+    samples = np.zeros((2, kernel.LAGS + size, ny, nx), np.float32)
     sums = FrameSums(
         rows=np.zeros((4, n, ny)),
         columns=np.zeros((2, n, nx), np.float32),
@@ -123,12 +121,12 @@ def sum_frames(frames: NDArray[Any], edges: IntArray, laws: PixelLaws, pixels: P
     channels = kernel.Channels(
         support=np.ascontiguousarray(code_ranges(laws, pixels.usable).transpose(1, 0, 2)),
         tables=laws.tables,
-        modes=np.stack([pixels.exposure, pixels.usable]).astype(np.float32),
+        modes=pixels.mode.astype(np.float32),
         weights=np.stack([pixels.factor, pixels.shift, pixels.square]).astype(np.float32),
-        norms=np.array([pixels.exposure.sum(), pixels.usable.sum()], np.float64),
+        norms=pixels.mode.sum(axis=(1, 2)),
     )
     for number, (first, last) in enumerate(pairwise(edges.tolist())):
-        kernel.sum_block(frames, (number, first, last), channels, charge, readout, sums)
+        kernel.sum_block(frames, (number, first, last), channels, samples, sums)
     return sums._replace(
         gain=(sums.gain - pixels.gain_offset) / max(pixels.gain_norm, 1e-300),
         lags=sums.lags / np.maximum(pairs_at_lags(edges), 1)[:, None, None],
@@ -155,13 +153,10 @@ def samples_beyond(
     frames: NDArray[Any], laws: PixelLaws, usable: NDArray[np.bool_], *, above: bool
 ) -> IntArray:
     """Return the samples above or below the support of their pixel, by frame: position, y, x, DN."""
-    column = columns_of.SEEN_HIGH if above else columns_of.SEEN_LOW
-    seen = (laws.moments[:, column] > 0).reshape(usable.shape) & usable
-    first, length = laws.support[seen.ravel(), 0], laws.support[seen.ravel(), 1]
-    ends = np.stack(
-        [np.full_like(first, -1), first + length - 1] if above else [first, np.full_like(first, _NO_CODE)], 1
-    )
-    hits = np.zeros((MOST_HITS, 4), np.int64)
-    found = kernel.find_hits(frames, np.ascontiguousarray(np.argwhere(seen)), ends, hits)
-    hits = hits[: min(found, MOST_HITS)]
+    seen = (laws.moments["high" if above else "low"][:, 0] > 0).reshape(usable.shape) & usable
+    samples, (first, length) = frames[:, seen].T, laws.support[seen.ravel(), :2].T[:, :, None]
+    pixel, frame = np.nonzero(samples > first + length - 1 if above else samples < first)
+    pixel, frame = pixel[:MOST_HITS], frame[:MOST_HITS]
+    y, x = np.nonzero(seen)
+    hits = np.stack([frame, y[pixel], x[pixel], samples[pixel, frame]], axis=1).astype(np.int64)
     return hits[np.lexsort((hits[:, 2], hits[:, 1], hits[:, 0]))]

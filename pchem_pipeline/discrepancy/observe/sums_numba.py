@@ -68,28 +68,22 @@ class FrameSums(NamedTuple):
 
 @kernel
 def _look_up(
-    frames: NDArray[Any],
-    support: NDArray[np.int32],
-    tables: Float32Array,
-    y: int,
-    at: int,
-    size: int,
-    charge: Float32Array,
-    readout: Float32Array,
+    frames: NDArray[Any], channels: Channels, y: int, at: int, size: int, samples: Float32Array
 ) -> None:
     """Turn the codes of a row into k and r; codes beyond the support count as its ends."""
+    support, tables = channels.support, channels.tables
     for j in range(size):
         for x in range(frames.shape[2]):
             first = support[y, 0, x]
             code = min(max(np.int32(frames[at + j, y, x]), first), support[y, 1, x])
             row = support[y, 2, x] + (code - first)
-            charge[LAGS + j, y, x] = tables[row, 0]
-            readout[LAGS + j, y, x] = tables[row, 1]
+            samples[0, LAGS + j, y, x] = tables[row, 0]
+            samples[1, LAGS + j, y, x] = tables[row, 1]
 
 
 @kernel
 def _sum_half(
-    charge: Float32Array, readout: Float32Array, weights: Float32Array, j: int, y: int, begin: int, end: int
+    samples: Float32Array, weights: Float32Array, j: int, y: int, begin: int, end: int
 ) -> tuple[Any, Any, Any]:
     """Return the sums of k, r and r (w_0 k + w_1) over part of a row.
 
@@ -99,17 +93,17 @@ def _sum_half(
     k0 = k1 = r0 = r1 = g0 = g1 = np.float32(0.0)
     x = begin
     while x < end - 1:
-        k, r = charge[j, y, x], readout[j, y, x]
+        k, r = samples[0, j, y, x], samples[1, j, y, x]
         k0 += k
         r0 += r
         g0 += r * (weights[0, y, x] * k + weights[1, y, x])
-        k, r = charge[j, y, x + 1], readout[j, y, x + 1]
+        k, r = samples[0, j, y, x + 1], samples[1, j, y, x + 1]
         k1 += k
         r1 += r
         g1 += r * (weights[0, y, x + 1] * k + weights[1, y, x + 1])
         x += 2
     if x < end:
-        k, r = charge[j, y, x], readout[j, y, x]
+        k, r = samples[0, j, y, x], samples[1, j, y, x]
         k0 += k
         r0 += r
         g0 += r * (weights[0, y, x] * k + weights[1, y, x])
@@ -117,111 +111,83 @@ def _sum_half(
 
 
 @kernel
-def _sum_rows(
-    charge: Float32Array,
-    readout: Float32Array,
+def _sum_lines(
+    samples: Float32Array,
     weights: Float32Array,
     y: int,
     at: int,
     size: int,
-    rows: FloatArray,
-    gain: FloatArray,
+    block: FloatArray,
+    sums: FrameSums,
 ) -> None:
-    half, nx = charge.shape[2] // 2, charge.shape[2]
+    """Add a row of a chunk to the sums of rows and columns, frame by frame, and of pixels."""
+    half, nx = samples.shape[3] // 2, samples.shape[3]
     for j in range(size):
         t = at + j
-        left = _sum_half(charge, readout, weights, LAGS + j, y, 0, half)
-        right = _sum_half(charge, readout, weights, LAGS + j, y, half, nx)
-        rows[0, t, y], rows[1, t, y] = left[0], right[0]
-        rows[2, t, y], rows[3, t, y] = left[1], right[1]
-        gain[t] += left[2] + right[2]
+        left = _sum_half(samples, weights, LAGS + j, y, 0, half)
+        right = _sum_half(samples, weights, LAGS + j, y, half, nx)
+        for channel in range(2):
+            sums.rows[2 * channel, t, y], sums.rows[2 * channel + 1, t, y] = left[channel], right[channel]
+        sums.gain[t] += left[2] + right[2]
+    for channel in range(2):
+        for j in range(size):
+            for x in range(nx):
+                sums.columns[channel, at + j, x] += samples[channel, LAGS + j, y, x]
+        for j in range(size):
+            for x in range(nx):
+                block[channel, y, x] += samples[channel, LAGS + j, y, x]
+    for j in range(size):
+        total = np.float32(0.0)
+        for x in range(nx):
+            square = weights[2, y, x] * samples[1, LAGS + j, y, x] * samples[1, LAGS + j, y, x]
+            sums.column_noise[at + j, x] += square
+            total += square
+        sums.row_noise[at + j, y] = total
 
 
 @kernel
-def _add(
-    values: Float32Array,
-    channel: int,
-    y: int,
-    at: int,
-    size: int,
-    columns: Float32Array,
-    block: FloatArray,
-) -> None:
-    """Add the rows of a chunk to the sums of columns, frame by frame, and of pixels."""
-    for j in range(size):
-        for x in range(values.shape[2]):
-            columns[channel, at + j, x] += values[LAGS + j, y, x]
-    for j in range(size):
-        for x in range(values.shape[2]):
-            block[channel, y, x] += values[LAGS + j, y, x]
-
-
-@kernel
-def _subtract(values: Float32Array, pattern: Float32Array, amount: np.float32, j: int) -> None:
-    for y in range(pattern.shape[0]):
-        for x in range(pattern.shape[1]):
-            values[j, y, x] -= amount * pattern[y, x]
+def _subtract_modes(samples: Float32Array, channels: Channels, rows: FloatArray, t: int, j: int) -> None:
+    """Subtract from a frame what is common to all pixels, by the sums of its half rows."""
+    for channel in range(2):
+        common = 0.0
+        for y in range(samples.shape[2]):
+            common += rows[2 * channel, t, y] + rows[2 * channel + 1, t, y]
+        amount = np.float32(common / channels.norms[channel])
+        for y in range(samples.shape[2]):
+            for x in range(samples.shape[3]):
+                samples[channel, j, y, x] -= amount * channels.modes[channel, y, x]
 
 
 @kernel
 def _add_lagged(
-    now: Float32Array,
-    before: Float32Array,
-    lag: int,
-    y: int,
-    done: int,
-    size: int,
-    which: int,
-    total: FloatArray,
+    samples: Float32Array, now: int, before: int, lag: int, y: int, done: int, size: int, total: FloatArray
 ) -> None:
     """Add products of frames ``lag`` apart; those before the block's first frame do not exist."""
     for j in range(max(0, lag - done), size):
-        for x in range(now.shape[2]):
-            total[which, y, x] += now[LAGS + j, y, x] * before[LAGS + j - lag, y, x]
+        for x in range(samples.shape[3]):
+            total[y, x] += samples[now, LAGS + j, y, x] * samples[before, LAGS + j - lag, y, x]
 
 
 @kernel
-def _add_squares(
-    readout: Float32Array,
-    weight: Float32Array,
-    y: int,
-    at: int,
-    size: int,
-    rows: FloatArray,
-    columns: Float32Array,
-) -> None:
-    """Add the weighted squares of a row of a chunk to the sums of rows and columns, frame by frame."""
-    for j in range(size):
-        total = np.float32(0.0)
-        for x in range(readout.shape[2]):
-            square = weight[y, x] * readout[LAGS + j, y, x] * readout[LAGS + j, y, x]
-            columns[at + j, x] += square
-            total += square
-        rows[at + j, y] = total
-
-
-@kernel
-def _add_neighbours(
-    charge: Float32Array, readout: Float32Array, y: int, dy: int, dx: int, size: int, total: FloatArray
-) -> None:
+def _add_neighbours(samples: Float32Array, y: int, dy: int, dx: int, size: int, total: FloatArray) -> None:
     """Add the products kk, rr, r k + k r of a row with the pixels ``dy`` rows and ``dx`` columns on."""
     for j in range(LAGS, LAGS + size):
-        for x in range(charge.shape[2] - dx):
-            total[0, y, x] += charge[j, y, x] * charge[j, y + dy, x + dx]
-        for x in range(charge.shape[2] - dx):
-            total[1, y, x] += readout[j, y, x] * readout[j, y + dy, x + dx]
-        for x in range(charge.shape[2] - dx):
-            one = readout[j, y, x] * charge[j, y + dy, x + dx]
-            total[2, y, x] += one + charge[j, y, x] * readout[j, y + dy, x + dx]
+        for channel in range(2):
+            for x in range(samples.shape[3] - dx):
+                total[channel, y, x] += samples[channel, j, y, x] * samples[channel, j, y + dy, x + dx]
+        for x in range(samples.shape[3] - dx):
+            one = samples[1, j, y, x] * samples[0, j, y + dy, x + dx]
+            total[2, y, x] += one + samples[0, j, y, x] * samples[1, j, y + dy, x + dx]
 
 
 @kernel
-def _keep_last(values: Float32Array, size: int) -> None:
+def _keep_last(samples: Float32Array, size: int) -> None:
     """Move the last frames of a chunk to where the next chunk looks for those before it."""
-    for j in range(LAGS):
-        for y in range(values.shape[1]):
-            for x in range(values.shape[2]):
-                values[j, y, x] = values[size + j, y, x]
+    for channel in range(2):
+        for j in range(LAGS):
+            for y in range(samples.shape[2]):
+                for x in range(samples.shape[3]):
+                    samples[channel, j, y, x] = samples[channel, size + j, y, x]
 
 
 @kernel
@@ -229,8 +195,7 @@ def sum_block(
     frames: NDArray[Any],
     block: tuple[int, int, int],
     channels: Channels,
-    charge: Float32Array,
-    readout: Float32Array,
+    samples: Float32Array,
     sums: FrameSums,
 ) -> None:
     """Add one block of consecutive frames to the sums.
@@ -239,54 +204,29 @@ def sum_block(
         frames: codes (frame, y, x).
         block: its number, its first frame, and the one behind its last.
         channels: of the pixels.
-        charge: workspace (LAGS + frames in a chunk, y, x).
-        readout: the same.
+        samples: workspace for k and r, (2, LAGS + frames in a chunk, y, x).
         sums: to add to.
     """
     number, begin, end = block
     ny = frames.shape[1]
-    chunk = charge.shape[0] - LAGS
+    chunk = samples.shape[1] - LAGS
     at = begin
     while at < end:
         size, done = min(chunk, end - at), at - begin
         for y in range(ny):
-            _look_up(frames, channels.support, channels.tables, y, at, size, charge, readout)
-            _sum_rows(charge, readout, channels.weights, y, at, size, sums.rows, sums.gain)
-            _add(charge, 0, y, at, size, sums.columns, sums.blocks[number])
-            _add(readout, 1, y, at, size, sums.columns, sums.blocks[number])
-            _add_squares(readout, channels.weights[2], y, at, size, sums.row_noise, sums.column_noise)
+            _look_up(frames, channels, y, at, size, samples)
+            _sum_lines(samples, channels.weights, y, at, size, sums.blocks[number], sums)
         for j in range(size):
-            common_k = common_r = 0.0
-            for y in range(ny):
-                common_k += sums.rows[0, at + j, y] + sums.rows[1, at + j, y]
-                common_r += sums.rows[2, at + j, y] + sums.rows[3, at + j, y]
-            _subtract(charge, channels.modes[0], np.float32(common_k / channels.norms[0]), LAGS + j)
-            _subtract(readout, channels.modes[1], np.float32(common_r / channels.norms[1]), LAGS + j)
+            _subtract_modes(samples, channels, sums.rows, at + j, LAGS + j)
         for y in range(ny):
             for lag in range(1, LAGS + 1):
-                _add_lagged(charge, charge, lag, y, done, size, lag - 1, sums.lags)
-                _add_lagged(readout, readout, lag, y, done, size, LAGS + lag - 1, sums.lags)
-            _add_lagged(readout, charge, 1, y, done, size, 2 * LAGS, sums.lags)
-            _add_lagged(charge, readout, 1, y, done, size, 2 * LAGS + 1, sums.lags)
-            _add_neighbours(charge, readout, y, 0, 1, size, sums.next_column)
+                for channel in range(2):
+                    of_lag = sums.lags[LAGS * channel + lag - 1]
+                    _add_lagged(samples, channel, channel, lag, y, done, size, of_lag)
+            for channel in range(2):
+                _add_lagged(samples, 1 - channel, channel, 1, y, done, size, sums.lags[2 * LAGS + channel])
+            _add_neighbours(samples, y, 0, 1, size, sums.next_column)
             if y < ny - 1:
-                _add_neighbours(charge, readout, y, 1, 0, size, sums.next_row)
+                _add_neighbours(samples, y, 1, 0, size, sums.next_row)
         at += size
-        _keep_last(charge, size)
-        _keep_last(readout, size)
-
-
-@kernel
-def find_hits(frames: NDArray[Any], pixels: IntArray, ends: IntArray, hits: IntArray) -> int:
-    """Fill ``hits`` (frame, y, x, DN) with samples of m pixels beyond ``ends``, (m, 2); return how many."""
-    found = 0
-    for i in range(pixels.shape[0]):
-        y, x = pixels[i]
-        for t in range(frames.shape[0]):
-            code = np.int64(frames[t, y, x])
-            if code < ends[i, 0] or code > ends[i, 1]:
-                if found < hits.shape[0]:
-                    hits[found, 0], hits[found, 1], hits[found, 2] = t, y, x
-                    hits[found, 3] = code
-                found += 1
-    return found
+        _keep_last(samples, size)

@@ -8,28 +8,47 @@ directions in which the parameters move it; to first order the fit does not matt
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.observe import tables_numba as kernel
-from pchem_pipeline.discrepancy.observe.law_numba import N_TESTS, supports
-from pchem_pipeline.discrepancy.observe.tables_numba import CodeSums, Fitted, PixelLaws
+from pchem_pipeline.discrepancy.observe.efficient_scores import N_TESTS, efficient_scores, whiten
+from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
 from pchem_pipeline.model.histogram.count import histogram_frames
+from pchem_pipeline.model.law.cell_scores_numba import N_COLUMNS, N_NUISANCE
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 _SMALLEST_WIDTH = 0.1  # DN: below it peaks are single codes
 _ALLOWED = 1e-2  # samples expected beyond the codes of a pixel, on either side, at most
 #: Pixels whose law covers more codes than this are not looked at.
 _LONGEST_SUPPORT = 8192
 _NEGLIGIBLE = 1e-5  # samples expected beyond the electron numbers considered, in all pixels
+#: Probability below which a code carries no information on the shape.
+_NOTHING = 1e-14
 _LONGEST_AXIS = 1 << 17
 _COARSE, _MOST_BINS = 16, 256
+_AT_ONCE = 1 << 14  # codes of all pixels that are done together, which stay in the cache
+#: Codes are summed by their number modulo this.
+FOLD = 16
+
+#: What the law and the samples of a pixel give: standard deviations of k and r by the law; with the samples
+#: (those beyond the support count as its ends), k and r centred, means of k^2, r^2, k r, k r^2, k^2 r^2, r^4;
+#: chi-square with its mean and variance, of codes and of groups as wide as the read noise; samples seen and
+#: expected below and above the support, and far below and above it.
+MOMENTS = np.dtype([
+    *((name, np.float64) for name in ("charge_std", "readout_std", "kk", "rr", "kr", "krr", "kkrr", "rrrr")),
+    *((name, np.float64, 3) for name in ("goodness", "peaks")),
+    *((name, np.float64, 2) for name in ("low", "high", "far_low", "far_high")),
+])  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -78,6 +97,48 @@ class PixelHistograms:
         return np.asarray(self.counts.sum(axis=1) + self.outside.sum(axis=1))
 
 
+class CodeSums(NamedTuple):
+    """Sums over pixels by code.
+
+    Attributes:
+        first: DN of the first one.
+        coarse: codes in a bin.
+        single: counts, expectation, residual and its variance, (4, n_codes).
+        fold, fold_covariance: residuals by DN modulo 16, (16,), (16, 16).
+        bins: score of a shift of the scale, its variance for given expectations, and expectation by bin,
+            (3, n_bins).
+        bin_covariance: of these scores.
+    """
+
+    first: int
+    coarse: int
+    single: FloatArray
+    fold: FloatArray
+    fold_covariance: FloatArray
+    bins: FloatArray
+    bin_covariance: FloatArray
+
+
+class PixelLaws(NamedTuple):
+    """What the fitted law of n pixels and their histograms give.
+
+    Attributes:
+        good: pixels with a law, (n,); all else is meaningless elsewhere.
+        moments: fields of :data:`MOMENTS`, (n,).
+        scores: standardised score, its skewness and its kurtosis excess, (n, 3, N_TESTS).
+        support: first DN, number of codes, first row in ``tables``, (n, 3); (0, 1, 0) where not good.
+        tables: k (e-) and r (DN) of every code of the support, minus their mean over the samples, (rows, 2).
+        codes: sums over all pixels.
+    """
+
+    good: BoolArray
+    moments: NDArray[np.void]
+    scores: FloatArray
+    support: IntArray
+    tables: NDArray[np.float32]
+    codes: CodeSums
+
+
 def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np.bool_]) -> PixelLaws:
     """Compare the histogram of every usable pixel with its fitted law.
 
@@ -90,7 +151,7 @@ def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np
     natural = _natural(parameters, usable)
     window, electrons = np.zeros((n, 2), np.int64), np.zeros((n, 2), np.int64)
     samples = float(seen.counts.sum(axis=1).max(initial=1)) + float(seen.outside.sum(axis=1).max(initial=0.0))
-    supports(*np.ascontiguousarray(natural.T), np.log(_NEGLIGIBLE / (samples * n)), electrons, window)
+    kernel.supports(natural, np.log(_NEGLIGIBLE / (samples * n)), electrons, window)
     length = window[:, 1] - window[:, 0] + 1
     good = usable & (length <= _LONGEST_SUPPORT)
     axis, n_codes = _code_axis(window[good])
@@ -98,28 +159,178 @@ def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np
     while n_codes > coarse * _MOST_BINS:
         coarse *= 2
     n_bins = n_codes // coarse + 1
-    codes = CodeSums(
-        first=axis,
-        coarse=coarse,
-        single=np.zeros((4, n_codes)),
-        fold=np.zeros(kernel.FOLD),
-        fold_covariance=np.zeros((kernel.FOLD, kernel.FOLD)),
-        bins=np.zeros((3, n_bins)),
-        bin_covariance=np.zeros((n_bins, n_bins)),
-    )
     laws = PixelLaws(
         good=good,
-        moments=np.zeros((n, kernel.N_MOMENTS)),
+        moments=np.zeros(n, MOMENTS),
         scores=np.full((n, 3, N_TESTS), np.nan),
         support=np.tile(np.array([0, 1, 0]), (n, 1)),
         tables=np.zeros((1 + int(length[good].sum()), 2), np.float32),
-        codes=codes,
+        codes=CodeSums(
+            first=axis,
+            coarse=coarse,
+            single=np.zeros((4, n_codes)),
+            fold=np.zeros(FOLD),
+            fold_covariance=np.zeros((FOLD, FOLD)),
+            bins=np.zeros((3, n_bins)),
+            bin_covariance=np.zeros((n_bins, n_bins)),
+        ),
     )
-    fitted = Fitted(seen.counts, seen.origin, seen.outside, natural, electrons, window)
-    kernel.summarise_pixels(fitted, _ALLOWED, _ALLOWED / max(int(good.sum()), 1), laws)
-    for covariance in (codes.fold_covariance, codes.bin_covariance):
-        covariance += np.tril(covariance, -1).T
+    allowed = _ALLOWED, _ALLOWED / max(int(good.sum()), 1)
+    used = 1  # row 0 of the tables is that of the pixels without a law
+    for pixels in _batches(np.flatnonzero(good), length):
+        used = _summarise(pixels, seen, (natural, electrons, window), allowed, laws, used)
     return laws
+
+
+def _batches(pixels: IntArray, length: IntArray) -> Iterator[IntArray]:
+    """Yield pixels in their order, so many that together they have no more codes than are done at once."""
+    first, widest = 0, 0
+    for i, codes in enumerate(length[pixels]):
+        if i > first and (i - first + 1) * max(widest, codes) > _AT_ONCE:
+            yield pixels[first:i]
+            first, widest = i, 0
+        widest = max(widest, codes)
+    if pixels.size:
+        yield pixels[first:]
+
+
+def _summarise(
+    pixels: IntArray,
+    seen: PixelHistograms,
+    fitted: tuple[FloatArray, IntArray, IntArray],
+    allowed: tuple[float, float],
+    laws: PixelLaws,
+    used: int,
+) -> int:
+    """Fill tables and sums of some pixels, and return the first row of the tables behind theirs.
+
+    Args:
+        pixels: their numbers, (p,).
+        seen: histograms of all pixels.
+        fitted: of all pixels H, 1/g, mu and analog read noise, (n, 4), ranges of electron numbers and of
+            codes, (n, 2).
+        allowed: samples expected beyond the support on either side, and far beyond, at most.
+        laws: to fill.
+        used: first row of the tables that is free.
+    """
+    natural, electrons, window = (each[pixels] for each in fitted)
+    exposure, step, bias, width = natural.T[:, :, None]
+    counts, outside = seen.counts[pixels].astype(np.float64), seen.outside[pixels]
+    samples = outside.sum(axis=1) + counts.sum(axis=1)
+    expected_of_all = np.zeros((pixels.size, int(np.diff(window).max()) + 1))
+    by_code = np.zeros((*expected_of_all.shape, N_COLUMNS))
+    ends, beyond = np.zeros((pixels.size, 4), np.int64), np.zeros((pixels.size, 4))
+    kernel.fill_laws(natural, electrons, window, samples, allowed, expected_of_all, by_code, ends, beyond)
+    size = ends[:, 1] - ends[:, 0] + 1
+    # the columns first
+    law = np.ascontiguousarray(np.moveaxis(by_code[:, : size.max()], 2, 0))
+    del by_code
+    x, first = np.arange(law.shape[2]), ends[:, :1]
+    inside = x < size[:, None]
+    mass = law[0].copy()
+    inverse = np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > _NOTHING)
+    known = inverse.any(axis=1)
+    if not known.all():
+        laws.good[pixels[~known]] = False
+        return _summarise(pixels[known], seen, fitted, allowed, laws, used) if known.any() else used
+    codes, moments = laws.codes, np.zeros(pixels.size, MOMENTS)
+    at = seen.origin[pixels, None] + np.arange(counts.shape[1])
+    for i, name in enumerate(("low", "high", "far_low", "far_high")):
+        out = at > ends[:, i, None] if i % 2 else at < ends[:, i, None]
+        moments[name] = np.stack([(counts * out).sum(axis=1) + outside[:, i % 2], beyond[:, i]], axis=1)
+    # k = E[K | x] and r = x - mu - k / g
+    offset = bias - first
+    between = np.clip(np.floor((x - offset) / step + 0.5), electrons[:, :1], electrons[:, 1:])
+    k = np.where(inverse > 0.0, exposure + np.sqrt(exposure) * law[1] * inverse, between)
+    r = x - offset - k * step
+    within, some = np.zeros_like(mass), (at >= first) & (at <= ends[:, 1:2])
+    within[np.nonzero(some)[0], (at - first)[some]] = counts[some]
+    factor = whiten(law, inverse)
+    slopes = law[:N_NUISANCE]
+    # the parameters moved, to first order, to suit the samples
+    expected = np.einsum("ip,ipx->px", np.einsum("ipx,px->ip", slopes, within * inverse), slopes)
+    in_window = (first - window[:, :1]) + x
+    expected_of_all[np.nonzero(inside)[0], in_window[inside]] = expected[inside]
+    in_window = window[:, :1] + np.arange(expected_of_all.shape[1])
+    for total, place, values in (
+        (codes.single[0], at, counts),
+        (codes.single[1], in_window, expected_of_all),
+    ):
+        some = (values != 0.0) & (place >= codes.first) & (place < codes.first + total.size)
+        np.add.at(total, place[some] - codes.first, values[some])
+    laws.scores[pixels] = efficient_scores(law, inverse, within, factor, exposure[:, 0])
+    for name, shortest in (("goodness", np.ones(pixels.size)), ("peaks", np.rint(width[:, 0]))):
+        kernel.goodness(slopes, within, expected, size, SMALLEST_EXPECTATION, shortest, moments[name])
+    _centre(mass, k, r, within, size - 1, moments)
+    rows = used + np.cumsum(size) - size
+    laws.moments[pixels], laws.support[pixels] = moments, np.stack([first[:, 0], size, rows], axis=1)
+    behind = used + int(size.sum())
+    laws.tables[used:behind] = np.stack([k[inside], r[inside]], axis=1)
+    shift = r / (width**2 + QUANTISATION_VARIANCE)
+    _add_codes(slopes, within, expected, shift, first + x - codes.first, inside, codes)
+    return behind
+
+
+def _centre(
+    mass: FloatArray,
+    k: FloatArray,
+    r: FloatArray,
+    seen: FloatArray,
+    last: IntArray,
+    moments: NDArray[np.void],
+) -> None:
+    """Subtract from the tables k and r their means over the samples, and fill the moments of the channels."""
+    total = mass.sum(axis=1)
+    weight, every = seen.copy(), np.arange(len(seen))
+    weight[:, 0] += moments["low"][:, 0]
+    weight[every, last] += moments["high"][:, 0]
+    weight /= weight.sum(axis=1, keepdims=True)
+    for name, values in (("charge_std", k), ("readout_std", r)):
+        mean, square = (each.sum(axis=1) / total for each in (mass * values, mass * values**2))
+        moments[name] = np.sqrt(np.maximum(square - mean**2, 0.0))
+        values -= (weight * values).sum(axis=1, keepdims=True)
+    for name in ("kk", "rr", "kr", "krr", "kkrr", "rrrr"):
+        moments[name] = math.prod((k if letter == "k" else r for letter in name), start=weight).sum(axis=1)
+
+
+def _add_codes(
+    slopes: FloatArray,
+    seen: FloatArray,
+    expected: FloatArray,
+    shift: FloatArray,
+    at: IntArray,
+    inside: BoolArray,
+    sums: CodeSums,
+) -> None:
+    """Add residuals and their covariance: per code, per code modulo 16, per bin of codes.
+
+    In the bins they are weighted with what a shift of the scale does to each code, so that they sum to the
+    shift of the scale there.
+    """
+    on_axis = (at >= 0) & (at < sums.single.shape[1])
+    some = inside & (on_axis | ~inside).all(axis=1, keepdims=True)
+    pixel, n = np.nonzero(some)[0], seen.sum(axis=1)
+    at, columns, wanted, moved = at[some], slopes[:, some], expected[some], shift[some]
+    residual, modulo, bins = seen[some] - wanted, (at + sums.first) % FOLD, at // sums.coarse
+    for total, place, values in (
+        (sums.single[2], at, residual),
+        (sums.single[3], at, np.maximum(wanted - n[pixel] * (columns**2).sum(axis=0), 0.0)),
+        (sums.fold, modulo, residual),
+        (sums.fold_covariance.reshape(-1), modulo * (FOLD + 1), wanted),
+        (sums.bins[0], bins, residual * moved),
+        (sums.bins[1], bins, wanted * moved**2),
+        (sums.bins[2], bins, wanted),
+        (sums.bin_covariance.reshape(-1), bins * (sums.bins.shape[1] + 1), wanted * moved**2),
+    ):
+        np.add.at(total, place, values)
+    for covariance, place, weighted in (
+        (sums.fold_covariance, modulo, columns),
+        (sums.bin_covariance, bins, columns * moved),
+    ):
+        size = len(covariance)
+        for column in weighted:
+            total = np.bincount(pixel * size + place, column, n.size * size).reshape(n.size, size)
+            covariance -= total.T @ (n[:, None] * total)
 
 
 def _natural(parameters: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:

@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe import laws
-from pchem_pipeline.discrepancy.observe import tables_numba as column
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS, PixelStatistics, pairs_at_lags
 from pchem_pipeline.discrepancy.observe.sums_numba import FrameSums
-from pchem_pipeline.discrepancy.observe.tables_numba import CodeSums, PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import FOLD, CodeSums, PixelLaws
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals
 from pchem_pipeline.model.arithmetic.significance import OUTLYING
 from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
@@ -32,11 +31,6 @@ FloatArray = NDArray[np.float64]
 
 _TAIL = float(special.ndtr(-OUTLYING))
 _ENOUGH = 25.0  # samples expected of a code or bin that is judged by itself
-#: Columns of samples seen and expected beyond the support, and far beyond it.
-_TAILS = {
-    "low": ((column.SEEN_LOW, column.EXPECTED_LOW), (column.SEEN_FAR_LOW, column.EXPECTED_FAR_LOW)),
-    "high": ((column.SEEN_HIGH, column.EXPECTED_HIGH), (column.SEEN_FAR_HIGH, column.EXPECTED_FAR_HIGH)),
-}
 _SMALLEST_EIGENVALUE = 0.02  # of residuals, relative to Poisson counts: below it the fits have absorbed them
 _Slices = tuple[slice, slice]
 
@@ -76,16 +70,15 @@ def named(start: str, forms: Mapping[str, float]) -> dict[str, float]:
     return {f"{start}.{form}": value for form, value in forms.items()}
 
 
-def goodness_of(moments: FloatArray, chi_square: int = column.CHI2) -> FloatArray:
+def goodness_of(chi_square: FloatArray) -> FloatArray:
     """Return the goodness of fit of each pixel as a normal quantile, 0 without degrees of freedom, (n,).
 
     Args:
-        moments: of the pixels.
-        chi_square: column of the chi-square; its mean and variance follow it.
+        chi_square: of the pixels, its mean and its variance, (n, 3).
     """
-    mean, variance = moments[:, chi_square + 1], moments[:, chi_square + 2]
+    value, mean, variance = chi_square.T
     some = mean > 0.5
-    z = laws.chi_square(moments[:, chi_square], np.where(some, mean, 1.0), np.where(some, variance, 2.0))
+    z = laws.chi_square(value, np.where(some, mean, 1.0), np.where(some, variance, 2.0))
     return np.where(some, z, 0.0)
 
 
@@ -100,11 +93,10 @@ def sample_statistics(pixels: PixelLaws, exposure: FloatArray, residuals: CodeRe
     good = pixels.good
     found = _score_statistics(pixels.scores[good], np.log(exposure[good]))
     moments = pixels.moments[good]
-    for name, chi_square in (("goodness", column.CHI2), ("peaks", column.PEAKS_CHI2)):
-        z = goodness_of(moments, chi_square)
-        found |= named(f"shape.{name}", pixel_forms(z, two_sided=False))
-    for side, tails in _TAILS.items():
-        near, far = (moments[:, list(columns)] for columns in tails)
+    for name in ("goodness", "peaks"):
+        found |= named(f"shape.{name}", pixel_forms(goodness_of(moments[name]), two_sided=False))
+    for side in ("low", "high"):
+        near, far = moments[side], moments[f"far_{side}"]
         found[f"tail.{side}.count"] = _beyond(near.sum(axis=0), far.sum(axis=0))
         pixels_with = [
             np.array([np.count_nonzero(seen), -np.expm1(-expected).sum()])
@@ -182,7 +174,7 @@ def period_statistics(fold: FloatArray, covariance: FloatArray) -> dict[str, flo
         fold: sums of the residuals, (16,).
         covariance: of these, (16, 16).
     """
-    code = np.arange(column.FOLD)
+    code = np.arange(FOLD)
     sign = (-1.0) ** code
     found = {"code.alternating": float(sign @ fold / np.sqrt(max(float(sign @ covariance @ sign), 1e-300)))}
     scale = np.diag(covariance).clip(1e-300)
@@ -261,14 +253,6 @@ class FrameView:
         b = self.edges.size - 1
         return b - (self.n - b) / (self.n - 1.0)
 
-    def variance(self, channel: int) -> FloatArray:
-        """Variance of k or r in each pixel, (y, x)."""
-        return self.pixels.readout if channel else self.pixels.charge
-
-    def mode(self, channel: int) -> FloatArray:
-        """Pattern of what is common to all pixels: H for a change of the exposure, 1 for one of the bias."""
-        return self.pixels.usable.astype(np.float64) if channel else self.pixels.exposure
-
     def lines(self, channel: int, axis: int) -> FloatArray:
         """Sums of k or r of each row (axis 1) or column (axis 0), (n, lines)."""
         if axis == 0:
@@ -277,7 +261,7 @@ class FrameView:
 
     def remaining(self, channel: int) -> FloatArray:
         """Variance of each pixel after the frame's common mode was removed, 1 in unusable pixels, (y, x)."""
-        v, h = self.variance(channel), self.mode(channel)
+        v, h = self.pixels.variance[channel], self.pixels.mode[channel]
         share = h / h.sum()
         left = v * (1.0 - 2.0 * share) + share**2 * v.sum()
         return np.where(self.pixels.usable, np.maximum(left, 1e-3 * np.where(v > 0, v, 1.0)), 1.0)
@@ -285,7 +269,7 @@ class FrameView:
     @property
     def noise_variance(self) -> FloatArray:
         """Variance of the weighted squares of r in each pixel, (y, x)."""
-        return np.asarray((self.pixels.square * self.pixels.readout) ** 2 * self.pixels.noise)
+        return np.asarray((self.pixels.square * self.pixels.variance[1]) ** 2 * self.pixels.noise)
 
     @cached_property
     def series(self) -> dict[str, FloatArray]:
@@ -295,7 +279,7 @@ class FrameView:
         """
         sums, pixels = self.sums, self.pixels
         found = {
-            name: self.lines(channel, 1).sum(axis=1) / np.sqrt(self.variance(channel).sum())
+            name: self.lines(channel, 1).sum(axis=1) / np.sqrt(pixels.variance[channel].sum())
             for channel, name in enumerate(CHANNELS)
         }
         found["gain"] = sums.gain * pixels.gain_norm / np.sqrt(max(pixels.gain_variance, 1e-300))
@@ -386,7 +370,7 @@ def frame_statistics(view: FrameView) -> dict[str, float]:
         found |= named(f"frame.{name}", _series_forms(view, u))
     for channel, name in enumerate(CHANNELS):
         found[f"frame.{name}.quadrants"] = _quadrants(view, channel)
-    rho = float(pixels.cross.sum() / np.sqrt(pixels.charge.sum() * pixels.readout.sum()))
+    rho = float(pixels.cross.sum() / np.sqrt(pixels.variance[0].sum() * pixels.variance[1].sum()))
     product = float(series["charge"] @ series["readout"])
     found["frame.covariance"] = (product - view.n * rho) / np.sqrt(view.n * (1.0 + rho**2))
     return found
@@ -414,13 +398,13 @@ def without_mode(values: FloatArray, pattern: FloatArray) -> FloatArray:
 
 
 def _quadrants(view: FrameView, channel: int) -> float:
-    variance = quadrant_sums(view.variance(channel))
+    variance = quadrant_sums(view.pixels.variance[channel])
     some = variance > 0
     if some.sum() < 2:
         return float("nan")
     scale = np.sqrt(variance[some])
     u = quadrant_series(view.sums.rows[2 * channel : 2 * channel + 2])[:, some] / scale
-    rest = without_mode(view.block_sums(u), quadrant_sums(view.mode(channel))[some] / scale)
+    rest = without_mode(view.block_sums(u), quadrant_sums(view.pixels.mode[channel])[some] / scale)
     return view.slow(rest, int(some.sum()) - 1)
 
 
@@ -447,7 +431,7 @@ def time_statistics(view: FrameView, lags: FloatArray) -> dict[str, float]:
             forms = pixel_forms(values[usable] * np.sqrt(pairs))
             found |= {name: forms["mean"], **named(name, forms)}
     for channel, name in enumerate(CHANNELS):
-        sums, mode = view.sums.blocks[:, channel], view.mode(channel)
+        sums, mode = view.sums.blocks[:, channel], view.pixels.mode[channel]
         rest = sums - (sums.sum(axis=(1, 2)) / mode.sum())[:, None, None] * mode
         lengths = np.diff(view.edges)[:, None]
         u = rest[:, usable] / np.sqrt(lengths * view.remaining(channel)[usable])
@@ -463,13 +447,13 @@ def space_statistics(view: FrameView) -> dict[str, float]:
     sums, pixels = view.sums, view.pixels
     for line, axis in (("row", 1), ("column", 0)):
         for channel, name in enumerate(CHANNELS):
-            variance, mode = view.variance(channel).sum(axis), view.mode(channel).sum(axis)
+            variance, mode = (each[channel].sum(axis) for each in (pixels.variance, pixels.mode))
             values = view.lines(channel, axis)
             forms = _line_forms(view, values, variance, mode, waves=name == "readout")
             found |= named(f"space.{line}.{name}", forms)
         noise = sums.column_noise if axis == 0 else sums.row_noise
         # of a common relative change of the noise
-        mode = (pixels.square * pixels.readout).sum(axis)
+        mode = (pixels.square * pixels.variance[1]).sum(axis)
         found |= named(f"space.{line}.noise", _line_forms(view, noise, view.noise_variance.sum(axis), mode))
     return found | {f"space.{name}": seen.z for name, seen in view.neighbours.items()}
 
@@ -565,7 +549,7 @@ def _after_removal(view: FrameView, a: int, b: int, one: _Slices, two: _Slices) 
     With ``a' = a - s sum(a)`` and ``b' = b - t sum(b)``, s and t the shares of the pixels in the modes.
     """
     pixels = view.pixels
-    covariance = (pixels.charge, pixels.cross, pixels.readout)[a + b]
-    share_a, share_b = view.mode(a) / view.mode(a).sum(), view.mode(b) / view.mode(b).sum()
+    covariance = (pixels.variance[0], pixels.cross, pixels.variance[1])[a + b]
+    share_a, share_b = (pixels.mode[each] / pixels.mode[each].sum() for each in (a, b))
     left = share_a[one] * share_b[two] * covariance.sum()
     return np.asarray(left - share_b[two] * covariance[one] - share_a[one] * covariance[two])

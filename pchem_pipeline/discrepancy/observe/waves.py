@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from pchem_pipeline.discrepancy.observe import laws as laws_of
-from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
+from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps, Wave
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, FALSE_ALARM
 from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
@@ -29,7 +29,7 @@ Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
-_MOST_SAMPLES = 1 << 22
+_MOST_SAMPLES, _FRAMES_AT_ONCE = 1 << 22, 32
 _ALL_OF_IT = 0.7  # of the amplitude of a wave at any phase, for one whose phase runs on
 _ROUNDS, _STEPS = 8, 9
 _NARROWER = 2.5  # from round to round
@@ -73,7 +73,7 @@ def waves_across(
     ny, nx = maps.usable.shape
     some = numbers - numbers[0] < max(_MOST_SAMPLES // maps.usable.size, 1)
     numbers = numbers[some]
-    samples = Samples.by_laws(Stack(frames[: numbers.size]), laws, maps)
+    samples = Samples.by_laws(FrameBlocks.of(frames[: numbers.size]), laws, maps)
     samples = samples if inside is None else samples.without(~inside)
     pixels = int(np.count_nonzero(samples.usable))
     if numbers.size < FEWEST_FRAMES or min(ny, nx) < FEWEST_LINES or not pixels:
@@ -93,10 +93,11 @@ def waves_across(
 def _spectrum(u: Float32Array, numbers: IntArray, pixels: int) -> tuple[Float32Array, Float32Array]:
     """Return powers over the noise's: the mean of the frames', (y, x), and along these, (frame, y, x)."""
     _, ny, nx = u.shape
-    # spectra are larger than the frames: no more than these are kept at a time
+    # spectra are larger than the frames: those of a few are made at a time
     over_time = np.zeros((int(numbers[-1] - numbers[0]) + 1, ny - 1, nx // 2), np.complex64)
-    for at, frame in zip(numbers - numbers[0], u, strict=True):
-        over_time[at] = fft.rfft2(frame)[1:, 1:]
+    for first in range(0, len(u), _FRAMES_AT_ONCE):
+        some = slice(first, first + _FRAMES_AT_ONCE)
+        over_time[numbers[some] - numbers[0]] = fft.rfft2(u[some])[:, 1:, 1:]
     power = _squared(over_time)
     mean = _halved(power.sum(axis=0) / (pixels * numbers.size), nx)
     for row in range(ny - 1):

@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 
@@ -68,51 +68,94 @@ class Check:
         return self.p_global < SIGNIFICANCE
 
 
+class _Kind(NamedTuple):
+    """What is said of a check, and what explains it.
+
+    Attributes:
+        unit: of the size.
+        title: the disturbance, a noun.
+        advice: consequence and cure.
+        signs: statistics of the catalogue that show the same: an effect with one of them in its signature
+            explains the check.
+        limits: sizes (of those in DN shares of the read noise) from which it deserves caution, and from which
+            it is serious.
+        map: of the sensor that shows where it fails; empty: none.
+    """
+
+    unit: str
+    title: str
+    advice: str
+    signs: str = ""
+    limits: tuple[float, float] = (_SOME, _MUCH)
+    map: str = ""
+
+
 _IN_NOISE = "included in each pixel's read noise, not reduced by averaging along a"
 _GAIN = "gain (e⁻/DN) is too {} by about"
 _COUPLE = f"if neighbours share charge, {_GAIN} twice this share"
-#: Unit of the size, title and advice of each check.
-_WORDS: dict[str, tuple[str, str, str]] = {
-    "levels": ("DN", "frames of several exposures", "make one run per exposure (own files, or "
-               "input.frame_range) and fit them jointly (pchem joint)"),
-    "odd_frames": ("1", "outlying frames", "included in the fit; leave them out {}"),
-    "empty_frames": ("1", "empty frames", "left out"),
-    "repeated_frames": ("1", "repeated frames", "left out, as exact copies of earlier frames; check the "
-                        "camera's link"),
-    "moved_frames": ("1", "moved frames", "included in the fit; leave them out {}"),
-    "frame_noise": ("DN", "frame noise", f"{_IN_NOISE} frame"),
-    "row_noise": ("DN", "row noise", f"{_IN_NOISE} row"),
-    "column_noise": ("DN", "column noise", f"{_IN_NOISE} column"),
-    "drift": ("DN", "drift of the frame mean", "adds to the read noise; the exposure may drift"),
-    "period": ("DN", "periodic frame mean", "adds to the read noise"),
-    "frame_lag": ("1", "correlation of successive frame means", "frame noise is not white"),
-    "lag": ("1", "correlation of successive samples",
-            f"charge or signal is carried over: {_GAIN} this share"),
-    "neighbours_x": ("1", "correlation of neighbours in a row", _COUPLE),
-    "neighbours_y": ("1", "correlation of neighbours in a column", _COUPLE),
-    "wandering_pixels": ("1", "pixels with a changing level",
-                         "exposure and read noise are averages over these levels; check for a moved sensor, "
-                         "a drift, or blinking pixels"),
-    "local_drift": ("DN", "drift of a part of the sensor", "adds to the read noise there"),
-    "wave": ("DN", "pickup or periodic noise", "adds to the read noise{}"),
-    "codes": ("LSB", "unequal code widths (DNL)",
-              "the histograms of all pixels deviate from the model at the same DN"),
-    "top_code": ("1", "saturation",
-                 "larger signals are cut off there: lower the exposure. The fit does not know this limit: "
-                 "set input.bit_depth, or add the effect clipping with this high to model.effects"),
-    "top_limit": ("1", "saturation", "larger signals are cut off there: lower the exposure. The fit treats "
-                  "these samples as {} or more, so values are right, with larger errors"),
-    "bottom_code": ("1", "clipping at the lowest code", "values are cut off there: raise the black level. If "
-                    "the camera clips, add the effect clipping with this low to model.effects"),
-    "bottom_limit": ("1", "clipping at the lowest code", "the black level is too low: raise it. The fit "
-                     "treats these samples as {} or less, so values are right, with larger errors"),
+#: All checks by name.
+KINDS: dict[str, _Kind] = {
+    "levels": _Kind("DN", "frames of several exposures", "make one run per exposure (own files, or "
+                    "input.frame_range) and fit them jointly (pchem joint)",
+                    r"frame\.charge\.(variance|slow|trend)"),
+    "odd_frames": _Kind("1", "outlying frames", "included in the fit; leave them out {}",
+                        r"frame\.readout\.(largest|quadrants)", (0.0, 0.01)),
+    "empty_frames": _Kind("1", "empty frames", "left out", limits=(0.01, 0.1)),
+    "repeated_frames": _Kind("1", "repeated frames", "left out, as exact copies of earlier frames; check the "
+                             "camera's link", r"frame\.repeated", (1e-3, 1.0)),
+    "moved_frames": _Kind("1", "moved frames", "included in the fit; leave them out {}", limits=(0.0, 0.01)),
+    "frame_noise": _Kind("DN", "frame noise", f"{_IN_NOISE} frame",
+                         r"frame\.(readout|charge)\.(variance|slow|trend)|frame\.covariance", map="next_x"),
+    "row_noise": _Kind("DN", "row noise", f"{_IN_NOISE} row", r"space\.row\.readout\.variance",
+                       map="next_x"),
+    "column_noise": _Kind("DN", "column noise", f"{_IN_NOISE} column", r"space\.column\.readout\.variance",
+                          map="next_y"),
+    "drift": _Kind("DN", "drift of the frame mean", "adds to the read noise; the exposure may drift",
+                   r"frame\.(readout|charge|gain)\.(slow|trend)", map="spread"),
+    "period": _Kind("DN", "periodic frame mean", "adds to the read noise",
+                    r"frame\.(readout|charge)\.line|frame\.readout\.alternating|space\.row\.readout\.line"),
+    "frame_lag": _Kind("1", "correlation of successive frame means", "frame noise is not white",
+                       r"frame\.(readout|charge)\.lag1|time\.lag1\.readout\.mean|time\.cross\.readout_charge",
+                       (math.inf, math.inf)),
+    "lag": _Kind("1", "correlation of successive samples",
+                 f"charge or signal is carried over: {_GAIN} this share",
+                 r"time\.lag1\.(readout|charge)\.mean|time\.cross\.readout_charge|frame\.repeated",
+                 (0.005, 0.05), "lag"),
+    "neighbours_x": _Kind("1", "correlation of neighbours in a row", _COUPLE,
+                          r"space\.x\.(kk|rk|bits)|space\.row\.readout\.lag1|tail\.high\.clusters",
+                          (0.005, 0.05), "next_x"),
+    "neighbours_y": _Kind("1", "correlation of neighbours in a column", _COUPLE,
+                          r"space\.y\.(kk|rk)|tail\.high\.clusters", (0.005, 0.05), "next_y"),
+    "wandering_pixels": _Kind("1", "pixels with a changing level",
+                              "exposure and read noise are averages over these levels; check for a moved "
+                              "sensor, a drift, or blinking pixels",
+                              r"time\.block\.(charge|readout)\.(chi|cnt)", (0.01, 0.2)),
+    "local_drift": _Kind("DN", "drift of a part of the sensor", "adds to the read noise there",
+                         r"frame\.(readout|charge)\.(trend|quadrants)"),
+    "wave": _Kind("DN", "pickup or periodic noise", "adds to the read noise{}",
+                  r"space\.sample\.readout\.(line|spectrum)"),
+    "codes": _Kind("LSB", "unequal code widths (DNL)",
+                   "the histograms of all pixels deviate from the model at the same DN",
+                   r"code\.(rough|smooth)", (0.1, 0.5)),
+    "top_code": _Kind("1", "saturation", "larger signals are cut off there: lower the exposure. The fit does "
+                      "not know this limit: set input.bit_depth, or add the effect clipping with this high "
+                      "to model.effects", r"code\.top", (1e-4, 1e-2)),
+    "top_limit": _Kind("1", "saturation", "larger signals are cut off there: lower the exposure. The fit "
+                       "treats these samples as {} or more, so values are right, with larger errors",
+                       r"code\.top", (1e-4, 1.0)),
+    "bottom_code": _Kind("1", "clipping at the lowest code", "values are cut off there: raise the black "
+                         "level. If the camera clips, add the effect clipping with this low to model.effects",
+                         r"code\.bottom", (1e-4, 1e-2)),
+    "bottom_limit": _Kind("1", "clipping at the lowest code", "the black level is too low: raise it. The fit "
+                          "treats these samples as {} or less, so values are right, with larger errors",
+                          r"code\.bottom", (1e-4, 1.0)),
 }  # fmt: skip
 
 
 def check_of(name: str, p: float, size: float, *, how: str = "", **rest: Any) -> Check:
     """Make a check with its title and advice; ``how`` fills the gap in the advice."""
-    unit, title, advice = _WORDS[name]
-    return Check(name, title, p, size, unit, advice=advice.format(how), **rest)
+    kind = KINDS[name]
+    return Check(name, kind.title, p, size, kind.unit, advice=kind.advice.format(how), **rest)
 
 
 @dataclass(frozen=True)
@@ -149,32 +192,6 @@ class QuickLook:
         }
 
 
-#: Statistics of the catalogue that show the same as a check: an effect with one of them in its signature
-#: explains the check.
-_SIGNS = {
-    "frame_noise": r"frame\.(readout|charge)\.(variance|slow|trend)|frame\.covariance",
-    "levels": r"frame\.charge\.(variance|slow|trend)",
-    "row_noise": r"space\.row\.readout\.variance",
-    "column_noise": r"space\.column\.readout\.variance",
-    "drift": r"frame\.(readout|charge|gain)\.(slow|trend)",
-    "local_drift": r"frame\.(readout|charge)\.(trend|quadrants)",
-    "period": r"frame\.(readout|charge)\.line|frame\.readout\.alternating|space\.row\.readout\.line",
-    "frame_lag": r"frame\.(readout|charge)\.lag1|time\.lag1\.readout\.mean|time\.cross\.readout_charge",
-    "lag": r"time\.lag1\.(readout|charge)\.mean|time\.cross\.readout_charge|frame\.repeated",
-    "neighbours_x": r"space\.x\.(kk|rk|bits)|space\.row\.readout\.lag1|tail\.high\.clusters",
-    "neighbours_y": r"space\.y\.(kk|rk)|tail\.high\.clusters",
-    "wandering_pixels": r"time\.block\.(charge|readout)\.(chi|cnt)",
-    "repeated_frames": r"frame\.repeated",
-    "codes": r"code\.(rough|smooth)",
-    "top_code": r"code\.top",
-    "bottom_code": r"code\.bottom",
-    "top_limit": r"code\.top",
-    "bottom_limit": r"code\.bottom",
-    "wave": r"space\.sample\.readout\.(line|spectrum)",
-    "odd_frames": r"frame\.readout\.(largest|quadrants)",
-}
-
-
 def graded(checks: list[Check], gain: float, read_noise: float, model: Sequence[Effect]) -> tuple[Check, ...]:
     """Compute p-values corrected for the number of checks (Sidak), sizes in e- and read noises, and levels.
 
@@ -192,31 +209,12 @@ def graded(checks: list[Check], gain: float, read_noise: float, model: Sequence[
         done = replace(
             check,
             p_global=p_global,
-            in_model=any(re.fullmatch(_SIGNS.get(check.name, ""), name) for name in shown),
+            in_model=any(re.fullmatch(KINDS[check.name].signs, name) for name in shown),
             size_e=check.size * gain if in_dn else math.nan,
             share=check.size / read_noise if in_dn else math.nan,
         )
         found.append(replace(done, level=_level(done)))
     return tuple(found)
-
-
-#: Sizes from which a check deserves caution, and from which it is serious, by its name.
-_LIMITS: dict[str, tuple[float, float]] = {
-    "lag": (0.005, 0.05),
-    "frame_lag": (math.inf, math.inf),
-    "neighbours_x": (0.005, 0.05),
-    "neighbours_y": (0.005, 0.05),
-    "repeated_frames": (1e-3, 1.0),
-    "wandering_pixels": (0.01, 0.2),
-    "codes": (0.1, 0.5),
-    "top_code": (1e-4, 1e-2),
-    "bottom_code": (1e-4, 1e-2),
-    "top_limit": (1e-4, 1.0),
-    "bottom_limit": (1e-4, 1.0),
-    "odd_frames": (0.0, 0.01),
-    "empty_frames": (0.01, 0.1),
-    "moved_frames": (0.0, 0.01),
-}
 
 
 def _level(check: Check) -> Level:
@@ -225,7 +223,7 @@ def _level(check: Check) -> Level:
     if check.in_model:
         return "note"
     size = check.share if check.unit == "DN" else abs(check.size)
-    some, much = (_SOME, _MUCH) if check.unit == "DN" else _LIMITS[check.name]
+    some, much = KINDS[check.name].limits
     if size >= much:
         return "serious"
     return "caution" if size >= some else "note"

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe.laws import extreme, poisson
-from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
-from pchem_pipeline.discrepancy.observe.tables_numba import CHI2, CodeSums
+from pchem_pipeline.discrepancy.observe.tables import CodeSums, PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import width_statistics
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
 from pchem_pipeline.discrepancy.quick.series import normal_p
@@ -110,7 +109,8 @@ def _sums(sample: CodeSample) -> CodeSums | None:
         laws = pixel_laws(PixelHistograms.alone(counts, origin), found, usable)
         if not laws.good.any():
             return None
-        ratio = laws.moments[:, CHI2] / np.maximum(laws.moments[:, CHI2 + 1], 1.0)
+        chi2, mean, _ = laws.moments["goodness"].T
+        ratio = chi2 / np.maximum(mean, 1.0)
         usable = np.asarray(laws.good) & (ratio <= _POOR * np.median(ratio[laws.good]))
     return laws.codes
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -102,17 +103,21 @@ def sensor_cells(sums: StackSums) -> dict[str, CellMap]:
     return found
 
 
-def sensor_place(name: str, cells: CellMap, significance: float) -> Suspect | None:
-    """Return the part of the sensor where a map stands out most; None where it is everywhere alike.
+def sensor_places(maps: Mapping[str, CellMap], significance: float) -> dict[str, Suspect]:
+    """Return the part of the sensor where each map stands out most; none where it is everywhere alike.
 
     Args:
-        name: of the map, as :func:`sensor_cells` calls it.
-        cells: the map.
-        significance: largest probability of a chance.
+        maps: by name, as :func:`sensor_cells` makes them.
+        significance: largest probability of a chance in any of them.
 
     Returns:
-        A place whose means are those of the map, standard deviations of a pixel.
+        Places whose means are those of the map, standard deviations of a pixel.
     """
+    found = {name: _place(name, cells, significance / len(maps)) for name, cells in maps.items()}
+    return {name: place for name, place in found.items() if place is not None}
+
+
+def _place(name: str, cells: CellMap, significance: float) -> Suspect | None:
     usable = cells.counts > 0
     # standard normal as the pixels are
     scaled = cells.sums / np.sqrt(np.maximum(cells.counts, 1.0))

@@ -25,10 +25,10 @@ from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import chi_square, without_skew
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
-from pchem_pipeline.discrepancy.quick.checks import SIGNIFICANCE, Check, QuickLook, check_of, graded
+from pchem_pipeline.discrepancy.quick.checks import KINDS, SIGNIFICANCE, Check, QuickLook, check_of, graded
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.levels import levels_check
-from pchem_pipeline.discrepancy.quick.places import block_deviations, sensor_cells, sensor_place
+from pchem_pipeline.discrepancy.quick.places import block_deviations, sensor_cells, sensor_places
 from pchem_pipeline.discrepancy.quick.series import normal_p, series_checks
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.discrepancy.scan import Suspect
@@ -198,16 +198,6 @@ def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
     return _located(checks, sums)
 
 
-#: The map that shows where each check fails.
-_MAP_OF = {
-    "frame_noise": "next_x",
-    "row_noise": "next_x",
-    "column_noise": "next_y",
-    "neighbours_x": "next_x",
-    "neighbours_y": "next_y",
-    "lag": "lag",
-    "drift": "spread",
-}
 _SHARED = ("frame_noise", "row_noise", "column_noise")
 #: Checks of which a part of the sensor alone may fail.
 _LOCAL = ("neighbours_x", "neighbours_y", "lag")
@@ -216,16 +206,15 @@ _LOCAL = ("neighbours_x", "neighbours_y", "lag")
 def _located(checks: list[Check], sums: StackSums) -> list[Check]:
     """Return checks with the part of the sensor that they are about, and one of parts that drift apart."""
     cells = sensor_cells(sums)
-    limit = SIGNIFICANCE / len(cells)
-    places = {name: sensor_place(name, each, limit) for name, each in cells.items()}
+    places = sensor_places(cells, SIGNIFICANCE)
     found = []
     for check in checks:
-        place = places.get(_MAP_OF.get(check.name, ""))
+        place = places.get(KINDS[check.name].map)
         found.append(check if place is None else _placed(check, place, sums))
     for noise, neighbours in (("row_noise", "neighbours_x"), ("column_noise", "neighbours_y")):
         found = _told_once(found, noise, neighbours)
     if "spread" in cells:
-        found.append(_local_drift(sums, places["spread"]))
+        found.append(_local_drift(sums, places.get("spread")))
     return found
 
 

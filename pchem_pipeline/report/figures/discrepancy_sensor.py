@@ -174,7 +174,7 @@ def regions_of(data: DiscrepancyData) -> dict[str, Region]:
     placed.sort(key=lambda each: each.region_p)
     found: dict[str, Region] = {}
     for each in placed:
-        found.setdefault(map_of(each.statistic) or "", Region.model_validate(each.region))
+        found.setdefault(map_of(each.statistic), Region.model_validate(each.region))
     return found
 
 

@@ -10,8 +10,9 @@ pixels and a block of frames take the memory that the run may have, or no more t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,12 +22,11 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.compute.memory import resident_bytes
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
-from pchem_pipeline.discrepancy.observe.pairs import Samples, pairs_bytes
+from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples, pairs_bytes
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
-from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
-from pchem_pipeline.discrepancy.quick.places import CellMap, sensor_cells, sensor_place
+from pchem_pipeline.discrepancy.quick.places import CellMap, sensor_cells, sensor_places
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
 from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
@@ -170,12 +170,7 @@ def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, 
     """
     if sums is None or sums.shape != shape or sums.freedom <= 0:
         return None
-    return _places(sensor_cells(sums), SIGNIFICANCE)
-
-
-def _places(maps: Mapping[str, CellMap], significance: float) -> dict[str, Suspect]:
-    found = {name: sensor_place(name, cells, significance / len(maps)) for name, cells in maps.items()}
-    return {name: place for name, place in found.items() if place is not None}
+    return sensor_places(sensor_cells(sums), SIGNIFICANCE)
 
 
 def places_of_bands(
@@ -210,7 +205,8 @@ def places_of_bands(
             maps[name].add(values, first)
         if not laws.good.any():
             continue
-        samples = Samples.by_laws(_Band(source, (first, last), numbers), laws, fitted)
+        blocks = partial(frame_blocks, source, numbers, (first, last))
+        samples = Samples.by_laws(FrameBlocks(numbers.size, blocks), laws, fitted)
         samples = replace(samples, most=at_once)
         del laws
         for each in scan_pairs(samples, significance=SIGNIFICANCE / len(bands), most=1):
@@ -230,7 +226,7 @@ def places_of_bands(
     shares = {PAIRS: numbers.size / n}
     if plain:
         # maps of shapes rest on fits, whose errors are not quite normal
-        places |= _places(maps, NO_CHANCE)
+        places |= sensor_places(maps, NO_CHANCE)
         shares[SHAPES] = 1.0
     return places, shares
 
@@ -254,16 +250,12 @@ def _band_size(store: RunStore, shape: tuple[int, int], memory: int | None) -> t
         return rows, _MOST_AT_ONCE
     codes = mean_codes(store)
     pixel = counts.shape[2] * counts.dtype.itemsize + codes * _CODE_BYTES + _PIXEL_BYTES + _SAMPLE_BYTES
-    while True:
-        left = memory - pairs_bytes((rows, nx))
+    left = 0
+    for lower in range(rows, fewest - 1, -1):
+        left = memory - pairs_bytes((lower, nx))
         at_once = min(_MOST_AT_ONCE, max(left, 0) // 4 // _SAMPLE_BYTES)
-        affordable = int((left - at_once * _SAMPLE_BYTES) / (nx * pixel))
-        if affordable >= rows:
-            return rows, at_once
-        if rows == fewest:
-            break
-        # lower bands have smaller tables of pairs, too
-        rows = max(fewest, min(affordable, rows * 3 // 4))
+        if lower * nx * pixel <= left - at_once * _SAMPLE_BYTES:
+            return lower, at_once
     lacking = math.ceil((fewest * nx * pixel * 4 / 3 - left) / 2**20)
     raise ConfigError(
         f"discrepancy needs {lacking} MiB more for {fewest} rows of the sensor; raise compute.max_memory "
@@ -309,30 +301,5 @@ def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]
 def _shapes(laws: PixelLaws, shape: tuple[int, ...]) -> dict[str, FloatArray]:
     """Return the scores and the goodness of fit of each pixel, NaN without a law."""
     found = {f"score.{name}": laws.scores[:, 0, j] for j, name in enumerate(SCORES)}
-    found["goodness"] = goodness_of(laws.moments)
+    found["goodness"] = goodness_of(laws.moments["goodness"])
     return {name: np.where(laws.good, values, np.nan).reshape(shape) for name, values in found.items()}
-
-
-@dataclass(frozen=True)
-class _Band:
-    """Frames of a band of rows, read by blocks.
-
-    Attributes:
-        source: frames of the sensor.
-        rows: first, and end.
-        numbers: of the frames, increasing.
-    """
-
-    source: FrameSource
-    rows: tuple[int, int]
-    numbers: IntArray
-
-    @property
-    def n_frames(self) -> int:
-        """Number of frames."""
-        return int(self.numbers.size)
-
-    def blocks(self, size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
-        """Yield at most so many successive frames at a time, (frame, y, x), DN."""
-        for _, block in frame_blocks(self.source, self.numbers, self.rows, size):
-            yield block

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.discrepancy.null import free_of_parameters
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.scan import Suspect
+from pchem_pipeline.discrepancy.scan import Suspect, integral
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
@@ -203,7 +203,7 @@ def _corner(
         np.unique(np.linspace(first, last - length, _TRIED).astype(np.int64))
         for first, last, length in ((y0, y1, size[0]), (x0, x1, size[1]))
     )
-    total = np.pad(np.cumsum(np.cumsum(place, axis=0, dtype=np.int64), axis=1), ((1, 0), (1, 0)))
+    total = integral(place.astype(np.int64))
     inside = (
         total[np.ix_(ys + size[0], xs + size[1])]
         - total[np.ix_(ys, xs + size[1])]
@@ -223,15 +223,17 @@ def read_window(source: FrameSource, window: Window) -> NDArray[np.unsignedinteg
     stack = np.empty((window.numbers.size, y1 - y0, x1 - x0), source.dtype)
     # not more at once than a few dozen megabytes, whatever the width of the sensor
     step = max(1, (1 << 23) // ((y1 - y0) * source.shape[2]))
-    for at, block in frame_blocks(source, window.numbers, window.rows, step):
-        stack[at : at + block.shape[0]] = block[:, :, x0:x1]
+    done = 0
+    for block in frame_blocks(source, window.numbers, window.rows, step):
+        stack[done : done + block.shape[0]] = block[:, :, x0:x1]
+        done += block.shape[0]
     return stack
 
 
 def frame_blocks(
     source: FrameSource, numbers: NDArray[np.int64], rows: tuple[int, int], size: int
-) -> Iterator[tuple[int, NDArray[np.unsignedinteger]]]:
-    """Yield at most so many successive frames of some rows at a time, (frame, y, x), DN, with their place.
+) -> Iterator[NDArray[np.unsignedinteger]]:
+    """Yield at most so many successive frames of some rows at a time, (frame, y, x), DN.
 
     Args:
         source: the frames.
@@ -242,8 +244,8 @@ def frame_blocks(
     for part in np.split(np.arange(numbers.size), np.flatnonzero(np.diff(numbers) != 1) + 1):
         frames = int(numbers[part[0]]), int(numbers[part[-1]]) + 1
         with FrameStream(source, [rows], size, frames=frames) as stream:
-            for first, (block,) in stream:
-                yield int(part[0]) + first - frames[0], block
+            for _, (block,) in stream:
+                yield block
 
 
 def fewer_samples(

@@ -12,7 +12,7 @@ import pytest
 from helpers.standardised import samples_of
 
 from pchem_pipeline.discrepancy.observe.pairs import PERIOD, pairs_of
-from pchem_pipeline.discrepancy.scan_pairs import Side, scan_pairs, shared_elsewhere, sharpened
+from pchem_pipeline.discrepancy.scan_pairs import scan_pairs, shared_elsewhere
 from pchem_pipeline.effects.framework.region import Region
 
 SHAPE, FRAMES = (32, 32), 1000
@@ -165,13 +165,3 @@ def test_dead_lines_at_an_edge_belong_to_nothing_and_do_not_end_a_place() -> Non
     found = scan_pairs(samples_of(noisy(region, (FEW, 1, 1), 0.4), usable), most=1)
     assert found[0].region.mask(WIDE)[usable].sum() == region.mask(WIDE)[usable].sum()
     assert found[0].region.rows == ((9, 24),)
-
-
-def test_what_single_lines_hardly_show_leaves_the_edges_as_they_are() -> None:
-    edges, rng = np.arange(0, 65, 4), np.random.default_rng(2)
-    lines, across = Side.of(edges, (2, 6)), Side.of(np.array([0, 200]), (0, 1))
-    assert lines == Side(8, 24, 4, 28, (12, 20), sure=True)
-    assert across == Side(0, 200, 0, 200, (0, 200), sure=False)
-    samples = samples_of(np.clip(rng.standard_normal((FEW, *WIDE)), -6, 6))
-    for mode in ("row", "frame"):
-        assert sharpened(samples, 0, mode, lines, across) == ((8, 24), (0, 200))

@@ -17,7 +17,6 @@ from pchem_pipeline.discrepancy.where import (
     frame_series,
     map_of,
     pixel_maps,
-    series_of,
     suspected_frames,
     suspected_regions,
     unfitted_place,
@@ -104,11 +103,10 @@ def test_maps_and_series_are_standard_normal_by_chance() -> None:
 def test_every_statistic_is_asked_of_a_map_or_series_that_exists() -> None:
     evidence = seen()
     maps, series = pixel_maps(evidence), frame_series(evidence)
-    named = {map_of(name) for name in STATISTICS} - {None}
-    assert named <= set(maps)
-    assert {series_of(name) for name in STATISTICS} - {None} <= set(series)
-    assert (map_of("space.x.rk"), map_of("code.rough")) == ("x.rk", None)
-    assert series_of("space.row.readout.lag1") == "row.readout"
+    assert {map_of(name) for name in STATISTICS} - {""} <= set(maps)
+    assert {known.series for known in STATISTICS.values()} - {""} <= set(series)
+    assert (map_of("space.x.rk@rows=0:4"), map_of("code.rough")) == ("x.rk", "")
+    assert STATISTICS["space.row.readout.lag1"].series == "row.readout"
 
 
 def test_a_place_counts_from_the_corner_of_the_sensor() -> None:

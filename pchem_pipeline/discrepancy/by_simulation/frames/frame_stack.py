@@ -126,24 +126,11 @@ class FrameStack:
 
         Shorter blocks leave less between them that is not seen.
         """
-        stack, numbers = self.seen_stack, self.seen_numbers
-
-        def told(part: Part) -> Part:
-            if part.when is None:
-                return part
-            evidence = part_evidence(
-                stack,
-                numbers,
-                maps,
-                Part(part.region),
-                n_run=self.n_run,
-                block_frames=self.splits.block_frames,
-                window=self.window,
-                fitted=False,
-            )
-            return with_ends(part, evidence)
-
-        return replace(self, parts=tuple(told(part) for part in self.parts))
+        parts = [
+            part if part.when is None else with_ends(part, self._apart(Part(part.region), maps, fitted=False))
+            for part in self.parts
+        ]
+        return replace(self, parts=tuple(parts))
 
     def effects(self, model: Sequence[Effect]) -> tuple[Effect, ...]:
         """Return the effects of a model as they act on these pixels, row 0 being the first of these."""
@@ -160,7 +147,6 @@ class FrameStack:
             self.numbers[part],
             evidence.maps,
             self.parts,
-            n_run=self.n_run,
             block_frames=self.splits.block_frames,
             window=self.window,
         )
@@ -168,22 +154,20 @@ class FrameStack:
 
     def seen_apart(self, evidence: Evidence) -> list[tuple[Part, Evidence]]:
         """Return the evidence of each part, of train and test frames together."""
-        stack, numbers = self.seen_stack, self.seen_numbers
-        return [
-            (
-                part,
-                part_evidence(
-                    stack,
-                    numbers,
-                    evidence.maps,
-                    part,
-                    n_run=self.n_run,
-                    block_frames=self.splits.block_frames,
-                    window=self.window,
-                ),
-            )
-            for part in self.parts
-        ]
+        return [(part, self._apart(part, evidence.maps)) for part in self.parts]
+
+    def _apart(self, part: Part, maps: PixelMaps, *, fitted: bool = True) -> Evidence:
+        """Return the evidence of a part in train and test frames, see :func:`part_evidence`."""
+        return part_evidence(
+            self.seen_stack,
+            self.seen_numbers,
+            maps,
+            part,
+            n_run=self.n_run,
+            block_frames=self.splits.block_frames,
+            window=self.window,
+            fitted=fitted,
+        )
 
     def acquisition(self, as_data: bool = False) -> Acquisition:
         """Return how replicates of the train part are taken.

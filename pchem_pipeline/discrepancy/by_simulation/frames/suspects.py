@@ -20,7 +20,7 @@ from scipy import special
 from scipy.ndimage import binary_dilation
 
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
-from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack
+from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.observe.rare import N_SETS, rare_samples
 from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
@@ -163,7 +163,7 @@ def _places_of_frames(
 ) -> Iterator[Part]:
     """Yield ranges of frames in those pixels only that share noise there."""
     for part in ranges:
-        chosen = Stack(frames[part.frames(time.frames)])
+        chosen = FrameBlocks.of(frames[part.frames(time.frames)])
         for each in scan_pairs(replace(samples, frames=chosen), most=1):
             yield Part(each.region, part.when)
 

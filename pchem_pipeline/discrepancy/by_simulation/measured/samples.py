@@ -10,9 +10,9 @@ from typing import NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.observe.pairs import Samples, Stack, laws_of_frames
+from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples, laws_of_frames
 from pchem_pipeline.discrepancy.observe.places import Part
-from pchem_pipeline.discrepancy.observe.tables_numba import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
@@ -83,7 +83,7 @@ class PartSamples:
 
         Each beyond its mean, in its standard deviation, 0 where it is not known, shape (frame, y, x).
         """
-        samples = Samples.by_laws(Stack(self.frames), self.laws, self.maps).without(~inside)
+        samples = Samples.by_laws(FrameBlocks.of(self.frames), self.laws, self.maps).without(~inside)
         return np.concatenate([chunk for (chunk,) in samples.chunks((kind,), *box)])
 
 

@@ -136,7 +136,6 @@ class Replicate:
                 numbers,
                 evidence.maps,
                 taken.parts,
-                n_run=taken.n_run,
                 block_frames=taken.block_frames,
                 window=taken.window,
             )

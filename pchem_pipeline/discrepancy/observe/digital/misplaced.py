@@ -21,9 +21,9 @@ from pchem_pipeline.discrepancy.observe.digital.misplaced_numba import (
     N_PLACES,
     STEPS,
     compare_rows,
-    fill_ratios,
 )
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.neighbours import neighbours
 from pchem_pipeline.model.arithmetic.significance import CERTAIN
 from pchem_pipeline.model.histogram.count import histogram_frames
 
@@ -132,7 +132,7 @@ class _Table:
 
     Attributes:
         first: DN of the first code, shape (y, x).
-        ratios: see :func:`~.misplaced_numba.fill_ratios`, shape (y, x, B, 4).
+        ratios: see :func:`~.misplaced_numba.compare_rows`, shape (y, x, B, 4).
     """
 
     first: IntArray
@@ -151,8 +151,15 @@ class _Table:
         first = (origin + some[0] - 1).reshape(usable.shape)
         axis = _LINES.index(lines)
         own, begin, count = (np.ascontiguousarray(a.swapaxes(0, axis)) for a in (logs, first, usable))
-        ratios = np.empty((*own.shape, len(STEPS)), np.float32)
-        fill_ratios(own, begin, count, ratios)
+        ratios, codes = np.empty((*own.shape, len(STEPS)), np.float32), np.arange(own.shape[2])
+        for j, (dy, dx) in enumerate(STEPS):
+            # where one of two pixels does not count, it tells nothing
+            (other, there), (start, _), (counts_there, _) = (
+                neighbours(each.reshape(*count.shape, -1), (dy, dx, 0)) for each in (own, begin, count)
+            )
+            at = np.clip(codes + begin[:, :, None] - start, 0, codes.size - 1)
+            known = there[:, :, :1] & count[:, :, None] & counts_there
+            ratios[..., j] = known * (np.take_along_axis(other, at, axis=2) - own)
         return cls(begin, ratios)
 
     def compared(

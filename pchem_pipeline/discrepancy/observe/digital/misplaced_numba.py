@@ -19,35 +19,6 @@ N_PLACES = 6
 
 
 @kernel
-def fill_ratios(
-    counts: NDArray[np.float32],
-    first: NDArray[np.int64],
-    usable: NDArray[np.bool_],
-    table: NDArray[np.float32],
-) -> None:
-    """Fill the logarithms of the probabilities of codes at other pixels over that at their own.
-
-    Args:
-        counts: logarithms of the probabilities of codes, the first and last for all beyond, (y, x, B).
-        first: DN of the first code, (y, x).
-        usable: pixels that count, (y, x); where one of two does not, it tells nothing.
-        table: to fill, (y, x, B, 4).
-    """
-    ny, nx, size = counts.shape
-    for y in range(ny):
-        for x in range(nx):
-            for j in range(4):
-                oy, ox = y + STEPS[j][0], x + STEPS[j][1]
-                known = 0 <= oy < ny and 0 <= ox < nx and usable[y, x] and usable[oy, ox]
-                for b in range(size):
-                    if known:
-                        at = min(max(b + first[y, x] - first[oy, ox], 0), size - 1)
-                        table[y, x, b, j] = counts[oy, ox, at] - counts[y, x, b]
-                    else:
-                        table[y, x, b, j] = np.float32(0.0)
-
-
-@kernel
 def _log_mean(values: FloatArray) -> float:
     """Return the log of the mean of numbers given as logs."""
     largest = values.max()
@@ -73,7 +44,8 @@ def compare_rows(
     Args:
         frames: codes (frame, y, x), DN.
         first: DN of the first code of ``table``, (y, x).
-        table: of :func:`fill_ratios`.
+        table: logarithms of the probabilities of codes at the pixels :data:`STEPS` away over that at their
+            own, the first and last code for all beyond, (y, x, B, 4).
         stride: frames between the samples of neighbours, modulo their number; 0: rows as they are.
         share: of rows that come from elsewhere.
         whole: likelihoods of rows that come early or late from some sample on are means over that, else the

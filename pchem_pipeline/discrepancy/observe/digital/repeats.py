@@ -22,6 +22,7 @@ Frames = NDArray[np.unsignedinteger[Any]]
 
 _FIRST = 2  # samples of a line that are compared before all of them are
 _MOST_CODES = 1 << 26  # of all pixels together
+_AT_ONCE = 1 << 16  # samples
 
 
 @dataclass(frozen=True)
@@ -100,10 +101,11 @@ def equal_squares(frames: Frames) -> IntArray:
     """
     top = frames.max(initial=0)
     found = np.zeros((max(frames.shape[1] - 1, 0), max(frames.shape[2] - 1, 0)), np.int64)
-    for frame in frames:
-        rows = frame[1:] == frame[:-1]
-        equal = rows[:, 1:] & rows[:, :-1] & (frame[1:, 1:] == frame[1:, :-1])
-        found += equal & (frame[1:, 1:] != top)
+    step = max(1, _AT_ONCE // frames[0].size)
+    for some in (frames[first : first + step] for first in range(0, len(frames), step)):
+        rows = some[:, 1:] == some[:, :-1]
+        equal = rows[:, :, 1:] & rows[:, :, :-1] & (some[:, 1:, 1:] == some[:, 1:, :-1])
+        found += np.count_nonzero(equal & (some[:, 1:, 1:] != top), axis=0)
     return found
 
 

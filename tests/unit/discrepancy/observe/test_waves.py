@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from pchem_pipeline.discrepancy.by_simulation.measured.noise import measured_wave
 from pchem_pipeline.discrepancy.observe.observe import observe
@@ -50,11 +49,7 @@ def evidence(values: Frames) -> Evidence:
     return observe(values, np.arange(FRAMES), n_run=FRAMES, block_frames=100, start=MAPS, fitted=False)
 
 
-def test_the_statistics_follow_the_law_that_they_state() -> None:
-    """Of frames in random order; the largest of many powers is a standard normal number."""
-    z = [found(frames(seed)).z for seed in range(40)]
-    for name in ("space.sample.readout.line", "space.sample.readout.spectrum"):
-        assert stats.kstest([each[name] for each in z], "norm").pvalue > 1e-3, name
+def test_frames_in_random_order_have_hardly_a_wave() -> None:
     assert sum(len(found(frames(seed)).found) for seed in range(40)) <= 5  # 2 kinds, 2 % each
 
 

@@ -15,7 +15,7 @@ from helpers.quick_stacks import EXPOSURE, GAIN, READ_NOISE, added, codes_of, ma
 from pchem_pipeline import fit_counts
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.quick import places
-from pchem_pipeline.discrepancy.quick.checks import _SIGNS, SIGNIFICANCE, Check, QuickLook
+from pchem_pipeline.discrepancy.quick.checks import KINDS, SIGNIFICANCE, Check, QuickLook
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.levels import levels_check
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
@@ -512,7 +512,8 @@ def test_what_the_model_has_is_a_remark() -> None:
 
 
 def test_signs_are_statistics_of_the_catalogue() -> None:
-    assert all(any(re.fullmatch(sign, name) for name in STATISTICS) for sign in _SIGNS.values())
+    signs = {kind.signs for kind in KINDS.values()} - {""}
+    assert all(any(re.fullmatch(sign, name) for name in STATISTICS) for sign in signs)
 
 
 def test_probabilities_count_all_checks(clean: QuickLook) -> None:

@@ -154,7 +154,7 @@ def test_statistics_of_a_part_are_those_of_a_sensor_of_its_own():
     frames = camera(7, rows_of_columns)
     maps = observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=50).maps
     part = Part(Region(columns=((24, 29),)))
-    found = part_statistics(frames, np.arange(FRAMES), maps, [part], n_run=FRAMES, block_frames=50)
+    found = part_statistics(frames, np.arange(FRAMES), maps, [part], block_frames=50)
     alone = observe(
         np.ascontiguousarray(frames[:, :, 24:29]), np.arange(FRAMES), n_run=FRAMES, block_frames=50
     )
@@ -245,10 +245,10 @@ def test_a_range_of_few_frames_of_poor_pixels_has_statistics():
     maps = observe(frames, numbers, n_run=FRAMES, block_frames=50).maps
     some = np.flatnonzero(numbers // 20 % 3 == 0)
     part = Part(when=When(range=((600, 760),)))
-    found = part_statistics(frames[some], numbers[some], maps, [part], n_run=FRAMES, block_frames=20)
+    found = part_statistics(frames[some], numbers[some], maps, [part], block_frames=20)
     assert found["space.row.readout.variance@frames=600:760"] > 5.0
     quiet = Part(when=When(range=((900, 1060),)))
-    found = part_statistics(frames[some], numbers[some], maps, [quiet], n_run=FRAMES, block_frames=20)
+    found = part_statistics(frames[some], numbers[some], maps, [quiet], block_frames=20)
     assert abs(found["space.row.readout.variance@frames=900:1060"]) < 4.0
 
 
