@@ -94,6 +94,17 @@ def test_a_folder_of_files_is_one_pattern_wherever_the_store_is(tmp_path, monkey
     assert len(str(refused.value)) < 700  # twice the path of the test
 
 
+def test_an_edited_yaml_is_never_replaced(tmp_path, file):
+    place = tmp_path / "run.zarr"
+    target, _ = find_or_start([file], place, {})
+    RunStore.create(place).write_config(dump_config(target.config))
+    edited = (tmp_path / "run.yaml").read_text().replace("bit_shift: null", "bit_shift: 4")
+    (tmp_path / "run.yaml").write_text(edited)
+    with pytest.raises(ConfigError, match="exists with other settings"):
+        find_or_start([file], place, {"bit_depth": 12})
+    assert (tmp_path / "run.yaml").read_text() == edited
+
+
 def test_the_same_command_goes_on_with_a_yaml_that_says_more(tmp_path, file, monkeypatch):
     """What a search names is written into the YAML, what a user sets too; the command that began goes on."""
     monkeypatch.chdir(tmp_path)
