@@ -46,7 +46,7 @@ def test_nothing_is_guessed_where_nothing_is():
         AnalogMemory(memory=0.006),
         AnalogMemory(memory=-0.006),
         AnalogMemory(memory=0.05, spread=0.8),
-        FlickerNoise(share=0.03, correlation_frames=3.0),
+        FlickerNoise(share=0.03, correlation_frames=10.0),
         FlickerNoise(share=0.02, correlation_frames=40.0),
         GainDrift(drift=0.03),
         GainDrift(drift=-0.03),
