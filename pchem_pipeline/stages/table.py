@@ -148,7 +148,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=10,
+        version=11,
         upstream=("ingest",),
         settings=("discrepancy",),
         reads=("frames", "summary", "histogram", "fit"),

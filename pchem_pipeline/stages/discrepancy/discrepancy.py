@@ -119,7 +119,7 @@ class _Search:
         window = self.seen.window(self.source.shape, settings, self.roi)
         found = find_discrepancies(
             read_window(self.source, window),
-            window.numbers,
+            window.times,
             settings,
             **self._taken(window),
             model=(*self.before, *_limits(self.context, self.before)),
@@ -141,7 +141,7 @@ class _Search:
             return None
         self.tell("checking the model in another window")
         frames = FrameStack.of(
-            read_window(self.source, other), other.numbers, settings.block_frames, **self._taken(other)
+            read_window(self.source, other), other.times, settings.block_frames, **self._taken(other)
         )
         there = Elsewhere(rows=other.rows, columns=other.columns)
         effort = Effort(None)
@@ -159,7 +159,7 @@ class _Search:
     def _taken(self, window: Window) -> dict[str, Any]:
         """Return how the frames of a window were taken."""
         return {
-            "n_run": self.source.shape[0],
+            "n_run": self.source.shape[0] - len(window.copied),
             "bit_depth": self.context.bit_depth,
             "integration_time": self.context.integration_time or 1.0,
             "window": SensorWindow(
@@ -203,7 +203,9 @@ def _surveyed(
         tell("scanning all pixels and frames")
         seen = _survey(context, source, settings)
         if seen.left_out:
-            context.note(f"excluded, empty, outlying or moved: {frame_words(np.array(seen.left_out))}")
+            context.note(
+                f"excluded, empty, repeated, outlying or moved: {frame_words(np.array(seen.left_out))}"
+            )
         most, few = settings, fewer_samples(source, settings, roi, seen) if not before else settings
         if few != settings:
             context.note(

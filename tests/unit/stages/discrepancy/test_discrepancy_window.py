@@ -15,6 +15,7 @@ from helpers.discrepancy_material import verdict_of
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.discrepancy.splits import split_frames
 from pchem_pipeline.discrepancy.verdict import Elsewhere, Verdict
 from pchem_pipeline.effects.adc.clipping import Clipping
 from pchem_pipeline.effects.analog.shared_noise import RowNoise
@@ -62,6 +63,16 @@ def test_odd_frames_are_not_looked_at():
         assert not np.isin(numbers, (0, 700)).any()
         assert np.all(np.diff(numbers) > 0)
     assert seen.told(verdict_of("named"), 1.0).examined.left_out == (0, 700)
+
+
+def test_frames_delivered_twice_follow_each_other_without_their_copies():
+    copied = tuple(range(1, 1800, 2))
+    seen = Survey(left_out=(6, *copied), copied=copied)
+    seen = Survey.of_numbers(json.loads(json.dumps(seen.numbers())))
+    window = seen.window((1800, 16, 16), WHOLE, None)
+    np.testing.assert_array_equal(window.numbers, np.delete(np.arange(0, 1800, 2), 3))
+    np.testing.assert_array_equal(window.times, np.delete(np.arange(900), 3))
+    assert split_frames(window.times, 20).train.size == 280
 
 
 @pytest.mark.parametrize("shape", [(17750, 512, 512), (1000, 2048, 2048), (100_000, 8, 8), (7000, 3, 4000)])
