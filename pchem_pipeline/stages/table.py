@@ -91,7 +91,7 @@ _ALL = (
     ),
     Stage(
         "fit",
-        version=8,
+        version=9,
         upstream=("histogram",),
         settings=("fit", "run.tile"),
         reads=("frames/excluded", *(f"histogram/{name}" for name in ("counts", "origin", "under", "over"))),
