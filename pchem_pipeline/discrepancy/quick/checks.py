@@ -214,7 +214,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "top_limit": (1e-4, 1.0),
     "bottom_limit": (1e-4, 1.0),
     "odd_frames": (0.0, 0.01),
-    "empty_frames": (0.01, 0.1),
+    "empty_frames": (0.01, 1.0),
     "moved_frames": (0.0, 0.01),
 }
 

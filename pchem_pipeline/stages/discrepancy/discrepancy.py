@@ -48,6 +48,7 @@ from pchem_pipeline.store.run_store import RunStore
 _STAGE = "discrepancy"
 #: Settings that the memory, or a clear disagreement, may lower.
 _TAKEN = ("max_samples", "max_pixels", "replicates", "extended_replicates")
+_REACHED = 0.01  # share of the pixels with samples at a limit of the ADC from which it is in the model
 _USUAL_CODES = 128.0  # of the law of a pixel, where there are no histograms yet
 
 
@@ -238,7 +239,10 @@ def _start(context: StageContext) -> tuple[tuple[Effect, ...], tuple[int, ...] |
 
 def _limits(context: StageContext, model: Sequence[Effect]) -> tuple[Effect, ...]:
     """Return as an effect the codes at which samples pile up: the fit has them without a model."""
-    low, high = context.sensor.seen_limits
+    (low, high), ends, store = context.sensor.seen_limits, context.adc_limits, context.store
+    if ends is not None and store.has("histogram/minimum"):
+        low = ends[0] if (store.read("histogram/minimum") <= ends[0]).mean() > _REACHED else low
+        high = ends[1] if (store.read("histogram/maximum") >= ends[1]).mean() > _REACHED else high
     if (low is None and high is None) or any(effect.tag == "clipping" for effect in model):
         return ()
     return (Clipping(low=low, high=high),)

@@ -298,8 +298,9 @@ def test_a_name_that_does_not_hold_elsewhere_is_in_part():
     assert Verdict.from_json(found.to_json()) == found
 
 
-def context(low, high):
-    return SimpleNamespace(sensor=SimpleNamespace(seen_limits=(low, high)))
+def context(low, high, **ends):
+    store = SimpleNamespace(has=lambda _: bool(ends), read=lambda name: ends[name.partition("/")[2]])
+    return SimpleNamespace(sensor=SimpleNamespace(seen_limits=(low, high)), adc_limits=(0, 4095), store=store)
 
 
 def test_the_limits_of_the_run_are_in_the_model_of_the_search_once():
@@ -307,6 +308,11 @@ def test_the_limits_of_the_run_are_in_the_model_of_the_search_once():
     assert _limits(context(None, 135), ()) == (Clipping(high=135),)
     assert _limits(context(40, 135), ()) == (Clipping(low=40, high=135),)
     assert _limits(context(None, 135), (Clipping(high=130),)) == ()
+    # the end of the ADC is no code that is seen to be a limit, but samples lie there
+    cut = {"minimum": np.array([[0, 0, 3]]), "maximum": np.array([[90, 80, 95]])}
+    assert _limits(context(None, None, **cut), ()) == (Clipping(low=0),)
+    few = {"minimum": np.r_[0, np.full(200, 9)], "maximum": np.full(201, 99)}
+    assert _limits(context(None, None, **few), ()) == ()
 
 
 @pytest.mark.parametrize("error", [InterruptedRunError(signal.SIGINT), StoreError("no space left")])
