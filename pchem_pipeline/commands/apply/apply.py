@@ -72,7 +72,7 @@ _SEGMENT_SAMPLES = 1 << 27
 _SCENE_FRAMES, _PARTS = 256, 4
 #: Share of the samples at a limit of the ADC beyond which offsets cannot be told: with 6 % of them the stated
 #: probabilities of electron numbers are as right as without, with 32 % they are 0.1 too high.
-_MOST_CUT = 0.1
+_MOST_CUT = 0.2
 #: Frames that tell how wide the histograms are.
 _SEEN_FRAMES = 64
 #: Bytes that a code of a pixel takes while numbers are looked up.

@@ -451,14 +451,8 @@ class _Batch:
         low, high = self.adc_limits or (None, None)
         if self.adc_limits is not None and (none := self._reaches_adc(slice(None), beyond=1)).any():
             low, high = (np.where(none, np.nan, limit) for limit in self.adc_limits)
-        return [
-            replace(
-                each,
-                clip_low=low if each.clip_low is None else each.clip_low,
-                clip_high=high if each.clip_high is None else each.clip_high,
-            )
-            for each in ([law] * self.n_samples if isinstance(law, SampleLaw) else law)
-        ]
+        laws = [law] * self.n_samples if isinstance(law, SampleLaw) else law
+        return [each.between(low, high) for each in laws]
 
     def _at_limits(self, laws: Sequence[SampleLaw]) -> NDArray[np.bool_]:
         """Tell in which pixels codes pile up at a limit of the law."""

@@ -251,7 +251,8 @@ def test_the_work_is_that_of_all_searches_and_looks(monkeypatch):
     light = 11.0 * (rng.poisson(2.0, (400, 32, 32)) + 0.3 * rng.standard_normal((400, 32, 32)))
     values = np.rint(100.0 + light).astype(np.uint16)
     sensor = SimpleNamespace(seen_limits=(None, None))
-    context = SimpleNamespace(bit_depth=12, integration_time=1.0, sensor=sensor)
+    limits = {"sensor": sensor, "adc_limits": None, "store": None}
+    context = SimpleNamespace(bit_depth=12, integration_time=1.0, **limits)
     search = discrepancy._Search(context, Stack(values), (), None, Survey({}, {}), lambda _: None)
     named = SimpleNamespace(verdict=verdict_of("named").costing(30.04), model=())
     monkeypatch.setattr(discrepancy, "find_discrepancies", lambda *_, **__: named)
