@@ -415,7 +415,9 @@ def _root(
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    typer.echo(f"pchem: {' '.join(message.split())}", err=True)
+    from pchem_pipeline.report.style.wording import typeset
+
+    typer.echo(f"pchem: {typeset(' '.join(message.split()))}", err=True)
     begun = any(each.name.startswith("tile") for each in threading.enumerate())
     if begun and code in (ExitCode.SIGINT, ExitCode.SIGTERM):
         os._exit(code)  # nobody waits for what these threads do

@@ -26,7 +26,7 @@ def apply(
         str,
         typer.Option(
             help="numbers: prior exposure: frames (estimated from these frames), flat (all numbers equally "
-            "likely), run (from the characterisation), a number (e-), or a file with a map (npy, TIFF, FITS)"
+            "likely), run (from the characterisation), a number (e⁻), or a file with a map (npy, TIFF, FITS)"
         ),
     ] = "frames",
     dataset: Annotated[

@@ -14,11 +14,11 @@ def plan(
     run: Annotated[
         Path | None, typer.Argument(help="a run: its median pixel is the default of the options")
     ] = None,
-    read_noise: Annotated[float | None, typer.Option(help="read noise, e-, quantisation included")] = None,
+    read_noise: Annotated[float | None, typer.Option(help="read noise, e⁻, quantisation included")] = None,
     exposure: Annotated[
-        float | None, typer.Option(help="quanta exposure per frame, e- [default: best]")
+        float | None, typer.Option(help="quanta exposure per frame, e⁻ [default: best]")
     ] = None,
-    gain: Annotated[float | None, typer.Option(help="conversion gain, e-/DN [default: 0.09]")] = None,
+    gain: Annotated[float | None, typer.Option(help="conversion gain, e⁻/DN [default: 0.09]")] = None,
     target: Annotated[
         list[str] | None,
         typer.Option(help="target precision per pixel: conversion_gain=1%, bias=0.02e-, read_noise_e=2%, …"),
@@ -27,9 +27,9 @@ def plan(
         int | None, typer.Option(min=1, help="available frames: print the precision that they reach")
     ] = None,
     samples: Annotated[
-        str | None, typer.Option(help="divide the frames over several exposures: 0,2,8 in e-, or best")
+        str | None, typer.Option(help="divide the frames over several exposures: 0,2,8 in e⁻, or best")
     ] = None,
-    max_exposure: Annotated[float, typer.Option(min=0.01, help="largest allowed exposure, e-")] = 10.0,
+    max_exposure: Annotated[float, typer.Option(min=0.01, help="largest allowed exposure, e⁻")] = 10.0,
     max_frames: Annotated[float, typer.Option(min=1, help="largest allowed number of frames")] = 1e7,
     verify: Annotated[bool, typer.Option("--verify", help="simulate the plan and fit it")] = False,
     pixels: Annotated[int, typer.Option(min=10, help="simulated pixels of --verify")] = 1000,
@@ -50,10 +50,11 @@ def plan(
     From the Cramer-Rao bound; --verify simulates pixels and fits them.
     """
     from pchem_pipeline.commands.plan import PlanRequest, make_plan
+    from pchem_pipeline.report.style.wording import typeset
 
     request = PlanRequest(
         run=run, read_noise_e=read_noise, quanta_exposure=exposure, conversion_gain=gain,
         targets=tuple(target or ()), frames=frames, samples=samples, max_exposure=max_exposure,
         max_frames=max_frames, verify=verify, pixels=pixels, seed=seed, figure=figure, json=json,
     )  # fmt: skip
-    typer.echo(make_plan(request))
+    typer.echo(typeset(make_plan(request)))

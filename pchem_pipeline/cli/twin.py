@@ -23,7 +23,7 @@ def twin(
     scene: Annotated[
         str | None,
         typer.Option(
-            help="e- per frame: a number, or a file with an image or a sequence of images (npy, TIFF, FITS) "
+            help="e⁻ per frame: a number, or a file with an image or a sequence of images (npy, TIFF, FITS) "
             "[default: exposure of the run]"
         ),
     ] = None,

@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined, to_jsonable_python
 
 from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.report.style.wording import typeset
 
 _HEAD = """\
 # A run of pchem_pipeline. Every setting is shown with its default; delete what you do not change.
@@ -59,7 +60,7 @@ def _section(model: type[BaseModel], path: str, given: dict[str, Any], depth: in
         name = field.alias or key
         value = given.get(f"{path}.{key}", _default(field))
         width = max(40, 100 - len(pad))
-        lines += [f"{pad}# {line}" for line in textwrap.wrap(field.description or "", width)]
+        lines += [f"{pad}# {line}" for line in textwrap.wrap(typeset(field.description or ""), width)]
         section = _section_of(field)
         if isinstance(value, BaseModel) and section is not None and type(value) is section:
             lines += [f"{pad}{name}:", *_section(section, f"{path}.{key}", given, depth + 1)]

@@ -353,7 +353,7 @@ class Examined(_Part):
         places: deviating parts of the sensor in these surveys.
         unfitted: number of pixels left out for lack of a reliable fit.
         elsewhere: test of the model in another window; None: not done.
-        left_out: empty and outlying frames.
+        left_out: empty, repeated, outlying and moved frames.
     """
 
     frames: int

@@ -109,6 +109,7 @@ class Pair:
         versions: versions of programs and algorithms that differ.
         changed: whether anything changed.
         changes: what changed, one sentence each.
+        hot_new, hot_gone: pixels (y, x) that are hot in the other alone, and in one alone.
     """
 
     one: RunFacts
@@ -122,6 +123,8 @@ class Pair:
     versions: Sequence[Setting] = ()
     changed: bool = False
     changes: Sequence[str] = ()
+    hot_new: Sequence[tuple[int, int]] = ()
+    hot_gone: Sequence[tuple[int, int]] = ()
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, TextIO, TypeVar
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.report.style.wording import typeset
 from pchem_pipeline.store.progress_file import ProgressFile
 
 T = TypeVar("T")
@@ -248,7 +249,7 @@ class Reporter:
         from tqdm import tqdm
 
         self._told = time.monotonic()
-        tqdm.write(message, file=sys.stderr)
+        tqdm.write(typeset(message), file=sys.stderr)
 
 
 def _short(count: float) -> float:

@@ -171,7 +171,7 @@ class SimulateSettings(Section):
         default=None,
         ge=0,
         lt=2**63,
-        description="random seed of the pixels' parameters; null: seed. With a fixed pixel_seed, another "
+        description="random seed of the pixels' parameters; null: seed. With a fixed sensor_seed, another "
         "seed gives other frames of the same sensor",
     )
     integration_time: float = Field(default=4.87, gt=0, description="integration time per frame, s")

@@ -91,7 +91,7 @@ _ALL = (
     ),
     Stage(
         "fit",
-        version=8,
+        version=9,
         upstream=("histogram",),
         settings=("fit", "run.tile"),
         reads=("frames/excluded", *(f"histogram/{name}" for name in ("counts", "origin", "under", "over"))),
@@ -148,7 +148,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=10,
+        version=11,
         upstream=("ingest",),
         settings=("discrepancy",),
         reads=("frames", "summary", "histogram", "fit"),

@@ -167,8 +167,11 @@ def test_the_history_of_a_camera(shell, copies, finished):
     exposure = third.read("maps/quanta_exposure")
     places = [tuple(place) for place in good[:3].tolist()]
     words = third.read("fit/fit_status")
+    origin = third.read("histogram/origin")
     for place in places:  # a flagged pixel is hot, too
         exposure[place] = 60.0
+        origin[place] += 50  # its samples are others, too
+    third.write("histogram/origin", whole(third, "histogram/origin"), origin)
     words[places[0]] |= int(FitStatus.BIAS_AMBIGUOUS)
     third.write("maps/quanta_exposure", whole(third, "maps/quanta_exposure"), exposure)
     third.write("fit/fit_status", whole(third, "fit/fit_status"), words)

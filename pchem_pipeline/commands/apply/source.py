@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.first_look import first_look
@@ -145,6 +146,20 @@ def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:
     return remarks
 
 
+def share_cut(frames: FrameSequence, limits: tuple[int, int] | None) -> float:
+    """Return the share of the samples that lie at a limit of the ADC."""
+    if limits is None:
+        return 0.0
+    some = _some(frames)
+    return float(np.mean((some <= limits[0]) | (some >= limits[1])))
+
+
+def _some(frames: FrameSequence) -> NDArray[np.unsignedinteger[Any]]:
+    """Return frames spread over all, (frame, y, x), DN."""
+    chosen = np.unique(np.linspace(0, frames.shape[0] - 1, _SEEN).astype(int))
+    return np.concatenate([frames.read(t, t + 1) for t in chosen.tolist()])
+
+
 def check_level(frames: FrameSequence, calibration: Calibration) -> list[str]:
     """Return remarks on a mean level that does not fit the characterisation; none where it does.
 
@@ -155,8 +170,7 @@ def check_level(frames: FrameSequence, calibration: Calibration) -> list[str]:
     Raises:
         InputError: the mean lies so far below the bias that the frames are no frames of these pixels.
     """
-    chosen = np.unique(np.linspace(0, frames.shape[0] - 1, _SEEN).astype(int))
-    mean = np.mean([frames.read(int(t), int(t) + 1)[0] for t in chosen], axis=0, dtype=np.float64)
+    mean = _some(frames).mean(axis=0, dtype=np.float64)
     known = calibration.usable
     if not known.any():
         raise InputError("the run has no pixel with a good fit, so it cannot calibrate frames")

@@ -21,7 +21,12 @@ from pchem_pipeline.commands.compare.history import (
 )
 from pchem_pipeline.commands.compare.settings import settings_that_differ, versions_that_differ
 from pchem_pipeline.commands.figures import warn_if_old
-from pchem_pipeline.model.checks.run_differences import compare_maps, reasons_of_change
+from pchem_pipeline.model.checks.run_differences import (
+    CommonFit,
+    common_fit_p,
+    compare_maps,
+    reasons_of_change,
+)
 from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD, NO_VALUE
 from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, RunFacts
@@ -185,6 +190,7 @@ def _data_digest(store: RunStore, sensor: SensorInfo) -> str:
 def _pair(first: _Side, second: _Side, tolerance: float, rate: float, reporter: Reporter) -> Pair:
     (one, one_target, one_store, before), (other, other_target, other_store, now) = first, second
     same_data = one.digest == other.digest
+    confirm = None if same_data else _common_fit((one_target, one_store), (other_target, other_store))
     maps: dict[str, Any] = {}
     transitions: list[list[int]] = []
     if one.shape == other.shape:
@@ -193,19 +199,31 @@ def _pair(first: _Side, second: _Side, tolerance: float, rate: float, reporter: 
         good = (before.quality == GOOD) & (now.quality == GOOD)
         in_both = (name for name in MAPS if one_store.has(f"maps/{name}") and other_store.has(f"maps/{name}"))
         read = ((name, _value(one_store, name), _value(other_store, name)) for name in in_both)
-        maps = compare_maps(read, good, same_data=same_data, rate=rate)
+        maps = compare_maps(read, good, same_data=same_data, rate=rate, confirm=confirm)
     arrays = compare_arrays(one_store, other_store, tolerance, reporter) if same_data else []
     reasons = {} if same_data else {name: reasons_of_change(found) for name, found in maps.items()}
     words = _words(one, other, arrays, maps, reasons)
-    new, gone = now.new_since(before), before.new_since(now)
+    new, gone = now.new_since(before, confirm), before.new_since(now, confirm)
     if new or gone:
         words.append(f"Hot pixels: {len(new):,} new, {len(gone):,} gone.")
     return Pair(
         one, other, same_data, arrays, maps, reasons, transitions,
         settings_that_differ(one_target.config, other_target.config),
         versions_that_differ(one_store, other_store),
-        bool(words), words,
+        bool(words), words, new, gone,
     )  # fmt: skip
+
+
+def _common_fit(*runs: tuple[Target, RunStore]) -> CommonFit | None:
+    """Return the test whether pixels of two runs are the same; None for fits of several exposures."""
+    stores = [store for _, store in runs]
+    sensors = [target.sensor(store) for target, store in runs]
+    if any(sensor.samples or sensor.adc_limits != sensors[0].adc_limits for sensor in sensors):
+        return None
+    names = ("histogram/counts", "histogram/origin")
+    return lambda y, x: common_fit_p(
+        sensors[0].adc_limits, *([store.read_pixels(name, y, x) for store in stores] for name in names)
+    )
 
 
 def _value(store: RunStore, name: str) -> tuple[FloatArray, FloatArray]:

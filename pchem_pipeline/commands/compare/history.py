@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erfc
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.frames.camera import CameraFacts
-from pchem_pipeline.model.checks.run_differences import LIMIT
+from pchem_pipeline.model.checks.run_differences import LIMIT, CommonFit
 from pchem_pipeline.model.fit.status import FitStatus, flags_of
 from pchem_pipeline.model.maps.maps import GOOD, hot_pixels
 from pchem_pipeline.report.comparison import Against, HistoryRow, Pair, RunFacts
@@ -99,8 +100,8 @@ def history_rows(
                 {"date": _days(date), "temperature": _number(warmth), "label": _number(label)}[against],
                 run,
                 int(states[i].hot.sum()),
-                states[i].new_since(states[0]),
-                states[0].new_since(states[i]),
+                pairs[i - 1].hot_new if i else (),
+                pairs[i - 1].hot_gone if i else (),
                 states[i].flags(),
                 _effects(store),
                 moved,
@@ -164,13 +165,22 @@ class PixelStates:
         """Return how many pixels bear each word of the status."""
         return {str(bit.name).lower(): int(((self.status & int(bit)) != 0).sum()) for bit in FitStatus if bit}
 
-    def new_since(self, first: PixelStates) -> tuple[tuple[int, int], ...]:
-        """Return the places of hot ones that were not hot, unless H agrees within its error, if known."""
+    def new_since(self, first: PixelStates, confirm: CommonFit | None = None) -> tuple[tuple[int, int], ...]:
+        """Return the places of hot ones that were not hot, unless H agrees within its error, if known.
+
+        Args:
+            first: the pixels of an earlier run.
+            confirm: p-values of pixels (y, x) for a common fit of both runs; None: not known.
+        """
         if self.hot.shape != first.hot.shape:
             return ()
         error = np.hypot(np.nan_to_num(self.stderr), np.nan_to_num(first.stderr))
         near = np.abs(self.exposure - first.exposure) <= LIMIT * error
-        return tuple((int(y), int(x)) for y, x in np.argwhere(self.hot & ~first.hot & ~near))
+        y, x = np.nonzero(self.hot & ~first.hot & ~near)
+        if confirm is not None and y.size:
+            differs = ~(confirm(y, x) > erfc(LIMIT / np.sqrt(2.0)))
+            y, x = y[differs], x[differs]
+        return tuple(zip(y.tolist(), x.tolist(), strict=True))
 
 
 def _effects(store: RunStore) -> tuple[str, ...]:

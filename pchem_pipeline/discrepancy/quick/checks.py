@@ -100,7 +100,7 @@ KINDS: dict[str, _Kind] = {
                     r"frame\.charge\.(variance|slow|trend)"),
     "odd_frames": _Kind("1", "outlying frames", "included in the fit; leave them out {}",
                         r"frame\.readout\.(largest|quadrants)", (0.0, 0.01)),
-    "empty_frames": _Kind("1", "empty frames", "left out", limits=(0.01, 0.1)),
+    "empty_frames": _Kind("1", "empty frames", "left out", limits=(0.01, 1.0)),
     "repeated_frames": _Kind("1", "repeated frames", "left out, as exact copies of earlier frames; check the "
                              "camera's link", r"frame\.repeated", (1e-3, 1.0)),
     "moved_frames": _Kind("1", "moved frames", "included in the fit; leave them out {}", limits=(0.0, 0.01)),

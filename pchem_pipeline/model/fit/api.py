@@ -114,7 +114,7 @@ def fit_histograms(
     dark = [False] * len(samples) if dark is None else list(dark)
     _check(samples, origins, dark)
     batch = _Batch(samples, origins, dark, settings, adc_limits, under, over)
-    laws = None if law is None else [law] * len(samples) if isinstance(law, SampleLaw) else list(law)
+    laws = None if law is None else batch.between_limits(law)
     near = None if isinstance(start, FitResult) else start
     if laws is not None and near is not None:
         found = batch.fit_cells(laws, near, warm=True)
@@ -168,7 +168,8 @@ def likelihood_moments(
     for pixels in (np.flatnonzero(~cells), np.flatnonzero(cells)):
         if pixels.size:
             batch = _Batch([counts[pixels]], [origin[pixels]], [False], settings, adc_limits, None, None)
-            own = None if not cells[pixels[0]] else batch.neutral() if law is None else [law.of(pixels)]
+            given = SampleLaw() if law is None else law.of(pixels)
+            own = batch.between_limits(given) if cells[pixels[0]] else None
             parts.append((pixels, batch.moments(known[pixels], outlier_share[pixels], own, free[pixels])))
     return profile.Moments.joined(len(known), parts)
 
@@ -441,13 +442,18 @@ class _Batch:
         )
 
     def neutral(self) -> list[SampleLaw]:
-        """Return the law of the PCD between the limits of the ADC, but in pixels with samples beyond them."""
+        """Return the law of the PCD between the limits of the ADC."""
+        return self.between_limits(SampleLaw())
+
+    def between_limits(self, law: SampleLaw | Sequence[SampleLaw]) -> list[SampleLaw]:
+        """Return laws without limits between those of the ADC, but in pixels with samples beyond them."""
         low: FloatArray | int | None
         high: FloatArray | int | None
         low, high = self.adc_limits or (None, None)
         if self.adc_limits is not None and (none := self._reaches_adc(slice(None), beyond=1)).any():
             low, high = (np.where(none, np.nan, limit) for limit in self.adc_limits)
-        return [SampleLaw(clip_low=low, clip_high=high)] * self.n_samples
+        laws = [law] * self.n_samples if isinstance(law, SampleLaw) else law
+        return [each.between(low, high) for each in laws]
 
     def _at_limits(self, laws: Sequence[SampleLaw]) -> NDArray[np.bool_]:
         """Tell in which pixels codes pile up at a limit of the law."""

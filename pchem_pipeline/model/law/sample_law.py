@@ -313,6 +313,11 @@ class SampleLaw:
             clip_high=min(highs) if highs else None,
         )
 
+    def between(self, low: int | FloatArray | None, high: int | FloatArray | None) -> SampleLaw:
+        """Return a copy with limits of the codes where it has none of its own."""
+        low = low if self.clip_low is None else self.clip_low
+        return replace(self, clip_low=low, clip_high=high if self.clip_high is None else self.clip_high)
+
     def with_outliers(self, share: float, codes: int = 65536) -> SampleLaw:
         """Return a copy in which a share of the samples may lie anywhere among so many codes."""
         return replace(self, outlier_share=share, outlier_codes=codes)

@@ -75,10 +75,12 @@ def _pair_sentence(pair: Pair, tolerance: float) -> str:
         first = f"{pair.other.title} differs from {pair.one.title}: {_first_change(pair)}."
         return f"{first}{_largest_text(pair)}"
     if not pair.same_data:
-        return (
-            f"Nothing changed: all maps of {pair.other.title} and {pair.one.title} (different frames) agree "
-            "within their standard errors."
-        )
+        n = max((each.n_counted for each in pair.maps.values()), default=0)
+        both = f"{pair.other.title} and {pair.one.title} (different frames)"
+        if n == 0:
+            return f"Nothing can be compared: no pixel has a good fit in both {both}."
+        pixels = count(n, "pixel")
+        return f"Nothing changed: all maps of {both} agree within their standard errors in {pixels}."
     rows = [row for row in pair.arrays if row.counts and row.state in ("identical", "equal")]
     values = sum(row.n_values for row in rows)
     inexact = sum(row.state == "equal" for row in rows)

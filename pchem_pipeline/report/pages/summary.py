@@ -217,7 +217,9 @@ def _spaced_codes(data: ReportData) -> Iterator[Flag]:
 
 def _unfitted(data: ReportData) -> Iterator[Flag]:
     if missing := int(data.unfitted.sum()):
-        yield Flag("serious", f"{count(missing, data.noun)} not fitted yet. Continue the run.")
+        few = missing <= data.allowed_failed * data.unfitted.size
+        text = f"{count(missing, data.noun)} not fitted yet. Continue the run."
+        yield Flag("caution" if few else "serious", text)
 
 
 def _flagged(data: ReportData) -> Iterator[Flag]:

@@ -48,6 +48,7 @@ from pchem_pipeline.store.run_store import RunStore
 _STAGE = "discrepancy"
 #: Settings that the memory, or a clear disagreement, may lower.
 _TAKEN = ("max_samples", "max_pixels", "replicates", "extended_replicates")
+_REACHED = 0.01  # share of the pixels with samples at a limit of the ADC from which it is in the model
 _USUAL_CODES = 128.0  # of the law of a pixel, where there are no histograms yet
 
 
@@ -119,7 +120,7 @@ class _Search:
         window = self.seen.window(self.source.shape, settings, self.roi)
         found = find_discrepancies(
             read_window(self.source, window),
-            window.numbers,
+            window.times,
             settings,
             **self._taken(window),
             model=(*self.before, *_limits(self.context, self.before)),
@@ -141,7 +142,7 @@ class _Search:
             return None
         self.tell("checking the model in another window")
         frames = FrameStack.of(
-            read_window(self.source, other), other.numbers, settings.block_frames, **self._taken(other)
+            read_window(self.source, other), other.times, settings.block_frames, **self._taken(other)
         )
         there = Elsewhere(rows=other.rows, columns=other.columns)
         effort = Effort(None)
@@ -159,7 +160,7 @@ class _Search:
     def _taken(self, window: Window) -> dict[str, Any]:
         """Return how the frames of a window were taken."""
         return {
-            "n_run": self.source.shape[0],
+            "n_run": self.source.shape[0] - len(window.copied),
             "bit_depth": self.context.bit_depth,
             "integration_time": self.context.integration_time or 1.0,
             "window": SensorWindow(
@@ -203,7 +204,9 @@ def _surveyed(
         tell("scanning all pixels and frames")
         seen = _survey(context, source, settings)
         if seen.left_out:
-            context.note(f"excluded, empty, outlying or moved: {frame_words(np.array(seen.left_out))}")
+            context.note(
+                f"excluded, empty, repeated, outlying or moved: {frame_words(np.array(seen.left_out))}"
+            )
         most, few = settings, fewer_samples(source, settings, roi, seen) if not before else settings
         if few != settings:
             context.note(
@@ -236,7 +239,10 @@ def _start(context: StageContext) -> tuple[tuple[Effect, ...], tuple[int, ...] |
 
 def _limits(context: StageContext, model: Sequence[Effect]) -> tuple[Effect, ...]:
     """Return as an effect the codes at which samples pile up: the fit has them without a model."""
-    low, high = context.sensor.seen_limits
+    (low, high), ends, store = context.sensor.seen_limits, context.adc_limits, context.store
+    if ends is not None and store.has("histogram/minimum"):
+        low = ends[0] if (store.read("histogram/minimum") <= ends[0]).mean() > _REACHED else low
+        high = ends[1] if (store.read("histogram/maximum") >= ends[1]).mean() > _REACHED else high
     if (low is None and high is None) or any(effect.tag == "clipping" for effect in model):
         return ()
     return (Clipping(low=low, high=high),)

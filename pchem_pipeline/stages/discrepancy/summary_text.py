@@ -45,7 +45,7 @@ def verdict_text(found: Verdict) -> str:
     lines += _gap(found)
     if found.examined.left_out:
         words = frame_words(np.array(found.examined.left_out))
-        lines += _wrapped(f"left out (empty, outlying or moved): {words}")
+        lines += _wrapped(f"left out (empty, repeated, outlying or moved): {words}")
     if found.proposed:
         tags = ", ".join(str(effect["tag"]) for effect in found.proposed)
         lines += _wrapped(f"proposed, not in the model: {tags} (see proposed in discrepancy.json)")

@@ -61,6 +61,7 @@ _MOST_AT_ONCE = 1 << 22
 #: Samples whose pairs are summed at most: some five minutes.
 _MOST_SAMPLES = 1 << 31
 _WRITTEN = ("p", "inside", "outside")  # of a place, beside its region
+_FRAMES = ("left_out", "copied")  # of a survey
 _FEWEST_SAMPLES = 50  # of a histogram that is compared with its law
 
 SUMS, SHAPES, PAIRS = (
@@ -77,18 +78,20 @@ class Survey:
     Attributes:
         places: the most significant place of each map (next_x, score.C2, pairs.row.readout) that has one.
         shares: of the run's samples, by what was looked at; what is absent was not.
-        left_out: frames that are empty, far from the others or moved: nothing is said of them.
+        left_out: frames that are empty, copies, far from the others or moved: nothing is said of them.
+        copied: those of them that are copies of earlier ones.
     """
 
     places: Mapping[str, Suspect] = field(default_factory=dict)
     shares: Mapping[str, float] = field(default_factory=dict)
     left_out: tuple[int, ...] = ()
+    copied: tuple[int, ...] = ()
 
     def window(
         self, shape: tuple[int, int, int], settings: DiscrepancySettings, roi: Sequence[int] | None
     ) -> Window:
         """Return what to look at closely, see `choose_window`."""
-        return choose_window(shape, settings, roi, self.places, self.left_out)
+        return choose_window(shape, settings, roi, self.places, self.left_out, self.copied)
 
     def numbers(self) -> dict[str, Any]:
         """Return it as JSON data, of which :meth:`of_numbers` makes it again."""
@@ -96,7 +99,8 @@ class Survey:
             name: {"region": each.region.numbers()} | {key: getattr(each, key) for key in _WRITTEN}
             for name, each in self.places.items()
         }
-        return {"places": places, "shares": dict(self.shares), "left_out": list(self.left_out)}
+        frames = {name: list(getattr(self, name)) for name in _FRAMES}
+        return {"places": places, "shares": dict(self.shares), **frames}
 
     @classmethod
     def of_numbers(cls, numbers: Mapping[str, Any]) -> Survey:
@@ -112,7 +116,7 @@ class Survey:
             )
             for name, each in numbers["places"].items()
         }
-        return cls(places, numbers["shares"], tuple(numbers.get("left_out", ())))
+        return cls(places, numbers["shares"], *(tuple(numbers[name]) for name in _FRAMES))
 
     def told(self, verdict: Verdict, share: float) -> Verdict:
         """Return a verdict that says on what share of the samples it rests, and on what else."""
@@ -145,9 +149,7 @@ def survey(context: StageContext, source: FrameSource, compared: int) -> Survey:
         StoreError: an array is corrupt.
     """
     store, shape = context.store, source.shape
-    odd, out = odd_frames_of(store)
-    # copies are an effect that can be found
-    left_out = np.setdiff1d(out, odd["copied"])
+    odd, left_out = odd_frames_of(store)
     places = places_of_sums(read_sums(store), shape[1:])
     shares = {} if places is None else {SUMS: 1.0}
     model = model_of(store, "fit")
@@ -158,7 +160,7 @@ def survey(context: StageContext, source: FrameSource, compared: int) -> Survey:
         memory = None if limit is None else (limit << 20) - resident_bytes()
         here, more = places_of_bands(store, source, plain=not model.effects, memory=memory, left_out=left_out)
         places, shares = (places or {}) | here, shares | more
-    return Survey(places or {}, shares, tuple(left_out.tolist()))
+    return Survey(places or {}, shares, tuple(left_out.tolist()), tuple(odd["copied"].tolist()))
 
 
 def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, Suspect] | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -53,11 +53,18 @@ class Window:
     Attributes:
         numbers: frame numbers, whole blocks, increasing.
         rows, columns: first, and end.
+        copied: frames of the run that are copies of earlier ones.
     """
 
     numbers: NDArray[np.int64]
     rows: tuple[int, int]
     columns: tuple[int, int]
+    copied: tuple[int, ...] = ()
+
+    @property
+    def times(self) -> NDArray[np.int64]:
+        """Frame numbers without the copies, which took no time."""
+        return self.numbers - np.searchsorted(self.copied, self.numbers)
 
     def pixel(self, y: int, x: int) -> tuple[int, int]:
         """Return the place on the sensor of a pixel of the window."""
@@ -75,6 +82,7 @@ def choose_window(
     roi: Sequence[int] | None = None,
     places: Mapping[str, Suspect] | None = None,
     left_out: Sequence[int] = (),
+    copied: tuple[int, ...] = (),
 ) -> Window:
     """Return what to look at: everything if small enough, else a window and blocks over the whole run.
 
@@ -87,6 +95,7 @@ def choose_window(
         roi: rows and columns that the user asked for: y0, y1, x0, x1.
         places: where the survey found that the sensor stands out.
         left_out: odd frames, which are not looked at.
+        copied: those of them that are copies of earlier ones.
     """
     kept = np.setdiff1d(np.arange(shape[0], dtype=np.int64), left_out)
     n_frames, ny, nx = kept.size, *shape[1:]
@@ -104,7 +113,7 @@ def choose_window(
         length = block_length(frames, settings.block_frames)
         starts = np.linspace(0, n_frames - length, frames // length).astype(np.int64)
         numbers = kept[(starts[:, None] + np.arange(length)).ravel()]
-    return Window(numbers, (y0, y1), (x0, x1))
+    return Window(numbers, (y0, y1), (x0, x1), copied)
 
 
 def other_window(window: Window, shape: tuple[int, int, int], roi: Sequence[int] | None) -> Window | None:
@@ -129,7 +138,7 @@ def other_window(window: Window, shape: tuple[int, int, int], roi: Sequence[int]
     y, x = max(itertools.product(sorted(rows), sorted(columns)), key=away)
     if -away((y, x))[0] > _SHARED * height * width:
         return None
-    return Window(window.numbers, (y, y + height), (x, x + width))
+    return replace(window, rows=(y, y + height), columns=(x, x + width))
 
 
 def search_bytes(window: Window, codes: float) -> int:
@@ -273,7 +282,7 @@ def fewer_samples(
             break
         length = block_length(window.numbers.size, settings.block_frames)
         frames = read_window(source, window)
-        if is_clear(frames, window.numbers, n_run=source.shape[0], block_frames=length):
+        if is_clear(frames, window.times, n_run=source.shape[0], block_frames=length):
             lower = {
                 "replicates": min(settings.replicates, _REPLICATES),
                 "extended_replicates": min(settings.extended_replicates, _EXTENDED),

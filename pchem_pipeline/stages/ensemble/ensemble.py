@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -329,13 +329,7 @@ def _law(
     store: RunStore, maps: list[NDArray[np.float64]], place: tuple[slice, slice], job: _Job
 ) -> SampleLaw:
     """Return the law of the samples, with effects and limits of the codes."""
-    law = FittedModel.read(store, place).law(maps)
-    low, high = job.limits or (None, None)
-    return replace(
-        law,
-        clip_low=low if law.clip_low is None else law.clip_low,
-        clip_high=high if law.clip_high is None else law.clip_high,
-    )
+    return FittedModel.read(store, place).law(maps).between(*(job.limits or (None, None)))
 
 
 def _read_counted(store: RunStore, tile: Tile, origin: NDArray[np.int64]) -> PixelHistograms:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -274,3 +275,16 @@ def test_one_hit_does_not_move_a_fit_that_allows_for_outliers() -> None:
     assert moved[1].max() < 0.02
     assert moved[2].max() < 0.02
     np.testing.assert_allclose(guarded.outlier_share, 1 / (FRAMES + 1))
+
+
+def test_a_law_without_limits_is_cut_where_the_adc_cuts() -> None:
+    """A third of the samples at 0 DN, and noise that a row shares: as the PCD, whose read noise has it in."""
+    rng = np.random.default_rng(3)
+    samples = 10.0 * (rng.poisson(1.0, (12, 3000)) + 0.34 * rng.standard_normal((12, 3000))) - 3.0
+    samples = np.rint(samples).astype(np.int64).clip(0, 4095)
+    counts = np.stack([np.bincount(row, minlength=200) for row in samples]).astype(np.uint32)
+    fit = functools.partial(fit_histograms, counts, np.zeros(12, np.int32), adc_limits=(0, 4095))
+    plain, shared = fit(), fit(law=SampleLaw(extra_variance_dn2=np.array([4.0])))
+    np.testing.assert_allclose(shared.log_likelihood, plain.log_likelihood, atol=1e-3)
+    np.testing.assert_allclose(shared.bias, plain.bias, atol=1e-2)
+    np.testing.assert_allclose(np.hypot(shared.read_noise_dn, 2.0), plain.read_noise_dn, rtol=1e-3)

@@ -15,6 +15,7 @@ from helpers.discrepancy_material import verdict_of
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
+from pchem_pipeline.discrepancy.splits import split_frames
 from pchem_pipeline.discrepancy.verdict import Elsewhere, Verdict
 from pchem_pipeline.effects.adc.clipping import Clipping
 from pchem_pipeline.effects.analog.shared_noise import RowNoise
@@ -62,6 +63,16 @@ def test_odd_frames_are_not_looked_at():
         assert not np.isin(numbers, (0, 700)).any()
         assert np.all(np.diff(numbers) > 0)
     assert seen.told(verdict_of("named"), 1.0).examined.left_out == (0, 700)
+
+
+def test_frames_delivered_twice_follow_each_other_without_their_copies():
+    copied = tuple(range(1, 1800, 2))
+    seen = Survey(left_out=(6, *copied), copied=copied)
+    seen = Survey.of_numbers(json.loads(json.dumps(seen.numbers())))
+    window = seen.window((1800, 16, 16), WHOLE, None)
+    np.testing.assert_array_equal(window.numbers, np.delete(np.arange(0, 1800, 2), 3))
+    np.testing.assert_array_equal(window.times, np.delete(np.arange(900), 3))
+    assert split_frames(window.times, 20).train.size == 280
 
 
 @pytest.mark.parametrize("shape", [(17750, 512, 512), (1000, 2048, 2048), (100_000, 8, 8), (7000, 3, 4000)])
@@ -240,7 +251,8 @@ def test_the_work_is_that_of_all_searches_and_looks(monkeypatch):
     light = 11.0 * (rng.poisson(2.0, (400, 32, 32)) + 0.3 * rng.standard_normal((400, 32, 32)))
     values = np.rint(100.0 + light).astype(np.uint16)
     sensor = SimpleNamespace(seen_limits=(None, None))
-    context = SimpleNamespace(bit_depth=12, integration_time=1.0, sensor=sensor)
+    limits = {"sensor": sensor, "adc_limits": None, "store": None}
+    context = SimpleNamespace(bit_depth=12, integration_time=1.0, **limits)
     search = discrepancy._Search(context, Stack(values), (), None, Survey({}, {}), lambda _: None)
     named = SimpleNamespace(verdict=verdict_of("named").costing(30.04), model=())
     monkeypatch.setattr(discrepancy, "find_discrepancies", lambda *_, **__: named)
@@ -287,8 +299,9 @@ def test_a_name_that_does_not_hold_elsewhere_is_in_part():
     assert Verdict.from_json(found.to_json()) == found
 
 
-def context(low, high):
-    return SimpleNamespace(sensor=SimpleNamespace(seen_limits=(low, high)))
+def context(low, high, **ends):
+    store = SimpleNamespace(has=lambda _: bool(ends), read=lambda name: ends[name.partition("/")[2]])
+    return SimpleNamespace(sensor=SimpleNamespace(seen_limits=(low, high)), adc_limits=(0, 4095), store=store)
 
 
 def test_the_limits_of_the_run_are_in_the_model_of_the_search_once():
@@ -296,6 +309,11 @@ def test_the_limits_of_the_run_are_in_the_model_of_the_search_once():
     assert _limits(context(None, 135), ()) == (Clipping(high=135),)
     assert _limits(context(40, 135), ()) == (Clipping(low=40, high=135),)
     assert _limits(context(None, 135), (Clipping(high=130),)) == ()
+    # the end of the ADC is no code that is seen to be a limit, but samples lie there
+    cut = {"minimum": np.array([[0, 0, 3]]), "maximum": np.array([[90, 80, 95]])}
+    assert _limits(context(None, None, **cut), ()) == (Clipping(low=0),)
+    few = {"minimum": np.r_[0, np.full(200, 9)], "maximum": np.full(201, 99)}
+    assert _limits(context(None, None, **few), ()) == ()
 
 
 @pytest.mark.parametrize("error", [InterruptedRunError(signal.SIGINT), StoreError("no space left")])
