@@ -176,9 +176,9 @@ def _scale(axes: Axes, name: str, axis: Axis, most: int) -> None:
 
 
 def _end(axes: Axes, name: str, axis: Axis) -> None:
-    """Set the ends of an axis that are given; the others follow the marks."""
+    """Set the ends of an axis that are given and differ; the others follow the marks."""
     ends = (axis.high, axis.low) if axis.down else (axis.low, axis.high)
-    if ends != (None, None):
+    if ends[0] != ends[1]:
         getattr(axes, f"set_{name}lim")(*ends)
 
 

@@ -262,3 +262,6 @@ def test_axes_end_where_they_are_told_or_beyond_the_marks() -> None:
     low, high = y_window(Panel(Axis("y", log=True), (Line(np.arange(2.0), np.array([0.0, 10.0])),)))
     assert 0 < low < 10 < high
     assert y_window(Panel(Axis("y"), ())) == (1.0 - 0.45, 10.0 + 0.45)
+    # equal ends are none: the drawing follows the marks, without a warning
+    same = Chart((Stack((Panel(Axis("y", low=1.0, high=1.0), (line,)),), Axis("x")),))
+    assert np.diff(draw_chart(Look(), same).axes[0].get_ylim()) > 1.9
