@@ -56,7 +56,7 @@ def test_methods_with_other_exposures(exposures):
     for run in ("bright.zarr", "bright.yaml"):
         assert "methods     complete" in exposures.ok("status", run).stdout
     again = exposures.ok("methods", "bright.yaml", "--pixels", "20", "--study-pixels", "0", "--dry-run")
-    assert "input.chosen.pixels None -> 20" in again.stderr
+    assert "input.chosen.pixels None → 20" in again.stderr
     # what is up to date is not done again, and a wrong sample costs nothing of it
     before = (exposures.folder / "bright.zarr" / "methods.json").stat().st_mtime_ns
     for others, words in (

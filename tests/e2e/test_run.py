@@ -66,7 +66,7 @@ def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, fi
     assert rows["fit"] == "stale - fit.gap_threshold 5.0 -> 6.0  (with model 1)"
     assert rows["report"].startswith("stale")
     dry = shell.ok("run", "run.yaml", "--dry-run")
-    assert "fit: stale - fit.gap_threshold 5.0 -> 6.0 -> would run" in dry.stderr
+    assert "fit: stale - fit.gap_threshold 5.0 → 6.0 → would run" in dry.stderr
     shell.ok("run", "run.yaml", "--until", "ensemble")
     after = {stage: record(shell.folder / "run.zarr", stage) for stage in STAGES}
     same = [stage for stage in STAGES if before[stage] == after[stage]]

@@ -220,7 +220,7 @@ def find_members(
             continue
         # whatever a stranger's effect raises must not stop the others
         try:
-            starts = [*effect.estimate(evidence), *effect.typical()]
+            starts = [*effect.typical(), *effect.estimate(evidence)]
             found = [Member.of(start) for start in _distinct(starts) if _changes(start, evidence)]
         except Exception as error:
             failed[tag] = error_words(error)

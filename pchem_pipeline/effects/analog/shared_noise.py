@@ -14,11 +14,16 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from pchem_pipeline.effects.estimators.common_modes import responsivity
+from pchem_pipeline.effects.estimators.common_modes import (
+    line_excess,
+    mean_variance,
+    responsivity,
+    successive,
+)
 from pchem_pipeline.effects.families.offsets import OffsetEffect
 from pchem_pipeline.effects.framework.context import DIMS
 from pchem_pipeline.effects.framework.effect import Dn, SharedOffset, register_effect
-from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray
+from pchem_pipeline.effects.types import EffectContext, Evidence, FloatArray, TimeSeries
 from pchem_pipeline.model.arithmetic.significance import POSSIBLE
 
 
@@ -40,25 +45,13 @@ class SharedNoise(OffsetEffect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return by how much means of successive frames, or of their lines, differ beyond what chance makes.
-
-        That is told by the pixels of a line; of a frame by its rows or columns, which may have noise, too.
-        """
-        if evidence.time is None or not evidence.maps.usable.any():
+        """Return the excess variance of the means of rows (columns) within their frames (moment estimate)."""
+        if evidence.time is None:
             return ()
-        rows, columns = evidence.time.row_readout, evidence.time.column_readout
-        if cls.shared_by == "frame":
-            means = evidence.time.frame_readout[:, None]
-            own = max(float(np.nanvar(lines, axis=1).mean()) / lines.shape[1] for lines in (rows, columns))
-        else:
-            lines, axis = (rows, 1) if cls.shared_by == "row" else (columns, 0)
-            means = np.asarray(lines - np.nanmean(lines, axis=1, keepdims=True), np.float64)
-            variance = np.where(evidence.maps.usable, np.nan_to_num(evidence.readout_std) ** 2, 0.0)
-            number = evidence.maps.usable.sum(axis)
-            own = float((variance.sum(axis) / np.maximum(number, 1) ** 2.0)[number > 0].mean())
-            own *= 1.0 - 1.0 / (number > 0).sum()
-        excess = 0.5 * float(np.nanmean(np.diff(means, axis=0) ** 2)) - own
-        if not excess > POSSIBLE * own * (2.0 / np.isfinite(means).sum()) ** 0.5:
+        rows = cls.shared_by == "row"
+        means = evidence.time.row_readout if rows else evidence.time.column_readout
+        excess, error = line_excess(means, mean_variance(evidence, axis=1 if rows else 0))
+        if excess < POSSIBLE * error:
             return ()
         return (cls.model_validate({cls.strength: excess**0.5 / responsivity(evidence)}),)
 
@@ -156,3 +149,43 @@ class FrameNoise(SharedNoise):
 
     #: at 0.12 DN
     typical_values = ({"frame_noise_dn": 0.12},)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Sequence[Self]:
+        """Return the excess variance of successive frames, so that a slow drift does not count.
+
+        Half the mean squared difference of successive frame means, even and odd frames centred apart, less
+        what the noise of pixels, rows and columns gives.
+        """
+        if evidence.time is None:
+            return ()
+        expected = _expected(evidence, evidence.time)
+        steps = _steps(evidence.time)
+        if steps.size < 8 or not expected > 0:
+            return ()
+        excess = float((steps**2).mean() / 2.0 - expected)
+        # successive differences share a frame: their squares are correlated by 1/4
+        error = expected * np.sqrt(3.0 / steps.size)
+        if excess < POSSIBLE * error:
+            return ()
+        return (cls(frame_noise_dn=float(np.sqrt(excess)) / responsivity(evidence)),)
+
+
+def _expected(evidence: Evidence, time: TimeSeries) -> float:
+    """Return the variance, DN^2, that pixels, rows and columns by themselves give to frame means."""
+    expected = float(mean_variance(evidence))
+    for means, axis in ((time.row_readout, 1), (time.column_readout, 0)):
+        excess, error = line_excess(means, mean_variance(evidence, axis))
+        if excess > 2.0 * error:
+            expected += excess / means.shape[1]
+    return expected
+
+
+def _steps(time: TimeSeries) -> FloatArray:
+    """Return differences of the frame means of successive frames, DN, without even-odd contrast."""
+    means = time.frame_readout.astype(np.float64).copy()
+    for parity in (0, 1):
+        chosen = time.frames % 2 == parity
+        if chosen.any():
+            means[chosen] -= means[chosen].mean()
+    return np.asarray(np.diff(means)[successive(time.frames)], np.float64)

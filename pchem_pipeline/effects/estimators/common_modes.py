@@ -10,7 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from pchem_pipeline.effects.types import AnyArray, BoolArray, Evidence, FloatArray, IntArray
+from pchem_pipeline.effects.types import (
+    AnyArray,
+    BoolArray,
+    Evidence,
+    FloatArray,
+    IntArray,
+)
 
 
 def run_position(frames: IntArray, n_run: int) -> FloatArray:
@@ -18,9 +24,14 @@ def run_position(frames: IntArray, n_run: int) -> FloatArray:
     return np.asarray(frames.clip(0, n_run - 1) / max(n_run - 1, 1), np.float64)
 
 
-def responsivity(evidence: Evidence) -> float:
-    """Return the mean change of r per DN of a common offset, in (0, 1] (see the module's text)."""
-    ratio = (evidence.readout_std / evidence.maps.read_noise_dn)[evidence.maps.usable] ** 2
+def responsivity(evidence: Evidence, inside: BoolArray | None = None) -> float:
+    """Return the mean change of r per DN of a common offset, in (0, 1] (see the module's text).
+
+    Args:
+        evidence: of some pixels.
+        inside: those that count, (y, x); None: all.
+    """
+    ratio = _of_usable((evidence.readout_std / evidence.maps.read_noise_dn) ** 2, evidence, inside)
     ratio = ratio[np.isfinite(ratio)]
     return float(np.clip(ratio.mean(), 0.02, 1.0)) if ratio.size else 1.0
 
@@ -32,11 +43,47 @@ def mean_response(evidence: Evidence, inside: BoolArray | None = None) -> float:
         evidence: of some pixels.
         inside: those that count, (y, x); None: all.
     """
-    usable = evidence.maps.usable if inside is None else evidence.maps.usable & inside
-    return float(np.mean((evidence.readout_std / evidence.maps.read_noise_dn**2)[usable]))
+    return float(np.mean(_of_usable(evidence.readout_std / evidence.maps.read_noise_dn**2, evidence, inside)))
+
+
+def _of_usable(values: FloatArray, evidence: Evidence, inside: BoolArray | None) -> FloatArray:
+    usable = evidence.maps.usable
+    return values[usable if inside is None else usable & inside]
+
+
+def mean_variance(evidence: Evidence, axis: int | tuple[int, int] = (0, 1)) -> FloatArray:
+    """Return the variance, DN^2, that the pixels' own noise gives to means of r over usable pixels.
+
+    ``axis`` as in a sum over (y, x): both for frame means, 1 for row means, 0 for column means; NaN where
+    there is no usable pixel.
+    """
+    usable = evidence.maps.usable & np.isfinite(evidence.readout_std)
+    n = usable.sum(axis)
+    total = (np.where(usable, evidence.readout_std, 0.0) ** 2).sum(axis)
+    return np.asarray(np.where(n > 0, total / np.maximum(n, 1) ** 2, np.nan), np.float64)
 
 
 def successive(frames: AnyArray) -> BoolArray:
     """Return which frames follow the one before as closely as any here do, (n - 1,); of a period, all."""
     apart = np.diff(frames)
     return np.asarray(apart == apart.min(initial=apart.max(initial=1)))
+
+
+def line_excess(means: AnyArray, variance: FloatArray) -> tuple[float, float]:
+    """Return the variance of the lines' offsets beyond that of their pixels, and its standard error, DN^2.
+
+    Args:
+        means: mean of r of each line in each frame, shape (n, lines), NaN for lines without pixels.
+        variance: what the pixels' noise gives to each, shape (lines,), NaN for such lines.
+    """
+    good = np.isfinite(variance) & np.isfinite(means).all(axis=0)
+    n_frames, n_lines = means.shape[0], int(good.sum())
+    if n_lines < 2 or n_frames < 2:
+        return 0.0, np.inf
+    kept = means[:, good].astype(np.float64)
+    kept = kept - kept.mean(axis=1, keepdims=True)
+    kept -= kept.mean(axis=0)
+    expected = variance[good]
+    degrees = (n_frames - 1) * (n_lines - 1)
+    excess = float((kept**2).sum() / degrees - expected.mean())
+    return excess, float(np.sqrt(2.0 / degrees) * np.sqrt((expected**2).mean()))
