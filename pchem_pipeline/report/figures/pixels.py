@@ -213,7 +213,7 @@ def cells_chart(tables: Sequence[DataTable]) -> Chart:
     curve = Line(x, density["density"], colour="ink", label="fitted density" if histogram else "PCD")
     top = 1.28 * max(float(np.max(each)) for each in (curve.y, *(bars.values for bars in frames)))
     ends = np.full(edges.size, 0.86 * top)
-    dashed = Sticks(edges, ends, colour="blue", dash="--", width=0.9, label="limit between electron numbers")
+    dashed = Sticks(edges, ends, colour="blue", dash="--", width=0.9, label="limit between numbers k")
     cells = np.concatenate([[low], edges, [high]])
     every = max(1, int(np.ceil(len(cells) / _MOST_NUMBERS)))
     words = [
