@@ -64,8 +64,8 @@ def without_formulas(text: str) -> str:
     return _FORMULA.sub(characters, text).replace(r"\$", "$")
 
 
-#: Electrons in plain text, not a word that is broken at a hyphen.
-_PLAIN_E = re.compile(r"(?<![\w.])e-(?!\w)")
+#: Electrons in plain text, not a word that is broken at a hyphen, nor a part of a file's name.
+_PLAIN_E = re.compile(r"(?:(?<![\w./])|(?<=1/))e-(?!\w|\.\w)")
 
 
 def plain(text: str) -> str:

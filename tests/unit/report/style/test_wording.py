@@ -109,6 +109,8 @@ def test_the_units_of_maps_are_those_of_the_store(name: str) -> None:
 def test_plain_sentences_get_the_signs_of_a_page() -> None:
     plain = "5 -> 3 e-, 0.1 e-/DN: one-sided, 1e-3"
     assert typeset(plain) == "5 → 3 e⁻, 0.1 e⁻/DN: one-sided, 1e-3"
+    # names of files stay as they are
+    assert typeset("noise e-.tif in /data/e-/run: 2 e-.") == "noise e-.tif in /data/e-/run: 2 e⁻."
 
 
 def test_what_is_not_seen_in_a_name_is_written() -> None:
