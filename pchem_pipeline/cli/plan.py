@@ -49,8 +49,8 @@ def plan(
 
     From the Cramer-Rao bound; --verify simulates pixels and fits them.
     """
+    from pchem_pipeline.base.units import typeset
     from pchem_pipeline.commands.plan import PlanRequest, make_plan
-    from pchem_pipeline.report.style.wording import typeset
 
     request = PlanRequest(
         run=run, read_noise_e=read_noise, quanta_exposure=exposure, conversion_gain=gain,

@@ -11,8 +11,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined, to_jsonable_python
 
+from pchem_pipeline.base.units import typeset
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.report.style.wording import typeset
 
 _HEAD = """\
 # A run of pchem_pipeline. Every setting is shown with its default; delete what you do not change.

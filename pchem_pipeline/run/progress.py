@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, TextIO, TypeVar
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.report.style.wording import typeset
+from pchem_pipeline.base.units import typeset
 from pchem_pipeline.store.progress_file import ProgressFile
 
 T = TypeVar("T")

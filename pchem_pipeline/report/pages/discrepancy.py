@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from pchem_pipeline.base.units import typeset
 from pchem_pipeline.discrepancy.verdict import (
     CONVINCING_PLACEBO,
     RARE,
@@ -32,7 +33,6 @@ from pchem_pipeline.report.style.wording import (
     fitted_or_chosen,
     percent,
     short,
-    typeset,
     unit_text,
 )
 

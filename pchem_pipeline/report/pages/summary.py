@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from pchem_pipeline.base.units import typeset
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 from pchem_pipeline.model.checks.map_parts import Parts
@@ -25,7 +26,6 @@ from pchem_pipeline.report.style.wording import (
     scientific,
     short,
     symbol,
-    typeset,
 )
 
 Level = Literal["good", "note", "caution", "serious"]

@@ -64,10 +64,6 @@ def without_formulas(text: str) -> str:
     return _FORMULA.sub(characters, text).replace(r"\$", "$")
 
 
-#: Electrons in plain text, not a word that is broken at a hyphen, nor a part of a file's name.
-_PLAIN_E = re.compile(r"(?:(?<![\w./])|(?<=1/))e-(?!\w|\.\w)")
-
-
 def plain(text: str) -> str:
     """Return a text of others so that it is shown as it is, not read as a formula."""
     return text.replace("$", r"\$")
@@ -76,11 +72,6 @@ def plain(text: str) -> str:
 def unit_text(unit: str) -> str:
     """Return a stored unit as people write it, e.g. ``e-/DN`` as ``e⁻/DN``; ``1`` as nothing."""
     return _UNITS.get(unit, unit)
-
-
-def typeset(text: str) -> str:
-    """Return a plain sentence, as a verdict has it, with the signs of a page: ``e⁻``, ``→``."""
-    return _PLAIN_E.sub("e⁻", text.replace(" -> ", " → "))
 
 
 def symbol(name: str) -> tuple[str, str, str]:

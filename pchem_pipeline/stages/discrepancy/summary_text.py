@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pchem_pipeline.base.units import typeset
 from pchem_pipeline.discrepancy.verdict import (
     Place,
     Rival,
@@ -19,7 +20,7 @@ from pchem_pipeline.discrepancy.verdict import (
     sigma_text,
 )
 from pchem_pipeline.model.histogram.odd_frames import frame_words
-from pchem_pipeline.report.style.wording import fitted_or_chosen, typeset
+from pchem_pipeline.report.style.wording import fitted_or_chosen
 
 _WIDTH = 100
 #: Longer lists end with a count.

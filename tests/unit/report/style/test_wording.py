@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
+from pchem_pipeline.base.units import typeset
 from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.report.style.wording import (
     count,
@@ -15,7 +16,6 @@ from pchem_pipeline.report.style.wording import (
     short_name,
     signed,
     symbol,
-    typeset,
     unit_text,
     visible,
 )
