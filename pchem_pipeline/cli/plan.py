@@ -31,7 +31,7 @@ def plan(
     ] = None,
     max_exposure: Annotated[float, typer.Option(min=0.01, help="largest allowed exposure, e⁻")] = 10.0,
     max_frames: Annotated[float, typer.Option(min=1, help="largest allowed number of frames")] = 1e7,
-    verify: Annotated[bool, typer.Option("--verify", help="simulate the plan and fit it")] = False,
+    verify: Annotated[bool, typer.Option("--verify", help="simulate the plan with other pixels")] = False,
     pixels: Annotated[int, typer.Option(min=10, help="simulated pixels of --verify")] = 1000,
     seed: Annotated[int, typer.Option(min=0, help="random seed of --verify")] = 1,
     figure: Annotated[
@@ -47,7 +47,7 @@ def plan(
 ) -> None:
     """Compute how many frames are needed for a precision.
 
-    From the Cramer-Rao bound; --verify simulates pixels and fits them.
+    From the Cramer-Rao bound and simulated pixels; --verify simulates the plan with others.
     """
     from pchem_pipeline.base.units import typeset
     from pchem_pipeline.commands.plan import PlanRequest, make_plan

@@ -1,9 +1,8 @@
-"""``pchem plan``: the frames for a target, at once from the Cramer-Rao bound, and by simulation if asked."""
+"""``pchem plan``: the frames for a target, from the Cramer-Rao bound and from simulated pixels."""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.planning.frames import contour_data
-from pchem_pipeline.planning.plan import LEAST_SHARE, Plan, SamplesPlan, plan_one_sample, plan_samples
+from pchem_pipeline.planning.plan import Plan, SamplesPlan, plan_one_sample, plan_samples
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import Target, parse_target
 from pchem_pipeline.store.files import write_atomic, write_json
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.planning.verify import Verification
 
 _DEFAULT_GAIN = 0.09  # e-/DN, of the cameras that this package was made for
-_ROUNDS = 4
-_LARGEST_STEP = 3.0  # wrong maxima make errors that more frames end at once
 _ERRORS = ("wanted", "rmse", "rmse_stderr", "robust_sd")
 _FIGURES = (".svg", ".png", ".pdf")
 
@@ -41,9 +38,9 @@ class PlanRequest:
         samples: exposures separated by commas, or ``best``.
         max_exposure: largest exposure to choose, e-.
         max_frames: more are as good as never.
-        verify: simulate the plan.
-        pixels: simulated pixels.
-        seed: of the simulation.
+        verify: simulate the plan once more, with pixels of its own.
+        pixels: of these, their number.
+        seed: of this simulation.
         figure: file for the contours.
         json: file for the numbers.
     """
@@ -152,36 +149,34 @@ def _one(
         max_exposure=request.max_exposure,
         max_frames=request.max_frames,
     )
-    content = _plan_json(plan)
-    lines = _plan_lines(plan, request, exposure_given)
+    content = _plan_json(plan, targets)
+    lines = _plan_lines(plan, request, targets, exposure_given)
     if request.verify:
-        from pchem_pipeline.planning.verify import verify
-
-        wanted = targets or [Target("conversion_gain", 1.0, "%")]
-        checks = _verified(
-            request, plan.frames, lambda n, seed: verify(wanted, plan.point, n, request.pixels, seed)
+        check = _verified(
+            request, targets, point=plan.point, frames={plan.point.quanta_exposure: plan.frames}
         )
-        lines += ["", *(_check_line(check) for check in checks)]
-        content["verified"] = [_verification_json(check) for check in checks]
+        lines += ["", _check_line(check)]
+        content["verified"] = [_verification_json(check)]
     return lines, content
 
 
-def _plan_lines(plan: Plan, request: PlanRequest, exposure_given: bool) -> list[str]:
+def _plan_lines(
+    plan: Plan, request: PlanRequest, targets: Sequence[Target], exposure_given: bool
+) -> list[str]:
     point = plan.point
     at = f"exposure {point.quanta_exposure:.3g} e-{'' if exposure_given else ' (the best)'}"
     lines = [
         f"one sample, read noise {point.read_noise_e:.4g} e-, {at}, {point.conversion_gain:.3g} e-/DN",
         "",
     ]
-    for need in plan.needs:
-        words = f"{need.target!s:<34}{need.bound:>14,.0f} frames"
-        if need.seen > max(need.bound, need.certain):
-            words += f"; {need.seen:,.0f} to rule out a wrong gain"
-        elif need.certain > need.bound:
-            words += f"; {need.certain:,.0f} to rule out a bias off by one electron"
-        lines.append(words)
-    if plan.needs and request.frames is not None:
-        enough = max(need.frames for need in plan.needs) <= request.frames
+    lines += [
+        f"{target!s:<34}{bound:>14,.0f} frames (Cramer-Rao bound)"
+        for target, bound in zip(targets, plan.bounds, strict=True)
+    ]
+    if targets:
+        lines.append(f"{'simulated, at most 5 % flagged':<34}{plan.needed:>14,.0f} frames")
+    if targets and request.frames is not None:
+        enough = plan.needed <= request.frames
         lines.append(f"{request.frames:,} frames are {'enough' if enough else 'too few'}")
     lines += ["", f"with {plan.frames:,.0f} frames, 1 sigma error per pixel (Cramer-Rao bound):"]
     for name, value in plan.precision.items():
@@ -191,11 +186,11 @@ def _plan_lines(plan: Plan, request: PlanRequest, exposure_given: bool) -> list[
     if exposure_given and np.isfinite(plan.best_exposure):
         limit = " (the largest allowed)" if plan.best_exposure > 0.99 * request.max_exposure else ""
         best = f"best exposure: {plan.best_exposure:.3g} e-{limit}, {plan.best_frames:,.0f} frames"
-        lines += ["", f"{best}, no pixel flagged"]
+        lines += ["", f"{best}, no quantity flagged in 95 % of the pixels"]
     return lines
 
 
-def _plan_json(plan: Plan) -> dict[str, Any]:
+def _plan_json(plan: Plan, targets: Sequence[Target]) -> dict[str, Any]:
     return {
         "samples": 1,
         "read_noise_e": plan.point.read_noise_e,
@@ -203,14 +198,10 @@ def _plan_json(plan: Plan) -> dict[str, Any]:
         "conversion_gain": plan.point.conversion_gain,
         "frames": plan.frames,
         "targets": [
-            {
-                "target": str(need.target),
-                "frames_bound": need.bound,
-                "frames_certain": need.certain,
-                "frames_seen": need.seen,
-            }
-            for need in plan.needs
+            {"target": str(target), "frames_bound": bound}
+            for target, bound in zip(targets, plan.bounds, strict=True)
         ],
+        "frames_simulated": _finite(plan.needed),
         "precision": plan.precision,
         "best_exposure": _finite(plan.best_exposure),
         "best_frames": _finite(plan.best_frames),
@@ -222,30 +213,14 @@ def _finite(value: float) -> float | None:
 
 
 def _verified(
-    request: PlanRequest, frames: float, simulate: Callable[[int, int], Verification]
-) -> list[Verification]:
-    """Simulate; where the real fit falls short of the bound, again with the frames that it asks for.
+    request: PlanRequest, targets: Sequence[Target], point: Point, frames: Mapping[float, float]
+) -> Verification:
+    """Simulate a plan; ``frames`` has those of each exposure."""
+    from pchem_pipeline.planning.verify import verify
 
-    Args:
-        request: from the command line.
-        frames: to begin with.
-        simulate: takes a number of frames and a seed.
-    """
-    number, found = int(frames), []
-    for round_ in range(_ROUNDS):
-        result = simulate(number, request.seed + round_)
-        found.append(result)
-        short = max((check.rmse / check.wanted) ** 2 for check in result.checks)
-        reached = all(check.reached for check in result.checks)
-        if (
-            reached
-            or request.frames is not None
-            or not np.isfinite(short)
-            or number * short > request.max_frames
-        ):
-            break
-        number = int(np.ceil(number * min(short, _LARGEST_STEP)))
-    return found
+    aims = targets or [Target("conversion_gain", 1.0, "%")]
+    numbers = [max(int(np.ceil(n)), 2) for n in frames.values()]
+    return verify(aims, point, list(frames), numbers, request.pixels, request.seed)
 
 
 def _check_line(result: Verification) -> str:
@@ -296,21 +271,11 @@ def _several(
     )
     lines, content = _split_lines(plan, targets), _split_json(plan, targets)
     if request.verify:
-        checks = _verified(request, plan.frames, functools.partial(_verify_split, request, targets, plan))
-        lines += [*([""] if lines[-1] else []), *(_check_line(check) for check in checks)]
-        content["verified"] = [_verification_json(check) for check in checks]
+        frames = {h: float(n) for h, n in zip(plan.split.exposures, plan.per_sample, strict=True) if n}
+        check = _verified(request, targets, plan.point, frames)
+        lines += [*([""] if lines[-1] else []), _check_line(check)]
+        content["verified"] = [_verification_json(check)]
     return lines, content
-
-
-def _verify_split(
-    request: PlanRequest, targets: Sequence[Target], plan: SamplesPlan, frames: int, seed: int
-) -> Verification:
-    from pchem_pipeline.planning.verify import verify_samples
-
-    used = [(h, p) for h, p in zip(plan.split.exposures, plan.split.shares, strict=True) if p > LEAST_SHARE]
-    total = sum(p for _, p in used)
-    per_sample = [max(int(np.ceil(frames * p / total)), 2) for _, p in used]
-    return verify_samples(targets, plan.point, [h for h, _ in used], per_sample, request.pixels, seed)
 
 
 def _exposures(text: str) -> list[float] | None:
@@ -336,14 +301,12 @@ def _split_lines(plan: SamplesPlan, targets: Sequence[Target]) -> list[str]:
     for exposure, share, frames in zip(plan.split.exposures, plan.split.shares, plan.per_sample, strict=True):
         lines.append(f"{exposure:>14.3g}{100 * share:>8.1f} %{frames:>14,}")
     lines.append("")
-    if plan.certain > plan.split.frames:
-        lines.append(
-            f"Cramer-Rao bound: {plan.split.frames:,.0f}; more are needed to fix the electron numbers"
-        )
+    lines += [
+        f"Cramer-Rao bound: {plan.split.frames:,.0f} frames",
+        f"simulated, at most 5 % of the pixels flagged: {plan.needed:,.0f} frames",
+    ]
     if len(plan.split.exposures) > 1 and np.isfinite(plan.even):
-        lines.append(
-            f"evenly divided: {plan.even:,.0f} frames instead of {plan.split.frames:,.0f} (Cramer-Rao bound)"
-        )
+        lines.append(f"Cramer-Rao bound, evenly divided: {plan.even:,.0f} frames")
     return lines
 
 
@@ -358,7 +321,7 @@ def _split_json(plan: SamplesPlan, targets: Sequence[Target]) -> dict[str, Any]:
         "frames_per_sample": list(plan.per_sample),
         "frames_bound": _finite(plan.split.frames),
         "frames_evenly": _finite(plan.even),
-        "frames_certain": plan.certain,
+        "frames_simulated": plan.needed,
         "targets": [{"target": str(target)} for target in targets],
     }
 

@@ -8,42 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.model.fit.status import COUNTS_ELECTRONS
 from pchem_pipeline.planning.frames import best_exposure, exposure_grid, frames_needed, precision
-from pchem_pipeline.planning.likelihood_limits import ambiguity, gain_rival
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.split import Split, best_samples, best_split, split_frames
 from pchem_pipeline.planning.targets import Target
+from pchem_pipeline.planning.verify import frames_simulated
 
-#: Without so much knowledge of the gain, the bound says nothing about real fits.
+#: Without so much knowledge of the gain, one Gaussian fits as well.
 _SEEN = Target("conversion_gain", 25.0, "%")
 _TRIED = 10  # exposures
-#: Smaller shares are not worth a sample.
-LEAST_SHARE = 1e-3
-
-
-@dataclass(frozen=True)
-class Need:
-    """What one target asks for.
-
-    Attributes:
-        target: what is wanted.
-        bound: frames by the Cramer-Rao bound.
-        certain: frames until electron numbers are not off by one; 0 where that does not matter: at a given
-            exposure for a gain or a read noise.
-        seen: frames until the gain is known to a quarter, below which one Gaussian fits as well, and until no
-            other gain is as likely by chance.
-    """
-
-    target: Target
-    bound: float
-    certain: float
-    seen: float
-
-    @property
-    def frames(self) -> float:
-        """Frames for all of it."""
-        return max(self.bound, self.certain, self.seen)
+# smaller shares are not worth a sample.
+_LEAST_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -52,15 +27,17 @@ class Plan:
 
     Attributes:
         point: exposure, read noise and gain.
-        needs: one a target.
-        frames: that reach all targets; those of the budget where there is none.
+        bounds: frames for each target by the Cramer-Rao bound.
+        needed: frames with which simulated pixels reach all targets, few of them flagged.
+        frames: these, or those of the budget.
         precision: standard deviations with these frames, by parameter; relative, of the bias in e-.
         best_exposure: H with which the targets need the fewest frames, e-.
         best_frames: these frames.
     """
 
     point: Point
-    needs: tuple[Need, ...]
+    bounds: tuple[float, ...]
+    needed: float
     frames: float
     precision: dict[str, float]
     best_exposure: float
@@ -75,15 +52,15 @@ class SamplesPlan:
         point: read noise and gain.
         split: exposures, shares and frames in total by the bound.
         even: frames in total with the same exposures and even shares.
-        certain: frames in total until electron numbers are not off by one.
-        frames: in total, for both.
+        needed: frames in total with which simulated pixels reach the targets, few of them flagged.
+        frames: these, or those of the budget.
         per_sample: frames of each sample.
     """
 
     point: Point
     split: Split
     even: float
-    certain: float
+    needed: float
     frames: float
     per_sample: tuple[int, ...]
 
@@ -111,57 +88,46 @@ def plan_one_sample(
         ConfigError: a target that no number of frames reaches.
     """
     aims = tuple(targets) or (Target("conversion_gain", 1.0, "%"),)
-    best, best_frames = _best(aims, point, max_exposure)
+    best, best_frames = _best(aims, point, max_exposure, max_frames)
     if not exposure_given:
-        if not np.isfinite(best):
+        if not np.isfinite(best_frames):
             raise ConfigError(_hopeless(aims[0], point, "at any exposure", ""))
         point = replace(point, quanta_exposure=best)
-    needs = tuple(_need(target, point, sure=not exposure_given) for target in targets)
-    for need in needs:
-        _refuse(need, point, max_frames, best, best_frames)
-    frames = float(budget) if budget is not None else max(need.frames for need in needs)
-    return Plan(point, needs, frames, precision(point, frames), best, best_frames)
+    bounds = tuple(frames_needed(target, point) for target in targets)
+    needed = best_frames if not exposure_given else _needed(aims, point, max_frames)
+    if targets and needed > max_frames:
+        raise ConfigError(_out_of_reach(targets, bounds, point, max_frames, best, best_frames))
+    frames = needed if budget is None else float(budget)
+    return Plan(point, bounds, needed, frames, precision(point, frames), best, best_frames)
 
 
-def _need(target: Target, point: Point, *, sure: bool) -> Need:
-    """Return what a target asks for; ``sure``: no flag is to be left, of whatever quantity."""
-    certain = 0.0
-    if sure or target.name in COUNTS_ELECTRONS:
-        certain = ambiguity([point.quanta_exposure], [1.0], point.read_noise_e).frames()
-    seen = max(frames_needed(_SEEN, point), _gain_certain([point.quanta_exposure], [1.0], [target], point))
-    return Need(target, frames_needed(target, point), certain, seen)
+def _needed(targets: Sequence[Target], point: Point, most: float, *, every_flag: bool = False) -> float:
+    """Compute the frames under one exposure with which simulated pixels reach the targets."""
+    h = point.quanta_exposure
+    bound = max(frames_needed(target, point) for target in targets)
+    return frames_simulated(targets, point, [h], [1.0], bound, most, every_flag=every_flag)
 
 
-def _gain_certain(
-    exposures: Sequence[float], shares: Sequence[float], targets: Sequence[Target], point: Point
-) -> float:
-    """Return the frames until no other gain, farther away than what is wanted of it, is as likely."""
-    wanted = [target.wanted(point) for target in targets if target.name == "conversion_gain"]
-    nearest = max(0.1, 4 * min(wanted, default=0.0))
-    gap = gain_rival(exposures, shares, point.read_noise_e, min(nearest, 0.2), point.conversion_gain)
-    return gap.frames()
-
-
-def _refuse(need: Need, point: Point, max_frames: float, best: float, best_frames: float) -> None:
-    """Say in one line that a target is out of reach, and what would help.
-
-    Raises:
-        ConfigError: it is.
-    """
-    target = need.target
-    if need.frames > max_frames:
-        cure = ""
-        if best_frames <= max_frames and best_frames < 0.5 * need.frames:
-            cure = f"; an exposure of {best:.3g} e- needs {best_frames:,.0f}"
-        elif target.shared:
-            several = best_samples([target, _SEEN], point, max(point.quanta_exposure, 1.0))
-            if several.frames <= max_frames:
-                cure = f"; several samples (--samples best) need {several.frames:,.0f}"
-        # a larger number is as good as none
-        asked = f"{float(f'{need.frames:.2g}'):,.0f} frames" if need.frames < 1e12 else "no number suffices"
-        raise ConfigError(
-            _hopeless(target, point, f"at an exposure of {point.quanta_exposure:.3g} e-", f" ({asked}){cure}")
-        )
+def _out_of_reach(
+    targets: Sequence[Target],
+    bounds: Sequence[float],
+    point: Point,
+    max_frames: float,
+    best: float,
+    best_frames: float,
+) -> str:
+    """Say in one line that targets are out of reach, and what would help."""
+    asked, target = max(zip(bounds, targets, strict=True), key=lambda each: each[0])
+    cure = ""
+    if best_frames <= max_frames:
+        cure = f"; an exposure of {best:.3g} e- needs {best_frames:,.0f}"
+    elif target.shared:
+        several = best_samples([target, _SEEN], point, max(point.quanta_exposure, 1.0))
+        if several.frames <= max_frames:
+            cure = f"; several samples (--samples best) need at least {several.frames:,.0f}"
+    # a larger number is as good as none
+    bound = f" (bound: {float(f'{asked:.2g}'):,.0f} frames)" if asked < 1e12 else " (no number suffices)"
+    return _hopeless(target, point, f"at an exposure of {point.quanta_exposure:.3g} e-", f"{bound}{cure}")
 
 
 def _hopeless(target: Target, point: Point, where: str, more: str) -> str:
@@ -171,31 +137,27 @@ def _hopeless(target: Target, point: Point, where: str, more: str) -> str:
     )
 
 
-def _best(targets: Sequence[Target], point: Point, max_exposure: float) -> tuple[float, float]:
-    """Return the best exposure and its frames: those of the bound, and until nothing is flagged.
+def _best(
+    targets: Sequence[Target], point: Point, max_exposure: float, max_frames: float
+) -> tuple[float, float]:
+    """Return the exposure with the fewest frames until few pixels are flagged, of whatever quantity.
 
-    Where the bound's best will not do, the others are tried in the order of their bounds, as long as these
-    promise anything.
+    Exposures are simulated in the order of their bounds, as long as these promise anything.
     """
     low = min(0.02, 0.1 * max_exposure)
-    aims = (*targets, _SEEN)
-    first, fewest = best_exposure(aims, point, low, max_exposure)
+    first, fewest = best_exposure((*targets, _SEEN), point, low, max_exposure)
     if not np.isfinite(first):
         return first, fewest
-    others = [replace(point, quanta_exposure=float(h)) for h in exposure_grid(low, max_exposure, _TRIED)]
-    promises = [(max(frames_needed(target, there) for target in aims), there) for there in others]
-    promises.append((fewest, replace(point, quanta_exposure=first)))
-    promises.sort(key=lambda each: each[0])
+    tried = [first, *exposure_grid(low, max_exposure, _TRIED).tolist()]
+    points = [replace(point, quanta_exposure=h) for h in tried]
+    promises = [(max(frames_needed(target, there) for target in targets), there) for there in points]
     best, frames = first, float("inf")
-    for bound, there in promises:
+    for bound, there in sorted(promises, key=lambda each: each[0]):
         if bound >= frames:
             break
-        h = there.quanta_exposure
-        certain = _gain_certain([h], [1.0], targets, there)
-        if certain < frames:
-            certain = max(certain, ambiguity([h], [1.0], point.read_noise_e).frames())
-        if max(bound, certain) < frames:
-            best, frames = h, max(bound, certain)
+        needed = _needed(targets, there, min(frames, max_frames), every_flag=True)
+        if needed < frames:
+            best, frames = there.quanta_exposure, needed
     return best, frames
 
 
@@ -227,20 +189,16 @@ def plan_samples(
     else:
         split = best_split(aims, exposures, point)
     # too few frames to be worth a sample of their own
-    kept = [(h, p) for h, p in zip(split.exposures, split.shares, strict=True) if p > LEAST_SHARE]
-    certain = 0.0
-    if any(exposure > 0 for exposure, _ in kept):
-        used, parts = [h for h, _ in kept], [p for _, p in kept]
-        certain = ambiguity(used, parts, point.read_noise_e).frames()
-        certain = max(certain, _gain_certain(used, parts, targets, point))
-    frames = max(split.frames, certain)
+    kept = [(h, p) for h, p in zip(split.exposures, split.shares, strict=True) if p > _LEAST_SHARE]
+    used, parts = [h for h, _ in kept], [p for _, p in kept]
+    frames = frames_simulated(targets, point, used, parts, split.frames, max_frames)
     if frames > max_frames:
         lights = ", ".join(f"{h:g}" for h in split.exposures)
         raise ConfigError(
             f"{targets[0]}: not reached within --max-frames with exposures of {lights} e- and a read noise "
             f"of {point.read_noise_e:g} e-; give other exposures, at least one above 0"
         )
-    total = float(budget) if budget is not None else frames
+    total = frames if budget is None else float(budget)
     even = split_frames(aims, split.exposures, [1.0 / len(split.shares)] * len(split.shares), point)
-    per_sample = tuple(int(np.ceil(share * total)) if share > LEAST_SHARE else 0 for share in split.shares)
-    return SamplesPlan(point, split, even, certain, total, per_sample)
+    per_sample = tuple(int(np.ceil(share * total)) if share > _LEAST_SHARE else 0 for share in split.shares)
+    return SamplesPlan(point, split, even, frames, total, per_sample)
