@@ -30,6 +30,7 @@ from pchem_pipeline.cli.options import (
     Workers,
     on_this_machine,
     region_of,
+    say,
     takes_command,
 )
 from pchem_pipeline.cli.plan import plan
@@ -184,7 +185,7 @@ def discrepancy(
     command = replace(command, options=replace(command.options, roi=region_of(roi)))
     text = find_and_add(find_run(target), command, refit=refit, effort=effort)
     if text:
-        typer.echo(text)
+        say(text)
 
 
 @app.command()
@@ -231,7 +232,8 @@ def status(
     from pchem_pipeline.run.target import find_run
 
     terminal = sys.stdout.isatty()
-    follow(find_run(target), typer.echo, follow=watch, as_json=as_json, terminal=terminal)
+    write = typer.echo if as_json else say
+    follow(find_run(target), write, follow=watch, as_json=as_json, terminal=terminal)
 
 
 @app.command()
@@ -249,10 +251,13 @@ def model(
 
     run = find_run(target)
     if use is not None:
-        typer.echo(use_model(run, use))
+        say(use_model(run, use))
     else:
         models = list_models(run)
-        typer.echo(models_json(models) if as_json else "\n".join(model_lines(models)))
+        if as_json:
+            typer.echo(models_json(models))
+        else:
+            say("\n".join(model_lines(models)))
 
 
 @app.command()
@@ -395,8 +400,7 @@ def demo(
     """
     from pchem_pipeline.commands.demo import run_demo
 
-    text = run_demo(output, size=size, n_frames=frames, seed=seed, hidden=hidden, quiet=quiet)
-    typer.echo(text)
+    say(run_demo(output, size=size, n_frames=frames, seed=seed, hidden=hidden, quiet=quiet))
 
 
 def _version(wanted: bool) -> None:

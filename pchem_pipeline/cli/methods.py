@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pchem_pipeline.cli.options import Target, takes_command
+from pchem_pipeline.cli.options import Target, say, takes_command
 
 if TYPE_CHECKING:
     from pchem_pipeline.runner.session import Command
@@ -44,4 +44,4 @@ def methods(
     known = {name: value for name, value in given.items() if value is not None}
     text = compare_methods(find_run(target), command, known)
     if text:
-        typer.echo(text)
+        say(text)

@@ -200,6 +200,13 @@ def region_of(text: str | None) -> tuple[int, int, int, int] | None:
     return y0, y1, x0, x1
 
 
+def say(text: str) -> None:
+    """Print sentences with the signs of a page: ``e⁻``, ``→``."""
+    from pchem_pipeline.base.units import typeset
+
+    typer.echo(typeset(text))
+
+
 def _command(
     *,
     force: bool = False,

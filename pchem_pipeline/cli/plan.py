@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pchem_pipeline.cli.options import on_this_machine
+from pchem_pipeline.cli.options import on_this_machine, say
 
 
 def plan(
@@ -49,7 +49,6 @@ def plan(
 
     From the Cramer-Rao bound and simulated pixels; --verify simulates the plan with others.
     """
-    from pchem_pipeline.base.units import typeset
     from pchem_pipeline.commands.plan import PlanRequest, make_plan
 
     request = PlanRequest(
@@ -57,4 +56,4 @@ def plan(
         targets=tuple(target or ()), frames=frames, samples=samples, max_exposure=max_exposure,
         max_frames=max_frames, verify=verify, pixels=pixels, seed=seed, figure=figure, json=json,
     )  # fmt: skip
-    typer.echo(typeset(make_plan(request)))
+    say(make_plan(request))
