@@ -75,8 +75,9 @@ def _run_frames(
 ) -> None:
     source = open_source(context)
     block_length(source.shape[0], context.config.discrepancy.block_frames)
-    settings, seen, whole = _surveyed(context, source, before, roi, tell)
-    search = _Search(context, source, before, roi, seen, tell)
+    model = (*before, *_limits(context, before))
+    settings, seen, whole = _surveyed(context, source, model, roi, tell)
+    search = _Search(context, source, model, roi, seen, tell)
     window, found = search.found(settings, "")
     elsewhere = search.elsewhere(settings, "elsewhere-", window, found)
     if elsewhere is not None and elsewhere.deviates and whole != settings:
@@ -100,7 +101,7 @@ class _Search:
     Attributes:
         context: of the stage.
         source: the frames.
-        before: effects that the model had.
+        model: its effects, the limits of the ADC among them.
         roi: rows and columns that the user asked for.
         seen: what was seen of the whole sensor.
         tell: hears what is done next.
@@ -109,7 +110,7 @@ class _Search:
 
     context: StageContext
     source: FrameSource
-    before: Sequence[Effect]
+    model: Sequence[Effect]
     roi: tuple[int, ...] | None
     seen: Survey
     tell: Callable[[str], None]
@@ -123,7 +124,7 @@ class _Search:
             window.times,
             settings,
             **self._taken(window),
-            model=(*self.before, *_limits(self.context, self.before)),
+            model=tuple(self.model),
             mapper=_Mapper(self.context, prefix),
             tell=self.tell,
         )
@@ -175,7 +176,7 @@ class _Search:
 def _surveyed(
     context: StageContext,
     source: FrameSource,
-    before: Sequence[Effect],
+    model: Sequence[Effect],
     roi: tuple[int, ...] | None,
     tell: Callable[[str], None],
 ) -> tuple[DiscrepancySettings, Survey, DiscrepancySettings]:
@@ -207,7 +208,7 @@ def _surveyed(
             context.note(
                 f"excluded, empty, repeated, outlying or moved: {frame_words(np.array(seen.left_out))}"
             )
-        most, few = settings, fewer_samples(source, settings, roi, seen) if not before else settings
+        most, few = settings, fewer_samples(source, settings, roi, seen, model)
         if few != settings:
             context.note(
                 f"clear disagreement in {few.max_samples:,} samples, so no more are compared; for smaller "

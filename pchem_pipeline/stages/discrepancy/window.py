@@ -20,6 +20,7 @@ from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.scan import Suspect, integral
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
+from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 
 if TYPE_CHECKING:
@@ -262,6 +263,7 @@ def fewer_samples(
     settings: DiscrepancySettings,
     roi: Sequence[int] | None,
     seen: Survey,
+    model: Sequence[Effect],
 ) -> DiscrepancySettings:
     """Return the settings with as few samples to be compared as show the disagreement beyond any doubt.
 
@@ -272,7 +274,10 @@ def fewer_samples(
         settings: as configured, or as the memory allows.
         roi: rows and columns that the user asked for.
         seen: what the survey found.
+        model: its effects; where there are any, only a simulation tells what disagrees with them.
     """
+    if model:
+        return settings
     most = seen.window(source.shape, settings, roi).share(source.shape)
     samples = settings.clear_samples
     while samples < settings.max_samples:
