@@ -501,13 +501,11 @@ class Neighbours:
 
     Attributes:
         correlation: mean over all pairs.
-        products: number of them.
         z: statistic of all pairs.
         deviation: of each pixel and the next one, N(0, 1) by chance; NaN where one is not usable, (y, x).
     """
 
     correlation: float
-    products: int
     z: float
     deviation: FloatArray
 
@@ -536,7 +534,6 @@ def _neighbours(view: FrameView, axis: str) -> dict[str, Neighbours]:
         deviation[one][both] = excess * np.sqrt(n / variance[both])
         found[kind] = Neighbours(
             float(np.mean(excess / size[both])),
-            n * pairs * (2 if kind == "rk" else 1),
             float(np.sum(deviation[one][both]) / np.sqrt(pairs)),
             deviation,
         )

@@ -158,8 +158,8 @@ class TimeSeries:
         frame_readout: mean of r over the usable pixels, DN, shape (n,).
         frame_gain: slope of r against k - H over the usable pixels of a frame, in units of 1/g: relative
             deviation of the gain (DN/e-) of each frame, shape (n,).
-        quadrant_charge, quadrant_readout: the same two for each quadrant (top left, top right, bottom left,
-            bottom right), shape (n, 4).
+        quadrant_readout: mean of r of each quadrant, DN (top left, top right, bottom left, bottom right),
+            shape (n, 4).
         row_charge: mean of k - H of each row, e-, shape (n, y).
         row_readout: mean of r of each row, DN, shape (n, y).
         column_charge: mean of k - H of each column, e-, shape (n, x).
@@ -170,12 +170,10 @@ class TimeSeries:
             removed as for the neighbours, and without the bias of a centred series, shape (3, y, x).
         lag_readout: autocorrelation of r, shape (3, y, x).
         lag_readout_charge: correlation of r at t with k at t - 1, shape (y, x).
-        lag_charge_readout: correlation of k at t with r at t - 1, shape (y, x).
         n_pairs: number of pairs of frames behind a lag-1 correlation.
         neighbours: correlation of neighbouring pixels in the same frame, mean over all pairs of usable
             pixels: "x.kk", "x.rr", "x.rk" (readout of one with charge of the other, both ways) and the same
             for "y", with the mean taken after the frame's common mode was removed.
-        neighbour_pairs: number of products behind each of them.
         neighbour_maps: by the same names the correlation of each pixel with the next one along the axis, over
             its standard error by chance, shape (y, x); NaN without one.
         repeated: frame numbers that are, sample by sample, the frame before, shape (n_repeated,).
@@ -201,7 +199,6 @@ class TimeSeries:
     frame_charge: NDArray[np.float64]
     frame_readout: NDArray[np.float64]
     frame_gain: NDArray[np.float64]
-    quadrant_charge: NDArray[np.float64]
     quadrant_readout: NDArray[np.float64]
     row_charge: NDArray[np.float32]
     row_readout: NDArray[np.float32]
@@ -212,10 +209,8 @@ class TimeSeries:
     lag_charge: NDArray[np.float32]
     lag_readout: NDArray[np.float32]
     lag_readout_charge: NDArray[np.float32]
-    lag_charge_readout: NDArray[np.float32]
     n_pairs: int
     neighbours: Mapping[str, float]
-    neighbour_pairs: Mapping[str, int]
     repeated: NDArray[np.int64]
     repeated_rows: int
     hits: NDArray[np.int64]
