@@ -15,10 +15,10 @@ from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.expected_information import inverse_information
 from pchem_pipeline.model.errors.fisher import expected_scores
 from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_may_matter
-from pchem_pipeline.model.fit import engine, guard_numba, profile, profile_numba, search_numba, tile_numba
+from pchem_pipeline.model.fit import engine, profile, profile_numba, search_numba, tile_numba
 from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, Limits
 from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
-from pchem_pipeline.model.fit.guard import fit_guarded
+from pchem_pipeline.model.fit.guard import expected_counts, far_samples, fit_guarded, leave_out
 from pchem_pipeline.model.fit.result import FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus, with_rivals_named
@@ -253,25 +253,22 @@ class _Batch:
 
     def resume(self, plain: FitResult) -> FitResult:
         """Leave out the samples that a fit with the density left out; return it."""
-        self.leave_out_again(
-            plain.columns, plain.outlier_share, [SampleLaw()] * self.n_samples, self.limits(None)
-        )
+        self.leave_out_again(plain.columns, plain.outlier_share, None, np.zeros((self.n, 2)))
         return plain
 
     def leave_out_again(
-        self, columns: FloatArray, outlier_share: FloatArray, laws: Sequence[SampleLaw], limits: Limits
+        self,
+        columns: FloatArray,
+        outlier_share: FloatArray,
+        laws: Sequence[SampleLaw] | None,
+        satellites: FloatArray,
     ) -> None:
-        """Leave out the samples that a fit under these laws left out."""
+        """Leave out the samples that a fit under these laws (None: with the density) left out."""
         pixels = np.flatnonzero(outlier_share > 0)
         if self.settings.tail_guard > 0 and pixels.size:
-            answers = self._answers(self.n)
-            answers.parameters[:] = columns
-            gone = outlier_share * self.given.counts.sum(axis=1, dtype=np.float64)
-            evaluate = cells_likelihood() if limits.cells else density_likelihood()
-            guard_numba.leave_out_tile(
-                *(self.given, pixels, pack(laws, self.n), limits, evaluate, answers),
-                *(gone, np.zeros(self.n, np.bool_)),
-            )
+            gone = outlier_share[pixels] * self.given.counts[pixels].sum(axis=1, dtype=np.float64)
+            expected = expected_counts(self.given, pixels, laws, columns[pixels], satellites[pixels], gone)
+            leave_out(self.given, pixels, expected < self.settings.tail_guard)
 
     def set_aside(self, plain: FitResult, intervals: Sequence[Interval]) -> None:
         """Set codes aside, but for pixels of which too few would be left."""
@@ -382,12 +379,12 @@ class _Batch:
                     answers,
                 )
 
-        def leave_out(pixels: NDArray[np.intp], gone: FloatArray) -> NDArray[np.bool_]:
-            changed = np.zeros(n, np.bool_)
-            guard_numba.leave_out_tile(given, pixels, packed, limits, evaluate, answers, gone, changed)
-            return changed[pixels]
+        def expect(pixels: NDArray[np.intp], gone: FloatArray) -> FloatArray:
+            satellites = answers.out[pixels][:, [search_numba.AMPLITUDE, search_numba.SATELLITE_WEIGHT]]
+            own = laws if cells else None
+            return expected_counts(given, pixels, own, answers.parameters[pixels], satellites, gone)
 
-        fit_guarded(fit, leave_out, given, limits, answers)
+        fit_guarded(fit, expect, given, limits, answers)
         return answers
 
     def _answers(self, n: int) -> Answers:
@@ -412,7 +409,7 @@ class _Batch:
         limits, evaluate = self.limits(laws), cells_likelihood() if laws else density_likelihood()
         laws = laws or [SampleLaw()]
         columns = np.ascontiguousarray(known[:, :4])
-        self.leave_out_again(columns, outlier_share, laws, limits)
+        self.leave_out_again(columns, outlier_share, laws if limits.cells else None, satellites)
         reach = np.where(known[:, 4] < _RIVAL_GAP, _RIVAL_REACH, 0.0)
         law = pack(laws, self.n)
         return profile.moments_along_bias(self.given, law, limits, evaluate, columns, satellites, reach)
@@ -631,10 +628,8 @@ def _count_near(given: Histograms) -> None:
 
     Another law may expect them: satellite peaks, tails.
     """
-    gone = np.zeros(given.counts.shape[0])
-    guard_numba.cut_tile(given, np.arange(gone.size), 0.0, np.empty((0, 0), np.uint8), gone)
-    near = np.flatnonzero(gone == 0)
-    given.mask[near] = np.where(given.mask[near] == LEFT_OUT, np.uint8(COUNTED), given.mask[near])
+    near = np.flatnonzero(~far_samples(given)[1])
+    leave_out(given, near, np.zeros((near.size, given.counts.shape[1]), np.bool_))
 
 
 def _reshapes(law: SampleLaw) -> bool:

@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.law.mass import sample_mass, sample_slopes
-from pchem_pipeline.model.law.mass_numba import LEAST_SEEN
+from pchem_pipeline.model.law.mass import LEAST_SEEN, sample_mass, sample_slopes, score_and_information
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
@@ -319,10 +318,8 @@ class Tangent:
 
     def slopes(self, counts: NDArray[np.integer]) -> Slopes:
         """Return score and information of histograms, shape (n, B)."""
-        seen = np.where(self.problem.kept, counts, 0).astype(np.float64)
-        score = np.einsum("nab,nb->na", self.derivatives, seen)
-        weighted = self.derivatives * (self.masses * seen.sum(axis=1)[:, None])[:, None, :]
-        information = weighted @ self.derivatives.transpose(0, 2, 1)
+        seen = np.where(self.problem.kept, counts, 0)
+        score, information = score_and_information(self.derivatives, self.masses, seen)
         information, score = self.problem.samples.by_pixel(information, score)
         own = self.problem.samples.n_exposures + 3
         shared_score = score[:, own:].sum(axis=0)
