@@ -15,16 +15,16 @@ from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.expected_information import inverse_information
 from pchem_pipeline.model.errors.fisher import expected_scores
 from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_may_matter
-from pchem_pipeline.model.fit import engine, profile, profile_numba, search_numba, tile_numba
+from pchem_pipeline.model.fit import engine, search_numba, tile_numba
 from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, Limits
 from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
 from pchem_pipeline.model.fit.guard import expected_counts, far_samples, fit_guarded, leave_out
+from pchem_pipeline.model.fit.profile import Moments, Profile, moments_along_bias
 from pchem_pipeline.model.fit.result import FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus, with_rivals_named
 from pchem_pipeline.model.fit.tile_numba import Answers, Histograms, Starts
 from pchem_pipeline.model.law.inputs import kernel_counts, pack
-from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -138,7 +138,7 @@ def likelihood_moments(
     satellites: FloatArray | None = None,
     settings: FitSettings | None = None,
     adc_limits: tuple[int, int] | None = None,
-) -> profile.Moments:
+) -> Moments:
     """Return mean square deviations of (H, g, mu, sigma) from their estimates, of pixels that are fitted.
 
     The inverse information is the covariance of a likelihood that falls as a normal law does. Where the read
@@ -171,7 +171,7 @@ def likelihood_moments(
             given = SampleLaw() if law is None else law.of(pixels)
             own = batch.between_limits(given) if cells[pixels[0]] else None
             parts.append((pixels, batch.moments(known[pixels], outlier_share[pixels], own, free[pixels])))
-    return profile.Moments.joined(len(known), parts)
+    return Moments.joined(len(known), parts)
 
 
 def satellite_threshold(law: SampleLaw) -> float:
@@ -358,7 +358,7 @@ class _Batch:
         answers = self._answers(n)
         packed = pack(laws, n)
         cells = limits.cells
-        evaluate = cells_likelihood() if cells else density_likelihood()
+        evaluate = engine.likelihood(cells)
         search = engine.cells_search() if cells else engine.density_search()
 
         def fit(pixels: NDArray[np.intp], quick: bool) -> None:
@@ -404,15 +404,13 @@ class _Batch:
         outlier_share: FloatArray,
         laws: Sequence[SampleLaw] | None,
         satellites: FloatArray,
-    ) -> profile.Moments:
+    ) -> Moments:
         """Return moments over the likelihood of the cells under these laws, or of the density."""
-        limits, evaluate = self.limits(laws), cells_likelihood() if laws else density_likelihood()
-        laws = laws or [SampleLaw()]
         columns = np.ascontiguousarray(known[:, :4])
-        self.leave_out_again(columns, outlier_share, laws if limits.cells else None, satellites)
+        self.leave_out_again(columns, outlier_share, laws, satellites)
+        law, limits = pack(laws or [SampleLaw()], self.n), self.limits(laws)
         reach = np.where(known[:, 4] < _RIVAL_GAP, _RIVAL_REACH, 0.0)
-        law = pack(laws, self.n)
-        return profile.moments_along_bias(self.given, law, limits, evaluate, columns, satellites, reach)
+        return moments_along_bias(Profile(self.given, law, limits, columns, satellites), columns, reach)
 
     # -- what they are told
 
@@ -605,21 +603,14 @@ class _Batch:
             if some.size == 0:
                 continue
             chosen = (laws or self.neutral()) if cells else [SampleLaw()] * self.n_samples
-            part = np.full((some.size, *ends.shape[1:]), np.nan)
             satellites = np.stack([found.satellite_amplitude_e[some], found.satellite_weight[some]], axis=1)
-            profile_numba.profile_tile(
-                self.given._replace(
-                    counts=self.given.counts[some], origin=self.given.origin[some], mask=self.given.mask[some]
-                ),
-                pack([each.of(some) for each in chosen], some.size),
-                self.limits(chosen if cells else None),
-                cells_likelihood() if cells else density_likelihood(),
-                engine.climb(),
-                profile_numba.Maxima(found.columns[some], np.nan_to_num(satellites)),
-                quantile_of(self.settings.interval_level),
-                part,
+            given = self.given._replace(
+                counts=self.given.counts[some], origin=self.given.origin[some], mask=self.given.mask[some]
             )
-            ends[some] = part
+            law = pack([each.of(some) for each in chosen], some.size)
+            limits = self.limits(chosen if cells else None)
+            near = Profile(given, law, limits, found.columns[some], np.nan_to_num(satellites))
+            ends[some] = near.ends(quantile_of(self.settings.interval_level))
         return ends
 
 
