@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -325,15 +326,7 @@ class _Batch:
     ) -> FitResult:
         """Fit with the cells from parameters that are near; ``warm``: of a fit with nearly these laws."""
         some = np.arange(self.n) if pixels is None else pixels
-        whole = some.size == self.n
-        given = (
-            self.given
-            if whole
-            else self.given._replace(
-                counts=self.given.counts[some], origin=self.given.origin[some], mask=self.given.mask[some]
-            )
-        )
-        own = laws if whole else [each.of(some) for each in laws]
+        given, own = self._given_of(some), [each.of(some) for each in laws]
         gap = np.full(some.size, np.inf) if gaps is None else gaps[some]
         for each in own:  # the plain fit of an exposure that is not one may be an electron off
             mixed = ((each.added_weights > 0.0) & (each.added_exposure > 0.0)).any(axis=1)
@@ -349,9 +342,13 @@ class _Batch:
         if not adjust:
             _count_near(given)
         answers = self._fit(given, own, starts, limits)
-        if not whole:
-            self.given.mask[some] = given.mask
+        self.given.mask[some] = given.mask
         return self._result(answers, cells=True, adjust=adjust, pixels=some)
+
+    def _given_of(self, some: NDArray[np.intp]) -> Histograms:
+        """Return copies of the histograms of some pixels."""
+        counts, places, origin, dark, mask = self.given
+        return Histograms(counts[some], places, origin[some], dark, mask[some])
 
     def _fit(self, given: Histograms, laws: Sequence[SampleLaw], starts: Starts, limits: Limits) -> Answers:
         n = given.counts.shape[0]
@@ -445,24 +442,28 @@ class _Batch:
         low: FloatArray | int | None
         high: FloatArray | int | None
         low, high = self.adc_limits or (None, None)
-        if self.adc_limits is not None and (none := self._reaches_adc(slice(None), beyond=1)).any():
+        if self.adc_limits is not None and (none := self._reaches_adc(beyond=1)).any():
             low, high = (np.where(none, np.nan, limit) for limit in self.adc_limits)
         laws = [law] * self.n_samples if isinstance(law, SampleLaw) else law
         return [each.between(low, high) for each in laws]
 
+    @cached_property
+    def _extremes(self) -> tuple[FloatArray, FloatArray]:
+        """Smallest and largest code of each sample, those left out included, (n, J); NaN without any."""
+        found = np.full((2, self.n, self.n_samples), np.nan)
+        for j in np.flatnonzero(np.diff(self.given.places)):
+            seen = self.given.counts[:, self.given.places[j] : self.given.places[j + 1]] > 0
+            ends = np.stack([seen.argmax(axis=1), seen.shape[1] - 1 - seen[:, ::-1].argmax(axis=1)])
+            found[:, :, j] = np.where(seen.any(axis=1), self.given.origin[:, j] + ends, np.nan)
+        return found[0], found[1]
+
     def _at_limits(self, laws: Sequence[SampleLaw]) -> NDArray[np.bool_]:
         """Tell in which pixels codes pile up at a limit of the law."""
-        found = np.zeros(self.n, np.bool_)
+        (low, high), found = self._extremes, np.zeros(self.n, np.bool_)
         for j, each in enumerate(laws):
-            part = slice(self.given.places[j], self.given.places[j + 1])
-            codes = self.given.origin[:, j, None] + np.arange(part.stop - part.start)
-            beyond = np.zeros(codes.shape, np.bool_)
             # of some pixels there may be no limit: NaN is below and above nothing
-            if each.clip_low is not None:
-                beyond |= codes <= np.reshape(each.clip_low, (-1, 1))
-            if each.clip_high is not None:
-                beyond |= codes >= np.reshape(each.clip_high, (-1, 1))
-            found |= (beyond & (self.given.counts[:, part] > 0)).any(axis=1)
+            found |= low[:, j] <= (np.nan if each.clip_low is None else each.clip_low)
+            found |= high[:, j] >= (np.nan if each.clip_high is None else each.clip_high)
         return found
 
     def _coarse(self, plain: FitResult) -> NDArray[np.bool_]:
@@ -523,7 +524,7 @@ class _Batch:
                 loose = np.sqrt(covariance[:, n, n]) > _LOOSE * parameters[:, n]
             status[loose] |= FitStatus.NOT_INFORMATIVE
         if self.adc_limits is not None:
-            status[self._reaches_adc(some)] |= FitStatus.ADC_LIMIT
+            status[self._reaches_adc()[some]] |= FitStatus.ADC_LIMIT
         status = with_rivals_named(status, dark=bool(np.any(self.given.dark)), several=n > 1)
         failed = (status & int(FAILED)) != 0
         parameters[failed] = np.nan
@@ -575,18 +576,12 @@ class _Batch:
             freedom[few] += 4.0 - np.clip(np.nan_to_num(known, nan=4.0), 0.0, 4.0)
         return freedom
 
-    def _reaches_adc(self, pixels: NDArray[np.intp] | slice, beyond: int = 0) -> NDArray[np.bool_]:
+    def _reaches_adc(self, beyond: int = 0) -> NDArray[np.bool_]:
         """Tell which pixels have samples at the limits of the ADC or ``beyond``, those left out included."""
         assert self.adc_limits is not None
+        low, high = self._extremes
         first, last = self.adc_limits[0] - beyond, self.adc_limits[1] + beyond
-        found = np.zeros(self.n, np.bool_)[pixels]
-        for j in range(self.n_samples):
-            counts = self.given.counts[pixels, self.given.places[j] : self.given.places[j + 1]] > 0
-            seen = counts.any(axis=1)
-            low = self.given.origin[pixels, j] + counts.argmax(axis=1)
-            high = self.given.origin[pixels, j] + counts.shape[1] - 1 - counts[:, ::-1].argmax(axis=1)
-            found |= seen & ((low <= first) | (high >= last))
-        return found
+        return np.asarray(((low <= first) | (high >= last)).any(axis=1))
 
     def intervals(self, found: FitResult, laws: Sequence[SampleLaw] | None) -> FloatArray:
         """Return the ends of profile-likelihood intervals, (n, J + 4, 2); NaN where there are none.
@@ -604,12 +599,9 @@ class _Batch:
                 continue
             chosen = (laws or self.neutral()) if cells else [SampleLaw()] * self.n_samples
             satellites = np.stack([found.satellite_amplitude_e[some], found.satellite_weight[some]], axis=1)
-            given = self.given._replace(
-                counts=self.given.counts[some], origin=self.given.origin[some], mask=self.given.mask[some]
-            )
             law = pack([each.of(some) for each in chosen], some.size)
             limits = self.limits(chosen if cells else None)
-            near = Profile(given, law, limits, found.columns[some], np.nan_to_num(satellites))
+            near = Profile(self._given_of(some), law, limits, found.columns[some], np.nan_to_num(satellites))
             ends[some] = near.ends(quantile_of(self.settings.interval_level))
         return ends
 
