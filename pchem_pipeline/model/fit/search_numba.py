@@ -650,14 +650,15 @@ def _climb_start(
     """Climb from ``trial``; a higher maximum takes the place of ``best``."""
     n, cells = pixel.facts.shape[0], tools.limits.cells
     known, goal = best[n + STEP] > 0.0, from_start()
-    if known and n == 1:  # of several samples, one comb may have two maxima
+    # of several samples, and of cells, one comb may have two maxima
+    if known and n == 1 and not cells:
         goal = goal_beside(True, found.loglik, found.runner_up)
     outcome, loglik, count = climb_on(pixel, tools, goal, best, trial)
     used = found.used + count
     if outcome == DEGENERATE:
         return Found(found.loglik, found.runner_up, used, np.bool_(True))
     same = known and same_place(best, trial, cells)
-    least = found.loglik + _SAME_COMB if same else found.loglik
+    least = found.loglik + _SAME_COMB if same and not cells else found.loglik
     if outcome != CONVERGED or loglik <= least:
         # where a climb did not arrive, a higher value is none of the density's likelihood
         no_rival = same or (outcome != CONVERGED and loglik > found.loglik and not cells)
@@ -665,6 +666,8 @@ def _climb_start(
         return Found(found.loglik, runner_up, used, found.degenerate)
     runner_up = found.runner_up if same else max(found.runner_up, found.loglik)
     copy(trial, best)
+    if same and cells:  # its neighbours are known
+        return Found(examine(pixel, tools, best, out), runner_up, used + 1, found.degenerate)
     weighed: Found = _weigh(pixel, tools, clear, Found(loglik, runner_up, used, found.degenerate), best, out)
     return weighed
 
