@@ -11,8 +11,10 @@ PCH-EM, and the ensemble of the chosen frames is compared with its predictions. 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,10 +33,12 @@ from pchem_pipeline.model.ensemble.ensemble_binned import (
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.law.parameters import UsablePixels
-from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+from helpers.plain_law import pcd_mass
 
 _CHUNK = 4096
 PAPER = {

@@ -28,9 +28,11 @@ from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.starts import starting_points
-from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
+from pchem_pipeline.model.law.pcd import log_pcd
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
+from helpers.plain_law import pcd_mass
+
 Array = NDArray[np.float64]
 NAMES = ("H", "g", "mu", "sigma")
 

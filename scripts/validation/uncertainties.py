@@ -23,7 +23,9 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,6 +34,9 @@ from scipy.special import bdtr, bdtrc, ndtri
 from pchem_pipeline.compute.environment import prepare_environment
 
 prepare_environment()
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+
+from helpers.plain_law import pcd_mass  # noqa: E402
 
 from pchem_pipeline.model.checks.multiple_testing import false_discovery  # noqa: E402
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of  # noqa: E402
@@ -39,7 +44,6 @@ from pchem_pipeline.model.fit.api import fit_histograms  # noqa: E402
 from pchem_pipeline.model.fit.result import FitResult, quantile_of  # noqa: E402
 from pchem_pipeline.model.fit.settings import FitSettings  # noqa: E402
 from pchem_pipeline.model.fit.status import FitStatus  # noqa: E402
-from pchem_pipeline.model.law.pcd import pcd_mass  # noqa: E402
 
 Array = NDArray[np.float64]
 NAMES = ("H", "g", "mu", "sigma", "s_e")

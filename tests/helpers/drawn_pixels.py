@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from helpers.plain_law import pcd_mass
 from numpy.typing import ArrayLike, NDArray
-
-from pchem_pipeline.model.law.pcd import pcd_mass
 
 
 class Drawn(NamedTuple):

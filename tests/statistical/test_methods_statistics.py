@@ -5,6 +5,7 @@ Limits are five standard errors of the simulation; each failure sought is more t
 
 import numpy as np
 import pytest
+from helpers.plain_law import pcd_mass
 
 from pchem_pipeline.methods.base import PixelSamples, Sample, Settings
 from pchem_pipeline.methods.photon_transfer import gain_variance
@@ -15,7 +16,6 @@ from pchem_pipeline.model.errors.expected_information import (
     shared_information,
 )
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
-from pchem_pipeline.model.law.pcd import pcd_mass
 
 GAIN, N = 1 / 11, 4000
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +16,16 @@ from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.expected_information import inverse_information
 from pchem_pipeline.model.errors.fisher import expected_scores
 from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_may_matter
-from pchem_pipeline.model.fit import engine, guard_numba, profile, profile_numba, search_numba, tile_numba
+from pchem_pipeline.model.fit import engine, search_numba, tile_numba
 from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, Limits
 from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
-from pchem_pipeline.model.fit.guard import fit_guarded
+from pchem_pipeline.model.fit.guard import expected_counts, far_samples, fit_guarded, leave_out
+from pchem_pipeline.model.fit.profile import Moments, Profile, moments_along_bias
 from pchem_pipeline.model.fit.result import FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus, with_rivals_named
 from pchem_pipeline.model.fit.tile_numba import Answers, Histograms, Starts
 from pchem_pipeline.model.law.inputs import kernel_counts, pack
-from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -138,7 +139,7 @@ def likelihood_moments(
     satellites: FloatArray | None = None,
     settings: FitSettings | None = None,
     adc_limits: tuple[int, int] | None = None,
-) -> profile.Moments:
+) -> Moments:
     """Return mean square deviations of (H, g, mu, sigma) from their estimates, of pixels that are fitted.
 
     The inverse information is the covariance of a likelihood that falls as a normal law does. Where the read
@@ -171,7 +172,7 @@ def likelihood_moments(
             given = SampleLaw() if law is None else law.of(pixels)
             own = batch.between_limits(given) if cells[pixels[0]] else None
             parts.append((pixels, batch.moments(known[pixels], outlier_share[pixels], own, free[pixels])))
-    return profile.Moments.joined(len(known), parts)
+    return Moments.joined(len(known), parts)
 
 
 def satellite_threshold(law: SampleLaw) -> float:
@@ -253,25 +254,22 @@ class _Batch:
 
     def resume(self, plain: FitResult) -> FitResult:
         """Leave out the samples that a fit with the density left out; return it."""
-        self.leave_out_again(
-            plain.columns, plain.outlier_share, [SampleLaw()] * self.n_samples, self.limits(None)
-        )
+        self.leave_out_again(plain.columns, plain.outlier_share, None, np.zeros((self.n, 2)))
         return plain
 
     def leave_out_again(
-        self, columns: FloatArray, outlier_share: FloatArray, laws: Sequence[SampleLaw], limits: Limits
+        self,
+        columns: FloatArray,
+        outlier_share: FloatArray,
+        laws: Sequence[SampleLaw] | None,
+        satellites: FloatArray,
     ) -> None:
-        """Leave out the samples that a fit under these laws left out."""
+        """Leave out the samples that a fit under these laws (None: with the density) left out."""
         pixels = np.flatnonzero(outlier_share > 0)
         if self.settings.tail_guard > 0 and pixels.size:
-            answers = self._answers(self.n)
-            answers.parameters[:] = columns
-            gone = outlier_share * self.given.counts.sum(axis=1, dtype=np.float64)
-            evaluate = cells_likelihood() if limits.cells else density_likelihood()
-            guard_numba.leave_out_tile(
-                *(self.given, pixels, pack(laws, self.n), limits, evaluate, answers),
-                *(gone, np.zeros(self.n, np.bool_)),
-            )
+            gone = outlier_share[pixels] * self.given.counts[pixels].sum(axis=1, dtype=np.float64)
+            expected = expected_counts(self.given, pixels, laws, columns[pixels], satellites[pixels], gone)
+            leave_out(self.given, pixels, expected < self.settings.tail_guard)
 
     def set_aside(self, plain: FitResult, intervals: Sequence[Interval]) -> None:
         """Set codes aside, but for pixels of which too few would be left."""
@@ -328,15 +326,7 @@ class _Batch:
     ) -> FitResult:
         """Fit with the cells from parameters that are near; ``warm``: of a fit with nearly these laws."""
         some = np.arange(self.n) if pixels is None else pixels
-        whole = some.size == self.n
-        given = (
-            self.given
-            if whole
-            else self.given._replace(
-                counts=self.given.counts[some], origin=self.given.origin[some], mask=self.given.mask[some]
-            )
-        )
-        own = laws if whole else [each.of(some) for each in laws]
+        given, own = self._given_of(some), [each.of(some) for each in laws]
         gap = np.full(some.size, np.inf) if gaps is None else gaps[some]
         for each in own:  # the plain fit of an exposure that is not one may be an electron off
             mixed = ((each.added_weights > 0.0) & (each.added_exposure > 0.0)).any(axis=1)
@@ -352,16 +342,20 @@ class _Batch:
         if not adjust:
             _count_near(given)
         answers = self._fit(given, own, starts, limits)
-        if not whole:
-            self.given.mask[some] = given.mask
+        self.given.mask[some] = given.mask
         return self._result(answers, cells=True, adjust=adjust, pixels=some)
+
+    def _given_of(self, some: NDArray[np.intp]) -> Histograms:
+        """Return copies of the histograms of some pixels."""
+        counts, places, origin, dark, mask = self.given
+        return Histograms(counts[some], places, origin[some], dark, mask[some])
 
     def _fit(self, given: Histograms, laws: Sequence[SampleLaw], starts: Starts, limits: Limits) -> Answers:
         n = given.counts.shape[0]
         answers = self._answers(n)
         packed = pack(laws, n)
         cells = limits.cells
-        evaluate = cells_likelihood() if cells else density_likelihood()
+        evaluate = engine.likelihood(cells)
         search = engine.cells_search() if cells else engine.density_search()
 
         def fit(pixels: NDArray[np.intp], quick: bool) -> None:
@@ -382,12 +376,12 @@ class _Batch:
                     answers,
                 )
 
-        def leave_out(pixels: NDArray[np.intp], gone: FloatArray) -> NDArray[np.bool_]:
-            changed = np.zeros(n, np.bool_)
-            guard_numba.leave_out_tile(given, pixels, packed, limits, evaluate, answers, gone, changed)
-            return changed[pixels]
+        def expect(pixels: NDArray[np.intp], gone: FloatArray) -> FloatArray:
+            satellites = answers.out[pixels][:, [search_numba.AMPLITUDE, search_numba.SATELLITE_WEIGHT]]
+            own = laws if cells else None
+            return expected_counts(given, pixels, own, answers.parameters[pixels], satellites, gone)
 
-        fit_guarded(fit, leave_out, given, limits, answers)
+        fit_guarded(fit, expect, given, limits, answers)
         return answers
 
     def _answers(self, n: int) -> Answers:
@@ -407,15 +401,13 @@ class _Batch:
         outlier_share: FloatArray,
         laws: Sequence[SampleLaw] | None,
         satellites: FloatArray,
-    ) -> profile.Moments:
+    ) -> Moments:
         """Return moments over the likelihood of the cells under these laws, or of the density."""
-        limits, evaluate = self.limits(laws), cells_likelihood() if laws else density_likelihood()
-        laws = laws or [SampleLaw()]
         columns = np.ascontiguousarray(known[:, :4])
-        self.leave_out_again(columns, outlier_share, laws, limits)
+        self.leave_out_again(columns, outlier_share, laws, satellites)
+        law, limits = pack(laws or [SampleLaw()], self.n), self.limits(laws)
         reach = np.where(known[:, 4] < _RIVAL_GAP, _RIVAL_REACH, 0.0)
-        law = pack(laws, self.n)
-        return profile.moments_along_bias(self.given, law, limits, evaluate, columns, satellites, reach)
+        return moments_along_bias(Profile(self.given, law, limits, columns, satellites), columns, reach)
 
     # -- what they are told
 
@@ -450,24 +442,28 @@ class _Batch:
         low: FloatArray | int | None
         high: FloatArray | int | None
         low, high = self.adc_limits or (None, None)
-        if self.adc_limits is not None and (none := self._reaches_adc(slice(None), beyond=1)).any():
+        if self.adc_limits is not None and (none := self._reaches_adc(beyond=1)).any():
             low, high = (np.where(none, np.nan, limit) for limit in self.adc_limits)
         laws = [law] * self.n_samples if isinstance(law, SampleLaw) else law
         return [each.between(low, high) for each in laws]
 
+    @cached_property
+    def _extremes(self) -> tuple[FloatArray, FloatArray]:
+        """Smallest and largest code of each sample, those left out included, (n, J); NaN without any."""
+        found = np.full((2, self.n, self.n_samples), np.nan)
+        for j in np.flatnonzero(np.diff(self.given.places)):
+            seen = self.given.counts[:, self.given.places[j] : self.given.places[j + 1]] > 0
+            ends = np.stack([seen.argmax(axis=1), seen.shape[1] - 1 - seen[:, ::-1].argmax(axis=1)])
+            found[:, :, j] = np.where(seen.any(axis=1), self.given.origin[:, j] + ends, np.nan)
+        return found[0], found[1]
+
     def _at_limits(self, laws: Sequence[SampleLaw]) -> NDArray[np.bool_]:
         """Tell in which pixels codes pile up at a limit of the law."""
-        found = np.zeros(self.n, np.bool_)
+        (low, high), found = self._extremes, np.zeros(self.n, np.bool_)
         for j, each in enumerate(laws):
-            part = slice(self.given.places[j], self.given.places[j + 1])
-            codes = self.given.origin[:, j, None] + np.arange(part.stop - part.start)
-            beyond = np.zeros(codes.shape, np.bool_)
             # of some pixels there may be no limit: NaN is below and above nothing
-            if each.clip_low is not None:
-                beyond |= codes <= np.reshape(each.clip_low, (-1, 1))
-            if each.clip_high is not None:
-                beyond |= codes >= np.reshape(each.clip_high, (-1, 1))
-            found |= (beyond & (self.given.counts[:, part] > 0)).any(axis=1)
+            found |= low[:, j] <= (np.nan if each.clip_low is None else each.clip_low)
+            found |= high[:, j] >= (np.nan if each.clip_high is None else each.clip_high)
         return found
 
     def _coarse(self, plain: FitResult) -> NDArray[np.bool_]:
@@ -528,7 +524,7 @@ class _Batch:
                 loose = np.sqrt(covariance[:, n, n]) > _LOOSE * parameters[:, n]
             status[loose] |= FitStatus.NOT_INFORMATIVE
         if self.adc_limits is not None:
-            status[self._reaches_adc(some)] |= FitStatus.ADC_LIMIT
+            status[self._reaches_adc()[some]] |= FitStatus.ADC_LIMIT
         status = with_rivals_named(status, dark=bool(np.any(self.given.dark)), several=n > 1)
         failed = (status & int(FAILED)) != 0
         parameters[failed] = np.nan
@@ -580,18 +576,12 @@ class _Batch:
             freedom[few] += 4.0 - np.clip(np.nan_to_num(known, nan=4.0), 0.0, 4.0)
         return freedom
 
-    def _reaches_adc(self, pixels: NDArray[np.intp] | slice, beyond: int = 0) -> NDArray[np.bool_]:
+    def _reaches_adc(self, beyond: int = 0) -> NDArray[np.bool_]:
         """Tell which pixels have samples at the limits of the ADC or ``beyond``, those left out included."""
         assert self.adc_limits is not None
+        low, high = self._extremes
         first, last = self.adc_limits[0] - beyond, self.adc_limits[1] + beyond
-        found = np.zeros(self.n, np.bool_)[pixels]
-        for j in range(self.n_samples):
-            counts = self.given.counts[pixels, self.given.places[j] : self.given.places[j + 1]] > 0
-            seen = counts.any(axis=1)
-            low = self.given.origin[pixels, j] + counts.argmax(axis=1)
-            high = self.given.origin[pixels, j] + counts.shape[1] - 1 - counts[:, ::-1].argmax(axis=1)
-            found |= seen & ((low <= first) | (high >= last))
-        return found
+        return np.asarray(((low <= first) | (high >= last)).any(axis=1))
 
     def intervals(self, found: FitResult, laws: Sequence[SampleLaw] | None) -> FloatArray:
         """Return the ends of profile-likelihood intervals, (n, J + 4, 2); NaN where there are none.
@@ -608,21 +598,11 @@ class _Batch:
             if some.size == 0:
                 continue
             chosen = (laws or self.neutral()) if cells else [SampleLaw()] * self.n_samples
-            part = np.full((some.size, *ends.shape[1:]), np.nan)
             satellites = np.stack([found.satellite_amplitude_e[some], found.satellite_weight[some]], axis=1)
-            profile_numba.profile_tile(
-                self.given._replace(
-                    counts=self.given.counts[some], origin=self.given.origin[some], mask=self.given.mask[some]
-                ),
-                pack([each.of(some) for each in chosen], some.size),
-                self.limits(chosen if cells else None),
-                cells_likelihood() if cells else density_likelihood(),
-                engine.climb(),
-                profile_numba.Maxima(found.columns[some], np.nan_to_num(satellites)),
-                quantile_of(self.settings.interval_level),
-                part,
-            )
-            ends[some] = part
+            law = pack([each.of(some) for each in chosen], some.size)
+            limits = self.limits(chosen if cells else None)
+            near = Profile(self._given_of(some), law, limits, found.columns[some], np.nan_to_num(satellites))
+            ends[some] = near.ends(quantile_of(self.settings.interval_level))
         return ends
 
 
@@ -631,10 +611,8 @@ def _count_near(given: Histograms) -> None:
 
     Another law may expect them: satellite peaks, tails.
     """
-    gone = np.zeros(given.counts.shape[0])
-    guard_numba.cut_tile(given, np.arange(gone.size), 0.0, np.empty((0, 0), np.uint8), gone)
-    near = np.flatnonzero(gone == 0)
-    given.mask[near] = np.where(given.mask[near] == LEFT_OUT, np.uint8(COUNTED), given.mask[near])
+    near = np.flatnonzero(~far_samples(given)[1])
+    leave_out(given, near, np.zeros((near.size, given.counts.shape[1]), np.bool_))
 
 
 def _reshapes(law: SampleLaw) -> bool:

@@ -11,7 +11,7 @@ from scipy import special
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
-from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, LEAST_STEP, same_place
+from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, CONVERGED, LEAST_STEP
 from pchem_pipeline.model.fit.satellites_numba import search_satellites
 from pchem_pipeline.model.fit.search_numba import (
     AMPLITUDE,
@@ -30,13 +30,13 @@ from pchem_pipeline.model.fit.search_numba import (
     above_blurred,
     climb_neighbours,
     climb_on,
+    climb_starts,
     examine,
     fall_and_parabola,
     from_start,
     judge,
     loglik_without_gain,
     nats_of_peaks,
-    next_start,
     plus,
     rival_moves_gain,
     score_of,
@@ -135,33 +135,6 @@ def _from_density(pixel: Pixel, warm: bool, near: FloatArray, theta: FloatArray)
 
 
 @kernel(borrows=True)
-def _better(pixel: Pixel, tools: Tools, trial: FloatArray, best: FloatArray, found: Found) -> Found:
-    """Climb from ``trial`` and its neighbours; put it in the place of ``best`` if it is likelier.
-
-    Args:
-        pixel: its samples.
-        tools: of the search.
-        trial: a start; overwritten.
-        best: best maximum so far; its step is 0 where there is none.
-        found: how far the search has come.
-    """
-    n = pixel.facts.shape[0]
-    outcome, loglik, count = climb_on(pixel, tools, from_start(), trial, trial)
-    used = found.used + count
-    if best[n + STEP] > 0.0 and same_place(best, trial, tools.limits.cells):
-        if outcome == CONVERGED and loglik > found.loglik:
-            copy(trial, best)
-            return Found(loglik, found.runner_up, used, found.degenerate)
-        return Found(found.loglik, found.runner_up, used, found.degenerate)
-    if outcome != CONVERGED or loglik <= found.loglik:
-        return Found(found.loglik, max(found.runner_up, loglik), used, found.degenerate)
-    copy(trial, best)
-    higher, beside, count = climb_neighbours(pixel, tools, best, loglik)
-    runner_up = max(found.runner_up, found.loglik, beside)
-    return Found(higher, runner_up, used + count, found.degenerate)
-
-
-@kernel(borrows=True)
 def _share_at_limits(pixel: Pixel) -> float:
     """Return the largest share of a sample in the codes that hold what lies beyond the limits."""
     largest = 0.0
@@ -202,23 +175,15 @@ def _scan_cut(pixel: Pixel, tools: Tools) -> int:
 
 
 @kernel(borrows=True)
-def _climb_kept(pixel: Pixel, tools: Tools, best: FloatArray, found: Found) -> Found:
-    """Climb from the starts that are kept; see `_better`."""
-    while next_start(tools.scratch, tools.scratch.small[HERE]):
-        found = _better(pixel, tools, tools.scratch.small[HERE], best, found)
-    return found
-
-
-@kernel(borrows=True)
-def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, found: Found) -> Found:
-    """Climb from starts ranked by the cells, where a DN is no small part of an electron; see `_better`."""
+def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, out: FloatArray, found: Found) -> Found:
+    """Climb from starts ranked by the cells, where a DN is no small part of an electron."""
     scratch = tools.scratch
     if pixel.facts.shape[0] == 1:
         used = scan_steps(pixel, tools.evaluate, np.bool_(True), scratch)
     else:
         _, used = fill_starts(np.int64(1), np.bool_(False), pixel, tools.basis, tools.evaluate, scratch)
         used += add_line_starts(pixel, tools.evaluate, np.bool_(True), np.bool_(True), scratch)
-    found = _climb_kept(pixel, tools, best, plus(found, used))
+    found = climb_starts(pixel, tools, np.bool_(False), plus(found, used), best, out)
     return found
 
 
@@ -258,6 +223,7 @@ def _start_anew(
     score: float,
     settled: bool,
     best: FloatArray,
+    out: FloatArray,
     found: Found,
 ) -> Found:
     """Climb from other starts in pixels that the density may have led astray.
@@ -265,26 +231,27 @@ def _start_anew(
     These are pixels at the limits of the codes, those of few DN per electron, those whose gain is not
     settled, and those whose climb did not arrive.
     """
-    n, limits = pixel.facts.shape[0], tools.limits
+    n, limits, no = pixel.facts.shape[0], tools.limits, np.bool_(False)
     place = n + STEP
     if cut and (limits.scan or not best[place] > 0.0 or score > _POOR):
-        found = _climb_kept(pixel, tools, best, plus(found, _scan_cut(pixel, tools)))
+        used = _scan_cut(pixel, tools)
+        found = climb_starts(pixel, tools, no, plus(found, used), best, out)
     few = not best[place] > FEW_STEP
     # several samples, some of them cut, may have led the density astray
     astray = not settled if n == 1 else score > SUSPICIOUS
     lost = known and not best[place] > 0.0
     if lost or (limits.scan and (astray or few)):
-        found = _climb_few(pixel, tools, best, found)
+        found = _climb_few(pixel, tools, best, out, found)
     if not (limits.scan and best[place] < ALIASED_STEP):
         return found
     if abs(1.0 / best[place] - 0.5) > NEAR_TWO:
         used = alias_of_step(pixel, tools.evaluate, best, tools.scratch)
-        found = _climb_kept(pixel, tools, best, plus(found, used))
+        found = climb_starts(pixel, tools, no, plus(found, used), best, out)
     elif n == 1:
         for nearer in (1.0, 3.0):
             a = 1.0 / (0.5 - (1.0 / best[place] - 0.5) / nearer)
             used = combs_of_step(pixel, tools.evaluate, a, tools.scratch)
-            found = _climb_kept(pixel, tools, best, plus(found, used))
+            found = climb_starts(pixel, tools, np.bool_(False), plus(found, used), best, out)
     return found
 
 
@@ -348,14 +315,11 @@ def search_cells(
         score = score_of(out)
         sure = np.bool_(not settled(pixel, best, np.bool_(False), loglik - null, out)[1])
         found = Found(loglik, runner_up, used + 1, found.degenerate)
-    before = found.loglik
-    found = _start_anew(pixel, tools, known, cut, score, sure, best, found)
+    found = _start_anew(pixel, tools, known, cut, score, sure, best, out, found)
     if not best[n + STEP] > 0.0:
         return FIT_NOT_CONVERGED, found.used, 0
     if n == 1 and not limits.warm and min(gap, found.loglik - found.runner_up) < limits.gap:
-        found = _climb_few(pixel, tools, best, found)
-    if found.loglik > before:
-        examine(pixel, tools, best, out)
+        found = _climb_few(pixel, tools, best, out, found)
     bias_gap = min(gap, found.loglik - found.runner_up)
     blurred = math.inf
     if n == 1 and not (limits.warm or limits.reshapes):

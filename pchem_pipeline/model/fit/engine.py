@@ -18,7 +18,7 @@ from pchem_pipeline.model.fit import (
 )
 from pchem_pipeline.model.fit.climb_numba import Goal, Limits
 from pchem_pipeline.model.law.inputs import pack
-from pchem_pipeline.model.law.likelihood import evaluation_arguments
+from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood, evaluation_arguments
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 _VECTOR = np.zeros(1)
@@ -56,6 +56,11 @@ def _search_arguments() -> tuple[Any, ...]:
 def climb() -> Any:
     """Return the climb to the nearest maximum, :func:`.climb_numba.climb`."""
     return callback(climb_numba.climb, _OUTCOME, _climb_arguments(), borrows=True)
+
+
+def likelihood(cells: bool) -> Any:
+    """Return the likelihood of the cells, integrated, or of the density at whole DN."""
+    return cells_likelihood() if cells else density_likelihood()
 
 
 @functools.cache

@@ -8,7 +8,7 @@ set of them stays.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,8 +19,13 @@ from pchem_pipeline.model.fit import guard_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
 from pchem_pipeline.model.fit.search_numba import CHI2, FIT_NOT_CONVERGED, GAIN_NOT_IDENTIFIED, OUTLYING
 from pchem_pipeline.model.fit.tile_numba import EVALUATIONS, FREEDOM, STATUS, Answers, Histograms
-from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT
+from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.pcd import pcd
+from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 Pixels = NDArray[np.intp]
 
 _MOST_PASSES = 8
@@ -28,9 +33,73 @@ _MOST_PASSES = 8
 _EXPECTED, _ENDS, _CORE, _N_ATTEMPTS = range(4)
 
 
+def far_samples(given: Histograms) -> tuple[NDArray[np.int64], BoolArray]:
+    """Return ends of the bins that no gap cuts off, (n, J, 2), and which pixels have samples beyond, (n,)."""
+    n = given.counts.shape[0]
+    ends, far = np.empty((n, given.dark.size, 2), np.int64), np.empty(n, np.bool_)
+    guard_numba.find_cores(given, ends, far)
+    return ends, far
+
+
+def expected_counts(
+    given: Histograms,
+    pixels: Pixels,
+    laws: Sequence[SampleLaw] | None,
+    parameters: FloatArray,
+    satellites: FloatArray,
+    left_out: FloatArray,
+) -> FloatArray:
+    """Return the samples expected in each occupied bin of some pixels, shape (m, all bins).
+
+    Args:
+        given: histograms.
+        pixels: m of them.
+        laws: of the samples, the cells integrated; None: the density of the PCD.
+        parameters: (H_1 ... H_J, g, mu, sigma) of these, shape (m, J + 3).
+        satellites: amplitude (e-) and weight of their free satellites, shape (m, 2).
+        left_out: samples that the likelihood of these parameters left out, shape (m,).
+    """
+    counts, kept = given.counts[pixels], given.mask[pixels] != SET_ASIDE
+    counts = counts if kept.all() else np.where(kept, counts, 0)
+    total, found = counts.sum(axis=1, dtype=np.float64), np.zeros(counts.shape)
+    for j in range(given.dark.size):
+        part = slice(given.places[j], given.places[j + 1])
+        own, first = [parameters[:, j], *parameters[:, -3:].T], given.origin[pixels, j]
+        if laws is None:
+            row, code = np.nonzero(counts[:, part])
+            found[row, part.start + code] = pcd(first[row] + code, *(each[row] for each in own))
+        else:
+            codes, free = first[:, None] + np.arange(part.stop - part.start), tuple(satellites.T)
+            mass = sample_mass(laws[j].of(pixels), own, codes, satellites=free, far_tails=False)
+            aside = ~kept[:, part].all(axis=1, keepdims=True)  # the likelihood is given the others
+            inside = np.where(kept[:, part], mass, 0.0).sum(axis=1, keepdims=True)
+            found[:, part] = np.where(aside, mass / inside, mass)
+        frames = counts[:, part].sum(axis=1, dtype=np.float64) * (1.0 - left_out / total)
+        found[:, part] *= frames[:, None]
+    return found
+
+
+def leave_out(given: Histograms, pixels: Pixels, outside: BoolArray) -> tuple[FloatArray, BoolArray]:
+    """Leave out the samples in some bins, and count all others but those set aside.
+
+    Args:
+        given: histograms; their mask is updated.
+        pixels: m of them.
+        outside: bins, shape (m, all bins).
+
+    Returns:
+        How many samples are left out, and whether these are others than before, shape (m,) each.
+    """
+    counts, mask = given.counts[pixels], given.mask[pixels]
+    gone = outside & (counts > 0) & (mask != SET_ASIDE)
+    changed = ((gone != (mask == LEFT_OUT)) & (counts > 0)).any(axis=1)
+    given.mask[pixels] = np.where(mask == SET_ASIDE, mask, np.where(gone, LEFT_OUT, COUNTED))
+    return np.where(gone, counts, 0).sum(axis=1, dtype=np.float64), changed
+
+
 def fit_guarded(
     fit: Callable[[Pixels, bool], None],
-    leave_out: Callable[[Pixels, NDArray[np.float64]], NDArray[np.bool_]],
+    expect: Callable[[Pixels, FloatArray], FloatArray],
     given: Histograms,
     limits: Limits,
     answers: Answers,
@@ -45,8 +114,8 @@ def fit_guarded(
 
     Args:
         fit: fits some pixels; quickly (True): the first maximum that tells the gain will do.
-        leave_out: leaves out what the last fit does not expect: from the number left out before, which it
-            updates, to whether they are others.
+        expect: the samples that the last fit expects in each bin, see :func:`expected_counts`, from how many
+            it left out.
         given: histograms; codes that are left out before stay so at first; out: those left out at last.
         limits: bounds and limits.
         answers: what the fit fills; out: ``OUTLYING``, the samples left out.
@@ -58,12 +127,11 @@ def fit_guarded(
         answers.out[:, OUTLYING] = 0.0
         return
     counters = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64), np.full(n, -1)
-    guard = _Guard(fit, leave_out, given, limits, answers, answers, *counters)
+    ends, far = far_samples(given)
+    guard = _Guard(fit, expect, given, limits, ends, answers, answers, *counters)
     left = given.mask == LEFT_OUT
     resumed = left.any(axis=1)
-    guard_numba.cut_tile(given, everything, 0.0, np.empty((0, 0), np.uint8), guard.gone)
-    far = guard.gone > 0
-    guard.gone[:] = (given.counts * left).sum(axis=1) if resumed.any() else 0.0
+    guard.gone[resumed] = (given.counts[resumed] * left[resumed]).sum(axis=1)
     fit(np.flatnonzero(~far | resumed), False)
     good = (_scores(answers) <= BEYOND_DOUBT) | limits.cells
     suspicious = ~far & ~resumed & guard.suspicious(everything)
@@ -83,7 +151,8 @@ class _Guard:
     """What the tail guard knows of n pixels, and works with.
 
     Attributes:
-        fit, leave_out, given, limits, answers: see :func:`fit_guarded`.
+        fit, expect, given, limits, answers: see :func:`fit_guarded`.
+        ends: of the bins that no gap cuts off, shape (n, J, 2).
         whole: answers for some pixels, all their samples counted.
         gone: samples left out.
         attempt, passes: the attempt, and fits of it.
@@ -91,9 +160,10 @@ class _Guard:
     """
 
     fit: Callable[[Pixels, bool], None]
-    leave_out: Callable[[Pixels, NDArray[np.float64]], NDArray[np.bool_]]
+    expect: Callable[[Pixels, FloatArray], FloatArray]
     given: Histograms
     limits: Limits
+    ends: NDArray[np.int64]
     answers: Answers
     whole: Answers
     gone: NDArray[np.float64]
@@ -141,20 +211,40 @@ class _Guard:
                 self.attempt[pixels[self.attempt[pixels] > _EXPECTED]] = _N_ATTEMPTS
             self.attempt[pixels[(self.attempt[pixels] == _CORE) & ~far[pixels]]] += 1
             self.passes[pixels] = 0
-            for attempt, share in ((_ENDS, self.limits.most_outliers), (_CORE, 0.0)):
+            for attempt in range(_EXPECTED, _N_ATTEMPTS + 1):
                 some = pixels[self.attempt[pixels] == attempt]
-                guard_numba.cut_tile(self.given, some, share, self.given.mask, self.gone)
-            some = pixels[self.attempt[pixels] == _EXPECTED]
-            self.gone[some] = 0.0
-            self.leave_out(some, self.gone)
-            last = pixels[self.attempt[pixels] == _N_ATTEMPTS]
-            mask = self.given.mask[last]
-            self.given.mask[last] = np.where(mask == LEFT_OUT, np.uint8(COUNTED), mask)
-            self.gone[last] = 0.0
+                if attempt == _EXPECTED:
+                    self.gone[some] = 0.0  # of the fit of all samples
+                    self._leave_out_unexpected(some)
+                else:
+                    self.gone[some], _ = leave_out(self.given, some, self._outside(some, attempt))
             few = self._few(pixels)
             begun.append(pixels[few])
             pixels = pixels[~few]
         return np.concatenate(begun)
+
+    def _outside(self, pixels: Pixels, attempt: int) -> BoolArray:
+        """Tell which bins an attempt leaves out: both ends, what a gap cuts off, or none."""
+        counts = self.given.counts[pixels]
+        outside = np.zeros(counts.shape, np.bool_)
+        for j in range(self.given.dark.size if attempt < _N_ATTEMPTS else 0):
+            part = slice(self.given.places[j], self.given.places[j + 1])
+            if attempt == _CORE:
+                low, end = self.ends[pixels, j, :, None].swapaxes(0, 1)
+                place = np.arange(part.stop - part.start)
+                outside[:, part] = (place < low) | (place >= end)
+            else:
+                upto = np.cumsum(counts[:, part], axis=1, dtype=np.float64)
+                before, total = upto - counts[:, part], upto[:, -1:]
+                cut = 0.5 * self.limits.most_outliers * total
+                outside[:, part] = (upto <= cut) | (total - before <= cut)
+        return outside
+
+    def _leave_out_unexpected(self, pixels: Pixels) -> BoolArray:
+        """Leave out the samples that the last fit does not expect; tell where these are others."""
+        outside = self.expect(pixels, self.gone[pixels]) < self.limits.floor
+        self.gone[pixels], changed = leave_out(self.given, pixels, outside)
+        return changed
 
     def check(self, pixels: Pixels, far: NDArray[np.bool_]) -> tuple[Pixels, Pixels]:
         """Settle the fits that stand; return those that another pass may settle, and those that none will."""
@@ -168,7 +258,7 @@ class _Guard:
         failed |= ~np.isfinite(answers.out[pixels, OUTLYING])
         stuck, pixels = pixels[failed], pixels[~failed]
         before = self.gone[pixels]
-        changed = self.leave_out(pixels, self.gone) | self._cut(pixels)
+        changed = self._leave_out_unexpected(pixels) | self._cut(pixels)
         answers.out[pixels[~changed], OUTLYING] = before[~changed]
         pixels = pixels[changed]
         self.passes[pixels] += 1

@@ -3,9 +3,8 @@
 Strong satellites lead a fit without them astray: it takes one for the peak of no electron, or the distance of
 the satellites for that of the peaks. Where it describes the histogram badly, other starts are tried that have
 the mean, the variance and the third cumulant of the histogram with the satellites in place: satellites on
-    both
-sides alike, and the read noise, add nothing to the third cumulant ``a^3 H``. The best amplitude is refined.
-All samples of a pixel share amplitude and weight; the other combs are those of a single sample.
+both sides alike, and the read noise, add nothing to the third cumulant ``a^3 H``. The best amplitude is
+refined. All samples of a pixel share amplitude and weight; the other combs are those of a single sample.
 """
 
 from __future__ import annotations
@@ -17,21 +16,21 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.climb_numba import CONVERGED, Goal, find_held, newton_step, sensible
-from pchem_pipeline.model.fit.search_numba import CLEAR_GAP, Tools, climb_neighbours, climb_on
-from pchem_pipeline.model.law.cells_numba import CORE, Law, cells_of, fill_masses, own_theta, set_peaks
+from pchem_pipeline.model.fit.search_numba import CLEAR_GAP, Tools, climb_neighbours, climb_on, next_start
+from pchem_pipeline.model.fit.starts_numba import keep_start, no_starts
+from pchem_pipeline.model.law.cells_numba import Law, set_peaks
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
     BIAS,
     DARK,
     DERIVATIVES,
     FIXED,
+    HEIGHTS,
     HELD,
     HERE,
     LOG_VARIANCE,
     MASS,
     N_BINS,
-    OWN,
-    RATIO,
     SATELLITE,
     SLOPES,
     STEP,
@@ -55,26 +54,8 @@ _LEAST_SKEWNESS = 0.15
 _SHORTFALL = 0.25  # of the electrons, by which their variance may exceed that of the histogram
 _N_ATTEMPTS = 4  # from the fit, one electron more and less, another comb
 _FINER, _N_REFINED = 0.12, 4  # first step of log amplitude, and steps at most
-_LEAST_MASS = 1e-9  # of a sample that must not decide between starts
+_LEAST_START, _MOST_START = 0.005, 0.5  # weight of the satellites at a start
 _ROW = SLOPES + 1 + SATELLITE  # of the slopes in the weight
-
-
-@kernel(borrows=True)
-def fill_core(pixel: Pixel, theta: FloatArray, scratch: Scratch) -> None:
-    """Fill mass and slopes of the cells of all samples, only as far out as most samples lie."""
-    own = scratch.small[OWN]
-    for j in range(pixel.facts.shape[0]):
-        own_theta(pixel, j, theta, own)
-        cells = cells_of(pixel, j)
-        fill_masses(
-            own,
-            cells,
-            np.int64(CORE),
-            np.int64(DERIVATIVES),
-            scratch.numbers,
-            scratch.edges,
-            scratch.cells[j],
-        )
 
 
 @kernel(borrows=True)
@@ -120,29 +101,36 @@ def _weight(pixel: Pixel, scratch: Scratch) -> tuple[float, float]:
     return weight, rise
 
 
-@kernel(inline=True)
-def _from_fit(pixel: Pixel, tools: Tools, theta: FloatArray) -> tuple[float, int]:
-    """Fit the weight of the free satellites too, from the fit without; ``theta`` is updated.
+@kernel(borrows=True)
+def _with_weight(pixel: Pixel, tools: Tools, theta: FloatArray) -> tuple[float, float]:
+    """Set the likeliest weight of the free satellites; return the log-likelihood without, and the rise.
 
-    Returns:
-        The log-likelihood, -inf where nothing speaks for these satellites; evaluations.
+    The evaluation without them stays in the scratch.
     """
     scratch = tools.scratch
-    at, held = scratch.evaluations[AT], scratch.flags[HELD]
-    tools.evaluate(pixel, theta, DERIVATIVES, scratch, at)
+    theta[-1] = 0.0
+    without: float = tools.evaluate(pixel, theta, DERIVATIVES, scratch, scratch.evaluations[AT])
     weight, rise = _weight(pixel, scratch)
-    find_held(theta, at, scratch.flags[FIXED], tools.limits, held)
-    expected, _ = newton_step(at, 0.0, 1.0, scratch, scratch.small[STEPS])
-    least = _SCREEN * tools.limits.satellite_rise
-    if not (rise > least or expected > least):
-        return -math.inf, 1
-    theta[-1] = max(weight, 0.005)
-    loglik, used = _climb(pixel, tools, -math.inf, theta)
-    return loglik, used + 1
+    theta[-1] = min(max(weight, _LEAST_START), _MOST_START)
+    return without, rise
 
 
 @kernel(inline=True)
-def _beside(direction: float, pixel: Pixel, scratch: Scratch, theta: FloatArray) -> float:
+def _from_fit(pixel: Pixel, tools: Tools, theta: FloatArray) -> bool:
+    """Add the weight of free satellites to the fit without; False where nothing speaks for them."""
+    scratch = tools.scratch
+    at, held = scratch.evaluations[AT], scratch.flags[HELD]
+    _, rise = _with_weight(pixel, tools, theta)
+    weight, theta[-1] = theta[-1], 0.0
+    find_held(theta, at, scratch.flags[FIXED], tools.limits, held)
+    expected, _ = newton_step(at, 0.0, 1.0, scratch, scratch.small[STEPS])
+    theta[-1] = weight
+    least = _SCREEN * tools.limits.satellite_rise
+    return bool(rise > least or expected > least)
+
+
+@kernel(inline=True)
+def _beside(direction: float, pixel: Pixel, tools: Tools, theta: FloatArray) -> float:
     """Move ``theta`` by one electron (H + direction, mu - direction/g); return the log-likelihood there.
 
     A satellite below the peak of no electron is taken for that peak by a fit without satellites. -inf where
@@ -156,17 +144,8 @@ def _beside(direction: float, pixel: Pixel, scratch: Scratch, theta: FloatArray)
                 return -math.inf
             theta[j] = math.log(exposure)
     theta[n + BIAS] -= direction * theta[n + STEP]
-    fill_core(pixel, theta, scratch)
-    weight, _ = _weight(pixel, scratch)
-    theta[n + SATELLITE] = min(max(weight, 0.005), 0.5)
-    loglik = 0.0
-    for j in range(n):
-        weights, room = pixel.bins[j, WEIGHT], scratch.cells[j]
-        for i in range(int(pixel.facts[j, N_BINS])):
-            if weights[i] > 0.0:
-                mass = room[MASS, i] + theta[n + SATELLITE] * room[_ROW, i]
-                loglik += weights[i] * math.log(max(mass, _LEAST_MASS))
-    return loglik
+    without, rise = _with_weight(pixel, tools, theta)
+    return float(without + rise)
 
 
 @kernel(inline=True)
@@ -218,69 +197,30 @@ def _with_cumulants(
 
 
 @kernel(inline=True)
-def _height(amplitude: float, theta: FloatArray, pixel: Pixel, law: Law, room: FloatArray) -> float:
-    """Return the log-likelihood with satellites: the masses without, moved by whole and part DN."""
-    n, weight = int(pixel.facts[0, N_BINS]), theta[1 + SATELLITE]
-    mass, moved, weights = room[MASS], room[RATIO], pixel.bins[0, WEIGHT]
-    for i in range(n):
-        moved[i] = (1.0 - weight) * mass[i]
-    for side in range(law.pattern.shape[0]):
-        shift = amplitude * law.pattern[side, 0] * theta[1 + STEP]
-        whole = math.floor(shift)
-        part, share = shift - whole, weight * law.pattern[side, 1]
-        move = int(whole)
-        for i in range(max(move, 0), min(n + move, n)):
-            moved[i] += share * (1.0 - part) * mass[i - move]
-        for i in range(max(move + 1, 0), min(n + move + 1, n)):
-            moved[i] += share * part * mass[i - move - 1]
-    loglik = 0.0
-    for i in range(n):
-        if weights[i] > 0.0:
-            loglik += weights[i] * math.log(max(moved[i], _LEAST_MASS))
-    return loglik
+def _from_cumulants(
+    pixel: Pixel, law: Law, amplitude: float, tools: Tools, theta: FloatArray
+) -> tuple[bool, int]:
+    """Fill ``theta`` of a single sample with the likeliest comb of the histogram's first three cumulants.
 
-
-@kernel(inline=True)
-def _scan(
-    pixel: Pixel, law: Law, amplitudes: FloatArray, scratch: Scratch, trial: FloatArray, starts: FloatArray
-) -> None:
-    """Fill the likeliest of a row of starts of the histogram's mean, variance and third cumulant.
-
-    Args:
-        pixel: of one sample, without free satellites.
-        law: of all pixels.
-        amplitudes: of the satellites, e-.
-        scratch: room to work in.
-        trial: room for parameters.
-        starts: out, theta for each amplitude; NaN where there is none.
-
+    Returns:
+        Whether there is one, and evaluations.
     """
-    histogram = histogram_of(pixel, np.int64(0))
-    heights = np.full(amplitudes.size, -math.inf)
+    scratch, histogram, used = tools.scratch, histogram_of(pixel, np.int64(0)), 0
     third = third_cumulant(histogram)
-    starts[:] = math.nan
+    m1 = m2 = m3 = 0.0
+    for side in range(law.pattern.shape[0]):
+        shift = law.pattern[side, 0] * amplitude
+        m1 += law.pattern[side, 1] * shift
+        m2 += law.pattern[side, 1] * shift * shift
+        m3 += law.pattern[side, 1] * shift * shift * shift
+    if abs(m1) < 1e-9 * amplitude:
+        m1 = m3 = 0.0
+    no_starts(scratch.small[HEIGHTS])
     for scale in _SCALES:
-        exposure = math.nan
-        for place in range(amplitudes.size):
-            amplitude = amplitudes[place]
-            m1 = m2 = m3 = 0.0
-            for side in range(law.pattern.shape[0]):
-                shift = law.pattern[side, 0] * amplitude
-                m1 += law.pattern[side, 1] * shift
-                m2 += law.pattern[side, 1] * shift * shift
-                m3 += law.pattern[side, 1] * shift * shift * shift
-            if abs(m1) < 1e-9 * amplitude:
-                m1 = m3 = 0.0
-            a = scale * third / histogram.variance
-            if not _with_cumulants(a, third, histogram, (m1, m2, m3), trial):
-                continue
-            if trial[0] != exposure:
-                exposure = trial[0]
-                fill_core(pixel, trial, scratch)
-            loglik = _height(amplitude, trial, pixel, law, scratch.cells[0])
-            if loglik > heights[place]:
-                heights[place] = loglik
-                copy(trial, starts[place])
+        a = scale * third / histogram.variance
+        if _with_cumulants(a, third, histogram, (m1, m2, m3), scratch.small[HERE]):
+            used += keep_start(pixel, tools.evaluate, np.bool_(True), scratch)
+    return next_start(scratch, theta), used
 
 
 @kernel(inline=True)
@@ -354,30 +294,26 @@ def search_satellites(
     scratch, weight, best = tools.scratch, theta.size - 1, theta.copy()
     trial, fixed = scratch.small[HERE], scratch.flags[FIXED]
     kept, highest, used = 0.0, loglik + tools.limits.satellite_rise, 0
-    starts = np.full((amplitudes.size, theta.size), math.nan)
-    if thorough and pixel.facts.shape[0] == 1:
-        _scan(pixel, law, amplitudes, scratch, trial, starts)
+    # a satellite above the others is no one's peak of no electron: only an unsure fit may be below
+    likely = loglik - CLEAR_GAP if not thorough else -math.inf
     fixed[weight] = False
-    for which in range(amplitudes.size):
-        amplitude = amplitudes[which]
+    for amplitude in amplitudes:
         set_peaks(law, index, amplitude, pixel)
-        for attempt in range(_N_ATTEMPTS if thorough else _N_ATTEMPTS - 1):
+        for attempt in range(_N_ATTEMPTS):
             copy(theta, trial)
+            usable, count = np.bool_(False), 1
             if attempt == 0:
-                found, count = _from_fit(pixel, tools, trial)
-            else:
-                if attempt < _N_ATTEMPTS - 1:
-                    # a satellite above the others is no one's peak of no electron: only an unsure fit may be
-                    # below
-                    likely = loglik - CLEAR_GAP if not thorough else -math.inf
-                    usable = attempt > 1 or unsure or thorough
-                    usable = usable and _beside(3.0 - 2.0 * attempt, pixel, scratch, trial) > likely
-                else:
-                    usable = math.isfinite(starts[which, 0])
-                    copy(starts[which], trial)
-                if not usable:
-                    continue
-                found, count = _climb(pixel, tools, highest, trial)
+                usable = _from_fit(pixel, tools, trial)
+            elif attempt == 1 and (unsure or thorough):
+                usable = _beside(1.0, pixel, tools, trial) > likely
+            elif attempt == 2:
+                usable = _beside(-1.0, pixel, tools, trial) > likely
+            elif attempt == 3 and thorough and pixel.facts.shape[0] == 1:
+                usable, count = _from_cumulants(pixel, law, amplitude, tools, trial)
+            used += count
+            if not usable:
+                continue
+            found, count = _climb(pixel, tools, -math.inf if attempt == 0 else highest, trial)
             used += count
             if thorough and found > highest - CLEAR_GAP:
                 found, _, count = climb_neighbours(pixel, tools, trial, found)

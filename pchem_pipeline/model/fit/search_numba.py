@@ -623,7 +623,7 @@ def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArr
     """
     n, loglik, runner_up, used = pixel.facts.shape[0], found.loglik, found.runner_up, found.used + 1
     at_best = examine(pixel, tools, best, out)
-    if n == 1:
+    if n == 1 and not tools.limits.cells:
         good, _ = settled(pixel, best, clear, math.inf, out)
         expected = expected_gap(pixel.facts[0, N_FRAMES], best)
         sure = max(_SURE_GAP, _SURE_THRESHOLDS * tools.limits.gap)
@@ -650,21 +650,24 @@ def _climb_start(
     """Climb from ``trial``; a higher maximum takes the place of ``best``."""
     n, cells = pixel.facts.shape[0], tools.limits.cells
     known, goal = best[n + STEP] > 0.0, from_start()
-    if known and n == 1:  # of several samples, one comb may have two maxima
+    # of several samples, and of cells, one comb may have two maxima
+    if known and n == 1 and not cells:
         goal = goal_beside(True, found.loglik, found.runner_up)
     outcome, loglik, count = climb_on(pixel, tools, goal, best, trial)
     used = found.used + count
     if outcome == DEGENERATE:
         return Found(found.loglik, found.runner_up, used, np.bool_(True))
     same = known and same_place(best, trial, cells)
-    least = found.loglik + _SAME_COMB if same else found.loglik
+    least = found.loglik + _SAME_COMB if same and not cells else found.loglik
     if outcome != CONVERGED or loglik <= least:
-        # where a climb did not arrive, a higher value is none of the likelihood
-        no_rival = same or (outcome != CONVERGED and loglik > found.loglik)
+        # where a climb did not arrive, a higher value is none of the density's likelihood
+        no_rival = same or (outcome != CONVERGED and loglik > found.loglik and not cells)
         runner_up = found.runner_up if no_rival else max(found.runner_up, loglik)
         return Found(found.loglik, runner_up, used, found.degenerate)
     runner_up = found.runner_up if same else max(found.runner_up, found.loglik)
     copy(trial, best)
+    if same and cells:  # its neighbours are known
+        return Found(examine(pixel, tools, best, out), runner_up, used + 1, found.degenerate)
     weighed: Found = _weigh(pixel, tools, clear, Found(loglik, runner_up, used, found.degenerate), best, out)
     return weighed
 
@@ -687,16 +690,20 @@ def _keep_highest(heights: FloatArray) -> None:
 
 
 @kernel(borrows=True)
-def _climb_starts(
-    pixel: Pixel,
-    tools: Tools,
-    clear: bool,
-    found: Found,
-    trial: FloatArray,
-    best: FloatArray,
-    out: FloatArray,
+def climb_starts(
+    pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: FloatArray
 ) -> Found:
-    """Climb from the starts, the highest first; see `_climb_start`."""
+    """Climb from the starts, the highest first; a higher maximum takes the place of ``best``.
+
+    Args:
+        pixel: its samples.
+        tools: of the search.
+        clear: a side lobe of one of several samples stands clear of the noise.
+        found: how far the search has come.
+        best: best maximum so far; its step is 0 where there is none.
+        out: out, what `examine` says of it.
+    """
+    trial = tools.scratch.small[HERE]
     while next_start(tools.scratch, trial):
         found = _climb_start(pixel, tools, clear, found, trial, best, out)
     return found
@@ -750,11 +757,11 @@ def search_density(
         before = found.loglik
         if clear and attempt == 0:
             _keep_highest(tools.scratch.small[HEIGHTS])
-        found = _climb_starts(pixel, tools, clear, plus(found, count), trial, best, out)
+        found = climb_starts(pixel, tools, clear, plus(found, count), best, out)
         if (n > 1 or attempt == 0) and best[n + STEP] > 0.0:
             poor, least = score_of(out) > SUSPICIOUS, found.loglik - CLEAR_GAP
             count = longer_steps(pixel, tools.evaluate, poor, best, least, tools.scratch)
-            found = _climb_starts(pixel, tools, clear, plus(found, count), trial, best, out)
+            found = climb_starts(pixel, tools, clear, plus(found, count), best, out)
         if found.loglik > before and not settled(pixel, best, clear, found.loglik - null, out)[1]:
             break
         if limits.quick and found.loglik - null > limits.gap:

@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.law.mass import sample_mass, sample_slopes
-from pchem_pipeline.model.law.mass_numba import LEAST_SEEN
+from pchem_pipeline.model.law.mass import LEAST_SEEN, sample_mass, sample_slopes, score_and_information
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
@@ -65,8 +64,7 @@ class Samples:
     @property
     def n_free(self) -> int:
         """Own parameters that are fitted."""
-        held = sum(map(self._empty, range(self.n))) if self.times is None else 0
-        return self.n_exposures + 3 - held
+        return int(self.slopes.any(axis=(0, 1)).sum())
 
     @property
     def slopes(self) -> FloatArray:
@@ -83,24 +81,14 @@ class Samples:
 
     def rows(self, theta: FloatArray) -> FloatArray:
         """Return (log H, log 1/g, mu, log sigma_R^2) of the rows, (n J, 4), of own parameters (n, P)."""
-        if self == Samples():
-            return theta
-        m = self.n_exposures
-        found = np.repeat(theta[:, None, m - 1 :], self.n, axis=1)
-        for j in range(self.n):
-            log_h = theta[:, j] if self.times is None else theta[:, 0]
-            if self._empty(j):
-                found[:, j, 0] = np.log(_NO_ELECTRONS)
-            else:
-                found[:, j, 0] = log_h + (0.0 if self.times is None else np.log(self.times[j]))
+        found = np.einsum("jap,np->nja", self.slopes, theta)
+        for j, time in enumerate(self.times or self.n * (1.0,)):
+            found[:, j, 0] += np.log(_NO_ELECTRONS if self._empty(j) else time)
         return np.asarray(found.reshape(-1, 4))
 
     def theta(self, parameters: FloatArray) -> FloatArray:
         """Return own parameters (n, P) of (H, g, mu, sigma), (n J, 4); g, mu, sigma of the first sample."""
-        rows = to_theta(parameters)
-        if self == Samples():
-            return rows
-        by_sample = rows.reshape(-1, self.n, 4)
+        by_sample = to_theta(parameters).reshape(-1, self.n, 4)
         exposures = by_sample[:, :, 0]
         if self.times is not None:
             lit = [j for j in range(self.n) if not self._empty(j)]
@@ -118,8 +106,6 @@ class Samples:
         Returns:
             Shapes (n, P + d, P + d) and (n, P + d).
         """
-        if self == Samples():
-            return information, score
         more = score.shape[1] - 4
         slopes = np.zeros((self.n, 4 + more, self.n_exposures + 3 + more))
         slopes[:, :4, : self.n_exposures + 3] = self.slopes
@@ -216,8 +202,6 @@ class SharedFit:
     @property
     def row_variance(self) -> FloatArray:
         """Variances of (log H, log 1/g, mu, log sigma_R^2) of the rows, shape (n J, 4)."""
-        if self.samples == Samples():
-            return np.asarray(np.einsum("naa->na", self.own_covariance))
         slopes = self.samples.slopes
         found = np.einsum("jap,npq,jaq->nja", slopes, self.own_covariance, slopes, optimize=True)
         return np.asarray(found.reshape(-1, 4))
@@ -319,10 +303,8 @@ class Tangent:
 
     def slopes(self, counts: NDArray[np.integer]) -> Slopes:
         """Return score and information of histograms, shape (n, B)."""
-        seen = np.where(self.problem.kept, counts, 0).astype(np.float64)
-        score = np.einsum("nab,nb->na", self.derivatives, seen)
-        weighted = self.derivatives * (self.masses * seen.sum(axis=1)[:, None])[:, None, :]
-        information = weighted @ self.derivatives.transpose(0, 2, 1)
+        seen = np.where(self.problem.kept, counts, 0)
+        score, information = score_and_information(self.derivatives, self.masses, seen)
         information, score = self.problem.samples.by_pixel(information, score)
         own = self.problem.samples.n_exposures + 3
         shared_score = score[:, own:].sum(axis=0)

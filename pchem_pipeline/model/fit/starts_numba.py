@@ -303,6 +303,26 @@ def start_regression(
 
 
 @kernel(borrows=True)
+def _keep_noises(pixel: Pixel, evaluate: Any, a: float, around: int, scratch: Scratch) -> int:
+    """Put combs of a step, a few DN, among the starts of a single sample; return the evaluations.
+
+    Aliases of the lobe at 1/a hide modulus and phase, so some read noises are tried, and exposures, so many
+    to either side of the one that has the variance right.
+    """
+    histogram, trial, used = histogram_of(pixel, np.int64(0)), scratch.small[HERE], 0
+    trial[1 + STEP], trial[1 + SATELLITE] = a, 0.0
+    for noise in _FEW_NOISES:
+        middle = (histogram.variance - QUANTISATION_VARIANCE) / (a * a) - noise * noise
+        trial[1 + LOG_VARIANCE] = max(2.0 * math.log(noise * a), min_log_variance(a, np.bool_(True)))
+        for place in range(-around, around + 1):
+            exposure = middle + 0.2 * place
+            if exposure > 1e-3:
+                trial[0], trial[1 + BIAS] = math.log(exposure), histogram.mean - exposure * a
+                used += keep_start(pixel, evaluate, np.bool_(True), scratch)
+    return used
+
+
+@kernel(borrows=True)
 def _keep_lobe(
     pixel: Pixel, evaluate: Any, cells: bool, a: float, lobe: tuple[float, float], scratch: Scratch
 ) -> int:
@@ -319,13 +339,7 @@ def _keep_lobe(
         trial[1 + LOG_VARIANCE] = max(math.log(analog), min_log_variance(a, cells))
     used: int = keep_start(pixel, evaluate, cells, scratch)
     if cells and a < FEW_STEP and trial[0] < _DIM:
-        for noise in _FEW_NOISES:
-            exposure = (histogram.variance - QUANTISATION_VARIANCE) / (a * a) - noise * noise
-            if exposure > 1e-3:
-                trial[0], trial[1 + STEP] = math.log(exposure), a
-                trial[1 + BIAS] = histogram.mean - exposure * a
-                trial[1 + LOG_VARIANCE] = max(2.0 * math.log(noise * a), min_log_variance(a, cells))
-                used += keep_start(pixel, evaluate, cells, scratch)
+        used += _keep_noises(pixel, evaluate, a, np.int64(0), scratch)
     return used
 
 
@@ -409,25 +423,9 @@ def alias_of_step(pixel: Pixel, evaluate: Any, best: NDArray[np.float64], scratc
 
 @kernel(borrows=True)
 def combs_of_step(pixel: Pixel, evaluate: Any, a: float, scratch: Scratch) -> int:
-    """Put the likeliest combs of a few DN per electron among the starts of a single sample, of one step.
-
-    Aliases of the lobe at 1/a hide modulus and phase, so read noises and exposures around the one that has
-    the variance right are tried.
-
-    Returns:
-        Evaluations.
-    """
-    histogram, trial, used = histogram_of(pixel, np.int64(0)), scratch.small[HERE], 0
+    """Put the likeliest combs of a few DN per electron, of one step, among the starts; see `_keep_noises`."""
     no_starts(scratch.small[HEIGHTS])
-    trial[1 + STEP], trial[1 + SATELLITE] = a, 0.0
-    for noise in _FEW_NOISES:
-        middle = (histogram.variance - QUANTISATION_VARIANCE) / (a * a) - noise * noise
-        trial[1 + LOG_VARIANCE] = max(2.0 * math.log(noise * a), min_log_variance(a, np.bool_(True)))
-        for around in range(-2, 3):
-            exposure = middle + 0.2 * around
-            if exposure > 1e-3:
-                trial[0], trial[1 + BIAS] = math.log(exposure), histogram.mean - exposure * a
-                used += keep_start(pixel, evaluate, np.bool_(True), scratch)
+    used: int = _keep_noises(pixel, evaluate, a, np.int64(2), scratch)
     return used
 
 

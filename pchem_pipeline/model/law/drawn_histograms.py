@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.law.pcd import pcd_mass
+from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
 class DrawnHistograms(NamedTuple):
@@ -42,13 +43,12 @@ def draw_histograms(
     """
     given = [np.asarray(a, np.float64) for a in (quanta_exposure, conversion_gain, bias, read_noise_e)]
     exposure, gain, offset, noise = (np.ravel(a) for a in np.broadcast_arrays(*given))
-    variance = noise**2 - QUANTISATION_VARIANCE * gain**2
-    if (variance < 0).any():
+    if (noise**2 < QUANTISATION_VARIANCE * gain**2).any():
         raise ValueError("the read noise is below the rounding noise")
     origin = np.floor(offset - 9 * noise / gain).astype(np.int64) - 1
     width = np.ceil((exposure + 11 * np.sqrt(exposure) + 12 * (exposure > 0) + 18 * noise) / gain) + 3
     x = origin[:, None] + np.arange(int(width.max()))
-    mass = pcd_mass(x, exposure[:, None], gain[:, None], offset[:, None], np.sqrt(variance)[:, None])
+    mass = sample_mass(SampleLaw(), [exposure, gain, offset, noise / gain], x, far_tails=False)
     counts = rng.multinomial(n_frames, mass / mass.sum(axis=1, keepdims=True))
     return DrawnHistograms(
         counts.astype(np.uint32), origin, np.stack([exposure, gain, offset, noise / gain], axis=1)

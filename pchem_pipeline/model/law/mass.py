@@ -9,15 +9,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.law import mass_numba
 from pchem_pipeline.model.law.cells_numba import EXACT, NEAR
-from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
+from pchem_pipeline.model.law.inputs import pack, satellites_of
 from pchem_pipeline.model.law.parameters import Parameters, columns_of, usable_pixels
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
 
+#: Mass of an occupied code, at least.
+LEAST_SEEN = 1e-60
+
 #: Pixels whose masses are held at a time.
 _AT_ONCE = 256
+# mass of a cell that tells nothing: a difference of two tails that are alike, whose slopes are left over
+_LEAST_TOLD = 1e-15
 
 
 def code_ranges(
@@ -145,11 +150,34 @@ def sample_parabolas(
         Nats, shape (n,), samples of less than 1e-50 as of that; slopes in log H, 1/g, mu and log sigma_R^2,
         (n, 4); information in the same, (n, 4, 4).
     """
-    columns, counts = columns_of(maps), kernel_counts(counts)
-    n = counts.shape[0]
-    value, score, information = np.full(n, np.nan), np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
-    first = np.ascontiguousarray(origin, np.int64)
-    none = np.empty((0, counts.shape[1]))
-    rule = (none, none, np.empty(0, np.int64)) if replaced is None else replaced.arrays
-    mass_numba.parabola_tile(counts, first, columns, pack([model], n), *rule, value, score, information)
+    columns, (n, width) = columns_of(maps), counts.shape
+    value, score, information = np.empty(n), np.empty((n, 4)), np.empty((n, 4, 4))
+    beyond = 0 if replaced is None else int(replaced.excess.max(initial=0))
+    for begin in range(0, n, _AT_ONCE):
+        some = slice(begin, begin + _AT_ONCE)
+        mass, slopes = sample_slopes(model.of(some), list(columns[some].T), origin[some], width + beyond)
+        if replaced is not None:
+            mass, slopes = replaced.of(some).mass_and_slopes(mass, slopes)
+        seen = np.maximum(mass, LEAST_SEEN)
+        value[some] = (counts[some] * np.log(seen)).sum(axis=1)
+        told = np.where(mass < _LEAST_TOLD, 0.0, mass)
+        score[some], information[some] = score_and_information(slopes / seen[:, None], told, counts[some])
     return value, score, information
+
+
+def score_and_information(
+    log_slopes: FloatArray, mass: FloatArray, counts: NDArray[np.integer]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the slopes of the log-likelihood of histograms, and Fisher's information of as many samples.
+
+    Args:
+        log_slopes: of the logarithm of the mass in a parameters, shape (n, a, B).
+        mass: of each code, shape (n, B).
+        counts: histograms, shape (n, B).
+
+    Returns:
+        Shapes (n, a) and (n, a, a).
+    """
+    expected = mass * counts.sum(axis=1, keepdims=True)
+    score = np.einsum("nab,nb->na", log_slopes, counts)
+    return score, (log_slopes * expected[:, None]) @ log_slopes.transpose(0, 2, 1)

@@ -11,8 +11,6 @@ from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
 from pchem_pipeline.model.law.cells_numba import (
-    CORE,
-    NEAR,
     Law,
     cells_of,
     fill_masses,
@@ -28,7 +26,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     N_BLOCK,
     OWN,
     SLOPES,
-    WEIGHT,
     Pixel,
     Scratch,
     make_pixel,
@@ -39,10 +36,6 @@ FloatArray = NDArray[np.float64]
 
 
 _MOST_EXPOSURE = 1e6  # e-: each electron number costs, and cumulants may ask for 1e13 of them
-_FAR = 1e-9  # mass of an occupied code below which the tails are looked at
-# mass of a cell that tells nothing: a difference of two tails that are alike, whose slopes are left over
-_LEAST_TOLD = 1e-15
-LEAST_SEEN = 1e-60  # mass of an occupied code, at least
 
 
 @kernel
@@ -123,96 +116,3 @@ def mass_tile(
         for j in range(N_BLOCK - 1 if slopes.shape[0] > 0 else 0):
             for i in range(n_codes):
                 slopes[index, j, i] = scratch.cells[0, SLOPES + j, i]
-
-
-@kernel(borrows=True)
-def replace_some(stays: FloatArray, comes: FloatArray, excess: int, total: float, values: FloatArray) -> None:
-    """Turn the mass of successive codes, or a slope of it, into that of the codes that come out.
-
-    Args:
-        stays: chance that a sample of each code stays, shape (B,).
-        comes: chance that what replaces others is that code, shape (B,).
-        excess: by how much a sample must exceed that, DN.
-        total: of all codes: 1 of a mass, 0 of a slope.
-        values: in and out, at least B + excess codes.
-    """
-    below = 0.0
-    for i in range(excess):
-        below += values[i]
-    for i in range(stays.size):
-        below += values[i + excess]
-        values[i] = stays[i] * values[i] + comes[i] * (total - below)
-
-
-@kernel
-def parabola_tile(
-    counts: NDArray[np.generic],
-    first: NDArray[np.int64],
-    parameters: FloatArray,
-    law: Law,
-    stays: FloatArray,
-    comes: FloatArray,
-    excess: NDArray[np.int64],
-    value: FloatArray,
-    score: FloatArray,
-    information: FloatArray,
-) -> None:
-    """Fill the parabola about the parameters of every row of ``counts``, if they are finite.
-
-    Args:
-        counts: shape (n, B).
-        first: DN of bin 0, shape (n,).
-        parameters: (H, g, mu, sigma), shape (n, 4).
-        law: of the samples.
-        stays: of :class:`.replaced_samples.ReplacedSamples`, shape (n, B), or (0, B) where none is replaced.
-        comes: likewise.
-        excess: likewise, shape (n,) or (0,).
-        value: out, log-likelihood down to masses of 1e-50, nats, shape (n,); comes as NaN.
-        score: out, its slopes in log H, 1/g, mu and log sigma_R^2, shape (n, 4); comes as NaN.
-        information: out, Fisher's, of as many samples, in the same, shape (n, 4, 4); comes as NaN.
-    """
-    n_bins, size = counts.shape[1], N_BLOCK - 1
-    more = 0
-    for index in range(excess.size):
-        more = max(more, excess[index])
-    room, scratch = pixel_scratch(n_bins + more, law)
-    theta, weights, cell = scratch.small[OWN], room.bins[0, WEIGHT], scratch.cells[0]
-    room.facts[0, N_BINS], room.facts[0, FIRST] = float(n_bins + more), 0.0
-    for index in range(parameters.shape[0]):
-        if not known_theta(parameters[index], first[index], 0.0, theta):
-            continue
-        total = 0.0
-        for i in range(n_bins):
-            weights[i] = float(counts[index, i])
-            total += weights[i]
-        pixel = _at(room, first[index])
-        resolve(law, index, 0.0, pixel)
-        cells = cells_of(pixel, np.int64(0))
-        fill_masses(theta, cells, CORE, np.int64(DERIVATIVES), scratch.numbers, scratch.edges, cell)
-        lowest = 1.0
-        for i in range(n_bins):
-            if weights[i] > 0.0:
-                lowest = min(lowest, cell[MASS, i])
-        if lowest < _FAR:
-            fill_masses(theta, cells, NEAR, np.int64(DERIVATIVES), scratch.numbers, scratch.edges, cell)
-        if excess.size > 0:
-            replace_some(stays[index], comes[index], excess[index], 1.0, cell[MASS])
-            for a in range(size):
-                replace_some(stays[index], comes[index], excess[index], 0.0, cell[SLOPES + a])
-        value[index] = 0.0
-        score[index] = 0.0
-        information[index] = 0.0
-        for i in range(n_bins):
-            mass = max(cell[MASS, i], LEAST_SEEN)
-            if weights[i] > 0.0:
-                value[index] += weights[i] * math.log(mass)
-            for a in range(size):
-                relative = cell[SLOPES + a, i] / mass
-                score[index, a] += weights[i] * relative
-                if cell[MASS, i] < _LEAST_TOLD:
-                    continue
-                for b in range(a + 1):
-                    information[index, a, b] += total * relative * cell[SLOPES + b, i]
-        for a in range(size):
-            for b in range(a):
-                information[index, b, a] = information[index, a, b]

@@ -1,4 +1,4 @@
-"""The photon counting distribution (PCD): density, quantised mass and thresholds.
+"""The photon counting distribution (PCD): density and thresholds.
 
 A pixel reads ``X = round((K + R)/g + mu)`` with ``K`` Poisson of mean ``H`` and ``R`` normal of
 standard deviation ``sigma_R`` (Hendrickson et al. 2023, eq. PCD_RV_definition). The PCD is the density that
@@ -9,18 +9,12 @@ All arguments broadcast. Units: H and sigma_R in e-, g in e-/DN, mu, sigma and x
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaln, ndtr, xlogy
-
-from pchem_pipeline.model.arithmetic.normal_numba import REACH
 
 _Array = NDArray[np.float64]
-
-_TERMS = 2**22  # of a sum over electron numbers, at once
 
 
 class PosteriorMeans(NamedTuple):
@@ -38,13 +32,6 @@ class PosteriorMeans(NamedTuple):
     ke: _Array
     ee: _Array
     log_density: _Array
-
-
-def _by_parts(terms: Callable[..., _Array], width: int, *arguments: _Array) -> _Array:
-    """Compute a function of flat arrays, as many elements at once as ``width`` terms of each allow."""
-    n_parts = arguments[0].size * width // _TERMS + 1
-    parts = (np.array_split(a, n_parts) for a in arguments)
-    return np.concatenate([terms(*some) for some in zip(*parts, strict=True)])
 
 
 def pcd_posterior(
@@ -106,43 +93,6 @@ def pcd(
         0.2035
     """
     return np.asarray(np.exp(log_pcd(x, quanta_exposure, conversion_gain, bias, read_noise_dn)))
-
-
-def pcd_mass(
-    x: ArrayLike,
-    quanta_exposure: ArrayLike,
-    conversion_gain: ArrayLike,
-    bias: ArrayLike,
-    analog_read_noise_e: ArrayLike,
-) -> _Array:
-    """Return the exact probability of the whole number x, the rounding of eq. (PCD_RV_definition) included.
-
-    Args:
-        x: whole DN, any shape.
-        quanta_exposure: H >= 0, e-.
-        conversion_gain: g > 0, e-/DN.
-        bias: mu, DN.
-        analog_read_noise_e: sigma_R >= 0 before quantisation, e-.
-
-    Returns:
-        P(X = x), of the broadcast shape.
-    """
-    at, exposure, gain, offset, noise = np.broadcast_arrays(
-        *[np.asarray(a, np.float64) for a in (x, quanta_exposure, conversion_gain, bias, analog_read_noise_e)]
-    )
-    # without noise a number between two cells is half in each
-    flat = [np.ravel(a) for a in (gain * (at - offset), exposure, 0.5 * gain, np.maximum(noise, 1e-200))]
-    reach = float(np.nanmax(REACH * flat[3] + flat[2], initial=0.0))
-    around = np.arange(-int(reach) - 1, int(reach) + 2)
-
-    def summed(y: _Array, h: _Array, half: _Array, s: _Array) -> _Array:
-        k = np.round(y)[:, None] + around
-        off = np.abs(y[:, None] - k)  # the tails above are those below
-        low, high = (off - half[:, None]) / s[:, None], (off + half[:, None]) / s[:, None]
-        weight = np.exp(xlogy(k, h[:, None]) - h[:, None] - gammaln(np.maximum(k, 0) + 1.0))
-        return np.asarray((np.where(k < 0, 0.0, weight) * (ndtr(-low) - ndtr(-high))).sum(axis=1))
-
-    return _by_parts(summed, around.size, *flat).reshape(at.shape)
 
 
 def thresholds(

@@ -57,15 +57,25 @@ class ReplacedSamples:
         # no sample lies beyond the codes
         return cls(stays, comes, np.minimum(excess, n_codes))
 
-    def of(self, pixels: NDArray[np.intp] | NDArray[np.bool_]) -> ReplacedSamples:
+    def of(self, pixels: NDArray[np.intp] | NDArray[np.bool_] | slice) -> ReplacedSamples:
         """Return it for some of the pixels."""
         return ReplacedSamples(self.stays[pixels], self.comes[pixels], self.excess[pixels])
 
-    @property
-    def arrays(self) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
-        """The three as the loops over cells take them."""
-        return (
-            np.ascontiguousarray(self.stays),
-            np.ascontiguousarray(self.comes),
-            np.ascontiguousarray(self.excess, np.int64),
-        )
+    def mass_and_slopes(self, mass: FloatArray, slopes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the mass of the codes that come out, and its slopes.
+
+        Args:
+            mass: of the samples, shape (n, at least c + the largest excess), DN by DN.
+            slopes: of it in a parameters, shape (n, a, as many).
+
+        Returns:
+            Shapes (n, c) and (n, a, c).
+        """
+        width = self.stays.shape[1]
+        values = np.concatenate([mass[:, None], slopes], axis=1)
+        place = np.arange(width) + self.excess[:, None]
+        below = np.take_along_axis(np.cumsum(values, axis=2), place[:, None], axis=2)
+        total = np.zeros((values.shape[1], 1))
+        total[0] = 1.0  # of a mass; that of a slope is 0
+        found = self.stays[:, None] * values[:, :, :width] + self.comes[:, None] * (total - below)
+        return found[:, 0], found[:, 1:]

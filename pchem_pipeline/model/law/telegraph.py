@@ -65,7 +65,8 @@ class _Series:
         exposure, gain, bias, sigma = (float(v) for v in pixel)
         codes, place = np.unique(samples, return_inverse=True)
         self.samples = np.ascontiguousarray(place, np.int64)
-        self.gaps = np.diff(frames, prepend=frames[0]).astype(np.int64)
+        self.gaps, gap_of = np.unique(np.diff(frames, prepend=frames[0]), return_inverse=True)
+        self.gap_of = np.ascontiguousarray(gap_of, np.int64)
         self.run = float(frames[-1] - frames[0] + 1)
         self.mean = exposure
         most = (float(codes[-1]) - bias) * gain + 8.0 * gain * sigma
@@ -81,22 +82,14 @@ class _Series:
         found: FloatArray = np.maximum(self.comb @ poisson, 1e-30)
         return found
 
-    def height(self, theta: FloatArray) -> float:
-        """Return the log-likelihood."""
+    def height(self, theta: FloatArray, states: bool = False) -> tuple[float, FloatArray]:
+        """Return the log-likelihood, and the probability of each state in each frame if asked for."""
         exposure, step, share, tau = unpacked(theta)
         emission = self.emission(exposure + added_of(step))
-        room = np.empty((0, emission.shape[1]))
-        return float(telegraph_numba.filtered(emission, self.samples, self.gaps, share, tau, room))
-
-    def weights(self, theta: FloatArray) -> FloatArray:
-        """Return the part of the frames spent in each state."""
-        exposure, step, share, tau = unpacked(theta)
-        emission = self.emission(exposure + added_of(step))
-        state = np.empty((self.samples.size, emission.shape[1]))
-        args = (emission, self.samples, self.gaps, share, tau, state)
-        telegraph_numba.filtered(*args)
-        telegraph_numba.smooth(*args)
-        return np.asarray(state.mean(axis=0))
+        start, moves = transitions(share, tau, self.gaps)
+        state = np.empty((self.samples.size if states else 0, start.size))
+        height = telegraph_numba.filtered(emission, self.samples, start, moves, self.gap_of, state)
+        return float(height), state
 
     def climbed(self, theta: FloatArray) -> tuple[float, FloatArray]:
         """Return the highest log-likelihood from a start, and where it is."""
@@ -108,7 +101,7 @@ class _Series:
             (np.log(_SHORTEST), longest),
         ]
         bounds = [(np.log(LEAST_EXPOSURE), None), *process * (theta.size // 3)]
-        found = minimize(lambda t: -self.height(t), theta, method="L-BFGS-B", bounds=bounds)
+        found = minimize(lambda t: -self.height(t)[0], theta, method="L-BFGS-B", bounds=bounds)
         return -float(found.fun), np.asarray(found.x)
 
 
@@ -124,6 +117,28 @@ def added_of(step: FloatArray) -> FloatArray:
     return np.asarray(((states[:, None] >> np.arange(step.size)) & 1) @ step)
 
 
+def transitions(
+    share: FloatArray, tau: FloatArray, gaps: NDArray[np.integer]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the probabilities of the states, (s,), and from each to each over gaps, (g, s, s).
+
+    Over a gap each process keeps its state with its correlation, or takes one by chance; the first is the
+    lowest bit of a state's number.
+
+    Args:
+        share: of the time that each process is up, shape (d,).
+        tau: its correlation time, frames, shape (d,).
+        gaps: frames from one to the next, shape (g,).
+    """
+    start, moves = np.ones(1), np.ones((gaps.size, 1, 1))
+    for s, t in zip(share, tau, strict=True):
+        kept, own = np.exp(-gaps / t)[:, None, None], np.array([1.0 - s, s])
+        one = kept * np.eye(2) + (1.0 - kept) * own
+        start = np.kron(own, start)
+        moves = np.einsum("gab,gij->gaibj", one, moves).reshape(gaps.size, start.size, start.size)
+    return start, moves
+
+
 def find_telegraph(
     samples: NDArray[np.integer], frames: NDArray[np.int64], pixel: FloatArray
 ) -> Telegraph | None:
@@ -136,7 +151,7 @@ def find_telegraph(
     """
     series = _Series(samples, frames, pixel)
     theta = np.log([series.mean])
-    constant = found = series.height(theta)
+    constant = found = series.height(theta)[0]
     for rise in _RISES:
         starts = _starts(series, theta)
         if not starts or starts[0][0] < found + _PROMISING:
@@ -148,7 +163,8 @@ def find_telegraph(
     if theta.size == 1:
         return None
     exposure, step, share, tau = unpacked(theta)
-    return Telegraph(exposure, step, share, tau, found - constant, added_of(step), series.weights(theta))
+    weight = series.height(theta, states=True)[1].mean(axis=0)
+    return Telegraph(exposure, step, share, tau, found - constant, added_of(step), weight)
 
 
 def _starts(series: _Series, theta: FloatArray) -> list[tuple[float, FloatArray]]:
@@ -163,5 +179,5 @@ def _starts(series: _Series, theta: FloatArray) -> list[tuple[float, FloatArray]
                 if own > 0.1 * exposure:
                     more = [np.log(step), np.log(share / (1.0 - share)), np.log(tau)]
                     start = np.array([np.log(own), *theta[1:], *more])
-                    found.append((series.height(start), start))
+                    found.append((series.height(start)[0], start))
     return sorted(found, key=lambda f: f[0], reverse=True)

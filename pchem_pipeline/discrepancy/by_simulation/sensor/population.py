@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.discrepancy.by_simulation.sensor.population_numba import solve_parabolas
 from pchem_pipeline.discrepancy.effort import MOST_LEARNT_FROM
 from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.fit.climb_numba import LEAST_STEP, MAX_LOG_EXPOSURE
@@ -53,6 +52,8 @@ _SHIFTS = (0, 1, -1)  # electrons by which a bias may be mistaken
 _ALIKE = np.array([0.3, 0.02, 0.5, 0.15])  # scatter of theta of pixels that are much alike
 _WIDEST_DRAW = 1.5  # of log H and log sigma_R^2 from the maximum
 _RARE = 0.003
+_ARRIVED = 0.2  # nats, twice the rise that a further step promises: more, and a point is no maximum
+_APART = 4.0  # squared standard deviations between two maxima
 _AGAIN = 100  # resamplings of the pixels behind the error of the centre
 _LARGEST_ERROR = np.array([0.8, 0.25, np.inf, 0.8])  # of theta
 _USUAL_NOISE, _NOISE_RANGE = 0.3, 0.2  # e-^2: squared read noise where peaks are hardly resolved, its scatter
@@ -278,13 +279,22 @@ class _Maxima:
     def solve(self, population: Population) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return posterior mean (j, n, 4), covariance (j, n, 4, 4) and weight (j, n) under a population."""
         prior = np.linalg.inv(population.scatter)
-        shape = self.value.shape
-        mean, covariance = np.empty((*shape, 4)), np.empty((*shape, 4, 4))
-        evidence, counts = np.empty(shape), np.empty(shape, np.bool_)
-        solve_parabolas(
-            *(self.theta, self.value, self.score, self.information, population.centre, prior, self.widening),
-            *(self.parabolic, mean, covariance, evidence, counts),
-        )
+        pull, off = prior / self.widening[:, None, None], self.theta - population.centre
+        precision = self.information + pull
+        covariance = np.asarray(np.linalg.inv(precision), np.float64)
+        slope = self.score - np.einsum("nab,jnb->jna", pull, off)
+        step = np.einsum("jnab,jnb->jna", covariance, slope)
+        promised, far = (slope * step).sum(axis=2), np.einsum("jna,nab,jnb->jn", off, pull, off)
+        arrived, ends = self.parabolic | (promised < _ARRIVED), self.theta + step
+        mean = np.where(arrived[:, :, None], ends, self.theta)
+        evidence = self.value + 0.5 * (promised - far - np.linalg.slogdet(precision)[1])
+        counts = arrived.copy()
+        counts[0] = True
+        for j in range(1, len(counts)):
+            for i in range(j):  # one of the earlier ones again
+                apart = ends[j] - ends[i]
+                distance = np.einsum("na,nab,nb->n", apart, precision[i], apart)
+                counts[j] &= ~counts[i] | (distance > _APART)
         # the prior's factor, its scatter widened in each pixel
         factor = 0.5 * np.linalg.slogdet(prior)[1] - 2.0 * np.log(self.widening)
         self.evidence = np.logaddexp.reduce(evidence, axis=0) + factor

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from helpers.plain_camera import PlainCamera
-from helpers.plain_law import joint_mass
+from helpers.plain_law import joint_mass, pcd_mass
 from helpers.small_stacks import small_stack
 from scipy import special, stats
 
@@ -23,7 +23,6 @@ from pchem_pipeline.effects.framework.evidence import MOST_HITS, SCORES, Evidenc
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law import cell_scores_numba
-from pchem_pipeline.model.law.pcd import pcd_mass
 
 H, STEP, BIAS, WIDTH = 1.7, 9.0, 40.3, 2.4
 

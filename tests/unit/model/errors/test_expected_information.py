@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from helpers.plain_law import pcd_mass
 from scipy.integrate import quad
 from scipy.stats import norm, poisson
 
@@ -13,7 +14,6 @@ from pchem_pipeline.model.errors.expected_information import (
     shared_information,
 )
 from pchem_pipeline.model.errors.fisher import expected_scores
-from pchem_pipeline.model.law.pcd import pcd_mass
 
 POINTS = [(2.0, 0.2), (0.1, 0.305), (2.0, 0.305), (10.0, 0.45), (2.0, 0.6), (1.0, 1.0)]
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.bounds import cramer_rao
 from helpers.drawn_pixels import draw
+from helpers.plain_law import pcd_mass
 from scipy.optimize import minimize
 
 from pchem_pipeline.effects.analog.shared_noise import RowNoise
@@ -11,7 +12,7 @@ from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_roundin
 from pchem_pipeline.model.fit.api import fit_histograms, likelihood_moments
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.model.law.pcd import log_pcd, pcd_mass
+from pchem_pipeline.model.law.pcd import log_pcd
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import Command, run_stages, run_status
 from pchem_pipeline.stages.fit.fit import fit_tile

@@ -8,6 +8,7 @@ import functools
 import numpy as np
 import pytest
 from helpers.extended_reference import LAWS
+from helpers.plain_law import pcd_mass
 from numpy.typing import NDArray
 from scipy.optimize import root
 
@@ -17,7 +18,6 @@ from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.mass import sample_mass
-from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")

@@ -8,6 +8,7 @@ import pytest
 from helpers.bounds import cramer_rao
 from helpers.drawn_pixels import draw
 from helpers.em_trace import LIMITS, evaluated
+from helpers.plain_law import pcd_mass
 from helpers.reference_pchem import Theta, memberships
 from iminuit import Minuit
 
@@ -20,7 +21,6 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law import cells_numba
 from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood
-from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
     CENTRE,

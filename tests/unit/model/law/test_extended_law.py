@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.em_trace import evaluated
 from helpers.extended_reference import EVERYTHING, LAWS, reference_mass
+from helpers.plain_law import pcd_mass
 from scipy.stats import binom, norm, poisson
 
 from pchem_pipeline.model.fit.api import satellite_threshold
@@ -14,7 +15,6 @@ from pchem_pipeline.model.law.electron_laws_numba import LOST, _one_law, electro
 from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas, sample_slopes
-from pchem_pipeline.model.law.pcd import pcd_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 PIXELS = [(2.0, 1 / 12, 100.0, 3.0), (0.4, 0.1, 99.3, 2.0), (9.0, 1 / 5.5, 97.7, 1.1)]

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.plain_law import pcd_mass
 from scipy.stats import norm
 
-from pchem_pipeline.model.law.pcd import (
-    log_pcd,
-    pcd,
-    pcd_mass,
-)
+from pchem_pipeline.model.law.pcd import log_pcd, pcd
 
 CASES = [
     (0.05, 0.1, 50.2, 3.0),

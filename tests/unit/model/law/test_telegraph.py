@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law import telegraph_numba
-from pchem_pipeline.model.law.telegraph import added_of, find_telegraph
+from pchem_pipeline.model.law.telegraph import added_of, find_telegraph, transitions
 
 PIXEL = np.array([1.4, 1 / 12, 100.0, 3.6])
 STEP, SHARE, TAU = 0.9, 0.4, 60.0
@@ -75,10 +75,10 @@ def test_likelihood_and_states_are_those_of_the_matrices(n_processes: int) -> No
         after = moves(gaps[i]) @ (emission[samples[i]] * after)
         after /= after.max()
     got = np.empty((400, states))
-    args = (emission, samples, gaps, share, tau)
+    kinds, which = np.unique(gaps, return_inverse=True)
+    args = (emission, samples, *transitions(share, tau, kinds), which)
     assert telegraph_numba.filtered(*args, np.empty((0, states))) == pytest.approx(total, rel=1e-12)
     assert telegraph_numba.filtered(*args, got) == pytest.approx(total, rel=1e-12)
-    telegraph_numba.smooth(*args, got)
     np.testing.assert_allclose(got, smooth, rtol=1e-10)
 
 
