@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.html_page import Page
 from helpers.report_material import report_data
 
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
@@ -211,7 +212,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
     )
     share = next(each for each in criteria(data) if each.setting == "hot_pixels").found  # of the report
     assert share == percent(int(rows[2]["hot_pixels"]), known.size)
-    page = (shell.folder / "history" / "compare.html").read_text(encoding="utf-8")
+    page = Page((shell.folder / "history" / "compare.html").read_text(encoding="utf-8")).text
     assert "The camera over time" in page
     assert f"Hot pixels: {len(rows[2]['hot_new'].split())} new, " in page
     assert "-20 C" in page

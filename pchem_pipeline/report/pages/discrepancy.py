@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 from pchem_pipeline.base.units import typeset
 from pchem_pipeline.discrepancy.verdict import (
@@ -25,9 +24,9 @@ from pchem_pipeline.report.pages.discrepancy_tables import (
     parameter_name,
     probability_text,
 )
+from pchem_pipeline.report.pages.page import Finding, KeyFact, Section
 from pchem_pipeline.report.pages.pictures import Picture
 from pchem_pipeline.report.pages.summary import VERDICT_LEVELS, Flag, Level, gravest_first
-from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.style.wording import (
     count,
     fitted_or_chosen,
@@ -89,58 +88,26 @@ _EMPTY = {
 }
 
 
-@dataclass(frozen=True)
-class KeyFact:
-    """One number of the first screen, with up to three lines below it."""
-
-    label: str
-    value: str
-    more: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Part:
-    """A part of the page: figures and tables under a heading, or the reason ``empty`` of their absence."""
-
-    id: str
-    title: str
-    intro: str
-    empty: str
-    pictures: list[Picture]
-    tables: list[Table]
+def finding(data: DiscrepancyData) -> Finding:
+    """Return the verdict with its key numbers and remarks."""
+    found = data.found
+    return Finding(
+        VERDICT_LEVELS.get(found.verdict, "note"),
+        found.verdict.replace("_", " ").capitalize(),
+        typeset(found.sentence),
+        frames_text(found),
+        key_facts(data),
+        remarks(data),
+    )
 
 
-@dataclass(frozen=True)
-class DiscrepancyView:
-    """Content of the templates.
-
-    Attributes:
-        level: severity (a class of the style sheet).
-        name: name of the verdict.
-        sentence: the verdict in one sentence.
-        frames: samples examined.
-        facts: the key numbers.
-        remarks: evidence for and against it.
-        parts: figures and tables.
-    """
-
-    level: str
-    name: str
-    sentence: str
-    frames: str
-    facts: list[KeyFact]
-    remarks: list[Flag]
-    parts: list[Part]
-
-
-def discrepancy_view(data: DiscrepancyData, pictures: Sequence[Picture]) -> DiscrepancyView:
-    """Return the page's content.
+def evidence(data: DiscrepancyData, pictures: Sequence[Picture]) -> list[Section]:
+    """Return the sections of the page below the verdict.
 
     Args:
         data: verdict and arrays.
         pictures: the figures of the verdict.
     """
-    verdict = data.found.verdict
     tables = discrepancy_tables(data)
     parts = []
     first = _signature(data.found)
@@ -158,18 +125,10 @@ def discrepancy_view(data: DiscrepancyData, pictures: Sequence[Picture]) -> Disc
             continue  # no disagreement, or no data for figures
         if id_ == "where" and not data.found.where:
             title = "Data and model side by side"
-        empty = "" if shown or rows else _empty(data.found, id_)
-        parts.append(Part(f"discrepancy-part-{id_}", title, intro, empty, shown, rows))
-    sentence = typeset(data.found.sentence)
-    return DiscrepancyView(
-        VERDICT_LEVELS.get(verdict, "note"),
-        verdict.replace("_", " ").capitalize(),
-        sentence,
-        frames_text(data.found),
-        key_facts(data),
-        remarks(data),
-        parts,
-    )
+        missing = () if shown or rows else (_empty(data.found, id_),)
+        part = f"discrepancy-part-{id_}"
+        parts.append(Section(id=part, title=title, intro=intro, missing=missing, pictures=shown, tables=rows))
+    return parts
 
 
 def _empty(found: Verdict, part: str) -> str:

@@ -1,4 +1,4 @@
-"""What all pages share: frame and style, the scripts, the figures' numbers, the charts, the glossary."""
+"""What all pages share: sections, frame and style, scripts, the figures' numbers, charts, the glossary."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import base64
 import gzip
 import importlib.resources
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 from markupsafe import Markup
@@ -17,6 +18,11 @@ from pchem_pipeline.report.inspector.inspector import content_policy, json_for_h
 from pchem_pipeline.report.pages.glossary import GLOSSARY, explained
 from pchem_pipeline.report.style.wording import short_name, visible
 
+if TYPE_CHECKING:
+    from pchem_pipeline.report.pages.pictures import Picture
+    from pchem_pipeline.report.pages.summary import Flag
+    from pchem_pipeline.report.pages.tables import Table
+
 #: Numbers of a table that the page keeps.
 _LARGEST_TABLE = 6_000
 #: Folder of the library that draws charts.
@@ -25,17 +31,83 @@ _FLAG_WORDS = {"good": "Good", "note": "Note", "caution": "Caution", "serious": 
 _FLAG_SIGNS = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
 
 
-def render_page(name: str, figures: Sequence[Figure], /, *scripts: str, **content: Any) -> str:
+@dataclass(frozen=True)
+class KeyFact:
+    """A number below a finding, with up to three lines below it."""
+
+    label: str
+    value: str
+    more: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What came out.
+
+    Attributes:
+        level: good, note, caution or serious (a class of the style sheet).
+        name: of the verdict.
+        sentence: the verdict in one sentence.
+        about: what it is about, for example the samples examined.
+        facts: the key numbers.
+        remarks: evidence for and against it.
+    """
+
+    level: str
+    name: str
+    sentence: str
+    about: str = ""
+    facts: Sequence[KeyFact] = ()
+    remarks: Sequence[Flag] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A section of a page: what came out, tables, figures, further tables.
+
+    Attributes:
+        id: anchor in the page.
+        title: heading.
+        name: in the table of contents; empty: the title.
+        verdict: what came out.
+        intro: introduction.
+        missing: sentences on what is not shown, and why.
+        first: tables above the figures.
+        pictures: figures.
+        tables: tables below the figures.
+        kind: of a section of its own kind: the template ``section_<kind>.html.j2`` shows it, as ``section``.
+        content: what that template shows.
+        folded: whether it is closed until somebody opens it.
+    """
+
+    id: str
+    title: str
+    name: str = ""
+    verdict: Finding | None = None
+    intro: str = ""
+    missing: Sequence[str] = ()
+    first: Sequence[Table] = ()
+    pictures: Sequence[Picture] = ()
+    tables: Sequence[Table] = ()
+    kind: str = ""
+    content: Any = None
+    folded: bool = False
+
+
+def render_page(
+    name: str, sections: Sequence[Section], figures: Sequence[Figure], /, *scripts: str, **content: Any
+) -> str:
     """Return a page as HTML, complete in itself.
 
     Args:
         name: of its template, which extends ``page.html.j2``.
-        figures: those that it shows; their numbers can be saved from it.
+        sections: from top to bottom.
+        figures: those that they show; their numbers can be saved from the page.
         scripts: further ones that its template holds.
         content: what its template shows.
     """
     charts = {figure.name: figure.chart for figure in figures if not figure.chart.still}
-    always = (page_script(), *((chart_script(),) if charts else ()))
+    always = (text_of("page.js"), *((chart_script(),) if charts else ()))
     return _template(name).render(
         policy=content_policy(*always, *scripts),
         page_scripts=[Markup(script) for script in always],
@@ -43,15 +115,9 @@ def render_page(name: str, figures: Sequence[Figure], /, *scripts: str, **conten
         chart_style=Markup(text_of("uPlot.min.css", _LIBRARY)) if charts else "",
         tables=json_for_html(figure_tables(figures)),
         glossary=GLOSSARY,
-        flag_words=_FLAG_WORDS,
-        flag_signs=_FLAG_SIGNS,
+        sections=sections,
         **content,
     )
-
-
-def page_script() -> str:
-    """Return the script of files, words and folded parts."""
-    return text_of("page.js")
 
 
 def chart_script() -> str:
@@ -91,6 +157,7 @@ def _template(name: str) -> jinja2.Template:
     environment.filters["together"] = _together
     environment.filters["explained"] = lambda text: explained(_together(visible(text)))
     environment.filters["name"] = short_name
+    environment.globals |= {"flag_words": _FLAG_WORDS, "flag_signs": _FLAG_SIGNS}
     return environment.get_template(name)
 
 

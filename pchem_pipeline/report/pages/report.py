@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
 from pchem_pipeline.report.inspector.inspector import embedded, script
-from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, DiscrepancyView, discrepancy_view
+from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, evidence, finding
 from pchem_pipeline.report.pages.emva import emva_tables
 from pchem_pipeline.report.pages.methods import method_tables
-from pchem_pipeline.report.pages.page import render_page
+from pchem_pipeline.report.pages.page import Finding, Section, render_page
 from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
 from pchem_pipeline.report.pages.provenance import provenance_tables
 from pchem_pipeline.report.pages.report_json import report_json
@@ -51,30 +52,30 @@ def render_report(
     shown = [figure for figure in every if figure.section]
     drawn = (draw or draw_here)([*(every if settings.figure_formats else shown), *others], settings)
     figures = {name: content for each in drawn.values() for name, content in each.files.items()}
-    pictures, evidence = (
-        [Picture(figure, drawn[figure.name]) for figure in each] for each in (shown, others)
-    )
-    view = None if data.discrepancy is None else discrepancy_view(data.discrepancy, evidence)
+    pictures, proofs = ([Picture(figure, drawn[figure.name]) for figure in each] for each in (shown, others))
+    verdict = None if data.discrepancy is None else finding(data.discrepancy)
+    parts = [] if data.discrepancy is None else evidence(data.discrepancy, proofs)
     makers = (result_tables, method_tables, emva_tables, provenance_tables)
     tables = [table for make in makers for table in make(data)]
-    sections = page_sections(Material(data, settings, pictures, tables, view))
-    pages = {} if view is None else {DISCREPANCY_PAGE: _discrepancy_page(data, view)}
+    sections = page_sections(Material(data, settings, pictures, tables, verdict, parts))
+    pages = {} if verdict is None else {DISCREPANCY_PAGE: _discrepancy_page(data, verdict, parts)}
     numbers, inspector = report_json(data), embedded(data)
     page = render_page(
         "report.html.j2",
+        sections,
         [*shown, *others],
         *([script()] if inspector else []),
         title=data.title,
         data=data,
         inspector=inspector,
-        sections=sections,
     )
     return RenderedReport(page, numbers, figures, pages)
 
 
-def _discrepancy_page(data: ReportData, view: DiscrepancyView) -> str:
+def _discrepancy_page(data: ReportData, verdict: Finding, parts: Sequence[Section]) -> str:
     about = "" if data.shape[0] == 1 else f"{data.shape[0]} × {data.shape[1]} pixels"
     if data.n_frames:
         about += f"{', ' if about else ''}{data.n_frames:,} frames"
-    figures = [picture.figure for part in view.parts for picture in part.pictures]
-    return render_page("discrepancy.html.j2", figures, title=data.title, about=about, view=view)
+    figures = [picture.figure for part in parts for picture in part.pictures]
+    sections = [Section(id="verdict", title="Verdict", verdict=verdict), *parts]
+    return render_page("discrepancy.html.j2", sections, figures, title=data.title, about=about)

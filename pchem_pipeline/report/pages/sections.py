@@ -7,16 +7,15 @@ table of contents follows the list.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.samples import AXES, slope_of
 from pchem_pipeline.report.pages.cite import citation
-from pchem_pipeline.report.pages.discrepancy import DiscrepancyView
 from pchem_pipeline.report.pages.next_steps import next_steps
+from pchem_pipeline.report.pages.page import Finding, Section
 from pchem_pipeline.report.pages.pictures import Picture
 from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, pixel_counts, sentence
 from pchem_pipeline.report.pages.tables import Table
@@ -113,33 +112,24 @@ class Material:
         settings: section ``report``.
         pictures: all drawn figures; each names its section.
         tables: all tables of results; each names its section.
-        view: what the model is missing, or None where nobody looked.
+        verdict: on what the model is missing, or None where nobody looked.
+        parts: of its evidence.
     """
 
     data: ReportData
     settings: ReportSettings
     pictures: list[Picture]
     tables: list[Table]
-    view: DiscrepancyView | None = None
+    verdict: Finding | None = None
+    parts: Sequence[Section] = ()
 
+    def pictures_of(self, section: str) -> list[Picture]:
+        """Return the figures of a section, by its id."""
+        return [picture for picture in self.pictures if picture.figure.section == section]
 
-@dataclass(frozen=True)
-class Section:
-    """One section of the page.
-
-    Attributes:
-        id: anchor in the page.
-        title: heading, also in the table of contents.
-        kind: the template ``section_<kind>.html.j2`` shows it, as ``section``.
-        content: what that template shows.
-        folded: whether it is closed until somebody opens it.
-    """
-
-    id: str
-    title: str
-    kind: str
-    content: Mapping[str, Any] = field(default_factory=dict)
-    folded: bool = False
+    def tables_of(self, section: str) -> list[Table]:
+        """Return the tables of a section, by its id."""
+        return [table for table in self.tables if table.section == section]
 
 
 Maker = Callable[[Material], Section | None]
@@ -162,30 +152,31 @@ def _summary(material: Material) -> Section:
         "next": [(step.of(data.typed_run), step.why) for step in next_steps(data)],
         "flags": [flag for flag in remarks if flag.level != "good"],
         "passed": [flag for flag in remarks if flag.level == "good" and flag.about == "results"],
-        "pictures": [each for each in material.pictures if each.figure.section == "summary"],
-        "verdict": material.view,
         "effects": data.discrepancy.found.effects if data.discrepancy else (),
     }
     return Section(
-        "summary", "Is the sensor within limits, and are these results reliable?", "summary", content
+        id="summary",
+        title="Is the sensor within limits, and are these results reliable?",
+        name="Summary",
+        verdict=material.verdict,
+        pictures=material.pictures_of("summary"),
+        kind="summary",
+        content=content,
     )
 
 
-def _inspector(material: Material) -> Section:
+def _inspector(_: Material) -> Section:
     """Say where the inspector is; what it shows lies at the end of the page."""
-    shown = material.data.inspector is not None
-    content = {"shown": shown, "why": "No pixel was fitted."}
-    return Section("inspector", "Look at pixels", "inspector", content)
+    return Section(id="inspector", title="Look at pixels", kind="inspector")
 
 
-def _figures(row: tuple[str, str, str, tuple[str, ...]], folded: bool, material: Material) -> Section | None:
+def _part(row: tuple[str, str, str, tuple[str, ...]], folded: bool, material: Material) -> Section | None:
     """Put figures and tables into their section; one without any says why."""
     id_, title, intro, parts = row
     data = material.data
     if data.samples is None and id_ in _OF_SAMPLES:
         return None
-    shown = [picture for picture in material.pictures if picture.figure.section == id_]
-    tables = [table for table in material.tables if table.section == id_]
+    shown, tables = material.pictures_of(id_), material.tables_of(id_)
     missing = [data.missing[part] for part in parts if part in data.missing]
     if not shown and not tables and not missing:
         if data.samples is not None:
@@ -199,46 +190,56 @@ def _figures(row: tuple[str, str, str, tuple[str, ...]], folded: bool, material:
         slope = slope_of(data)
         noun = symbol(slope)[1] if slope else "charge"
         intro = intro.format(against=words[0], noun=noun, offset=symbol(words[3])[1]) if words else _NO_LINE
-    content = {"intro": intro, "missing": missing, "pictures": shown, "tables": tables}
-    return Section(id_, title, "figures", content, folded)
+    reasons = [f"Not shown: {reason}" for reason in missing]
+    return Section(
+        id=id_, title=title, intro=intro, missing=reasons, pictures=shown, tables=tables, folded=folded
+    )
 
 
 def _discrepancy(material: Material) -> Section:
     look = material.data.quick_look
     content = {
         "found": look is not None and bool(look.found),
-        "view": material.view,
-        "tables": [table for table in material.tables if table.section == "discrepancy"],
+        "parts": material.parts,
         "command": f"pchem discrepancy {material.data.typed_run}",
     }
-    return Section("discrepancy", "What the model is missing", "discrepancy", content)
+    return Section(
+        id="discrepancy",
+        title="What the model is missing",
+        verdict=material.verdict,
+        tables=material.tables_of("discrepancy"),
+        kind="discrepancy",
+        content=content,
+    )
 
 
 def _tables(id_: str, title: str, empty: str, material: Material) -> Section | None:
     """Put tables into their section; one without any says why, or is left out."""
-    tables = [table for table in material.tables if table.section == id_]
-    content = {"tables": tables, "empty": empty}
-    return Section(id_, title, "tables", content, folded=True) if tables or empty else None
+    tables = material.tables_of(id_)
+    missing = (empty,) if empty and not tables else ()
+    return (
+        Section(id=id_, title=title, missing=missing, tables=tables, folded=True) if tables or empty else None
+    )
 
 
 def _cite(material: Material) -> Section:
-    content = {"citation": citation(material.data)}
-    return Section("cite", "How to cite", "cite", content, folded=True)
+    content = citation(material.data)
+    return Section(id="cite", title="How to cite", kind="cite", content=content, folded=True)
 
 
 def _configuration(material: Material) -> Section:
-    content = {"text": material.data.config_yaml}
-    return Section("configuration", "Configuration", "text", content, folded=True)
+    content = material.data.config_yaml
+    return Section(id="configuration", title="Configuration", kind="text", content=content, folded=True)
 
 
 #: The page from top to bottom.
 PAGE: tuple[Maker, ...] = (
     _summary,
-    partial(_figures, OPEN[0], False),
+    partial(_part, OPEN[0], False),
     _inspector,
-    *(partial(_figures, row, False) for row in OPEN[1:]),
+    *(partial(_part, row, False) for row in OPEN[1:]),
     _discrepancy,
-    *(partial(_figures, row, True) for row in FOLDED),
+    *(partial(_part, row, True) for row in FOLDED),
     partial(_tables, "tables", "Tables", "No pixel has a value."),
     partial(_tables, "emva", "Quantities of EMVA 1288", ""),
     _cite,

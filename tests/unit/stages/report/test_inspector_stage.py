@@ -15,7 +15,7 @@ from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.inspector.inspector import map_facts
 from pchem_pipeline.report.pages import sections
-from pchem_pipeline.report.pages.sections import Section
+from pchem_pipeline.report.pages.page import Section
 from pchem_pipeline.stages.report import inspector
 from pchem_pipeline.stages.report.inspector import listed_maps, map_entry, read_maps
 from pchem_pipeline.stages.report.pixels import choose_inspected
@@ -182,7 +182,8 @@ def test_the_choice_repeats() -> None:
 
 def test_a_new_section_is_one_entry_in_one_list(data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:
     def mine(material: sections.Material) -> Section:
-        return Section("mine", "My <section>", "text", {"text": f"{material.data.title} & more"})
+        text = f"{material.data.title} & more"
+        return Section(id="mine", title="My <section>", kind="text", content=text)
 
     monkeypatch.setattr(sections, "PAGE", (*sections.PAGE, mine, lambda _: None))
     page = page_without_pictures(data)
