@@ -214,7 +214,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
     assert share == percent(int(rows[2]["hot_pixels"]), known.size)
     page = Page((shell.folder / "history" / "compare.html").read_text(encoding="utf-8")).text
     assert "The camera over time" in page
-    assert f"Hot pixels: {len(rows[2]['hot_new'].split())} new, " in page
+    assert f"Hot pixels : {len(rows[2]['hot_new'].split())} new, " in page
     assert "-20 C" in page
     wrong = {"labels": ["one"]}, {"rate": 0.0}, {"against": "label"}, {"against": "temperature"}
     for each in wrong:

@@ -107,12 +107,13 @@ def render_page(
         content: what its template shows.
     """
     charts = {figure.name: figure.chart for figure in figures if not figure.chart.still}
-    always = (text_of("page.js"), *((chart_script(),) if charts else ()))
+    drawn = bool(charts or scripts)  # the inspector draws charts, too
+    always = (text_of("page.js"), *((chart_script(),) if drawn else ()))
     return _template(name).render(
         policy=content_policy(*always, *scripts),
         page_scripts=[Markup(script) for script in always],
-        charts=json_for_html(page_charts(charts)) if charts else "",
-        chart_style=Markup(text_of("uPlot.min.css", _LIBRARY)) if charts else "",
+        charts=json_for_html(page_charts(charts)) if drawn else "",
+        chart_style=Markup(text_of("uPlot.min.css", _LIBRARY)) if drawn else "",
         tables=json_for_html(figure_tables(figures)),
         glossary=GLOSSARY,
         sections=sections,
