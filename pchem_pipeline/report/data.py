@@ -27,7 +27,7 @@ from pchem_pipeline.report.settings import Criteria
 if TYPE_CHECKING:
     from pchem_pipeline.model.checks.map_parts import Parts
     from pchem_pipeline.report.figures.figure import Figure
-    from pchem_pipeline.report.inspector.inspector_data import InspectorData
+    from pchem_pipeline.report.inspector.inspector import InspectorData
 
 FloatArray = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from pchem_pipeline.compute.environment import prepare_environment
 prepare_environment()
 
 from pchem_pipeline.report.data import ReportData  # noqa: E402
-from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample  # noqa: E402
+from pchem_pipeline.report.inspector.inspector import InspectorData, MapEntry, PixelSample  # noqa: E402
 from pchem_pipeline.report.inspector.packing import choose_scale, pack_map  # noqa: E402
 from pchem_pipeline.report.pages.pictures import Drawn  # noqa: E402
 from pchem_pipeline.report.pages.report import render_report  # noqa: E402

@@ -19,8 +19,8 @@ from pchem_pipeline.commands.compare.compare import compare_runs, comparison_of
 from pchem_pipeline.commands.compare.history import HistorySettings, history_csv
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.report.figures.history import history_figures
-from pchem_pipeline.report.pages.criteria import criteria
+from pchem_pipeline.report.figures.compare import history_figures
+from pchem_pipeline.report.pages.summary import criteria
 from pchem_pipeline.report.style.wording import percent
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo

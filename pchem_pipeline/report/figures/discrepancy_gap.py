@@ -28,8 +28,7 @@ from pchem_pipeline.report.charts.chart import (
     Words,
 )
 from pchem_pipeline.report.data import DiscrepancyData
-from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.stacks import pull_axis, row_stack
+from pchem_pipeline.report.figures.figure import DataTable, Figure, pull_axis, row_stack
 from pchem_pipeline.report.style.wording import short
 
 #: The gap is shown in millionths of a nat per sample.

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from pchem_pipeline.report.comparison import ArrayRow, Comparison, HistoryRow, Pair, Setting
-from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures
+from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures, history_figures
 from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.figures.history import history_figures
 from pchem_pipeline.report.pages.page import Finding, Section, render_page
 from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
 from pchem_pipeline.report.pages.report_json import json_value

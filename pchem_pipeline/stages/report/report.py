@@ -17,14 +17,18 @@ from pchem_pipeline.compute.executor import Beside, beside
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
+from pchem_pipeline.model.maps.ordered import median_of
+from pchem_pipeline.planning.frames import contour_data, frames_needed, precision
+from pchem_pipeline.planning.point import Point
+from pchem_pipeline.planning.targets import Target, parse_target
 from pchem_pipeline.report.data import PixelFit, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
 from pchem_pipeline.report.figures.ensemble import case_name
 from pchem_pipeline.report.figures.stability import stability_figures
-from pchem_pipeline.report.inspector.inspector_data import InspectorData, PixelSample
+from pchem_pipeline.report.inspector.inspector import InspectorData, PixelSample
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
-from pchem_pipeline.report.pages.quick_look import check_sentence
 from pchem_pipeline.report.pages.report import render_report
+from pchem_pipeline.report.pages.summary import check_sentence
 from pchem_pipeline.report.style.wording import short_name
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy.result import verdict_data
@@ -41,7 +45,6 @@ from pchem_pipeline.stages.report.pixels import (
     pixel_fits,
     pixel_index,
 )
-from pchem_pipeline.stages.report.plan_section import plan_section
 from pchem_pipeline.stages.report.stored import PixelHistograms, StoredRun, read_histograms, read_run
 from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.stages.table import pipeline
@@ -390,3 +393,40 @@ _PARTS = {
     "electrons": "no electron numbers",
     "components": "no component widths",
 }
+
+
+_TARGETS = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
+_DRAWN = _TARGETS[:2]
+_FINE = 14  # points along each axis of the figure
+
+
+def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict[str, Any] | None:
+    """Return the numbers of the section, or None where no pixel has a value.
+
+    Args:
+        maps: of the run.
+        n_frames: frames of the run, or None where pixels differ.
+    """
+    names = ("quanta_exposure", "read_noise_e", "conversion_gain")
+    medians = [median_of(maps[name]) for name in names if name in maps]
+    if len(medians) < len(names) or not np.isfinite(medians).all():
+        return None
+    exposure, noise, gain = medians
+    try:
+        point = Point(exposure, noise, gain)
+    except ConfigError:
+        return None
+    rows = [
+        {"target": str(target), "name": target.name, "frames": frames_needed(target, point)}
+        for target in map(parse_target, _TARGETS)
+    ]
+    reached = {} if n_frames is None else precision(point, n_frames)
+    mark = (exposure, noise)
+    return {"rows": rows, "reached": reached, "n_frames": n_frames, "mark": mark, "contours": _contours()}
+
+
+@functools.cache
+def _contours() -> dict[str, Any]:
+    """Return the frames over exposure and read noise; relative targets look alike for every sensor."""
+    targets: list[Target] = [parse_target(text) for text in _DRAWN]
+    return contour_data(targets, 0.01, fine=_FINE)

@@ -14,7 +14,7 @@ from pchem_pipeline.base.variables import Variable
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.inspector.inspector import map_facts
-from pchem_pipeline.report.pages import sections
+from pchem_pipeline.report.pages import report as page_report
 from pchem_pipeline.report.pages.page import Section
 from pchem_pipeline.stages.report import inspector
 from pchem_pipeline.stages.report.inspector import listed_maps, map_entry, read_maps
@@ -181,11 +181,11 @@ def test_the_choice_repeats() -> None:
 
 
 def test_a_new_section_is_one_entry_in_one_list(data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:
-    def mine(material: sections.Material) -> Section:
+    def mine(material: page_report.Material) -> Section:
         text = f"{material.data.title} & more"
         return Section(id="mine", title="My <section>", kind="text", content=text)
 
-    monkeypatch.setattr(sections, "PAGE", (*sections.PAGE, mine, lambda _: None))
+    monkeypatch.setattr(page_report, "PAGE", (*page_report.PAGE, mine, lambda _: None))
     page = page_without_pictures(data)
     assert '<li><a href="#mine">My &lt;section&gt;</a></li>' in page
     assert '<h2 id="mine-heading">My &lt;section&gt;</h2>' in page
