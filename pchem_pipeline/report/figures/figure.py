@@ -35,7 +35,7 @@ from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import plain
 
 if TYPE_CHECKING:
-    from pchem_pipeline.report.style.style import Drawing, Look
+    from pchem_pipeline.report.charts.on_paper import Drawing, Look
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ def draw_figure(figure: Figure, settings: ReportSettings) -> Drawn:
         figure: the figure.
         settings: formats and resolution.
     """
-    from pchem_pipeline.report.style.style import Look, drawing_bytes
+    from pchem_pipeline.report.charts.on_paper import Look, drawing_bytes
 
     look = Look(figure.width_mm, dpi=settings.dpi)
     drawing = figure.draw(look)

@@ -27,6 +27,7 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.verdict import Place, Verdict
 from pchem_pipeline.effects.framework.registry import effect_class
 from pchem_pipeline.report.charts.chart import PAGE_MM
+from pchem_pipeline.report.charts.on_paper import Look
 from pchem_pipeline.report.data import DiscrepancyData, ReportData
 from pchem_pipeline.report.figures import discrepancy_gap, discrepancy_where
 from pchem_pipeline.report.figures.catalogue import DISCREPANCY_FIGURES, discrepancy_figures
@@ -44,7 +45,6 @@ from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.palette import LIGHT
-from pchem_pipeline.report.style.style import Look
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays, path_arrays
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 
