@@ -146,12 +146,7 @@ def _gap_alt(found: Verdict) -> str:
         + (f" ({short(bar.low)} to {short(bar.high)})" if math.isfinite(bar.low + bar.high) else "")
         for bar in gap_bars(found)
     ]
-    return "; ".join([*words, f"floor {gap_text(found.gap.floor)}"])
-
-
-def gap_text(gap: float) -> str:
-    """Return a gap in micronats, without the unit."""
-    return micronats(gap)
+    return "; ".join([*words, f"floor {micronats(found.gap.floor)}"])
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,11 @@ from pchem_pipeline.discrepancy.verdict import (
     Step,
     Verdict,
     families_words,
+    micronats,
     sigma_text,
 )
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.report.data import DiscrepancyData
-from pchem_pipeline.report.figures.discrepancy_gap import gap_text
 from pchem_pipeline.report.pages.page import Finding, KeyFact, Section
 from pchem_pipeline.report.pages.pictures import Picture
 from pchem_pipeline.report.pages.summary import VERDICT_LEVELS, Flag, Level, gravest_first
@@ -208,18 +208,18 @@ def _gaps(found: Verdict) -> Table:
     rows = []
     for i, step in enumerate(found.steps):
         low, high = step.gap_interval_after
-        interval = f" ({gap_text(low)} to {gap_text(high)})" if math.isfinite(low) else ""
+        interval = f" ({micronats(low)} to {micronats(high)})" if math.isfinite(low) else ""
         none = "none reduces it" if step.effect else "not fitted"
         rivals = [
-            f"{gap_text(rival.gap_after)} ({rival.effect})" if rival is not None else none
+            f"{micronats(rival.gap_after)} ({rival.effect})" if rival is not None else none
             for rival in (step.runner_up, step.placebo)
         ]
         rows.append(
             (
                 f"{i + 1}: {found.added(step) or step.verdict}",
-                gap_text(step.gap_before),
-                f"{gap_text(step.gap_after)}{interval}",
-                gap_text(step.gap_floor),
+                micronats(step.gap_before),
+                f"{micronats(step.gap_after)}{interval}",
+                micronats(step.gap_floor),
                 *rivals,
             )
         )
@@ -451,14 +451,9 @@ def evidence(data: DiscrepancyData, pictures: Sequence[Picture]) -> list[Section
     parts = []
     first = _signature(data.found)
     for id_, title, intro in PARTS:
-        shown = [
-            picture
-            for picture in pictures
-            if id_ == ("signature" if picture.figure.name in first else picture.figure.section)
-        ]
-        shown.sort(
-            key=lambda picture: first.index(picture.figure.name) if picture.figure.name in first else 0
-        )
+        shown = [each for each in pictures if each.figure.section == id_ and each.figure.name not in first]
+        if id_ == "signature":
+            shown = [each for name in first for each in pictures if each.figure.name == name]
         rows = tables.get(id_, [])
         if id_ == "signature" and not shown:
             continue  # no disagreement, or no data for figures
@@ -533,8 +528,8 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
     if not math.isfinite(gap.before):
         return []
     extended = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
-    nats = f"{gap_text(gap.before)} → {gap_text(gap.after)}" if extended else gap_text(gap.before)
-    unit, chance = "micronats per sample", f"sampling noise: up to {gap_text(gap.floor)}"
+    nats = f"{micronats(gap.before)} → {micronats(gap.after)}" if extended else micronats(gap.before)
+    unit, chance = "micronats per sample", f"sampling noise: up to {micronats(gap.floor)}"
     if not extended or gap.within_chance:
         return [KeyFact("gap between data and model", nats, (unit, chance))]
     more = (f"{nats} {unit}", chance + _interval(gap))
@@ -546,7 +541,7 @@ def _interval(gap: GapChange) -> str:
     low, high = gap.interval_after
     if not (math.isfinite(low) and math.isfinite(high)):
         return ""
-    return f"; remaining: {f'{gap_text(low)} to ' if low > 0.0 else 'at most '}{gap_text(high)}"
+    return f"; remaining: {f'{micronats(low)} to ' if low > 0.0 else 'at most '}{micronats(high)}"
 
 
 def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
@@ -654,7 +649,7 @@ def _closing(found: Verdict) -> Iterator[Flag]:
         yield Flag("good", "The remaining gap is within sampling noise.")
     else:
         left = percent(1.0 - gap.closed_fraction, 1.0)
-        words = f"{gap_text(gap.after)} micronats per sample, sampling noise up to {gap_text(gap.floor)}"
+        words = f"{micronats(gap.after)} micronats per sample, sampling noise up to {micronats(gap.floor)}"
         level: Level = "caution" if found.verdict == "named_in_part" else "note"
         yield Flag(level, f"{left} of the gap remains: {words}.")
 

@@ -18,7 +18,6 @@ from pchem_pipeline.report.inspector.inspector import embedded, script
 from pchem_pipeline.report.pages.cite import citation
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, evidence, finding
 from pchem_pipeline.report.pages.emva import emva_tables
-from pchem_pipeline.report.pages.methods import method_tables
 from pchem_pipeline.report.pages.page import Finding, Section, render_page
 from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
 from pchem_pipeline.report.pages.report_json import report_json
@@ -30,7 +29,7 @@ from pchem_pipeline.report.pages.summary import (
     pixel_counts,
     sentence,
 )
-from pchem_pipeline.report.pages.tables import Table, provenance_tables, result_tables
+from pchem_pipeline.report.pages.tables import Table, method_tables, provenance_tables, result_tables
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import symbol
 

@@ -73,11 +73,10 @@ def _read_noise(data: ReportData) -> _Found:
 
 
 def _failed(data: ReportData) -> _Found:
-    status = data.fit.get("fit_status")
-    if status is None:
+    if "fit_status" not in data.fit:
         return None
-    failed = ((status & data.failed_mask) != 0) | data.unfitted
-    return float(failed[(status & int(FitStatus.EXCLUDED)) == 0].mean()), f"{data.noun}s without a value"
+    pixels = pixel_counts(data)
+    return pixels.failed / max(pixels.total, 1), f"{data.noun}s without a value"
 
 
 def _flagged_share(data: ReportData) -> _Found:
@@ -628,14 +627,12 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
     if pixel_counts(data).fitted == 0:
         return Answer(question, "serious", "No results", f"No {data.noun} has a value.")
     about = [flag for flag in remarks if flag.about == "results"]
-    serious = [flag for flag in about if flag.level == "serious"]
-    cautions = [flag for flag in about if flag.level == "caution"]
-    if serious:
-        more = f" ({len(serious) - 1} more below)" if len(serious) > 1 else ""
-        return Answer(question, "serious", "No", f"{serious[0].text}{more}")
-    if cautions:
-        more = f" ({len(cautions) - 1} more below)" if len(cautions) > 1 else ""
-        return Answer(question, "caution", "With caution", f"{cautions[0].text}{more}")
+    doubts: tuple[tuple[Level, str], ...] = (("serious", "No"), ("caution", "With caution"))
+    for level, word in doubts:
+        texts = [flag.text for flag in about if flag.level == level]
+        if texts:
+            more = f" ({len(texts) - 1} more below)" if len(texts) > 1 else ""
+            return Answer(question, level, word, f"{texts[0]}{more}")
     passed = sum(flag.level == "good" for flag in about)
     checks = f"{count(passed, 'check')} of the model against the data passed" if passed else "No check fails"
     looked = "" if data.discrepancy is not None else _not_looked_for(data)

@@ -216,9 +216,12 @@
     return keys.map((key) => [key, fact.words[key]]);
   };
   const categoryColour = (fact, order) => (order === 0 ? cssColour("--fine") : PALETTE[(order - 1) % PALETTE.length]);
-  const categoryOf = (fact, list, value) => {
-    if (fact.kind === "words") return Math.max(list.findIndex(([key]) => key === value), 0);
-    return Math.max(list.findIndex(([key], order) => order > 0 && value & key), 0);
+  const belongs = (fact, key, value) => (fact.kind === "bits" && key !== 0 ? (value & key) !== 0 : value === key);
+  const categoryOf = (fact, list, value) => Math.max(list.findIndex(([key]) => belongs(fact, key, value)), 0);
+  // ends of the colours on the axis of a map, with what leads there and back
+  const colourEnds = (map) => {
+    const axis = (value) => (map.log ? Math.log10(Math.max(value, 1e-300)) : value), back = (v) => (map.log ? 10 ** v : v);
+    return [axis, back, ...RANGES[state.colours].map((share) => axis(quantile(map, map.counts, share)))];
   };
   const levels = (map, counts) => {
     const level = new Float64Array(65536);
@@ -233,8 +236,7 @@
       }
       return level;
     }
-    const axis = (value) => (map.log ? Math.log10(Math.max(value, 1e-300)) : value);
-    const [low, high] = RANGES[state.colours].map((share) => axis(quantile(map, counts, share)));
+    const [axis, , low, high] = colourEnds(map);
     for (let code = FIRST; code < ABOVE; code++) {
       level[code] = high > low ? clamp((axis(codeValue(map, code)) - low) / (high - low), 0, 1) : 0.5;
     }
@@ -494,10 +496,7 @@
       for (let code = FIRST; code < ABOVE; code++) {
         if (!map.counts[code]) continue;
         const value = Math.round(codeValue(map, code));
-        list.forEach(([key], order) => {
-          const hit = map.fact.kind === "bits" ? (key === 0 ? value === 0 : value & key) : value === key;
-          if (hit) count[order] += map.counts[code];
-        });
+        list.forEach(([key], order) => { if (belongs(map.fact, key, value)) count[order] += map.counts[code]; });
       }
       const legend = el("ul", { class: "legend" });
       list.forEach(([key, text], order) => {
@@ -516,11 +515,9 @@
     let labels;
     if (shares) labels = shares.map((share) => short(quantile(map, map.counts, share)));
     else {
-      const axis = (v) => (map.log ? Math.log10(Math.max(v, 1e-300)) : v);
-      const [low, high] = RANGES[state.colours].map((share) => axis(quantile(map, map.counts, share)));
-      const at = (level) => { const v = low + level * (high - low); return map.log ? 10 ** v : v; };
+      const [, back, low, high] = colourEnds(map);
       for (let digits = 3; digits < 7; digits++) {
-        labels = [0, 0.25, 0.5, 0.75, 1].map((level) => short(at(level), digits));
+        labels = [0, 0.25, 0.5, 0.75, 1].map((level) => short(back(low + level * (high - low)), digits));
         if (new Set(labels).size === 5) break;
       }
       if (state.colours !== "all") labels = [`≤ ${labels[0]}`, ...labels.slice(1, 4), `≥ ${labels[4]}`];
@@ -671,9 +668,7 @@
   const selectCategory = (map, key, text) => {
     const selection = new Uint8Array(n);
     for (let i = 0; i < n; i++) {
-      if (map.codes[i] === NONE) continue;
-      const value = Math.round(codeValue(map, map.codes[i]));
-      selection[i] = (map.fact.kind === "bits" ? (key === 0 ? value === 0 : value & key) : value === key) ? 1 : 0;
+      if (map.codes[i] !== NONE && belongs(map.fact, key, Math.round(codeValue(map, map.codes[i])))) selection[i] = 1;
     }
     select(selection, text, `is,${map.fact.path},${key}`);
   };
@@ -746,14 +741,18 @@
     const top = byId("inspector-title").getBoundingClientRect().top;
     if (top < 0 || top > window.innerHeight - 120) byId("inspector-pixel").scrollIntoView({ block: "start" });
   };
-  const medianPixel = () => {
-    const { map, status } = state, middle = quantile(map, map.counts, 0.5);
+  // the pixel in full that is least far by some measure; -1 where none is
+  const closest = (distance) => {
     let best = -1, least = Infinity;
     for (const i of inFull()) {
-      const away = Math.abs(valueAt(map, i) - middle) + (status && valueAt(status, i) !== 0 ? 1e300 : 0);
+      const away = distance(i);
       if (away < least) [best, least] = [i, away];
     }
     return best;
+  };
+  const medianPixel = () => {
+    const { map, status } = state, middle = quantile(map, map.counts, 0.5);
+    return closest((i) => Math.abs(valueAt(map, i) - middle) + (status && valueAt(status, i) !== 0 ? 1e300 : 0));
   };
   const pixelData = async (i) => {
     const found = { index: i, values: new Map(), counts: null, origin: 0, deciding: null, mass: null };
@@ -1001,11 +1000,7 @@
   };
   const nearest = () => {
     const y = Math.floor(state.pixel / nx), x = state.pixel % nx;
-    let best = -1, least = Infinity;
-    for (const i of sample.slot.keys()) {
-      const away = (Math.floor(i / nx) - y) ** 2 + ((i % nx) - x) ** 2;
-      if (away < least) [best, least] = [i, away];
-    }
+    const best = closest((i) => (Math.floor(i / nx) - y) ** 2 + ((i % nx) - x) ** 2);
     if (best >= 0) choose(best);
   };
 

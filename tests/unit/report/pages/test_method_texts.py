@@ -13,7 +13,7 @@ from pchem_pipeline.report.figures.methods import (
     measured_crossing,
     method_figures,
 )
-from pchem_pipeline.report.pages.methods import method_rows, method_tables, methods_text
+from pchem_pipeline.report.pages.tables import method_rows, method_tables, methods_text
 from pchem_pipeline.report.settings import ReportSettings
 
 
