@@ -26,7 +26,7 @@ import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError, StoreError, quoted
 from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.report.inspector.inspector import MapEntry, packed_facts, served_page
+from pchem_pipeline.report.inspector import MapEntry, packed_facts, served_page
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.stages.fit.fitted_model import FittedModel

@@ -11,7 +11,6 @@ from pchem_pipeline.discrepancy.verdict import (
     RARE,
     Candidate,
     GapChange,
-    Moved,
     Place,
     Step,
     Verdict,
@@ -113,7 +112,7 @@ def _frame_text(frames: Sequence[int]) -> str:
 def _where(data: DiscrepancyData, places: Sequence[Place]) -> Table:
     rows = tuple(
         (
-            place.sentence or _sentence(data, place.statistic),
+            place.sentence or data.statistics.get(place.statistic, ("", ""))[1] or place.statistic,
             place.channel or data.statistics.get(place.statistic, ("", ""))[0],
             signed(place.z),
             probability_text(place.p),
@@ -130,10 +129,6 @@ def _where(data: DiscrepancyData, places: Sequence[Place]) -> Table:
         ("disagreement", "channel", "sigma", "p", "where", "statistic"),
         rows,
     )
-
-
-def _sentence(data: DiscrepancyData, statistic: str) -> str:
-    return data.statistics.get(statistic, ("", ""))[1] or statistic
 
 
 def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
@@ -242,16 +237,16 @@ def _how(step: Step, found: Verdict) -> str:
     return " (empirical)" if found.part_of_model(step) else " (empirical, not in the model)"
 
 
-def _beside(step: Step, found: Verdict) -> str:
-    """Return region and status of an effect, for its title."""
-    return f"{f', in {step.place}' if step.place else ''}{_how(step, found)}"
-
-
 def _parameters(data: DiscrepancyData) -> Table:
     rows = tuple(
-        (f"{tag}: {name}", value, data.title(tag) + _beside(step, data.found), data.sources.get(tag, ""))
+        (
+            f"{tag}: {name}",
+            value,
+            f"{data.title(tag)}{place}{_how(step, data.found)}",
+            data.sources.get(tag, ""),
+        )
         for step in data.found.steps
-        for tag in [step.likeliest]
+        for tag, place in [(step.likeliest, f", in {step.place}" if step.place else "")]
         if tag and (step.effect or step.verdict == "described" or data.found.verdict == "ambiguous")
         for name, value in _values(step).items()
     )
@@ -573,10 +568,11 @@ def _size_texts(step: Step, values: Sequence[str]) -> tuple[str, tuple[str, ...]
 
 
 def _moved_fact(found: Verdict) -> list[KeyFact]:
-    moved = _largest_move([step for step in found.steps if not found.proposed or step.effect])
-    if moved is None or abs(moved[1].in_stderr) < _NOT_MOVED:
+    steps = [step for step in found.steps if not found.proposed or step.effect]
+    moved = [(name, m) for step in steps for name, m in step.moved.items() if math.isfinite(m.in_stderr)]
+    name, largest = max(moved, key=lambda pair: abs(pair[1].in_stderr), default=("", None))
+    if largest is None or abs(largest.in_stderr) < _NOT_MOVED:
         return []
-    name, largest = moved
     unit = unit_text(largest.unit)
     small = ", negligible" if abs(largest.in_stderr) < _IMMATERIAL else ""
     return [
@@ -586,11 +582,6 @@ def _moved_fact(found: Verdict) -> list[KeyFact]:
             (f"{_signed(largest.in_stderr, 2)} standard errors per pixel{small}",),
         )
     ]
-
-
-def _largest_move(steps: Sequence[Step]) -> tuple[str, Moved] | None:
-    moved = [(name, m) for step in steps for name, m in step.moved.items() if math.isfinite(m.in_stderr)]
-    return max(moved, key=lambda pair: abs(pair[1].in_stderr), default=None)
 
 
 def _signed(value: float, digits: int = 3) -> str:

@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from pchem_pipeline.report.charts.on_page import page_charts
 from pchem_pipeline.report.figures.figure import Figure, csv_text
-from pchem_pipeline.report.inspector.inspector import content_policy, json_for_html, text_of
+from pchem_pipeline.report.inspector import content_policy, json_for_html, text_of
 from pchem_pipeline.report.pages.glossary import GLOSSARY, explained
 from pchem_pipeline.report.style.wording import short_name, visible
 

@@ -14,7 +14,7 @@ from functools import partial
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
 from pchem_pipeline.report.figures.samples import AXES, slope_of
-from pchem_pipeline.report.inspector.inspector import embedded, script
+from pchem_pipeline.report.inspector import embedded, script
 from pchem_pipeline.report.pages.cite import citation
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, evidence, finding
 from pchem_pipeline.report.pages.emva import emva_tables

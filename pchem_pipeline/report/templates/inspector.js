@@ -1,6 +1,6 @@
 // The pixel inspector of the report: a map to look at, histograms to brush, and one pixel in full.
-// It reads what the page holds (elements inspector-facts, map-N and inspector-sample; see inspector/inspector.py and
-// inspector/packing.py for their form); under `pchem view` it asks that server for the rest. It writes text nodes and
+// It reads what the page holds (elements inspector-facts, map-N and inspector-sample; see report/inspector.py
+// for their form); under `pchem view` it asks that server for the rest. It writes text nodes and
 // attributes only, never markup.
 "use strict";
 (() => {

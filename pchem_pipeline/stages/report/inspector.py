@@ -23,8 +23,16 @@ from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.model.maps.ordered import Ordered
-from pchem_pipeline.report.inspector.inspector import InspectorData, MapEntry, PixelSample
-from pchem_pipeline.report.inspector.packing import AT_ONCE, PackedMap, choose_scale, pack_map, some_of
+from pchem_pipeline.report.inspector import (
+    AT_ONCE,
+    InspectorData,
+    MapEntry,
+    PackedMap,
+    PixelSample,
+    choose_scale,
+    pack_map,
+    some_of,
+)
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from pchem_pipeline.report.figures.catalogue import REPORT_FIGURES, report_figur
 from pchem_pipeline.report.figures.figure import DataTable, csv_text
 from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.figures.trust import left_out_chart
-from pchem_pipeline.report.inspector.inspector import script, text_of
+from pchem_pipeline.report.inspector import script, text_of
 from pchem_pipeline.report.pages.cite import citation
 from pchem_pipeline.report.pages.glossary import GLOSSARY, explained
 from pchem_pipeline.report.pages.page import chart_script, figure_tables

@@ -13,7 +13,7 @@ from pchem_pipeline.base import variables
 from pchem_pipeline.base.variables import Variable
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.inspector.inspector import map_facts
+from pchem_pipeline.report.inspector import map_facts
 from pchem_pipeline.report.pages import report as page_report
 from pchem_pipeline.report.pages.page import Section
 from pchem_pipeline.stages.report import inspector
