@@ -115,6 +115,11 @@ class Figure:
     chart: Chart
     width_mm: float = COLUMN_MM
 
+    @property
+    def wide(self) -> bool:
+        """Whether it takes the whole width of a page."""
+        return self.width_mm > COLUMN_MM
+
     def draw(self, look: Look) -> Drawing:
         """Draw it with matplotlib."""
         # takes as long as all else that a small report imports

@@ -10,7 +10,7 @@ from pchem_pipeline.report.comparison import ArrayRow, Comparison, HistoryRow, P
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures, history_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.page import Finding, Section, render_page
-from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
+from pchem_pipeline.report.pages.pictures import DrawAll, draw_here
 from pchem_pipeline.report.pages.report_json import json_value
 from pchem_pipeline.report.pages.summary import Flag, Level
 from pchem_pipeline.report.pages.tables import Table, rmse_unit, rmse_words
@@ -96,17 +96,14 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
     every = [*whole, *times, *(each for figures in maps.values() for each in figures)]
     drawn = (draw or draw_here)(every, _SETTINGS)
 
-    def pictures(figures: Sequence[Figure]) -> list[Picture]:
-        return [Picture(figure, drawn[figure.name]) for figure in figures]
-
     sections = [
         Section(id="verdict", title="Result", verdict=_finding(found.changed, sentence_of(found))),
-        Section(id="history", title="History", pictures=pictures(times), tables=[history_table(found)]),
-        *(_pair_section(pair, found, pictures(maps[pair.other.label])) for pair in found.pairs),
-        *([Section(id="ensemble", title="Ensembles", pictures=pictures(whole))] if whole else []),
+        Section(id="history", title="History", figures=times, tables=[history_table(found)]),
+        *(_pair_section(pair, found, maps[pair.other.label]) for pair in found.pairs),
+        *([Section(id="ensemble", title="Ensembles", figures=whole)] if whole else []),
         Section(id="all-runs", title="Runs", tables=[run_table(found)]),
     ]
-    page = render_page("compare.html.j2", sections, every, title=" · ".join(run.title for run in found.runs))
+    page = render_page("compare.html.j2", sections, drawn, title=" · ".join(run.title for run in found.runs))
     return page, json.dumps(_numbers(found), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
@@ -117,7 +114,7 @@ def _finding(changed: bool, sentence: str, changes: Sequence[str] = ()) -> Findi
     return Finding(level, name, sentence.replace(" -", " −"), remarks=remarks)
 
 
-def _pair_section(pair: Pair, found: Comparison, pictures: list[Picture]) -> Section:
+def _pair_section(pair: Pair, found: Comparison, figures: Sequence[Figure]) -> Section:
     more = len(pair.changes) - _MOST_WORDS
     words = (*pair.changes[:_MOST_WORDS], *((f"And {more} more; see compare.json.",) if more > 0 else ()))
     # of a single pair it is said above
@@ -128,7 +125,7 @@ def _pair_section(pair: Pair, found: Comparison, pictures: list[Picture]) -> Sec
         title=f"{pair.other.title} against {pair.one.title}",
         verdict=_finding(pair.changed, sentence, words),
         first=tables[:1],
-        pictures=pictures,
+        figures=figures,
         tables=tables[1:],
     )
 

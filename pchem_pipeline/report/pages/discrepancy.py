@@ -20,8 +20,8 @@ from pchem_pipeline.discrepancy.verdict import (
 )
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.report.data import DiscrepancyData
+from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.page import Finding, KeyFact, Section
-from pchem_pipeline.report.pages.pictures import Picture
 from pchem_pipeline.report.pages.summary import VERDICT_LEVELS, Flag, Level, gravest_first
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.style.wording import (
@@ -435,20 +435,20 @@ def finding(data: DiscrepancyData) -> Finding:
     )
 
 
-def evidence(data: DiscrepancyData, pictures: Sequence[Picture]) -> list[Section]:
+def evidence(data: DiscrepancyData, figures: Sequence[Figure]) -> list[Section]:
     """Return the sections of the page below the verdict.
 
     Args:
         data: verdict and arrays.
-        pictures: the figures of the verdict.
+        figures: of the verdict.
     """
     tables = discrepancy_tables(data)
     parts = []
     first = _signature(data.found)
     for id_, title, intro in PARTS:
-        shown = [each for each in pictures if each.figure.section == id_ and each.figure.name not in first]
+        shown = [each for each in figures if each.section == id_ and each.name not in first]
         if id_ == "signature":
-            shown = [each for name in first for each in pictures if each.figure.name == name]
+            shown = [each for name in first for each in figures if each.name == name]
         rows = tables.get(id_, [])
         if id_ == "signature" and not shown:
             continue  # no disagreement, or no data for figures
@@ -456,7 +456,7 @@ def evidence(data: DiscrepancyData, pictures: Sequence[Picture]) -> list[Section
             title = "Data and model side by side"
         missing = () if shown or rows else (_empty(data.found, id_),)
         part = f"discrepancy-part-{id_}"
-        parts.append(Section(id=part, title=title, intro=intro, missing=missing, pictures=shown, tables=rows))
+        parts.append(Section(id=part, title=title, intro=intro, missing=missing, figures=shown, tables=rows))
     return parts
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import importlib.resources
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ from pchem_pipeline.report.pages.glossary import GLOSSARY, explained
 from pchem_pipeline.report.style.wording import short_name, visible
 
 if TYPE_CHECKING:
-    from pchem_pipeline.report.pages.pictures import Picture
+    from pchem_pipeline.report.pages.pictures import Drawn
     from pchem_pipeline.report.pages.summary import Flag
     from pchem_pipeline.report.pages.tables import Table
 
@@ -73,8 +73,9 @@ class Section:
         intro: introduction.
         missing: sentences on what is not shown, and why.
         first: tables above the figures.
-        pictures: figures.
+        figures: between these and the others.
         tables: tables below the figures.
+        parts: sections within it, of the kind that shows them.
         kind: of a section of its own kind: the template ``section_<kind>.html.j2`` shows it, as ``section``.
         content: what that template shows.
         folded: whether it is closed until somebody opens it.
@@ -87,36 +88,40 @@ class Section:
     intro: str = ""
     missing: Sequence[str] = ()
     first: Sequence[Table] = ()
-    pictures: Sequence[Picture] = ()
+    figures: Sequence[Figure] = ()
     tables: Sequence[Table] = ()
+    parts: Sequence[Section] = ()
     kind: str = ""
     content: Any = None
     folded: bool = False
 
 
 def render_page(
-    name: str, sections: Sequence[Section], figures: Sequence[Figure], /, *scripts: str, **content: Any
+    name: str, sections: Sequence[Section], drawn: Mapping[str, Drawn], /, *scripts: str, **content: Any
 ) -> str:
     """Return a page as HTML, complete in itself.
 
     Args:
         name: of its template, which extends ``page.html.j2``.
         sections: from top to bottom.
-        figures: those that they show; their numbers can be saved from the page.
+        drawn: their figures, by name.
         scripts: further ones that its template holds.
         content: what its template shows.
     """
+    parts = [part for section in sections for part in (section, *section.parts)]
+    figures = [figure for part in parts for figure in part.figures]
     charts = {figure.name: figure.chart for figure in figures if not figure.chart.still}
-    drawn = bool(charts or scripts)  # the inspector draws charts, too
-    always = (text_of("page.js"), *((chart_script(),) if drawn else ()))
+    scripted = bool(charts or scripts)  # the inspector draws charts, too
+    always = (text_of("page.js"), *((chart_script(),) if scripted else ()))
     return _template(name).render(
         policy=content_policy(*always, *scripts),
         page_scripts=[Markup(script) for script in always],
-        charts=json_for_html(page_charts(charts)) if drawn else "",
-        chart_style=Markup(text_of("uPlot.min.css", _LIBRARY)) if drawn else "",
+        charts=json_for_html(page_charts(charts)) if scripted else "",
+        chart_style=Markup(text_of("uPlot.min.css", _LIBRARY)) if scripted else "",
         tables=json_for_html(figure_tables(figures)),
         glossary=GLOSSARY,
         sections=sections,
+        drawn=drawn,
         **content,
     )
 

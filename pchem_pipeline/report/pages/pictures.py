@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from urllib.parse import quote
 
-from pchem_pipeline.report.charts.chart import COLUMN_MM
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.settings import ReportSettings
 
@@ -28,19 +27,6 @@ class Drawn:
     width: int
     height: int
     files: Mapping[str, bytes] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure with its drawing, as a page shows it."""
-
-    figure: Figure
-    drawn: Drawn
-
-    @property
-    def wide(self) -> bool:
-        """Whether it takes the whole width of a page."""
-        return self.figure.width_mm > COLUMN_MM
 
 
 #: Draws many figures at once and returns them by name.

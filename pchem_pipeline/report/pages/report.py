@@ -7,19 +7,20 @@ and a template ``section_<kind>.html.j2``. The table of contents follows the lis
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
+from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.samples import AXES, slope_of
 from pchem_pipeline.report.inspector import embedded, script
 from pchem_pipeline.report.pages.cite import citation
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, evidence, finding
 from pchem_pipeline.report.pages.emva import emva_tables
 from pchem_pipeline.report.pages.page import Finding, Section, render_page
-from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
+from pchem_pipeline.report.pages.pictures import DrawAll, Drawn, draw_here
 from pchem_pipeline.report.pages.report_json import report_json
 from pchem_pipeline.report.pages.summary import (
     answers,
@@ -121,7 +122,7 @@ class Material:
     Attributes:
         data: what the run found.
         settings: section ``report``.
-        pictures: all drawn figures; each names its section.
+        figures: all of the page; each names its section.
         tables: all tables of results; each names its section.
         verdict: on what the model is missing, or None where nobody looked.
         parts: of its evidence.
@@ -129,14 +130,14 @@ class Material:
 
     data: ReportData
     settings: ReportSettings
-    pictures: list[Picture]
+    figures: list[Figure]
     tables: list[Table]
     verdict: Finding | None = None
     parts: Sequence[Section] = ()
 
-    def pictures_of(self, section: str) -> list[Picture]:
+    def figures_of(self, section: str) -> list[Figure]:
         """Return the figures of a section, by its id."""
-        return [picture for picture in self.pictures if picture.figure.section == section]
+        return [figure for figure in self.figures if figure.section == section]
 
     def tables_of(self, section: str) -> list[Table]:
         """Return the tables of a section, by its id."""
@@ -170,7 +171,7 @@ def _summary(material: Material) -> Section:
         title="Is the sensor within limits, and are these results reliable?",
         name="Summary",
         verdict=material.verdict,
-        pictures=material.pictures_of("summary"),
+        figures=material.figures_of("summary"),
         kind="summary",
         content=content,
     )
@@ -187,7 +188,7 @@ def _part(row: tuple[str, str, str, tuple[str, ...]], folded: bool, material: Ma
     data = material.data
     if data.samples is None and id_ in _OF_SAMPLES:
         return None
-    shown, tables = material.pictures_of(id_), material.tables_of(id_)
+    shown, tables = material.figures_of(id_), material.tables_of(id_)
     missing = [data.missing[part] for part in parts if part in data.missing]
     if not shown and not tables and not missing:
         if data.samples is not None:
@@ -203,7 +204,7 @@ def _part(row: tuple[str, str, str, tuple[str, ...]], folded: bool, material: Ma
         intro = intro.format(against=words[0], noun=noun, offset=symbol(words[3])[1]) if words else _NO_LINE
     reasons = [f"Not shown: {reason}" for reason in missing]
     return Section(
-        id=id_, title=title, intro=intro, missing=reasons, pictures=shown, tables=tables, folded=folded
+        id=id_, title=title, intro=intro, missing=reasons, figures=shown, tables=tables, folded=folded
     )
 
 
@@ -211,7 +212,6 @@ def _discrepancy(material: Material) -> Section:
     look = material.data.quick_look
     content = {
         "found": look is not None and bool(look.found),
-        "parts": material.parts,
         "command": f"pchem discrepancy {material.data.typed_run}",
     }
     return Section(
@@ -219,6 +219,7 @@ def _discrepancy(material: Material) -> Section:
         title="What the model is missing",
         verdict=material.verdict,
         tables=material.tables_of("discrepancy"),
+        parts=material.parts,
         kind="discrepancy",
         content=content,
     )
@@ -291,18 +292,17 @@ def render_report(
     shown = [figure for figure in every if figure.section]
     drawn = (draw or draw_here)([*(every if settings.figure_formats else shown), *others], settings)
     figures = {name: content for each in drawn.values() for name, content in each.files.items()}
-    pictures, proofs = ([Picture(figure, drawn[figure.name]) for figure in each] for each in (shown, others))
     verdict = None if data.discrepancy is None else finding(data.discrepancy)
-    parts = [] if data.discrepancy is None else evidence(data.discrepancy, proofs)
+    parts = [] if data.discrepancy is None else evidence(data.discrepancy, others)
     makers = (result_tables, method_tables, emva_tables, provenance_tables)
     tables = [table for make in makers for table in make(data)]
-    sections = page_sections(Material(data, settings, pictures, tables, verdict, parts))
-    pages = {} if verdict is None else {DISCREPANCY_PAGE: _discrepancy_page(data, verdict, parts)}
+    sections = page_sections(Material(data, settings, shown, tables, verdict, parts))
+    pages = {} if verdict is None else {DISCREPANCY_PAGE: _discrepancy_page(data, verdict, parts, drawn)}
     numbers, inspector = report_json(data), embedded(data)
     page = render_page(
         "report.html.j2",
         sections,
-        [*shown, *others],
+        drawn,
         *([script()] if inspector else []),
         title=data.title,
         data=data,
@@ -311,10 +311,11 @@ def render_report(
     return RenderedReport(page, numbers, figures, pages)
 
 
-def _discrepancy_page(data: ReportData, verdict: Finding, parts: Sequence[Section]) -> str:
+def _discrepancy_page(
+    data: ReportData, verdict: Finding, parts: Sequence[Section], drawn: Mapping[str, Drawn]
+) -> str:
     about = "" if data.shape[0] == 1 else f"{data.shape[0]} × {data.shape[1]} pixels"
     if data.n_frames:
         about += f"{', ' if about else ''}{data.n_frames:,} frames"
-    figures = [picture.figure for part in parts for picture in part.pictures]
     sections = [Section(id="verdict", title="Verdict", verdict=verdict), *parts]
-    return render_page("discrepancy.html.j2", sections, figures, title=data.title, about=about)
+    return render_page("discrepancy.html.j2", sections, drawn, title=data.title, about=about)
