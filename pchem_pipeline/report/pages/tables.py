@@ -230,21 +230,22 @@ def _truth_rows(data: ReportData) -> Iterator[Row]:
         }
 
 
-_RMSE_ROWS = (
-    ("epcd_exact", "raw, exact mean over pixels", "noise_floor"),
-    ("epcd_dependent", "raw, dependent parameters", "noise_floor"),
-    ("epcd_independent", "raw, independent parameters", "noise_floor"),
-    ("nuced_exact", "NUCed, exact mean over pixels", "nuced_noise_floor"),
-    ("nuced_dependent", "NUCed, dependent parameters", "nuced_noise_floor"),
-    ("nuced_independent", "NUCed, independent parameters", "nuced_noise_floor"),
-)
+#: Predictions of the ensemble, and the sampling noise beside them, in words.
+_RMSE = {
+    "epcd_exact": "raw, exact mean over pixels",
+    "epcd_dependent": "raw, dependent parameters",
+    "epcd_independent": "raw, independent parameters",
+    "noise_floor": "raw, sampling noise alone",
+    "nuced_exact": "NUCed, exact mean over pixels",
+    "nuced_dependent": "NUCed, dependent parameters",
+    "nuced_independent": "NUCed, independent parameters",
+    "nuced_noise_floor": "NUCed, sampling noise alone",
+}
 
 
 def rmse_words(name: str) -> str:
     """Return what a prediction of the ensemble is called, or the sampling noise beside it."""
-    words = {row[0]: row[1] for row in _RMSE_ROWS}
-    floors = {"noise_floor": "raw, sampling noise alone", "nuced_noise_floor": "NUCed, sampling noise alone"}
-    return {**words, **floors}.get(name, name.replace("_", " "))
+    return _RMSE.get(name, name.replace("_", " "))
 
 
 def rmse_unit(name: str) -> str:
@@ -255,10 +256,11 @@ def rmse_unit(name: str) -> str:
 def _rmse(data: ReportData) -> Table:
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
     rows = []
-    for name, words, floor_name in _RMSE_ROWS:
-        if rmse.get(name) is None:
+    for name, words in _RMSE.items():
+        if rmse.get(name) is None or name.endswith("noise_floor"):
             continue
-        floor, unit = rmse.get(floor_name), rmse_unit(name)
+        floor = rmse.get("nuced_noise_floor" if name.startswith("nuced") else "noise_floor")
+        unit = rmse_unit(name)
         rows.append(
             {
                 "prediction": words,

@@ -72,18 +72,11 @@ _LABELS = {
 #: The maps that are first in the file, in case that not all fit.
 _FIRST = (
     "fit/fit_status",
-    "maps/read_noise_e",
-    "maps/read_noise_e_stderr",
-    "maps/conversion_gain",
-    "maps/conversion_gain_stderr",
-    "maps/quanta_exposure",
-    "maps/quanta_exposure_stderr",
-    "maps/charge_rate",
-    "maps/charge_rate_stderr",
-    "maps/dark_current",
-    "maps/dark_current_stderr",
-    "maps/bias",
-    "maps/bias_stderr",
+    *(
+        f"maps/{name}{end}"
+        for name in ("read_noise_e", "conversion_gain", "quanta_exposure", *CHARGE_RATES, "bias")
+        for end in ("", "_stderr")
+    ),
     "fit/goodness_p",
     "maps/quality",
 )
