@@ -22,10 +22,8 @@ from pchem_pipeline.report.figures.figure import DataTable, csv_text
 from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.figures.trust import left_out_chart
 from pchem_pipeline.report.inspector import script, text_of
-from pchem_pipeline.report.pages.cite import citation
-from pchem_pipeline.report.pages.glossary import GLOSSARY, explained
-from pchem_pipeline.report.pages.page import chart_script, figure_tables
-from pchem_pipeline.report.pages.report import RenderedReport, render_report
+from pchem_pipeline.report.pages.page import GLOSSARY, chart_script, explained, figure_tables
+from pchem_pipeline.report.pages.report import RenderedReport, citation, render_report
 from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, sentence
 from pchem_pipeline.report.pages.tables import result_tables
 from pchem_pipeline.report.settings import ReportSettings
