@@ -16,8 +16,7 @@ from pchem_pipeline.report.figures.paper import FORMATS, PaperFigure, draw_paper
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.runner.session import run_status
-from pchem_pipeline.stages.report.drawing import drawing_executor, drawing_workers
-from pchem_pipeline.stages.report.report import gather
+from pchem_pipeline.stages.report.report import drawing_executor, drawing_workers, gather
 from pchem_pipeline.store.files import storage_error, write_atomic
 
 #: Narrowest and widest figure, mm.

@@ -46,7 +46,7 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
     result = read_methods(target.stored())
     if result is None:
         return ""
-    from pchem_pipeline.report.pages.methods import methods_text
+    from pchem_pipeline.report.pages.tables import methods_text
 
     files = [target.store / METHODS_FILE, *([target.store / "report.html"] if reported else [])]
     return "\n".join([methods_text(result), "", *map(str, files)])

@@ -26,10 +26,9 @@ from pchem_pipeline.model.fit.result import html_table
 from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD
 from pchem_pipeline.report.charts.chart import COLUMN_MM
-from pchem_pipeline.report.charts.on_paper import draw_chart
+from pchem_pipeline.report.charts.on_paper import Look, draw_chart
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.pixels import cell_tables, cells_chart, has_fit, pixels_chart
-from pchem_pipeline.report.style.style import Look
 from pchem_pipeline.report.style.wording import measured, symbol
 from pchem_pipeline.run.model_versions import ModelVersion, model_of, model_versions
 from pchem_pipeline.run.sensor import SensorInfo
@@ -47,7 +46,7 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.discrepancy.verdict import Verdict
-    from pchem_pipeline.report.style.style import Drawing
+    from pchem_pipeline.report.charts.on_paper import Drawing
     from pchem_pipeline.run.progress import ProgressMode
     from pchem_pipeline.use.twin import Twin
 

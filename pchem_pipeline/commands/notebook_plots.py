@@ -10,17 +10,16 @@ from typing import TYPE_CHECKING, Literal
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.commands.figures import millimetres
 from pchem_pipeline.report.charts.chart import COLUMN_MM
-from pchem_pipeline.report.charts.on_paper import draw_chart
+from pchem_pipeline.report.charts.on_paper import Look, draw_chart, drawing_bytes
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.maps import map_chart, map_tables
 from pchem_pipeline.report.figures.paper import FORMATS
-from pchem_pipeline.report.style.style import Look, drawing_bytes
 from pchem_pipeline.store.files import write_atomic
 
 if TYPE_CHECKING:
+    from pchem_pipeline.report.charts.on_paper import Drawing
     from pchem_pipeline.report.data import ReportData
     from pchem_pipeline.report.settings import ReportSettings
-    from pchem_pipeline.report.style.style import Drawing
 
 #: The maps that ``Plots.maps`` draws where none is named.
 _MAPS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")

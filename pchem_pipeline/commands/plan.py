@@ -328,9 +328,8 @@ def _split_json(plan: SamplesPlan, targets: Sequence[Target]) -> dict[str, Any]:
 
 def _draw(path: Path, targets: Sequence[Target], content: dict[str, Any], gain: float) -> None:
     from pchem_pipeline.report.charts.chart import COLUMN_MM
-    from pchem_pipeline.report.charts.on_paper import draw_chart
+    from pchem_pipeline.report.charts.on_paper import Look, draw_chart, drawing_bytes
     from pchem_pipeline.report.figures.plan import frames_chart, frames_table
-    from pchem_pipeline.report.style.style import Look, drawing_bytes
 
     mark = None
     if content["samples"] == 1:

@@ -26,12 +26,11 @@ import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError, StoreError, quoted
 from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.report.inspector.inspector import packed_facts, served_page
+from pchem_pipeline.report.inspector import MapEntry, packed_facts, served_page
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
 from pchem_pipeline.stages.report.inspector import (
-    Listed,
     StoredMaps,
     deciding_parameters,
     listed_maps,
@@ -78,8 +77,8 @@ class RunView:
         return SensorInfo.read(self.store).shape
 
     @cached_property
-    def _maps(self) -> dict[str, Listed]:
-        return {each.variable.path: each for each in listed_maps(self.store, self._shape)}
+    def _maps(self) -> dict[str, MapEntry]:
+        return {each.path: each for each in listed_maps(self.store, self._shape)}
 
     def check(self) -> None:
         """Make sure that there is something to show.
@@ -187,7 +186,7 @@ class RunView:
         asked = query.get("path", [])
         if len(query) != 1 or len(asked) != 1 or asked[0] not in self._maps:
             return _text(HTTPStatus.NOT_FOUND, "this run has no such map")
-        packed = packed_map(StoredMaps(self.store), self._maps[asked[0]].variable)
+        packed = packed_map(StoredMaps(self.store), asked[0])
         return _json({**packed_facts(packed), "data": base64.b64encode(packed.data).decode("ascii")})
 
 

@@ -27,7 +27,7 @@ from pchem_pipeline.report.settings import Criteria
 if TYPE_CHECKING:
     from pchem_pipeline.model.checks.map_parts import Parts
     from pchem_pipeline.report.figures.figure import Figure
-    from pchem_pipeline.report.inspector.inspector_data import InspectorData
+    from pchem_pipeline.report.inspector import InspectorData
 
 FloatArray = NDArray[np.float64]
 
@@ -42,10 +42,6 @@ LINE_MAPS = ("charge_per_level", "spurious_charge", "dark_signal")
 
 #: Order of the axis ``channel`` of the arrays of a verdict.
 CHANNELS = ("charge", "readout")
-
-#: The parts of a report that a run may lack; the keys of ``ReportData.missing``.
-PARTS = ("pixels", "maps", "charge_rate", "ensemble", "nuced", "electrons", "components", "truth", "methods")
-
 
 #: Codes from which their distance is known.
 _FEWEST_CODES = 8
@@ -185,7 +181,8 @@ class ReportData:
             ``worst`` (rows of ``y``, ``x``, ``chi2``, ``dof``, ``p``, ``q``), ``pixels_with_outliers``.
         intervals: by quantity the ends of its profile intervals, (y, x) each, where they were asked for.
         interval_level: probability that these cover the truth.
-        missing: part (see ``PARTS``) to the reason why it is absent.
+        missing: part (maps, charge_rate, ensemble, nuced, electrons, components, methods) to the reason of
+            its absence.
         discrepancy: what the model is missing, or None where nobody looked.
         quick_look: checks of rows, columns, frames, neighbours, lags and codes; None without a fit.
         stability: figures of frames, rows and columns, made of sums as large as several maps; may be empty.

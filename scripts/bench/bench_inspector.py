@@ -24,8 +24,13 @@ from pchem_pipeline.compute.environment import prepare_environment
 prepare_environment()
 
 from pchem_pipeline.report.data import ReportData  # noqa: E402
-from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample  # noqa: E402
-from pchem_pipeline.report.inspector.packing import choose_scale, pack_map  # noqa: E402
+from pchem_pipeline.report.inspector import (  # noqa: E402  # noqa: E402
+    InspectorData,
+    MapEntry,
+    PixelSample,
+    choose_scale,
+    pack_map,
+)
 from pchem_pipeline.report.pages.pictures import Drawn  # noqa: E402
 from pchem_pipeline.report.pages.report import render_report  # noqa: E402
 from pchem_pipeline.report.settings import ReportSettings  # noqa: E402

@@ -28,7 +28,7 @@ from helpers.bounds import cramer_rao  # noqa: E402
 from helpers.plain_law import pcd_mass  # noqa: E402
 
 from pchem_pipeline.model.fit.api import fit_histograms  # noqa: E402
-from pchem_pipeline.report.style.style import Look, drawing_bytes, styled  # noqa: E402
+from pchem_pipeline.report.charts.on_paper import Look, drawing_bytes, styled  # noqa: E402
 
 NOISES = (0.2, 0.3, 0.4, 0.45, 0.5, 0.55, 0.6, 0.7, 0.8, 0.9, 1.0)
 EXPOSURES = (0.5, 3.0, 12.0)

@@ -25,7 +25,7 @@ from helpers.plain_law import pcd_mass  # noqa: E402
 from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_rounding, rounding_bias  # noqa: E402
 from pchem_pipeline.model.fit.api import fit_histograms  # noqa: E402
 from pchem_pipeline.model.fit.settings import FitSettings  # noqa: E402
-from pchem_pipeline.report.style.style import Look, drawing_bytes, styled  # noqa: E402
+from pchem_pipeline.report.charts.on_paper import Look, drawing_bytes, styled  # noqa: E402
 
 STEPS = (0.7, 0.85, 1.0, 1.2, 1.5, 1.8, 2.2, 2.7, 3.3, 4.0, 5.0, 7.0, 10.0, 14.0, 20.0)
 NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.html_page import Page
 from helpers.report_material import report_data
 
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
@@ -18,8 +19,8 @@ from pchem_pipeline.commands.compare.compare import compare_runs, comparison_of
 from pchem_pipeline.commands.compare.history import HistorySettings, history_csv
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.report.figures.history import history_figures
-from pchem_pipeline.report.pages.criteria import criteria
+from pchem_pipeline.report.figures.compare import history_figures
+from pchem_pipeline.report.pages.summary import criteria
 from pchem_pipeline.report.style.wording import percent
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
@@ -211,9 +212,9 @@ def test_the_history_of_a_camera(shell, copies, finished):
     )
     share = next(each for each in criteria(data) if each.setting == "hot_pixels").found  # of the report
     assert share == percent(int(rows[2]["hot_pixels"]), known.size)
-    page = (shell.folder / "history" / "compare.html").read_text(encoding="utf-8")
+    page = Page((shell.folder / "history" / "compare.html").read_text(encoding="utf-8")).text
     assert "The camera over time" in page
-    assert f"Hot pixels: {len(rows[2]['hot_new'].split())} new, " in page
+    assert f"Hot pixels : {len(rows[2]['hot_new'].split())} new, " in page
     assert "-20 C" in page
     wrong = {"labels": ["one"]}, {"rate": 0.0}, {"against": "label"}, {"against": "temperature"}
     for each in wrong:

@@ -15,7 +15,7 @@ from helpers.places import ROOT
 
 import pchem_pipeline
 from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError
-from pchem_pipeline.report.style.style import drawing_bytes
+from pchem_pipeline.report.charts.on_paper import drawing_bytes
 from pchem_pipeline.store.run_store import RunStore
 
 TUTORIAL = ROOT / "docs" / "tutorial.ipynb"

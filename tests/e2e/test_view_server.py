@@ -18,7 +18,7 @@ from helpers.packed_maps import unpack_map
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.commands.view import make_server
-from pchem_pipeline.report.inspector.packing import PackedMap, Scale
+from pchem_pipeline.report.inspector import PackedMap, Scale
 from pchem_pipeline.store.run_store import RunStore
 
 

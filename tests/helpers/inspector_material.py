@@ -14,7 +14,7 @@ from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.inspector.inspector_data import InspectorData, PixelSample
+from pchem_pipeline.report.inspector import InspectorData, PixelSample
 from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.report.settings import ReportSettings

@@ -5,7 +5,7 @@ import gzip
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.report.inspector.packing import PackedMap
+from pchem_pipeline.report.inspector import PackedMap
 
 #: Codes of no value, of values below the range, and of the first value in it.
 _NONE, _BELOW, _FIRST = 0, 1, 2

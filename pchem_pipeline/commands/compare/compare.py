@@ -40,7 +40,7 @@ from pchem_pipeline.report.style.wording import count, measured, p_value_text, s
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target, find_run, with_maps
-from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_workers
+from pchem_pipeline.stages.report.report import draw_by_workers, drawing_workers
 from pchem_pipeline.store.files import storage_error, write_atomic
 from pchem_pipeline.store.run_store import RunStore
 

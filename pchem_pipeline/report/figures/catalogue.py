@@ -10,14 +10,12 @@ from collections.abc import Callable, Iterable
 from pchem_pipeline.report.data import DiscrepancyData, ReportData
 from pchem_pipeline.report.figures import (
     discrepancy_gap,
-    discrepancy_sensor,
-    discrepancy_series,
+    discrepancy_where,
     ensemble,
     maps,
     methods,
     pixels,
     plan,
-    rounding,
     samples,
     trust,
 )
@@ -41,7 +39,7 @@ REPORT_FIGURES: tuple[
     (ensemble.electron_figures, ("electron_numbers",)),
     (ensemble.component_figures, ("component_widths",)),
     (trust.uncertainty_figures, ("uncertainty",)),
-    (rounding.rounding_figures, ("rounding",)),
+    (trust.rounding_figures, ("rounding",)),
     (maps.status_figures, ("fit_status",)),
     (methods.method_figures, ("methods_gain_error",)),
     (plan.plan_figures, ("frames_needed",)),
@@ -49,10 +47,10 @@ REPORT_FIGURES: tuple[
 
 #: Makers of the figures of a verdict; ``section`` is the id of a part of its page.
 DISCREPANCY_FIGURES: tuple[tuple[Callable[[DiscrepancyData], Iterable[Figure]], str], ...] = (
-    (discrepancy_sensor.sensor_figures, "discrepancy_maps"),
-    (discrepancy_series.code_figures, "discrepancy_codes"),
-    (discrepancy_series.frame_figures, "discrepancy_frames"),
-    (discrepancy_sensor.line_figures, "discrepancy_lines"),
+    (discrepancy_where.sensor_figures, "discrepancy_maps"),
+    (discrepancy_where.code_figures, "discrepancy_codes"),
+    (discrepancy_where.frame_figures, "discrepancy_frames"),
+    (discrepancy_where.line_figures, "discrepancy_lines"),
     (discrepancy_gap.gap_figures, "discrepancy_gap"),
     (discrepancy_gap.pull_figures, "discrepancy_pulls"),
 )

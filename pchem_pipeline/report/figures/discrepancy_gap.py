@@ -28,8 +28,7 @@ from pchem_pipeline.report.charts.chart import (
     Words,
 )
 from pchem_pipeline.report.data import DiscrepancyData
-from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.stacks import pull_axis, row_stack
+from pchem_pipeline.report.figures.figure import DataTable, Figure, pull_axis, row_stack
 from pchem_pipeline.report.style.wording import short
 
 #: The gap is shown in millionths of a nat per sample.
@@ -147,12 +146,7 @@ def _gap_alt(found: Verdict) -> str:
         + (f" ({short(bar.low)} to {short(bar.high)})" if math.isfinite(bar.low + bar.high) else "")
         for bar in gap_bars(found)
     ]
-    return "; ".join([*words, f"floor {gap_text(found.gap.floor)}"])
-
-
-def gap_text(gap: float) -> str:
-    """Return a gap in micronats, without the unit."""
-    return micronats(gap)
+    return "; ".join([*words, f"floor {micronats(found.gap.floor)}"])
 
 
 @dataclass(frozen=True)

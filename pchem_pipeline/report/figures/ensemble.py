@@ -299,7 +299,9 @@ def electrons_chart(table: DataTable) -> Chart:
             ``electron_pmf`` predicted from the map of H; where known the mass ``electron_pmf_map`` that the
             estimator itself should show, and ``electron_counts`` for the sampling noise in the strip.
     """
-    last = _last_shown(table["electron_mass"], table["electron_pmf"])
+    # the last number with a mass that can be seen, at least 1
+    seen = np.flatnonzero(np.nan_to_num(np.maximum(table["electron_mass"], table["electron_pmf"])) > 1e-3)
+    last = int(max(seen[-1] + 1 if seen.size else 1, 1)) if table["k"].size > 1 else 0
     k, mass, pmf = (table[name][: last + 1] for name in ("k", "electron_mass", "electron_pmf"))
     power = _power([mass - pmf])
     scale = 10.0**-power
@@ -328,12 +330,6 @@ def electrons_chart(table: DataTable) -> Chart:
     return Chart(
         (Stack(panels, Axis("electron number k (e⁻)", -0.6, last + 0.6, whole=True), height_mm=74.0),)
     )
-
-
-def _last_shown(mass: NDArray[Any], pmf: NDArray[Any]) -> int:
-    """Return the last electron number with a mass that can be seen, at least 1."""
-    seen = np.flatnonzero(np.nan_to_num(np.maximum(mass, pmf)) > 1e-3)
-    return int(max(seen[-1] + 1 if seen.size else 1, 1)) if mass.size > 1 else 0
 
 
 #: Hue and line style of the cases drawn in colour.

@@ -1,7 +1,8 @@
 """A figure: its words, its data as tables, and the chart that is drawn of them.
 
 The tables are made from plain arrays before anything is drawn; CSV files beside figures for papers hold them
-(:func:`csv_text`).
+(:func:`csv_text`). Stacks of panels that several figures are made of follow: maps, histograms of pulls,
+rows with a text each.
 """
 
 from __future__ import annotations
@@ -15,10 +16,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.report.charts.chart import COLUMN_MM, Chart
+from pchem_pipeline.report.charts.chart import (
+    COLUMN_MM,
+    LONGEST,
+    Axis,
+    Chart,
+    Image,
+    Line,
+    Mark,
+    Panel,
+    Points,
+    Span,
+    Stack,
+    Steps,
+)
+from pchem_pipeline.report.style.palette import DIVERGING
+from pchem_pipeline.report.style.ranges import finite
+from pchem_pipeline.report.style.wording import plain
 
 if TYPE_CHECKING:
-    from pchem_pipeline.report.style.style import Drawing, Look
+    from pchem_pipeline.report.charts.on_paper import Drawing, Look
 
 
 @dataclass(frozen=True)
@@ -98,6 +115,11 @@ class Figure:
     chart: Chart
     width_mm: float = COLUMN_MM
 
+    @property
+    def wide(self) -> bool:
+        """Whether it takes the whole width of a page."""
+        return self.width_mm > COLUMN_MM
+
     def draw(self, look: Look) -> Drawing:
         """Draw it with matplotlib."""
         # takes as long as all else that a small report imports
@@ -118,3 +140,141 @@ def csv_text(table: DataTable) -> str:
 
 def _known(column: list[Any]) -> list[Any]:
     return ["" if isinstance(value, float) and value != value else value for value in column]
+
+
+FloatArray = NDArray[np.float64]
+
+#: Sensors with so few rows or columns are drawn as points, not as an image.
+_STRIP = 2
+#: Most channels of which each has a tick.
+_FEW_TICKS = 12
+#: Bins of a histogram of pulls, and points of the normal distribution over it.
+_BINS, _POINTS = 60, 301
+
+
+def is_strip(shape: tuple[int, ...]) -> bool:
+    """Tell whether a sensor is a line of channels, drawn as points instead of an image."""
+    return min(shape) < _STRIP
+
+
+def place_of(
+    shape: tuple[int, ...], origin: tuple[int, int] = (0, 0)
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the ends of a map on the axes x and y.
+
+    Args:
+        shape: rows and columns.
+        origin: row and column of its first pixel.
+    """
+    y, x = ((first - 0.5, first + n - 0.5) for first, n in zip(origin, shape, strict=True))
+    return x, y
+
+
+def image_stack(image: Image, *others: Mark, title: str = "") -> Stack:
+    """Return a map of the sensor, square pixels unless it is very long, with other marks over it."""
+    rows, columns = image.values.shape
+    x, y = Axis("x (pixel)", *image.x, whole=True), Axis("y (pixel)", *image.y, whole=True, down=True)
+    square = 1.0 / LONGEST <= rows / columns <= LONGEST
+    return Stack((Panel(y, (image, *others), square=square),), x, title, height_mm=76.0)
+
+
+def channel_axis(n_channels: int) -> Axis:
+    """Return the axis of a line of channels."""
+    ticks = tuple((float(i), str(i)) for i in range(n_channels)) if n_channels <= _FEW_TICKS else ()
+    return Axis("channel", -0.5, n_channels - 0.5, whole=True, ticks=ticks)
+
+
+def sensor_stack(
+    values: NDArray[Any],
+    ends: tuple[float, float],
+    label: str,
+    *others: Mark,
+    ringed: NDArray[np.bool_] | None = None,
+    ring: str = "ink",
+    origin: tuple[int, int] = (0, 0),
+    title: str = "",
+    **colours: Any,
+) -> Stack:
+    """Return a value of each pixel as a map with a bar of its colours, of a line of channels as points.
+
+    Args:
+        values: (y, x), NaN where there is none.
+        ends: values with the first and the last colour.
+        label: what the values are, with their unit.
+        others: marks over the map.
+        ringed: pixels that are marked, (y, x); None: none.
+        ring: colour of the rings.
+        origin: row and column of the first pixel.
+        title: over it.
+        colours: ``scale``, ``none`` and ``whole`` of :class:`Image`.
+    """
+    rings = np.zeros(values.shape, bool) if ringed is None else ringed
+    style: dict[str, Any] = {"size": 5.0, "face": "none", "colour": ring}
+    if is_strip(values.shape):
+        flat, x = values.ravel(), np.flatnonzero(rings)
+        marks = (Points(np.arange(flat.size), flat, size=3.0, label=label, listed=False),)
+        found = (Points(x, flat[x], **style),) if x.size else ()
+        band = (Span(-2.0, 2.0, colour="band"),) if colours.get("scale") == DIVERGING else ()
+        return Stack((Panel(Axis(label), (*band, *marks, *found)),), channel_axis(flat.size), title)
+    y, x = np.nonzero(rings)
+    found = (Points(origin[1] + x, origin[0] + y, **style),) if x.size else ()
+    image = Image(values, *place_of(values.shape, origin), ends=ends, unit=label, **colours)
+    return image_stack(image, *others, *found, title=title)
+
+
+def pull_stack(
+    pulls: FloatArray,
+    edge: float,
+    label: str,
+    note: str,
+    *,
+    normal: bool = True,
+    part: FloatArray | None = None,
+) -> Stack:
+    """Return the histogram of standardised values beside N(0, 1); those beyond an edge are in the last bins.
+
+    Args:
+        pulls: any shape; NaN are left out.
+        edge: end of the axis.
+        label: of the axis.
+        note: words in a corner.
+        normal: whether N(0, 1) is drawn.
+        part: some of them, drawn over all.
+    """
+    known = finite(pulls)
+    counts, edges = np.histogram(np.clip(known, -edge, edge), _BINS, (-edge, edge))
+    marks: list[Mark] = [Steps(edges, counts, filled=True, colour="bars")]
+    highest = float(np.max(counts, initial=1))
+    if part is not None:
+        some = np.histogram(np.clip(finite(part), -edge, edge), edges)[0]
+        marks.append(Steps(edges, some, colour="vermilion", width=0.9))
+    if normal:
+        x = np.linspace(-edge, edge, _POINTS)
+        expected = known.size * (edges[1] - edges[0]) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
+        marks.append(Line(x, expected, width=0.9))
+        highest = max(highest, float(expected.max()))
+    panel = Panel(Axis("pixels", 0.5, 5.0 * highest, log=True), tuple(marks), note=note)
+    return Stack((panel,), Axis(label, -edge, edge), height_mm=34.0)
+
+
+def row_stack(labels: Sequence[str], marks: Sequence[Mark], x: Axis, title: str = "") -> Stack:
+    """Return marks in rows that have a text each, from top to bottom."""
+    rows = tuple((float(row), plain(label)) for row, label in enumerate(labels))
+    y = Axis("", -0.6, len(labels) - 0.5, ticks=rows, down=True)
+    return Stack((Panel(y, tuple(marks)),), x, title, height_mm=30.0)
+
+
+def pull_axis(label: str, reach: float, linear_to: float) -> Axis:
+    """Return an axis of standardised values, logarithmic to both sides where it reaches far.
+
+    Args:
+        label: of the axis.
+        reach: its end.
+        linear_to: end of the linear part.
+    """
+    if reach <= 3.0 * linear_to:
+        return Axis(label, -reach, reach)
+    some = [tick for tick in (4, 10, 100, 1000, 10_000, 100_000) if tick <= reach]
+    ticks = [*(-tick for tick in reversed(some)), 0, *some]
+    texts = tuple((float(tick), f"{tick:g}".replace("-", "−")) for tick in ticks)
+    return Axis(label, -reach, reach, linear_to=linear_to, ticks=texts)

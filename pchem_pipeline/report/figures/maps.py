@@ -26,11 +26,16 @@ from pchem_pipeline.report.charts.chart import (
     y_window,
 )
 from pchem_pipeline.report.data import FEW_CHANNELS, LINE_MAPS, MAP_NAMES, ReportData
-from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.stacks import channel_axis, image_stack, is_strip, place_of
+from pchem_pipeline.report.figures.figure import (
+    DataTable,
+    Figure,
+    channel_axis,
+    image_stack,
+    is_strip,
+    place_of,
+)
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.ranges import DisplayRange, histogram_edges, robust_range
-from pchem_pipeline.report.style.stretch import map_colours
+from pchem_pipeline.report.style.ranges import DisplayRange, histogram_edges, map_colours, robust_range
 from pchem_pipeline.report.style.wording import count, measured, percent, plain, short, stored_unit, symbol
 
 FloatArray = NDArray[np.float64]

@@ -25,8 +25,7 @@ from pchem_pipeline.report.charts.chart import (
     x_window,
 )
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.stacks import row_stack
+from pchem_pipeline.report.figures.figure import DataTable, Figure, row_stack
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import short
 

@@ -12,8 +12,8 @@ import matplotlib as mpl
 from matplotlib.style import library
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.report.charts.on_paper import Look, drawing_bytes
 from pchem_pipeline.report.figures.figure import Figure, csv_text
-from pchem_pipeline.report.style.style import Look, drawing_bytes
 
 #: File formats of figures for papers.
 FORMATS = ("pdf", "svg", "png")

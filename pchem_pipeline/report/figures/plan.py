@@ -72,8 +72,6 @@ def frames_table(contours: Mapping[str, Any]) -> DataTable:
 
 
 _FRAMES = "frames for "
-#: Part of an axis at its ends where a label of a contour would be cut.
-_EDGE = 0.04
 
 
 def target_text(target: str) -> str:

@@ -16,7 +16,7 @@ from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
 from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Level, Line, Panel, Stack
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.inspector.packing import AT_ONCE
+from pchem_pipeline.report.inspector import AT_ONCE
 from pchem_pipeline.report.style.wording import count, short
 
 FloatArray = NDArray[np.float64]

@@ -1,33 +1,32 @@
-"""Figures of how far the numbers can be trusted: goodness of fit, samples left out, and uncertainties."""
+"""Figures of how far to trust the numbers: goodness of fit, samples left out, uncertainties, rounding."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.checks.multiple_testing import misfit
+from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, rounding_bias
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
     Axis,
-    Bars,
     Chart,
     Level,
     Line,
-    Mark,
     Panel,
     Span,
     Stack,
     Steps,
-    Words,
 )
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.figures.stacks import is_strip, sensor_stack
+from pchem_pipeline.report.figures.figure import DataTable, Figure, is_strip, sensor_stack
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.wording import count, percent, symbol
+from pchem_pipeline.report.style.wording import count, percent, short
 
 FloatArray = NDArray[np.float64]
 
@@ -38,8 +37,6 @@ _MOST_MARKS = 400
 #: Widths of two stacks side by side.
 _TWO = (1.0, 1.15)
 
-#: Maps of which the figure of uncertainties tells the share of noise.
-_UNCERTAIN = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
 _GOODNESS = ("p", "chi2", "dof", "q")
 
 
@@ -92,29 +89,26 @@ def left_out_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
 
 
 def uncertainty_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
-    """Return the part of the maps that is noise, and the error of the predicted ensemble."""
-    shares = noise_shares(data, _UNCERTAIN)
-    arrays = data.ensemble
-    if not shares or "epcd_exact" not in arrays:
-        return
-    words = ", ".join(f"{symbol(name)[1]} {percent(min(value, 1.0), 1.0)}" for name, value in shares.items())
-    maps = DataTable({"map": list(shares), "share of the variance": list(shares.values())}, part="maps")
+    """Return the error of the predicted ensemble; a model with effects has none."""
     names = ("dn", "counts", "epcd_exact", "epcd_stderr")
-    columns = {name: arrays[name] for name in names if name in arrays}
-    units = {"dn": "DN", "epcd_exact": "1/DN", "epcd_stderr": "1/DN"}
-    ensemble = DataTable(columns, units, "ensemble")
+    if any(name not in data.ensemble for name in names):
+        return
+    table = DataTable(
+        {name: data.ensemble[name] for name in names},
+        {"dn": "DN", "epcd_exact": "1/DN", "epcd_stderr": "1/DN"},
+        "ensemble",
+    )
+    exact, error = table["epcd_exact"], table["epcd_stderr"]
+    peak = int(np.argmax(exact))
     yield Figure(
         "uncertainty",
         "uncertainty",
-        "Noise in the maps and in the prediction",
-        "Left: share of each map's variance over the pixels that is noise of the estimates; near 100 % "
-        "(dotted) the map shows only noise: take more frames. Right: predicted density of the ensemble "
-        "(black), its standard error from the errors of the maps (blue), and the sampling noise of the "
-        "data (light blue).",
-        f"Share of noise in the variance of the maps: {words}.",
-        (maps, ensemble),
-        _uncertainty_chart(maps, ensemble),
-        PAGE_MM,
+        "Noise in the prediction",
+        "Predicted density of the ensemble (black), its standard error from the errors of the maps (blue), "
+        "and the sampling noise of the data (light blue).",
+        f"Standard error of the predicted density at its peak: {percent(float(error[peak]), exact[peak])}.",
+        (table,),
+        _error_chart(table),
     )
 
 
@@ -183,32 +177,8 @@ def left_out_chart(share: FloatArray, n_frames: int | None) -> Chart:
     return Chart((left, right), _TWO)
 
 
-def _uncertainty_chart(maps: DataTable, ensemble: DataTable) -> Chart:
-    """Return the chart of how much of each map is noise of the estimates, and how sure the prediction is."""
-    return Chart((_noise_stack(maps), _error_stack(ensemble)), _TWO)
-
-
-def _noise_stack(maps: DataTable) -> Stack:
-    names, shares = maps["map"].tolist(), maps["share of the variance"].astype(np.float64)
-    places, values = np.arange(shares.size), np.clip(100.0 * shares, 0.0, 130.0)
-    end = 1.3 * max(float(values.max()), 1.0)
-    marks: list[Mark] = [
-        Bars(places, np.zeros(places.size), values, broad=0.6, colour="bars", label="noise", listed=False)
-    ]
-    for place, value, share in zip(places.tolist(), values.tolist(), shares.tolist(), strict=True):
-        marks.append(Words(place, value / end + 0.015, percent(share, 1.0), colour="ink"))
-    if end > 100.0:
-        marks.append(Level(100.0, colour="vermilion", width=0.9, dash=":"))
-    ticks = tuple((float(place), symbol(name)[0]) for place, name in enumerate(names))
-    x = Axis("map", -0.7, len(names) - 0.3, ticks=ticks)
-    return Stack((Panel(Axis("noise in the variance (%)", 0.0, end), tuple(marks)),), x, height_mm=62.0)
-
-
-def _error_stack(ensemble: DataTable) -> Stack:
-    x, label = Axis("signal (DN)"), "density (1/DN)"
-    if "epcd_stderr" not in ensemble:
-        note = "no error of the prediction: the model has effects"
-        return Stack((Panel(Axis(label), (), note=note),), x, height_mm=62.0)
+def _error_chart(ensemble: DataTable) -> Chart:
+    """Return the chart of how sure the prediction is."""
     exact, error = ensemble["epcd_exact"], ensemble["epcd_stderr"]
     total = max(float(ensemble["counts"].sum()), 1.0)
     seen = exact > 1e-6 * exact.max()
@@ -221,5 +191,83 @@ def _error_stack(ensemble: DataTable) -> Stack:
     lines = tuple(Line(dn, values[seen], colour=colour, label=words) for words, colour, values in curves)
     floor = float(np.min(error[seen & (error > 0)], initial=np.inf))
     low = max(0.5 * floor, 1e-5 * float(exact.max())) if np.isfinite(floor) else None
-    panel = Panel(Axis(label, low, log=True), lines, legend="upper right")
-    return Stack((panel,), x, height_mm=62.0)
+    panel = Panel(Axis("density (1/DN)", low, log=True), lines, legend="upper right")
+    return Chart((Stack((panel,), Axis("signal (DN)"), height_mm=62.0),))
+
+
+_STEPS = np.geomspace(1.5, 30.0, 40)  # DN per electron
+_PHASES = 8  # biases over a whole DN
+_NEEDED = ("quanta_exposure", "conversion_gain", "read_noise_e")
+_LEAST_NOISE = 0.01  # e-
+_NAMES = ("quanta exposure", "conversion gain", "bias", "read noise")
+
+
+def rounding_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
+    """Return the bias by rounding against 1/g."""
+    curves = rounding_curves(data)
+    if not curves or not data.has_values("conversion_gain"):
+        return
+    gain = data.maps["conversion_gain"]
+    step = 1.0 / data.summary("conversion_gain", with_flagged=True).median
+    words = [f"{name} {short(float(np.interp(step, curves['1/g'], curves[name])), 2)}" for name in _NAMES]
+    table = DataTable(curves, {"1/g": "DN/e-", **dict.fromkeys(_NAMES, "standard errors")})
+    yield Figure(
+        "rounding",
+        "uncertainty",
+        "Systematic error from rounding to whole DN",
+        "Systematic error from rounding to whole DN if the density of the PCD is fitted, in standard errors "
+        "per pixel, at this run's median quanta exposure, median read noise and number of frames (largest "
+        "over the position of the bias between two DN). Above the dotted line (0.05) exact probabilities "
+        "are fitted, unless fit.likelihood is density.",
+        f"At {short(step)} DN per electron, in standard errors per pixel: {', '.join(words)}.",
+        (table,),
+        _rounding_chart(table, gain),
+    )
+
+
+def rounding_curves(data: ReportData) -> dict[str, NDArray[np.float64]]:
+    """Return the largest bias by rounding of each parameter against 1/g, at the median H and read noise.
+
+    Args:
+        data: of the run; the medians of H, g and the read noise are taken.
+
+    Returns:
+        ``1/g``, DN per electron, and for each parameter the bias in standard errors of a pixel; empty where
+        the run does not know what is needed.
+    """
+    n_frames = data.n_frames
+    if not n_frames or not all(data.has_values(name) for name in _NEEDED):
+        return {}
+    exposure, gain, total = (data.summary(name, with_flagged=True).median for name in _NEEDED)
+    noise = np.sqrt(max(total**2 - gain**2 * QUANTISATION_VARIANCE, _LEAST_NOISE**2))
+    steps = np.repeat(_STEPS, _PHASES)
+    phases = np.tile(np.arange(_PHASES) / _PHASES, _STEPS.size)
+    sigma = np.sqrt((noise * steps) ** 2 + QUANTISATION_VARIANCE)
+    found = rounding_bias(
+        [np.full(steps.size, exposure), 1.0 / steps, 100.0 + phases, sigma],
+        np.full(steps.size, float(n_frames)),
+    )
+    largest = np.abs(found).reshape(_STEPS.size, _PHASES, 4).max(axis=1)
+    # beyond this the first order says no more than that the bias is large
+    largest = np.where(largest < 30.0, largest, np.nan)
+    return {"1/g": _STEPS, **{name: largest[:, i] for i, name in enumerate(_NAMES)}}
+
+
+#: Hues of the parameters' curves.
+_HUES = ("blue", "vermilion", "green", "orange")
+
+
+def _rounding_chart(table: DataTable, gain: NDArray[Any]) -> Chart:
+    """Return the chart of the bias of the density's estimates against 1/g, with the range of this sensor."""
+    steps = table["1/g"]
+    low, high = (1.0 / float(q) for q in np.quantile(finite(gain), [0.99, 0.01]))
+    lines = [
+        Line(steps, table[name], colour=hue, label=name) for hue, name in zip(_HUES, _NAMES, strict=True)
+    ]
+    limit = Level(LARGEST_BIAS, colour="green", width=0.9, dash=":")
+    here = Span(low, high, axis="x", colour="sky", alpha=0.3, label="this sensor, 1–99 %")
+    left, right = min(float(steps[0]), 0.9 * low), max(float(steps[-1]), 1.1 * high)
+    ticks = tuple((float(tick), str(tick)) for tick in (1, 2, 5, 10, 20, 50) if left <= tick <= right)
+    x = Axis("1/g (DN per electron)", left, right, log=True, ticks=ticks)
+    y = Axis("bias (standard errors)", 1e-4, 30.0, log=True)
+    return Chart((Stack((Panel(y, (here, *lines, limit), legend="upper right"),), x, height_mm=62.0),))

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from pchem_pipeline.report.comparison import ArrayRow, Comparison, HistoryRow, Pair, Setting
-from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures
+from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures, history_figures
 from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.figures.history import history_figures
-from pchem_pipeline.report.pages.page import render_page
-from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
+from pchem_pipeline.report.pages.page import Finding, Section, render_page
+from pchem_pipeline.report.pages.pictures import DrawAll, draw_here
 from pchem_pipeline.report.pages.report_json import json_value
+from pchem_pipeline.report.pages.summary import Flag, Level
 from pchem_pipeline.report.pages.tables import Table, rmse_unit, rmse_words
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import (
@@ -37,20 +36,6 @@ _SETTINGS = ReportSettings(figure_formats=(), dpi=200)
 _MOST_WORDS = 12
 #: Of more runs than so many no maps are drawn pair by pair, and of the ensembles the last ones.
 _MOST_DRAWN = 8
-
-
-@dataclass(frozen=True)
-class _Part:
-    """One pair as the page shows it."""
-
-    id: str
-    title: str
-    level: str
-    name: str
-    sentence: str
-    words: tuple[str, ...]
-    pictures: list[Picture]
-    tables: list[Table]
 
 
 def sentence_of(found: Comparison) -> str:
@@ -111,39 +96,37 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
     every = [*whole, *times, *(each for figures in maps.values() for each in figures)]
     drawn = (draw or draw_here)(every, _SETTINGS)
 
-    def pictures(figures: Sequence[Figure]) -> list[Picture]:
-        return [Picture(figure, drawn[figure.name]) for figure in figures]
-
-    parts = [_part(pair, found, pictures(maps[pair.other.label])) for pair in found.pairs]
-    page = render_page(
-        "compare.html.j2",
-        every,
-        title=" · ".join(run.title for run in found.runs),
-        level="caution" if found.changed else "good",
-        name="Changed" if found.changed else "Nothing changed",
-        sentence=sentence_of(found),
-        parts=parts,
-        runs=run_table(found),
-        history=history_table(found),
-        times=pictures(times),
-        pictures=pictures(whole),
-        sign="▲" if found.changed else "✓",
-    )
+    sections = [
+        Section(id="verdict", title="Result", verdict=_finding(found.changed, sentence_of(found))),
+        Section(id="history", title="History", figures=times, tables=[history_table(found)]),
+        *(_pair_section(pair, found, maps[pair.other.label]) for pair in found.pairs),
+        *([Section(id="ensemble", title="Ensembles", figures=whole)] if whole else []),
+        Section(id="all-runs", title="Runs", tables=[run_table(found)]),
+    ]
+    page = render_page("compare.html.j2", sections, drawn, title=" · ".join(run.title for run in found.runs))
     return page, json.dumps(_numbers(found), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
-def _part(pair: Pair, found: Comparison, pictures: list[Picture]) -> _Part:
+def _finding(changed: bool, sentence: str, changes: Sequence[str] = ()) -> Finding:
+    level: Level = "caution" if changed else "good"
+    remarks = [Flag(level, text) for text in changes]
+    name = "Changed" if changed else "Nothing changed"
+    return Finding(level, name, sentence.replace(" -", " −"), remarks=remarks)
+
+
+def _pair_section(pair: Pair, found: Comparison, figures: Sequence[Figure]) -> Section:
     more = len(pair.changes) - _MOST_WORDS
     words = (*pair.changes[:_MOST_WORDS], *((f"And {more} more; see compare.json.",) if more > 0 else ()))
-    return _Part(
-        f"pair-{pair.other.label}",
-        f"{pair.other.title} against {pair.one.title}",
-        "caution" if pair.changed else "good",
-        "Changed" if pair.changed else "Nothing changed",
-        _pair_sentence(pair, found.tolerance),
-        words,
-        pictures,
-        pair_tables(pair, found.tolerance),
+    # of a single pair it is said above
+    sentence = _pair_sentence(pair, found.tolerance) if len(found.pairs) > 1 else ""
+    tables = pair_tables(pair, found.tolerance)
+    return Section(
+        id=f"pair-{pair.other.label}",
+        title=f"{pair.other.title} against {pair.one.title}",
+        verdict=_finding(pair.changed, sentence, words),
+        first=tables[:1],
+        figures=figures,
+        tables=tables[1:],
     )
 
 

@@ -1,21 +1,193 @@
-"""What all pages share: frame and style, the scripts, the figures' numbers, the charts, the glossary."""
+"""What all pages share: sections, frame and style, scripts, the figures' numbers, charts, the glossary."""
 
 from __future__ import annotations
 
 import base64
 import gzip
 import importlib.resources
-from collections.abc import Sequence
-from typing import Any
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import jinja2
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from pchem_pipeline.report.charts.on_page import page_charts
 from pchem_pipeline.report.figures.figure import Figure, csv_text
-from pchem_pipeline.report.inspector.inspector import content_policy, json_for_html, text_of
-from pchem_pipeline.report.pages.glossary import GLOSSARY, explained
+from pchem_pipeline.report.inspector import content_policy, json_for_html, text_of
 from pchem_pipeline.report.style.wording import short_name, visible
+
+if TYPE_CHECKING:
+    from pchem_pipeline.report.pages.pictures import Drawn
+    from pchem_pipeline.report.pages.summary import Flag
+    from pchem_pipeline.report.pages.tables import Table
+
+
+@dataclass(frozen=True)
+class Term:
+    """A word of the field: how it is written in texts, and what it means."""
+
+    name: str
+    meaning: str
+    spellings: tuple[str, ...] = ()
+
+    @property
+    def id(self) -> str:
+        """Anchor of the entry."""
+        return "term-" + re.sub(r"\W+", "-", self.name.lower()).strip("-")
+
+
+#: In the order of the list.
+GLOSSARY: tuple[Term, ...] = (
+    Term(
+        "bias",
+        "The digital number (DN) at zero electrons, μ; also called offset or black level. Its spread between "
+        "pixels is a fixed-pattern noise.",
+    ),
+    Term(
+        "charge rate",
+        "Quanta exposure divided by integration time, electrons per pixel and second, whatever the source.",
+    ),
+    Term(
+        "conversion gain",
+        "Electrons per digital number, g (e⁻/DN). EMVA 1288 gives the inverse, the overall system gain "
+        "K = 1/g (DN/e⁻).",
+    ),
+    Term(
+        "dark current",
+        "Charge rate in the dark, electrons per pixel and second; only for frames with input.kind: dark.",
+    ),
+    Term("DN", "Digital number, the unit of raw data; also called ADU, count or LSB."),
+    Term(
+        "DSNU",
+        "Dark signal non-uniformity: spread between pixels of the mean dark signal. EMVA 1288 takes the "
+        "standard deviation of averaged dark frames, in e⁻.",
+        ("dark signal non-uniformity",),
+    ),
+    Term(
+        "ensemble",
+        "All values of all pixels in one histogram, as if the sensor were one pixel measured many times.",
+    ),
+    Term(
+        "fixed-pattern noise",
+        "Pattern that is the same in every frame: differences of bias (DSNU), dark current and gain between "
+        "pixels, rows and columns.",
+        ("fixed pattern",),
+    ),
+    Term(
+        "flagged",
+        "A pixel whose values the data do not fix, for example by one electron: the true errors are larger "
+        "than quoted. Flagged pixels are excluded from medians.",
+    ),
+    Term(
+        "gap",
+        "Kullback-Leibler divergence of the model from the data, on frames not used in the fit. More data do "
+        "not change it, but lower its floor (the value from sampling noise alone).",
+        ("floor",),
+    ),
+    Term(
+        "hot pixels",
+        "Pixels with far more charge than the others: H above its median by more than maps.outlier_sigmas "
+        "robust standard deviations. EMVA 1288 leaves the limit to the application.",
+        ("hot pixel",),
+    ),
+    Term(
+        "micronat",
+        "10⁻⁶ nat, the unit of the gap. N samples with a gap of G nats each have a likelihood ratio of "
+        "exp(N G) between data and model: a factor e for a million samples with 1 micronat.",
+        ("micronats",),
+    ),
+    Term(
+        "misfit",
+        "A pixel whose histogram the fitted density does not describe, at a given false-discovery rate.",
+        ("misfits",),
+    ),
+    Term(
+        "non-uniformity of the gain",
+        "Standard deviation of the conversion gain between pixels, relative to its mean. PRNU of EMVA 1288 "
+        "combines gain and sensitivity, measured under light.",
+    ),
+    Term(
+        "NUCed",
+        "After non-uniformity correction: each value minus its pixel's bias, times its gain, in electrons.",
+        ("non-uniformity correction",),
+    ),
+    Term(
+        "PCD",
+        "Photon counting distribution: a Poisson number of electrons with mean H, converted with gain g, on "
+        "top of the bias μ, with Gaussian read noise σ.",
+        ("photon counting distribution",),
+    ),
+    Term(
+        "placebo",
+        "Control: the best fit of an unrelated effect. A wrong effect can close as much of the gap.",
+        ("control",),
+    ),
+    Term(
+        "PRNU",
+        "Photo response non-uniformity: standard deviation of the response to light between pixels, relative "
+        "to its mean. Here computed from H under light; EMVA 1288 measures at half saturation.",
+        ("photo response non-uniformity",),
+    ),
+    Term("quanta exposure", "Mean number of electrons per pixel and frame, H (e⁻)."),
+    Term(
+        "read noise",
+        "Standard deviation that the readout adds to a pixel's signal, σ in DN or σ·g in e⁻, quantisation "
+        "included. Excludes dark shot noise, which the temporal dark noise of EMVA 1288 includes.",
+    ),
+    Term(
+        "readout and charge",
+        "Each sample is split by its pixel's fit into the expected number of electrons (charge) and the "
+        "remainder (readout). Effects of light appear in charge, effects of the electronics in readout.",
+        ("readout residuals", "readout channel", "charge channel"),
+    ),
+    Term(
+        "replicate",
+        "A stack simulated from the fitted model and analysed like the data; gives the sampling noise.",
+        ("replicates",),
+    ),
+    Term(
+        "RMSE",
+        "Root mean square difference between predicted and measured density of the ensemble; not 0 even for "
+        "a perfect model, because of sampling noise.",
+    ),
+    Term(
+        "sigma",
+        "Standard deviation of an estimate, or of a statistic between stacks simulated from the fitted "
+        "model. The largest of a hundred statistics is near 3 sigma by chance.",
+        ("sd",),
+    ),
+    Term(
+        "standard error",
+        "1 sigma error of an estimate, from the curvature of the likelihood.",
+        ("standard errors",),
+    ),
+    Term(
+        "temporal dark noise",
+        "Standard deviation of a pixel's dark signal from frame to frame (EMVA 1288: σ_d, σ_y.dark), shot "
+        "noise of the dark current included.",
+    ),
+)  # fmt: skip
+
+_BY_SPELLING = {spelling.lower(): term for term in GLOSSARY for spelling in (term.name, *term.spellings)}
+_WORDS = "|".join(re.escape(word) for word in sorted(_BY_SPELLING, key=len, reverse=True))
+_ANY = re.compile(rf"(?<![\w-])(?:{_WORDS})(?![\w-])", re.IGNORECASE)
+
+
+def explained(text: str) -> Markup:
+    """Return a text as HTML in which the first of each word of the glossary leads to its entry."""
+    seen = set()
+
+    def link(found: re.Match[str]) -> str:
+        term = _BY_SPELLING[found[0].lower()]
+        if term.id in seen:
+            return found[0]
+        seen.add(term.id)
+        return f'<a class="term" href="#{term.id}">{found[0]}</a>'
+
+    return Markup(_ANY.sub(link, str(escape(text))))
+
 
 #: Numbers of a table that the page keeps.
 _LARGEST_TABLE = 6_000
@@ -25,33 +197,99 @@ _FLAG_WORDS = {"good": "Good", "note": "Note", "caution": "Caution", "serious": 
 _FLAG_SIGNS = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
 
 
-def render_page(name: str, figures: Sequence[Figure], /, *scripts: str, **content: Any) -> str:
+@dataclass(frozen=True)
+class KeyFact:
+    """A number below a finding, with up to three lines below it."""
+
+    label: str
+    value: str
+    more: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What came out.
+
+    Attributes:
+        level: good, note, caution or serious (a class of the style sheet).
+        name: of the verdict.
+        sentence: the verdict in one sentence.
+        about: what it is about, for example the samples examined.
+        facts: the key numbers.
+        remarks: evidence for and against it.
+    """
+
+    level: str
+    name: str
+    sentence: str
+    about: str = ""
+    facts: Sequence[KeyFact] = ()
+    remarks: Sequence[Flag] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A section of a page: what came out, tables, figures, further tables.
+
+    Attributes:
+        id: anchor in the page.
+        title: heading.
+        name: in the table of contents; empty: the title.
+        verdict: what came out.
+        intro: introduction.
+        missing: sentences on what is not shown, and why.
+        first: tables above the figures.
+        figures: between these and the others.
+        tables: tables below the figures.
+        parts: sections within it, of the kind that shows them.
+        kind: of a section of its own kind: the template ``section_<kind>.html.j2`` shows it, as ``section``.
+        content: what that template shows.
+        folded: whether it is closed until somebody opens it.
+    """
+
+    id: str
+    title: str
+    name: str = ""
+    verdict: Finding | None = None
+    intro: str = ""
+    missing: Sequence[str] = ()
+    first: Sequence[Table] = ()
+    figures: Sequence[Figure] = ()
+    tables: Sequence[Table] = ()
+    parts: Sequence[Section] = ()
+    kind: str = ""
+    content: Any = None
+    folded: bool = False
+
+
+def render_page(
+    name: str, sections: Sequence[Section], drawn: Mapping[str, Drawn], /, *scripts: str, **content: Any
+) -> str:
     """Return a page as HTML, complete in itself.
 
     Args:
         name: of its template, which extends ``page.html.j2``.
-        figures: those that it shows; their numbers can be saved from it.
+        sections: from top to bottom.
+        drawn: their figures, by name.
         scripts: further ones that its template holds.
         content: what its template shows.
     """
+    parts = [part for section in sections for part in (section, *section.parts)]
+    figures = [figure for part in parts for figure in part.figures]
     charts = {figure.name: figure.chart for figure in figures if not figure.chart.still}
-    always = (page_script(), *((chart_script(),) if charts else ()))
+    scripted = bool(charts or scripts)  # the inspector draws charts, too
+    always = (text_of("page.js"), *((chart_script(),) if scripted else ()))
     return _template(name).render(
         policy=content_policy(*always, *scripts),
         page_scripts=[Markup(script) for script in always],
-        charts=json_for_html(page_charts(charts)) if charts else "",
-        chart_style=Markup(text_of("uPlot.min.css", _LIBRARY)) if charts else "",
+        charts=json_for_html(page_charts(charts)) if scripted else "",
+        chart_style=Markup(text_of("uPlot.min.css", _LIBRARY)) if scripted else "",
         tables=json_for_html(figure_tables(figures)),
         glossary=GLOSSARY,
-        flag_words=_FLAG_WORDS,
-        flag_signs=_FLAG_SIGNS,
+        sections=sections,
+        drawn=drawn,
         **content,
     )
-
-
-def page_script() -> str:
-    """Return the script of files, words and folded parts."""
-    return text_of("page.js")
 
 
 def chart_script() -> str:
@@ -91,6 +329,7 @@ def _template(name: str) -> jinja2.Template:
     environment.filters["together"] = _together
     environment.filters["explained"] = lambda text: explained(_together(visible(text)))
     environment.filters["name"] = short_name
+    environment.globals |= {"flag_words": _FLAG_WORDS, "flag_signs": _FLAG_SIGNS}
     return environment.get_template(name)
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from urllib.parse import quote
 
-from pchem_pipeline.report.charts.chart import COLUMN_MM
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.settings import ReportSettings
 
@@ -30,19 +29,6 @@ class Drawn:
     files: Mapping[str, bytes] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A figure with its drawing, as a page shows it."""
-
-    figure: Figure
-    drawn: Drawn
-
-    @property
-    def wide(self) -> bool:
-        """Whether it takes the whole width of a page."""
-        return self.figure.width_mm > COLUMN_MM
-
-
 #: Draws many figures at once and returns them by name.
 DrawAll = Callable[[Sequence[Figure], ReportSettings], Mapping[str, Drawn]]
 
@@ -56,7 +42,7 @@ def draw_figure(figure: Figure, settings: ReportSettings) -> Drawn:
         figure: the figure.
         settings: formats and resolution.
     """
-    from pchem_pipeline.report.style.style import Look, drawing_bytes
+    from pchem_pipeline.report.charts.on_paper import Look, drawing_bytes
 
     look = Look(figure.width_mm, dpi=settings.dpi)
     drawing = figure.draw(look)

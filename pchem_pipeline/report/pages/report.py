@@ -1,22 +1,267 @@
-"""The report: one HTML file without network access, ``report.json`` and the files of the figures."""
+"""The report: one HTML file without network access, ``report.json`` and the files of the figures.
+
+The sections of the page are in one list, from top to bottom. A further one of figures and tables is a row in
+:data:`OPEN` or :data:`FOLDED`; figures and tables name its id. One of another kind is a maker in :data:`PAGE`
+and a template ``section_<kind>.html.j2``. The table of contents follows the list.
+What a paper would say of the run, and cite, is at the end.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from importlib import metadata
+
+import numpy as np
 
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
-from pchem_pipeline.report.inspector.inspector import embedded, script
-from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, DiscrepancyView, discrepancy_view
+from pchem_pipeline.report.figures.figure import Figure
+from pchem_pipeline.report.figures.samples import AXES, slope_of
+from pchem_pipeline.report.inspector import embedded, script
+from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, evidence, finding
 from pchem_pipeline.report.pages.emva import emva_tables
-from pchem_pipeline.report.pages.methods import method_tables
-from pchem_pipeline.report.pages.page import render_page
-from pchem_pipeline.report.pages.pictures import DrawAll, Picture, draw_here
-from pchem_pipeline.report.pages.provenance import provenance_tables
+from pchem_pipeline.report.pages.page import Finding, Section, render_page
+from pchem_pipeline.report.pages.pictures import DrawAll, Drawn, draw_here
 from pchem_pipeline.report.pages.report_json import report_json
-from pchem_pipeline.report.pages.sections import Material, page_sections
-from pchem_pipeline.report.pages.tables import result_tables
+from pchem_pipeline.report.pages.summary import (
+    answers,
+    flags,
+    key_numbers,
+    next_steps,
+    pixel_counts,
+    sentence,
+)
+from pchem_pipeline.report.pages.tables import Table, method_tables, provenance_tables, result_tables
 from pchem_pipeline.report.settings import ReportSettings
+from pchem_pipeline.report.style.ranges import finite
+from pchem_pipeline.report.style.wording import count, measured, percent, symbol
+
+#: (id, heading, introduction, parts that may be missing) of the sections that show figures; the first ones
+#: are open.
+OPEN: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
+    ("maps", "Parameter maps", "", ("maps", "charge_rate")),
+    (
+        "exposures",
+        "Exposures",
+        "Each exposure has its own H. Slope against {against}: {noun}; offset: {offset} (or electrons in the "
+        "bias stack).",
+        ("samples",),
+    ),
+    (
+        "photon-transfer",
+        "Photon transfer",
+        "Variance against mean. Points off the curve: nonlinearity, or samples of different gain.",
+        ("samples",),
+    ),
+    ("stability", "Stability and structure", "Drift in time, fixed-pattern noise, row and column noise.", ()),
+    ("status", "Fit status", "", ()),
+)
+FOLDED: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
+    ("pixels", "Single pixels", "Histograms with the fitted photon counting distribution.", ("pixels",)),
+    (
+        "goodness",
+        "Does the model describe each pixel?",
+        "Chi-square of merged bins; misfits at a given false-discovery rate. Samples far outside the model "
+        "(cosmic rays, glitches) are excluded from the fit.",
+        (),
+    ),
+    (
+        "cells",
+        "From signal to electron number",
+        "The limits between electron numbers are not half-way between the peaks, since small and large "
+        "numbers are not equally likely.",
+        (),
+    ),
+    (
+        "ensemble",
+        "The sensor as a whole",
+        "If the model holds, the parameters of the pixels predict the ensemble.",
+        ("ensemble", "nuced"),
+    ),
+    (
+        "electrons",
+        "Electron numbers",
+        "Most probable electron number of each sample of the ensemble.",
+        ("electrons",),
+    ),
+    (
+        "components",
+        "Why the peaks of the ensemble blur",
+        "Where pixels differ in gain, the peak of an electron number is the wider, the larger the number.",
+        ("components",),
+    ),
+    ("uncertainty", "How precise are the numbers?", "", ()),
+    (
+        "methods",
+        "Comparison with other methods",
+        "The same pixels analysed by methods of the literature, and the smallest possible errors.",
+        ("methods",),
+    ),
+    ("plan", "How many frames are enough?", "", ()),
+)
+
+#: How to read the figures of the section ``maps``, by how they are drawn.
+MAP_READING: dict[str, str] = {
+    "beta": (
+        "Rank-based colours (histogram-equalised); labels at minimum, median ± 1 sigma and maximum. "
+        "Blue line: median."
+    ),
+    "linear": ("Linear colours from the 1st to the 99th percentile, clipped beyond. Blue line: median."),
+    "channels": (
+        "Points: channels with their standard errors; crosses at the bottom: channels without a value."
+    ),
+}
+
+#: Sections that only a run of several samples has.
+_OF_SAMPLES = ("exposures", "photon-transfer")
+_NO_LINE = "The samples share g, μ and σ; no line was fitted (input.against: none)."
+
+
+@dataclass(frozen=True)
+class Material:
+    """What sections are made of.
+
+    Attributes:
+        data: what the run found.
+        settings: section ``report``.
+        figures: all of the page; each names its section.
+        tables: all tables of results; each names its section.
+        verdict: on what the model is missing, or None where nobody looked.
+        parts: of its evidence.
+    """
+
+    data: ReportData
+    settings: ReportSettings
+    figures: list[Figure]
+    tables: list[Table]
+    verdict: Finding | None = None
+    parts: Sequence[Section] = ()
+
+    def figures_of(self, section: str) -> list[Figure]:
+        """Return the figures of a section, by its id."""
+        return [figure for figure in self.figures if figure.section == section]
+
+    def tables_of(self, section: str) -> list[Table]:
+        """Return the tables of a section, by its id."""
+        return [table for table in self.tables if table.section == section]
+
+
+Maker = Callable[[Material], Section | None]
+
+
+def page_sections(material: Material) -> list[Section]:
+    """Return the sections of a run's page; makers that have nothing to show return None."""
+    return [section for make in PAGE if (section := make(material)) is not None]
+
+
+def _summary(material: Material) -> Section:
+    data = material.data
+    remarks = flags(data)
+    content = {
+        "answers": answers(data, remarks),
+        "caption": f"unflagged {data.noun}s" if data.often_flagged else f"{data.noun}s",
+        "numbers": key_numbers(data),
+        "sentence": "" if pixel_counts(data).fitted else sentence(data),
+        "stepped_back": key_numbers(data, with_flagged=True) if data.mostly_flagged else [],
+        "next": [(step.of(data.typed_run), step.why) for step in next_steps(data)],
+        "flags": [flag for flag in remarks if flag.level != "good"],
+        "passed": [flag for flag in remarks if flag.level == "good" and flag.about == "results"],
+        "effects": data.discrepancy.found.effects if data.discrepancy else (),
+    }
+    return Section(
+        id="summary",
+        title="Is the sensor within limits, and are these results reliable?",
+        name="Summary",
+        verdict=material.verdict,
+        figures=material.figures_of("summary"),
+        kind="summary",
+        content=content,
+    )
+
+
+def _inspector(_: Material) -> Section:
+    """Say where the inspector is; what it shows lies at the end of the page."""
+    return Section(id="inspector", title="Look at pixels", kind="inspector")
+
+
+def _part(row: tuple[str, str, str, tuple[str, ...]], folded: bool, material: Material) -> Section | None:
+    """Put figures and tables into their section; one without any says why."""
+    id_, title, intro, parts = row
+    data = material.data
+    if data.samples is None and id_ in _OF_SAMPLES:
+        return None
+    shown, tables = material.figures_of(id_), material.tables_of(id_)
+    missing = [data.missing[part] for part in parts if part in data.missing]
+    if not shown and not tables and not missing:
+        if data.samples is not None:
+            return None  # a joint fit has less to show
+        missing = ["no data in this run."]
+    if id_ == "maps":
+        reading = "channels" if min(data.shape) < 2 else material.settings.map_stretch
+        intro = MAP_READING[reading]
+    if id_ == "exposures" and data.samples is not None:
+        words = AXES.get(data.samples.against)
+        slope = slope_of(data)
+        noun = symbol(slope)[1] if slope else "charge"
+        intro = intro.format(against=words[0], noun=noun, offset=symbol(words[3])[1]) if words else _NO_LINE
+    reasons = [f"Not shown: {reason}" for reason in missing]
+    return Section(
+        id=id_, title=title, intro=intro, missing=reasons, figures=shown, tables=tables, folded=folded
+    )
+
+
+def _discrepancy(material: Material) -> Section:
+    look = material.data.quick_look
+    content = {
+        "found": look is not None and bool(look.found),
+        "command": f"pchem discrepancy {material.data.typed_run}",
+    }
+    return Section(
+        id="discrepancy",
+        title="What the model is missing",
+        verdict=material.verdict,
+        tables=material.tables_of("discrepancy"),
+        parts=material.parts,
+        kind="discrepancy",
+        content=content,
+    )
+
+
+def _tables(id_: str, title: str, empty: str, material: Material) -> Section | None:
+    """Put tables into their section; one without any says why, or is left out."""
+    tables = material.tables_of(id_)
+    missing = (empty,) if empty and not tables else ()
+    return (
+        Section(id=id_, title=title, missing=missing, tables=tables, folded=True) if tables or empty else None
+    )
+
+
+def _cite(material: Material) -> Section:
+    content = citation(material.data)
+    return Section(id="cite", title="How to cite", kind="cite", content=content, folded=True)
+
+
+def _configuration(material: Material) -> Section:
+    content = material.data.config_yaml
+    return Section(id="configuration", title="Configuration", kind="text", content=content, folded=True)
+
+
+#: The page from top to bottom.
+PAGE: tuple[Maker, ...] = (
+    _summary,
+    partial(_part, OPEN[0], False),
+    _inspector,
+    *(partial(_part, row, False) for row in OPEN[1:]),
+    _discrepancy,
+    *(partial(_part, row, True) for row in FOLDED),
+    partial(_tables, "tables", "Tables", "No pixel has a value."),
+    partial(_tables, "emva", "Quantities of EMVA 1288", ""),
+    _cite,
+    partial(_tables, "provenance", "Provenance", "Nothing was recorded."),
+    _configuration,
+)
 
 
 @dataclass(frozen=True)
@@ -51,30 +296,145 @@ def render_report(
     shown = [figure for figure in every if figure.section]
     drawn = (draw or draw_here)([*(every if settings.figure_formats else shown), *others], settings)
     figures = {name: content for each in drawn.values() for name, content in each.files.items()}
-    pictures, evidence = (
-        [Picture(figure, drawn[figure.name]) for figure in each] for each in (shown, others)
-    )
-    view = None if data.discrepancy is None else discrepancy_view(data.discrepancy, evidence)
+    verdict = None if data.discrepancy is None else finding(data.discrepancy)
+    parts = [] if data.discrepancy is None else evidence(data.discrepancy, others)
     makers = (result_tables, method_tables, emva_tables, provenance_tables)
     tables = [table for make in makers for table in make(data)]
-    sections = page_sections(Material(data, settings, pictures, tables, view))
-    pages = {} if view is None else {DISCREPANCY_PAGE: _discrepancy_page(data, view)}
+    sections = page_sections(Material(data, settings, shown, tables, verdict, parts))
+    pages = {} if verdict is None else {DISCREPANCY_PAGE: _discrepancy_page(data, verdict, parts, drawn)}
     numbers, inspector = report_json(data), embedded(data)
     page = render_page(
         "report.html.j2",
-        [*shown, *others],
+        sections,
+        drawn,
         *([script()] if inspector else []),
         title=data.title,
         data=data,
         inspector=inspector,
-        sections=sections,
     )
     return RenderedReport(page, numbers, figures, pages)
 
 
-def _discrepancy_page(data: ReportData, view: DiscrepancyView) -> str:
+def _discrepancy_page(
+    data: ReportData, verdict: Finding, parts: Sequence[Section], drawn: Mapping[str, Drawn]
+) -> str:
     about = "" if data.shape[0] == 1 else f"{data.shape[0]} × {data.shape[1]} pixels"
     if data.n_frames:
         about += f"{', ' if about else ''}{data.n_frames:,} frames"
-    figures = [picture.figure for part in view.parts for picture in part.pictures]
-    return render_page("discrepancy.html.j2", figures, title=data.title, about=about, view=view)
+    sections = [Section(id="verdict", title="Verdict", verdict=verdict), *parts]
+    return render_page("discrepancy.html.j2", sections, drawn, title=data.title, about=about)
+
+
+@dataclass(frozen=True)
+class Paper:
+    """A paper: key, how the text names it, and its BibTeX."""
+
+    key: str
+    short: str
+    bibtex: str
+
+
+_VERIFICATION = Paper(
+    "Hendrickson2023",
+    "Hendrickson et al. 2023, arXiv:2302.14654",
+    """@article{Hendrickson2023,
+  author  = {Hendrickson, Aaron and Haefner, David P. and Shade, Nicholas R. and Fossum, Eric R.},
+  title   = {Experimental Verification of {PCH-EM} Algorithm for Characterizing {DSERN} Image Sensors},
+  journal = {arXiv preprint arXiv:2302.14654},
+  year    = {2023}
+}""",
+)
+_SEVERAL = Paper(
+    "Hendrickson2024",
+    "Hendrickson et al. 2024, arXiv:2403.04498",
+    """@article{Hendrickson2024,
+  author  = {Hendrickson, Aaron J. and Haefner, David P. and Chan, Stanley H. and Shade, Nicholas R. and
+             Fossum, Eric R.},
+  title   = {{PCH-EM}: A Solution to Information Loss in the Photon Transfer Method},
+  journal = {arXiv preprint arXiv:2403.04498},
+  year    = {2024}
+}""",
+)
+
+
+@dataclass(frozen=True)
+class Citation:
+    """A paragraph of methods and the entries of a bibliography."""
+
+    text: str
+    bibtex: str
+
+
+def citation(data: ReportData) -> Citation:
+    """Return what a paper would say of this run, its numbers filled in."""
+    versions = data.run.get("versions")
+    known: Mapping[str, str] = versions if isinstance(versions, Mapping) else {}
+    version = known.get("pchem-pipeline") or metadata.version("pchem-pipeline")
+    papers = [_VERIFICATION, *([_SEVERAL] if data.samples is not None else [])]
+    sentences = [_data_sentence(data), _method_sentence(data, papers), _result_sentence(data), _quality(data)]
+    libraries = ", ".join(f"{name} {known[name]}" for name in ("numpy", "numba") if name in known)
+    used = f" with {libraries}" if libraries else ""
+    sentences.append(f"The analysis was made with pchem_pipeline {version}{used}.")
+    digest = data.run.get("digest of the input")
+    if digest:
+        sentences.append(f"Digest of the input: {digest}.")
+    software = f"""@software{{pchem_pipeline,
+  title   = {{pchem\\_pipeline}},
+  version = {{{version}}}
+}}"""
+    return Citation(" ".join(filter(None, sentences)), "\n\n".join([*(p.bibtex for p in papers), software]))
+
+
+def _data_sentence(data: ReportData) -> str:
+    if data.shape[0] == 1:
+        return f"The histograms of {count(data.shape[1], 'channel')} were analysed one by one."
+    frames = f"{count(data.n_frames, 'frame')} of " if data.n_frames else ""
+    time = f" at an integration time of {data.integration_time:g} s" if data.integration_time else ""
+    if data.samples is not None:
+        several = count(len(data.samples.samples), "sample")
+        return (
+            f"{several} of {data.shape[0]} × {data.shape[1]} pixels were analysed together, pixel by pixel."
+        )
+    return f"{frames}{data.shape[0]} × {data.shape[1]} pixels{time} were analysed pixel by pixel."
+
+
+def _method_sentence(data: ReportData, papers: list[Paper]) -> str:
+    model = f"the model {data.run['model']}" if "model" in data.run else "the photon counting distribution"
+    text = (
+        "Quanta exposure H, conversion gain g, bias μ and read noise σ of each were estimated by maximum "
+        f"likelihood under {model} (PCH-EM; {'; '.join(paper.short for paper in papers)})"
+    )
+    return f"{text}, with standard errors from the information of the likelihood."
+
+
+def _result_sentence(data: ReportData) -> str:
+    pixels, flagged = pixel_counts(data), int(data.flagged.sum())
+    if pixels.fitted == 0:
+        return f"No {data.noun} could be fitted."
+    counts = f"{pixels.fitted:,} of {count(pixels.total, data.noun)} have a value"
+    if flagged:
+        share = percent(flagged, pixels.fitted)
+        counts += f"; {flagged:,} of them ({share}) are flagged: the data do not fix their electron number"
+    if data.mostly_flagged:
+        return f"{counts}; no medians can be given."
+    parts = []
+    for name in ("read_noise_e", "conversion_gain", "charge_rate", "dark_current"):
+        if data.has_median(name):
+            summary = data.summary(name)
+            _, words, unit = symbol(name)
+            value = measured(summary.median, summary.median_stderr, unit)
+            parts.append(
+                f"{words} {value} (robust spread between {data.noun}s {summary.robust_sd:.2g} {unit})"
+            )
+    left = "the others" if flagged else f"the {data.noun}s"
+    return f"{counts}. Medians over {left}: {'; '.join(parts)}."
+
+
+def _quality(data: ReportData) -> str:
+    p = finite(data.fit.get("goodness_p", np.empty(0)))
+    if not p.size:
+        return ""
+    return (
+        f"{percent(int((p < 1e-3).sum()), p.size)} of the fits fail the chi-square test (p < 0.001; "
+        "0.10 % expected)."
+    )

@@ -14,11 +14,11 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.maps import status_counts
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.samples import middle
-from pchem_pipeline.report.pages.next_steps import next_steps
 from pchem_pipeline.report.pages.summary import (
     answers,
     flags,
     key_numbers,
+    next_steps,
     pixel_counts,
     sentence,
 )

@@ -1,7 +1,8 @@
-"""The first screen: is the sensor within limits, are the results reliable, key numbers and remarks."""
+"""The first screen: is the sensor within limits, are the results reliable, remarks, next steps."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -10,13 +11,13 @@ import numpy as np
 
 from pchem_pipeline.base.units import typeset
 from pchem_pipeline.base.variables import CHARGE_RATES
+from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 from pchem_pipeline.model.checks.map_parts import Parts
 from pchem_pipeline.model.fit.status import FLAGGED, FitStatus, flags_of
+from pchem_pipeline.model.maps.maps import hot_pixels
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.maps import status_counts
-from pchem_pipeline.report.pages.criteria import Criterion, criteria
-from pchem_pipeline.report.pages.quick_look import check_sentence, nothing_found
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import (
     count,
@@ -27,6 +28,166 @@ from pchem_pipeline.report.style.wording import (
     short,
     symbol,
 )
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """One limit beside what was found.
+
+    Attributes:
+        setting: its key in ``report.criteria``.
+        words: what is judged.
+        found: the number, as text.
+        limit: the limit, as text.
+        met: whether the sensor meets it.
+    """
+
+    setting: str
+    words: str
+    found: str
+    limit: str
+    met: bool
+
+
+#: A share of pixels or a ratio, and what it is of; None where this sensor cannot be judged by it.
+_Found = tuple[float, str] | None
+
+
+def criteria(data: ReportData) -> list[Criterion]:
+    """Judge the sensor by each criterion that has a limit and can be judged."""
+    found = []
+    for setting, (measure, show) in _MEASURES.items():
+        limit = getattr(data.criteria, setting)
+        value = None if limit is None else measure(data)
+        if value is not None:
+            number, words = value
+            found.append(Criterion(setting, words, show(number), f"≤ {show(limit)}", number <= limit))
+    return found
+
+
+def _read_noise(data: ReportData) -> _Found:
+    if not data.has_values("read_noise_e"):
+        return None
+    median = data.summary("read_noise_e").median
+    return (median, "median read noise") if np.isfinite(median) else None
+
+
+def _failed(data: ReportData) -> _Found:
+    if "fit_status" not in data.fit:
+        return None
+    pixels = pixel_counts(data)
+    return pixels.failed / max(pixels.total, 1), f"{data.noun}s without a value"
+
+
+def _flagged_share(data: ReportData) -> _Found:
+    return float(data.flagged.mean()), f"flagged {data.noun}s"
+
+
+def _hot(data: ReportData) -> _Found:
+    """Return the share of hot pixels; a flagged one is hot, too, whatever electrons it is open by."""
+    if data.few_channels or not data.has_values("quanta_exposure"):
+        return None
+    values, flagged = data.maps["quanta_exposure"], data.flagged_in("quanta_exposure")
+    if flagged[np.isfinite(values)].all():
+        return None
+    stderr = data.maps.get("quanta_exposure_stderr", np.zeros(data.shape))
+    hot = hot_pixels(values, stderr, flagged, data.outlier_sigmas)
+    return float(hot.sum() / np.isfinite(values).sum()), f"hot {data.noun}s"
+
+
+def _outlying(data: ReportData) -> _Found:
+    """Return the largest share of outliers in the maps of gain, bias and read noise."""
+    if data.few_channels:
+        return None
+    shares = []
+    for name in ("conversion_gain", "bias", "read_noise_e"):
+        if data.has_values(name):
+            summary = data.summary(name)
+            share = (summary.n_low + summary.n_high) / max(summary.n_valid, 1)
+            shares.append((share, f"outliers in {name.removesuffix('_e').replace('_', ' ')}"))
+    return max(shares, default=None)
+
+
+def _gain_spread(data: ReportData) -> _Found:
+    """Return the spread of the gain between pixels over its median, without that of the pixels' errors."""
+    if data.few_channels or not data.has_values("conversion_gain"):
+        return None
+    summary = data.summary("conversion_gain")
+    if summary.n_valid < 2:
+        return None
+    own = data.pixel_error("conversion_gain") or 0.0
+    spread = np.sqrt(max(summary.robust_sd**2 - own**2, 0.0))
+    return float(spread / summary.median), "non-uniformity of the gain"
+
+
+def _share(value: float) -> str:
+    return percent(value, 1.0)
+
+
+def _electrons(value: float) -> str:
+    return f"{short(value, 3)} e⁻"
+
+
+_MEASURES: dict[str, tuple[Callable[[ReportData], _Found], Callable[[float], str]]] = {
+    "read_noise_e": (_read_noise, _electrons),
+    "failed_pixels": (_failed, _share),
+    "flagged_pixels": (_flagged_share, _share),
+    "hot_pixels": (_hot, _share),
+    "outlying_pixels": (_outlying, _share),
+    "gain_nonuniformity": (_gain_spread, _share),
+}
+
+
+def check_title(check: Check) -> str:
+    """Return the title of a check with a capital."""
+    return f"{check.title[:1].upper()}{check.title[1:]}"
+
+
+def check_sentence(check: Check) -> str:
+    """State title, size, place and consequence of a check, without a full stop."""
+    advice = "the model includes such an effect" if check.in_model else check.advice
+    if check.unit in ("DN", "LSB") and check.name != "levels":
+        place = f", {check.where}" if check.where else ""
+        return f"{check_title(check)} of {size_text(check)}{place}{f': {advice}' if advice else ''}"
+    place = f" ({check.where})" if check.where else ""
+    place = f" at {check.where}" if check.name.endswith("_code") else place
+    return f"{check_title(check)}: {size_text(check)}{place}{f'; {advice}' if advice else ''}"
+
+
+def size_text(check: Check) -> str:
+    """Format the size of a check, in DN, e- and as a share of the read noise."""
+    if check.name == "levels":
+        return f"{short(check.size, 2)} DN apart"
+    if check.unit == "DN":
+        electrons = f"{short(check.size_e, 2)} e⁻" if math.isfinite(check.size_e) else ""
+        share = f"{percent(check.share, 1.0)} of the read noise" if math.isfinite(check.share) else ""
+        others = ", ".join(filter(None, (electrons, share)))
+        return f"{short(check.size, 2)} DN{f' ({others})' if others else ''}"
+    if check.unit == "LSB":
+        return f"{short(check.size, 2)} LSB rms" if math.isfinite(check.size) else "unknown size"
+    if check.name in ("lag", "frame_lag", "neighbours_x", "neighbours_y"):
+        return short(check.size, 2)
+    noun = (
+        "frames"
+        if check.name.endswith("frames")
+        else "pixels"
+        if check.name.endswith("pixels")
+        else "samples"
+    )
+    return f"{percent(check.size, 1.0)} of the {noun}"
+
+
+def nothing_found(look: QuickLook) -> str:
+    """State that no check is significant, and the detection limit of row noise."""
+    rows = next((check for check in look.checks if check.name == "row_noise"), None)
+    if rows is None:
+        return "Quick look: the codes agree with the model within sampling noise."
+    codes = "" if "codes" in look.missing else ", codes"
+    text = f"Quick look: frames, rows, columns, neighbours{codes} and pickup agree with the model"
+    if math.isfinite(rows.limit):
+        text += f"; row noise above {short(rows.limit, 2)} DN is excluded (95 %)"
+    return f"{text}."
+
 
 Level = Literal["good", "note", "caution", "serious"]
 
@@ -466,14 +627,12 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
     if pixel_counts(data).fitted == 0:
         return Answer(question, "serious", "No results", f"No {data.noun} has a value.")
     about = [flag for flag in remarks if flag.about == "results"]
-    serious = [flag for flag in about if flag.level == "serious"]
-    cautions = [flag for flag in about if flag.level == "caution"]
-    if serious:
-        more = f" ({len(serious) - 1} more below)" if len(serious) > 1 else ""
-        return Answer(question, "serious", "No", f"{serious[0].text}{more}")
-    if cautions:
-        more = f" ({len(cautions) - 1} more below)" if len(cautions) > 1 else ""
-        return Answer(question, "caution", "With caution", f"{cautions[0].text}{more}")
+    doubts: tuple[tuple[Level, str], ...] = (("serious", "No"), ("caution", "With caution"))
+    for level, word in doubts:
+        texts = [flag.text for flag in about if flag.level == level]
+        if texts:
+            more = f" ({len(texts) - 1} more below)" if len(texts) > 1 else ""
+            return Answer(question, level, word, f"{texts[0]}{more}")
     passed = sum(flag.level == "good" for flag in about)
     checks = f"{count(passed, 'check')} of the model against the data passed" if passed else "No check fails"
     looked = "" if data.discrepancy is not None else _not_looked_for(data)
@@ -500,3 +659,75 @@ def _not_looked_for(data: ReportData) -> str:
         f"{parts} The quick checks do not detect what is the same in all frames and pixels (a nonlinearity, "
         f"charge that is not Poisson distributed): run {data.quick_look.command}."
     )
+
+
+#: Stands for the run in a command.
+RUN = "RUN"
+#: Frames that a search for what the model is missing needs.
+_SEARCHED = 600
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command, with :data:`RUN` in place of the run, and what it is for."""
+
+    command: str
+    why: str
+
+    def of(self, run: str) -> str:
+        """Return the command as it is typed for a run."""
+        return " ".join(run if word == RUN else word for word in self.command.split(" "))
+
+
+def next_steps(data: ReportData) -> list[Step]:
+    """Return what to do next; the first is the one to begin with."""
+    if any(stage.get("state") not in (None, "complete") for stage in data.stages) or data.unfitted.any():
+        return [Step(f"pchem run {RUN}", "finish the run")]
+    step, status = data.code_step, data.fit.get("fit_status")
+    if step > 1 and not step & (step - 1):
+        why = (
+            f"set input.bit_shift: {step.bit_length() - 1} in the YAML (left-justified samples) and run again"
+        )
+        return [Step(f"pchem run {RUN}", why)]
+    if status is not None and ((status & data.failed_mask) != 0).all():
+        return [
+            Step(
+                f"pchem joint EXPOSED.yaml --bias {RUN} --store joint.zarr",
+                "if these are bias frames: fit them together with exposed frames",
+            ),
+            Step(f"pchem view {RUN}", "view the histograms"),
+        ]
+    if data.quick_look is not None and any(check.name == "levels" for check in data.quick_look.found):
+        return [
+            Step(
+                "pchem run FILES_OF_ONE --store one.zarr",
+                "the frames have several exposures: make one run per exposure, then fit them together "
+                "(pchem joint)",
+            )
+        ]
+    found = []
+    if data.often_flagged and data.samples is None:
+        found += [
+            Step(
+                f"pchem joint {RUN} BRIGHTER.yaml --bias BIAS.yaml --store joint.zarr",
+                "fit several exposures together: a second exposure, or bias frames, fix the electron number",
+            ),
+            Step(
+                f"pchem plan --read-noise {_noise_to_plan(data)} --samples 0,2,8 --target conversion_gain=1%",
+                "compute how many frames at which exposures are needed, at the read noise that you expect",
+            ),
+        ]
+    if data.mostly_coarse:
+        found.append(Step(f"pchem run {RUN}", "set fit.likelihood: auto in the YAML and run again"))
+    if data.discrepancy is None and not data.often_flagged and (data.n_frames or 0) >= _SEARCHED:
+        found.append(Step(f"pchem discrepancy {RUN}", "search for effects missing from the model"))
+    if not found:
+        found.append(Step(f"pchem view {RUN}", "view every pixel in the browser"))
+    return found
+
+
+def _noise_to_plan(data: ReportData) -> str:
+    """Return the read noise to plan for, e-: the median's, or where most pixels are open a guess above it."""
+    if data.mostly_flagged or not data.has_values("read_noise_e"):
+        return "0.6"
+    return f"{data.summary('read_noise_e').median:.2g}"

@@ -1,9 +1,9 @@
-"""The tables of a report, as plain rows of text."""
+"""The tables of a report, as plain rows of text: results, and what was run on what."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,11 +14,12 @@ from pchem_pipeline.model.maps.maps import summarise
 from pchem_pipeline.report.data import ReportData, Samples
 from pchem_pipeline.report.figures.ensemble import bias_remark
 from pchem_pipeline.report.figures.maps import status_counts
+from pchem_pipeline.report.figures.methods import crossing_text, gain_rmse, percent_text
 from pchem_pipeline.report.figures.plan import frames_text, target_text
 from pchem_pipeline.report.figures.samples import AXES, middle
 from pchem_pipeline.report.figures.trust import noise_shares
-from pchem_pipeline.report.pages.quick_look import check_title
-from pchem_pipeline.report.pages.quick_look import size_text as check_size
+from pchem_pipeline.report.pages.summary import check_title
+from pchem_pipeline.report.pages.summary import size_text as check_size
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import (
     count,
@@ -229,21 +230,22 @@ def _truth_rows(data: ReportData) -> Iterator[Row]:
         }
 
 
-_RMSE_ROWS = (
-    ("epcd_exact", "raw, exact mean over pixels", "noise_floor"),
-    ("epcd_dependent", "raw, dependent parameters", "noise_floor"),
-    ("epcd_independent", "raw, independent parameters", "noise_floor"),
-    ("nuced_exact", "NUCed, exact mean over pixels", "nuced_noise_floor"),
-    ("nuced_dependent", "NUCed, dependent parameters", "nuced_noise_floor"),
-    ("nuced_independent", "NUCed, independent parameters", "nuced_noise_floor"),
-)
+#: Predictions of the ensemble, and the sampling noise beside them, in words.
+_RMSE = {
+    "epcd_exact": "raw, exact mean over pixels",
+    "epcd_dependent": "raw, dependent parameters",
+    "epcd_independent": "raw, independent parameters",
+    "noise_floor": "raw, sampling noise alone",
+    "nuced_exact": "NUCed, exact mean over pixels",
+    "nuced_dependent": "NUCed, dependent parameters",
+    "nuced_independent": "NUCed, independent parameters",
+    "nuced_noise_floor": "NUCed, sampling noise alone",
+}
 
 
 def rmse_words(name: str) -> str:
     """Return what a prediction of the ensemble is called, or the sampling noise beside it."""
-    words = {row[0]: row[1] for row in _RMSE_ROWS}
-    floors = {"noise_floor": "raw, sampling noise alone", "nuced_noise_floor": "NUCed, sampling noise alone"}
-    return {**words, **floors}.get(name, name.replace("_", " "))
+    return _RMSE.get(name, name.replace("_", " "))
 
 
 def rmse_unit(name: str) -> str:
@@ -254,10 +256,11 @@ def rmse_unit(name: str) -> str:
 def _rmse(data: ReportData) -> Table:
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
     rows = []
-    for name, words, floor_name in _RMSE_ROWS:
-        if rmse.get(name) is None:
+    for name, words in _RMSE.items():
+        if rmse.get(name) is None or name.endswith("noise_floor"):
             continue
-        floor, unit = rmse.get(floor_name), rmse_unit(name)
+        floor = rmse.get("nuced_noise_floor" if name.startswith("nuced") else "noise_floor")
+        unit = rmse_unit(name)
         rows.append(
             {
                 "prediction": words,
@@ -381,7 +384,8 @@ def _intervals(data: ReportData) -> Table:
     return Table.of(
         "uncertainties",
         "Uncertainties",
-        f"Median 1 sigma error per {data.noun}, and its share of the map's variance."
+        f"Median 1 sigma error per {data.noun}, and the share of the map's variance that is noise of the "
+        "estimates; near 100 % the map shows only noise: take more frames."
         + (words if data.intervals else ""),
         _interval_rows(data),
         "uncertainty",
@@ -494,3 +498,209 @@ def _plan(data: ReportData) -> Table | None:
         rows,
         "plan",
     )
+
+
+_SECTION = "provenance"
+
+
+def provenance_tables(data: ReportData) -> list[Table]:
+    """Return the tables of what was run on what."""
+    return [table for make in (_run, _stages, _inputs) if (table := make(data)).rows]
+
+
+def size_text(size: float) -> str:
+    """Return a number of bytes in MB or GB."""
+    return (
+        f"{size / 1e9:.2f} GB"
+        if size >= 1e9
+        else f"{size / 1e6:.1f} MB"
+        if size >= 1e5
+        else f"{size / 1e3:.1f} kB"
+    )
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            rows += _flat(value, f"{prefix}{key}: ")
+        elif isinstance(value, Sequence) and not isinstance(value, str):
+            rows.append((f"{prefix}{key}", ", ".join(str(item) for item in value)))
+        else:
+            rows.append((f"{prefix}{key}", "not known" if value is None else str(value)))
+    return rows
+
+
+def _run(data: ReportData) -> Table:
+    rows = ({"item": item, "value": value} for item, value in _flat(data.run))
+    return Table.of("run", "Run", "Program and settings of this report.", rows, _SECTION)
+
+
+def _stages(data: ReportData) -> Table:
+    words = "Wall time, CPU time and largest resident memory of a process."
+    return Table.of("stages", "Stages", words, map(_stage_row, data.stages), _SECTION)
+
+
+def _stage_row(stage: Mapping[str, Any]) -> Row:
+    def seconds(key: str) -> str:
+        return f"{float(stage[key]):.1f} s" if stage.get(key) is not None else ""
+
+    memory = stage.get("peak_memory_bytes")
+    return {
+        "stage": str(stage.get("stage", "")),
+        "state": str(stage.get("state", "")),
+        "wall": seconds("seconds"),
+        "CPU": seconds("cpu_seconds"),
+        "peak memory": f"{float(memory) / 2**20:.0f} MiB" if memory else "",
+        "started (UTC)": str(stage.get("started", "")),
+    }
+
+
+#: Files beyond this number are counted, not listed.
+_MOST_FILES = 200
+
+
+def _inputs(data: ReportData) -> Table:
+    more = len(data.inputs) - _MOST_FILES
+    words = f" The first {_MOST_FILES} of {len(data.inputs):,} files." if more > 0 else ""
+    return Table.of(
+        "inputs",
+        "Input files",
+        f"Names, sizes and content hashes of the files that were read.{words}",
+        (
+            {
+                "file": str(entry.get("name", "")),
+                "size": size_text(float(entry["size"])) if entry.get("size") is not None else "",
+                "hash": str(entry.get("hash", "")),
+            }
+            for entry in data.inputs[:_MOST_FILES]
+        ),
+        _SECTION,
+    )
+
+
+_COLUMNS = (
+    "pixels",
+    "g, e-/DN",
+    "g bias %",
+    "g rmse %",
+    "g spread %",
+    "g bound %",
+    "rmse/bound",
+    "s_e rmse %",
+    "H rmse %",
+    "us/pixel",
+)
+
+
+_HEAD = (
+    "method",
+    "pixels with a result",
+    "median g (e⁻/DN)",
+    "bias of g (%)",
+    "rms error of g (%)",
+    "robust spread of g (1.4826 MAD, %)",
+    "bound (%)",
+    "error / bound",
+    "rms error of the read noise (%)",
+    "rms error of H (%)",
+    "µs per pixel",
+)
+
+
+def methods_text(result: Mapping[str, Any]) -> str:
+    """Return the comparison as the command prints it.
+
+    Args:
+        result: content of ``methods.json``.
+    """
+    against = {"truth": "the truth", "fit": "this run's fit of the same frames"}[result["reference"]]
+    lines = [f"{result['pixels']:,} pixels, errors against {against}"]
+    lines += [f"sample {i}: {_sample(sample)}" for i, sample in enumerate(result["samples"])]
+    head = f"{'method':<34}" + "".join(f"{column:>12}" for column in _COLUMNS)
+    lines += ["", head, "-" * len(head)]
+    for row in method_rows(result):
+        lines.append(
+            f"{row[0]:<34}" + (f"  {row[1]}" if len(row) == 2 else "".join(f"{c:>12}" for c in row[1:]))
+        )
+    if result["study"]:
+        at = result["study_at"]
+        lines += [
+            "",
+            f"simulated, H = {at['quanta_exposure']:.3g} e-, {at['n_frames']:,} frames for every method, "
+            f"{at['n_pixels']} pixels at each read noise: rmse of g in %",
+            *_study_lines(result["study"]),
+            "",
+            crossing_text(result["study"]),
+        ]
+    return "\n".join(lines)
+
+
+def _sample(sample: Mapping[str, Any]) -> str:
+    exposure = sample["quanta_exposure"]
+    words = "exposure not known" if exposure is None else f"H = {exposure:.3g} e-"
+    return f"{sample['run']}, {sample['n_frames']:,} frames, {words}"
+
+
+def method_rows(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Return a row of text for every method: title and numbers, or title and why it was not run.
+
+    Against a fit of the same frames an error is no multiple of the bound: the reference errs too.
+
+    Args:
+        result: content of ``methods.json``.
+    """
+    rows: list[tuple[str, ...]] = []
+    for method in result["methods"]:
+        if method["missing"]:
+            rows.append((method["title"], method["missing"]))
+            continue
+        errors = method["errors"]
+        gain = errors.get("conversion_gain", {})
+        ratio = _ratio(gain.get("rmse"), gain.get("bound")) if result["reference"] == "truth" else "-"
+        if not errors:
+            cells = ["reference", *[""] * 6]
+        else:
+            cells = [percent_text(gain.get(name)) for name in ("bias", "rmse", "robust_sd", "bound")]
+            cells += [
+                ratio,
+                *(percent_text(errors[name]["rmse"]) for name in ("read_noise_e", "quanta_exposure")),
+            ]
+        time = f"{1e6 * method['seconds_per_pixel']:.0f}"
+        gain_value = method["medians"]["conversion_gain"]
+        value = "-" if gain_value is None else f"{gain_value:.5g}"
+        rows.append((method["title"], f"{method['n_answered']:,}", value, *cells, time))
+    return rows
+
+
+def _ratio(value: float | None, bound: float | None) -> str:
+    return "-" if value is None or not bound else f"{value / bound:.2f}"
+
+
+def _study_lines(study: Sequence[Mapping[str, Any]]) -> list[str]:
+    titles = {name: method["title"] for name, method in study[0]["methods"].items()}
+    lines = [f"{'read noise, e-':<34}" + "".join(f"{point['read_noise_e']:>9g}" for point in study)]
+    for name, title in titles.items():
+        cells = [percent_text(gain_rmse(point, name)) for point in study]
+        lines.append(f"{title:<34}" + "".join(f"{cell:>9}" for cell in cells))
+    for name in ("one sample", "a dark and a bright sample"):
+        cells = [percent_text(point["bounds"][name]) for point in study]
+        lines.append(f"{'bound, ' + name:<34}" + "".join(f"{cell:>9}" for cell in cells))
+    return lines
+
+
+def method_tables(data: ReportData) -> list[Table]:
+    """Return the table of the comparison, where one was made."""
+    result = data.methods
+    if result is None:
+        return []
+    against = {"truth": "the truth", "fit": "the fit of this run, from the same frames"}[result["reference"]]
+    rows = [row if len(row) > 2 else (*row, *[""] * (len(_HEAD) - 2)) for row in method_rows(result)]
+    remarks = " ".join(f"{remark[0].upper()}{remark[1:]}." for remark in result["remarks"])
+    verdict = crossing_text(result["study"]) if result["study"] else ""
+    caption = (
+        f"The same {result['pixels']:,} {data.noun}s for every method; errors against {against}. "
+        f"{f'{verdict[0].upper()}{verdict[1:]}.' if verdict else ''} {remarks}"
+    ).strip()
+    caption = caption.replace(" e-", " e⁻")
+    return [Table("methods-table", "Methods", caption, _HEAD, tuple(rows), section="methods")]

@@ -403,7 +403,7 @@
     return list;
   };
 
-  const drawn = [];
+  const drawn = new Set();
   const buildStack = (stack, row) => {
     const whole = made("div", "stack"), room = stack.height * PX_MM - BELOW - 2 * ABOVE * stack.panels.length;
     const shares = stack.panels.reduce((sum, each) => sum + each.height, 0);
@@ -423,13 +423,12 @@
       frame.addEventListener("keydown", (event) => keyed(panel, event));
     });
   };
-  const build = (figure, chart, alt) => {
-    const box = figure.querySelector(".picture"), element = made("div", "chart");
+  // draws a chart into a box of the page and returns what takes it away
+  const build = (box, chart, alt) => {
+    const element = made("div", "chart"), rows = [];
     element.setAttribute("role", "group");
     element.setAttribute("aria-label", alt);
     box.append(element);
-    figure.classList.add("drawn");
-    const rows = [];
     for (let i = 0; i < chart.stacks.length; i += chart.widths.length) {
       const row = { stacks: chart.stacks.slice(i, i + chart.widths.length), off: new Set(), keys: new Map(), tints: [] };
       Object.assign(row, { element: made("div", "row"), place: made("li", "place"), spoken: made("p", "spoken") });
@@ -448,14 +447,22 @@
       row.element.after(legend(row), row.spoken);
     }
     let width = box.clientWidth;
-    new ResizeObserver(() => {
+    const resized = new ResizeObserver(() => {
       if (!box.clientWidth || box.clientWidth === width) return;
       width = box.clientWidth;
       columns();
       for (const stack of chart.stacks) for (const panel of stack.panels) panel.plot.setSize({ width: stack.element.clientWidth, height: panel.plot.height });
-    }).observe(box);
-    drawn.push(...rows);
+    });
+    resized.observe(box);
+    for (const row of rows) drawn.add(row);
+    return () => {
+      resized.disconnect();
+      for (const row of rows) drawn.delete(row);
+      for (const stack of chart.stacks) for (const panel of stack.panels) panel.plot.destroy();
+      element.remove();
+    };
   };
+  window.pchemChart = build; // for the inspector
 
   dark.addEventListener("change", () => {
     palette = colours[dark.matches ? "dark" : "light"];
@@ -470,7 +477,8 @@
     for (const { target, isIntersecting } of entries) {
       if (!isIntersecting) continue;
       watch.unobserve(target);
-      build(target, charts[target.id.slice("figure-".length)], target.querySelector("img").alt);
+      target.classList.add("drawn");
+      build(target.querySelector(".picture"), charts[target.id.slice("figure-".length)], target.querySelector("img").alt);
     }
   }, { rootMargin: "600px" });
   for (const name of Object.keys(charts)) {

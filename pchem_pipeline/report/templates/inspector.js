@@ -1,6 +1,6 @@
 // The pixel inspector of the report: a map to look at, histograms to brush, and one pixel in full.
-// It reads what the page holds (elements inspector-facts, map-N and inspector-sample; see render/inspector.py and
-// render/packing.py for their form); under `pchem view` it asks that server for the rest. It writes text nodes and
+// It reads what the page holds (elements inspector-facts, map-N and inspector-sample; see report/inspector.py
+// for their form); under `pchem view` it asks that server for the rest. It writes text nodes and
 // attributes only, never markup.
 "use strict";
 (() => {
@@ -216,9 +216,12 @@
     return keys.map((key) => [key, fact.words[key]]);
   };
   const categoryColour = (fact, order) => (order === 0 ? cssColour("--fine") : PALETTE[(order - 1) % PALETTE.length]);
-  const categoryOf = (fact, list, value) => {
-    if (fact.kind === "words") return Math.max(list.findIndex(([key]) => key === value), 0);
-    return Math.max(list.findIndex(([key], order) => order > 0 && value & key), 0);
+  const belongs = (fact, key, value) => (fact.kind === "bits" && key !== 0 ? (value & key) !== 0 : value === key);
+  const categoryOf = (fact, list, value) => Math.max(list.findIndex(([key]) => belongs(fact, key, value)), 0);
+  // ends of the colours on the axis of a map, with what leads there and back
+  const colourEnds = (map) => {
+    const axis = (value) => (map.log ? Math.log10(Math.max(value, 1e-300)) : value), back = (v) => (map.log ? 10 ** v : v);
+    return [axis, back, ...RANGES[state.colours].map((share) => axis(quantile(map, map.counts, share)))];
   };
   const levels = (map, counts) => {
     const level = new Float64Array(65536);
@@ -233,8 +236,7 @@
       }
       return level;
     }
-    const axis = (value) => (map.log ? Math.log10(Math.max(value, 1e-300)) : value);
-    const [low, high] = RANGES[state.colours].map((share) => axis(quantile(map, counts, share)));
+    const [axis, , low, high] = colourEnds(map);
     for (let code = FIRST; code < ABOVE; code++) {
       level[code] = high > low ? clamp((axis(codeValue(map, code)) - low) / (high - low), 0, 1) : 0.5;
     }
@@ -494,10 +496,7 @@
       for (let code = FIRST; code < ABOVE; code++) {
         if (!map.counts[code]) continue;
         const value = Math.round(codeValue(map, code));
-        list.forEach(([key], order) => {
-          const hit = map.fact.kind === "bits" ? (key === 0 ? value === 0 : value & key) : value === key;
-          if (hit) count[order] += map.counts[code];
-        });
+        list.forEach(([key], order) => { if (belongs(map.fact, key, value)) count[order] += map.counts[code]; });
       }
       const legend = el("ul", { class: "legend" });
       list.forEach(([key, text], order) => {
@@ -516,11 +515,9 @@
     let labels;
     if (shares) labels = shares.map((share) => short(quantile(map, map.counts, share)));
     else {
-      const axis = (v) => (map.log ? Math.log10(Math.max(v, 1e-300)) : v);
-      const [low, high] = RANGES[state.colours].map((share) => axis(quantile(map, map.counts, share)));
-      const at = (level) => { const v = low + level * (high - low); return map.log ? 10 ** v : v; };
+      const [, back, low, high] = colourEnds(map);
       for (let digits = 3; digits < 7; digits++) {
-        labels = [0, 0.25, 0.5, 0.75, 1].map((level) => short(at(level), digits));
+        labels = [0, 0.25, 0.5, 0.75, 1].map((level) => short(back(low + level * (high - low)), digits));
         if (new Set(labels).size === 5) break;
       }
       if (state.colours !== "all") labels = [`≤ ${labels[0]}`, ...labels.slice(1, 4), `≥ ${labels[4]}`];
@@ -671,9 +668,7 @@
   const selectCategory = (map, key, text) => {
     const selection = new Uint8Array(n);
     for (let i = 0; i < n; i++) {
-      if (map.codes[i] === NONE) continue;
-      const value = Math.round(codeValue(map, map.codes[i]));
-      selection[i] = (map.fact.kind === "bits" ? (key === 0 ? value === 0 : value & key) : value === key) ? 1 : 0;
+      if (map.codes[i] !== NONE && belongs(map.fact, key, Math.round(codeValue(map, map.codes[i])))) selection[i] = 1;
     }
     select(selection, text, `is,${map.fact.path},${key}`);
   };
@@ -746,14 +741,18 @@
     const top = byId("inspector-title").getBoundingClientRect().top;
     if (top < 0 || top > window.innerHeight - 120) byId("inspector-pixel").scrollIntoView({ block: "start" });
   };
-  const medianPixel = () => {
-    const { map, status } = state, middle = quantile(map, map.counts, 0.5);
+  // the pixel in full that is least far by some measure; -1 where none is
+  const closest = (distance) => {
     let best = -1, least = Infinity;
     for (const i of inFull()) {
-      const away = Math.abs(valueAt(map, i) - middle) + (status && valueAt(status, i) !== 0 ? 1e300 : 0);
+      const away = distance(i);
       if (away < least) [best, least] = [i, away];
     }
     return best;
+  };
+  const medianPixel = () => {
+    const { map, status } = state, middle = quantile(map, map.counts, 0.5);
+    return closest((i) => Math.abs(valueAt(map, i) - middle) + (status && valueAt(status, i) !== 0 ? 1e300 : 0));
   };
   const pixelData = async (i) => {
     const found = { index: i, values: new Map(), counts: null, origin: 0, deciding: null, mass: null };
@@ -823,13 +822,11 @@
     const [from, to] = [Math.max(first - margin, -2), Math.min(last + margin, pixel.counts.length + 1)];
     return [pixel.origin + from, pixel.origin + to];
   };
-  // Everything that the drawing of a pixel needs: geometry, functions from DN to place, and what is known.
-  const sketch = (pixel, figure) => {
+  // Everything that the drawing of a pixel needs: the shown DN, and functions of them.
+  const sketch = (pixel) => {
     const theta = parametersOf(pixel), counts = pixel.counts;
     const all = counts ? counts.reduce((sum, count) => sum + count, 0) : 0;
     if (!theta && !all) return null;
-    const width = Math.max(figure.parentElement.clientWidth, 240), height = 330;
-    const area = { width, height, left: 52, right: width - 10, top: 22, floor: 212, stripTop: 232, stripFloor: 292 };
     const [low, high] = shownRange(pixel, theta), scale = all || 1;
     const bins = Array.from({ length: high - low + 1 }, (_, i) => low + i);
     const countAt = (dn) => counts?.[dn - pixel.origin] ?? 0;
@@ -844,101 +841,71 @@
       const fine = Array.from({ length: 601 }, (_, i) => low - 0.5 + ((high - low + 1) * i) / 600);
       curve = fine.map((dn) => [dn, scale * density(dn, theta)]);
     }
-    const heights = bins.map(countAt);
-    const peak = Math.max(...heights, ...curve.map(([, v]) => v), 1e-12);
+    const peak = Math.max(...bins.map(countAt), ...curve.map(([, v]) => v), 1e-12);
     const logarithmic = byId("inspector-log-pixel").checked && all > 0 && peak > 1;
-    const share = (v) => (logarithmic ? Math.log10(Math.max(2 * v, 1)) / Math.log10(2 * peak) : v / peak);
-    const level = (v) => area.floor - (area.floor - area.top) * share(v);
-    const x = (dn) => area.left + ((area.right - area.left) * (dn - low + 0.5)) / (high - low + 1);
-    return {
-      pixel, figure, theta, all, scale, area, low, high, bins, heights, countAt, expectedAt, curve, peak, logarithmic, level, x,
-    };
+    const limits = limitsOf(pixel, theta, low, high), residuals = residualsOf(bins, countAt, expectedAt, all);
+    return { pixel, theta, all, scale, low, high, bins, countAt, expectedAt, curve, peak, logarithmic, limits, residuals };
   };
-  const put = (s, tag, attributes, ...text) => s.figure.append(svgEl(tag, attributes, ...text));
-  const putText = (s, x, y, anchor, text, more = {}) => put(s, "text", { x, y, "text-anchor": anchor, ...more }, text);
-  const putLine = (s, x1, y1, x2, y2, kind) => put(s, "line", { x1, y1, x2, y2, class: kind });
-  const putUpright = (s, y, text) => putText(s, 12, y, "middle", text, { transform: `rotate(-90 12 ${y})` });
-  const putCurve = (s, points, kind) => {
-    const at = ([dn, v]) => `${s.x(dn).toFixed(1)} ${clamp(s.level(v), s.area.top, s.area.floor).toFixed(1)}`;
-    if (points.length) put(s, "path", { d: `M${points.map(at).join("L")}`, class: kind });
+  const limitsOf = (pixel, theta, low, high) => {
+    const deciding = pixel.deciding?.every(Number.isFinite) ? pixel.deciding : facts.model ? null : theta;
+    if (!deciding || !(deciding[0] > 0)) return [];
+    const found = [];
+    for (let k = 0; k < 400 && edge(k, deciding) < high + 0.5; k++) {
+      if (edge(k, deciding) > low - 0.5) found.push([k, edge(k, deciding)]);
+    }
+    return found;
   };
-  const drawDensity = (s) => {
-    if (s.all) put(s, "path", { d: stairs(s.heights, (i) => s.x(s.low - 0.5 + i), s.level, s.area.floor), class: "bars" });
-    if (s.theta && !facts.model) {
-      const parts = new Map();
-      for (const [dn] of s.curve) {
-        for (const [k, part] of components(dn, s.theta)) {
-          if (s.scale * part < s.peak * 2e-4) continue;
-          if (!parts.has(k)) parts.set(k, []);
-          parts.get(k).push([dn, s.scale * part]);
-        }
+  const residualsOf = (bins, countAt, expectedAt, all) => {
+    const expected = all ? bins.map((dn) => [dn, expectedAt(dn)]).filter(([, e]) => e >= 1) : [];
+    return expected.map(([dn, e]) => [dn, (countAt(dn) - e) / Math.sqrt(e)]);
+  };
+  const largestOf = (s) => Math.max(...s.residuals.map(([, r]) => Math.abs(r)));
+  // marks of charts.js from [x, y] of each point
+  const mark = (kind, points, colour, more = {}) => ({ kind, x: points.map(([x]) => x), y: points.map(([, y]) => y), colour, ...more });
+  const componentMarks = (s) => {
+    const parts = new Map();
+    for (const [dn] of s.theta && !facts.model ? s.curve : []) {
+      for (const [k, part] of components(dn, s.theta)) {
+        if (s.scale * part < s.peak * 2e-4) continue;
+        if (!parts.has(k)) parts.set(k, []);
+        parts.get(k).push([dn, s.scale * part]);
       }
-      if (parts.size <= 60) for (const [k, points] of parts) putCurve(s, points, `part part${k % 2}`);
     }
-    putCurve(s, s.curve, "curve");
+    if (parts.size > 60) return [];
+    return [...parts].map(([k, points]) => mark("line", points, k % 2 ? "green" : "vermilion", { width: 0.8 }));
   };
-  const drawEdges = (s) => {
-    const own = facts.model ? null : s.theta;
-    const deciding = s.pixel.deciding?.every(Number.isFinite) ? s.pixel.deciding : own;
-    const edges = [];
-    if (!deciding || !(deciding[0] > 0)) return edges;
-    for (let k = 0; k < 400 && edge(k, deciding) < s.high + 0.5; k++) {
-      if (edge(k, deciding) > s.low - 0.5) edges.push([k, edge(k, deciding)]);
-    }
-    const every = Math.max(1, Math.ceil(edges.length / (s.area.width / 26)));
-    edges.forEach(([k, dn], i) => {
-      putLine(s, s.x(dn), s.area.top, s.x(dn), s.area.floor, "edge");
-      const from = s.x(i ? edges[i - 1][1] : s.low - 0.5), to = s.x(dn);
-      if (k % every || to - from <= 8) return;
-      putText(s, (from + to) / 2, s.area.top - 8, "middle", k === 0 ? "k = 0" : String(k), { class: "number" });
+  const densityPanel = (s) => {
+    const ends = s.logarithmic ? [0.5, 8 * s.peak] : [0, 1.25 * s.peak], marks = [];
+    const dashed = s.logarithmic ? 0.5 * (ends[1] / 0.5) ** 0.88 : 0.88 * ends[1];
+    const edges = [...s.bins, s.high + 1].map((dn) => [dn - 0.5, s.countAt(dn)]);
+    if (s.all) marks.push({ ...mark("steps", edges, "bars", { filled: true, label: facts.samples }), y: s.bins.map(s.countAt) });
+    marks.push(...componentMarks(s));
+    if (s.curve.length) marks.push(mark("line", s.curve, "ink", { width: 1.2, label: "fit" }));
+    marks.push(mark("sticks", s.limits.map(([, dn]) => [dn, dashed]), "blue", { dash: "--", width: 0.9 }));
+    const every = Math.max(1, Math.ceil(s.limits.length / 18));
+    s.limits.forEach(([k, dn], i) => {
+      const from = i ? s.limits[i - 1][1] : s.low - 0.5;
+      if (k % every === 0) marks.push({ kind: "words", x: (from + dn) / 2, up: 0.9, text: k === 0 ? "k = 0" : String(k), align: "center", colour: "blue" });
     });
-    return edges;
+    return { height: 3, y: { label: s.all ? `${facts.samples} per DN` : "density", ends, log: s.logarithmic }, marks };
   };
-  const drawAxes = (s) => {
-    const { width, height, left, right, top, floor, stripFloor } = s.area;
-    putLine(s, left, floor, right, floor, "axis");
-    const upward = s.logarithmic ? [1, 10, 100, 1e3, 1e4, 1e5, 1e6].filter((t) => t <= s.peak) : ticks(0, s.peak, 4);
-    for (const t of upward) {
-      putLine(s, left - 4, s.level(t), left, s.level(t), "axis");
-      if (s.all) putText(s, left - 7, s.level(t) + 4, "end", t >= 1e4 ? `${t / 1000}k` : tickText(t));
-    }
-    for (const t of ticks(s.low, s.high, Math.floor(width / 80)).filter(Number.isInteger)) {
-      putLine(s, s.x(t), stripFloor, s.x(t), stripFloor + 4, "axis");
-      putText(s, s.x(t), stripFloor + 16, "middle", minus(String(t)));
-    }
-    putText(s, (left + right) / 2, height - 6, "middle", "signal (DN)");
-    putUpright(s, (top + floor) / 2, s.all ? `${facts.samples} per DN` : "density");
+  const residualPanel = (s) => {
+    const limit = s.residuals.length ? clamp(1.15 * largestOf(s), 3.5, 12) : 3.5, far = s.residuals.filter(([, r]) => Math.abs(r) > limit);
+    const marks = [
+      { kind: "span", axis: "y", low: -2, high: 2, colour: "band" },
+      { kind: "level", axis: "y", at: 0, colour: "ink", width: 0.6 },
+      mark("sticks", s.residuals.map(([dn, r]) => [dn, clamp(r, -limit, limit)]), "blue", { label: "residual" }),
+      mark("points", far.map(([dn, r]) => [dn, 0.93 * Math.sign(r) * limit]), "vermilion", { mark: "x", size: 3 }),
+    ];
+    return { height: 1, y: { label: "residual\n(σ)", ends: [-limit, limit] }, marks, note: s.theta ? "" : "no fit, no residuals" };
   };
-  const drawResiduals = (s) => {
-    if (!s.all) return null;
-    if (!s.theta) {
-      putText(s, (s.area.left + s.area.right) / 2, (s.area.stripTop + s.area.stripFloor) / 2 + 4, "middle", "no fit, no residuals");
-      return null;
-    }
-    const expected = s.bins.map((dn) => [dn, s.expectedAt(dn)]).filter(([, e]) => e >= 1);
-    const residuals = expected.map(([dn, e]) => [dn, (s.countAt(dn) - e) / Math.sqrt(e)]);
-    if (!residuals.length) return null;
-    const { left, right, stripTop, stripFloor } = s.area;
-    const largest = Math.max(...residuals.map(([, r]) => Math.abs(r)));
-    const limit = clamp(1.15 * largest, 3.5, 12), middle = (stripTop + stripFloor) / 2;
-    const y = (r) => middle - ((clamp(r, -limit, limit) / limit) * (stripFloor - stripTop)) / 2;
-    put(s, "rect", { x: left, width: right - left, y: y(2), height: y(-2) - y(2), class: "band" });
-    putLine(s, left, middle, right, middle, "axis");
-    const strokes = residuals.map(([dn, r]) => `M${s.x(dn).toFixed(1)} ${middle}V${y(r).toFixed(1)}`);
-    put(s, "path", { d: strokes.join(""), class: "residual" });
-    for (const [dn, r] of residuals) if (Math.abs(r) > limit) putText(s, s.x(dn), y(r) + 4, "middle", "×", { class: "far" });
-    for (const r of [2, -2]) putText(s, left - 7, y(r) + 4, "end", minus(String(r)));
-    putUpright(s, middle, "residual");
-    return largest;
-  };
-  const describePlot = (s, edges, largest) => {
-    const frames = `${whole(s.all)} ${facts.samples}`, off = largest === null ? "" : short(largest, 2);
-    const first = edges.slice(0, 4).map(([, dn]) => short(dn, 4)).join(", ");
+  const describePlot = (s) => {
+    const frames = `${whole(s.all)} ${facts.samples}`, off = s.residuals.length ? short(largestOf(s), 2) : "";
+    const first = s.limits.slice(0, 4).map(([, dn]) => short(dn, 4)).join(", ");
     const parts = [s.all ? `Histogram of ${frames}` : "Fitted density without a histogram", `${s.low} to ${s.high} DN`];
     if (s.theta) parts.push("fitted density");
     if (first) parts.push(`first limits between electron numbers at ${first} DN`);
     if (off) parts.push(`largest residual ${off} sigma`);
-    s.figure.setAttribute("aria-label", `${parts.join("; ")}.`);
     const line = facts.model
       ? `probability under the model ${facts.model}`
       : "fitted density; thin: its components, one per electron number";
@@ -948,20 +915,19 @@
     if (first) words.push("Dashed: limits between the electron numbers k.");
     if (off) words.push(`${below} ${off}.`);
     byId("inspector-caption").textContent = words.filter(Boolean).join(" ");
+    return `${parts.join("; ")}.`;
   };
+  let clearPlot = () => {};
   const drawPixel = (pixel) => {
-    const figure = byId("inspector-plot"), s = sketch(pixel, figure);
-    figure.replaceChildren();
-    figure.style.display = s ? "" : "none";
+    const s = sketch(pixel);
+    clearPlot();
+    clearPlot = () => {};
     byId("inspector-caption").textContent = "";
     byId("inspector-counts").hidden = !s || !s.all;
     if (!s) return;
-    figure.setAttribute("viewBox", `0 0 ${s.area.width} ${s.area.height}`);
-    figure.setAttribute("height", s.area.height);
-    drawDensity(s);
-    const edges = drawEdges(s);
-    drawAxes(s);
-    describePlot(s, edges, drawResiduals(s));
+    const panels = [densityPanel(s), ...(s.all ? [residualPanel(s)] : [])];
+    const stack = { height: 76, x: { label: "signal (DN)", ends: [s.low - 0.5, s.high + 0.5], whole: true }, panels };
+    clearPlot = window.pchemChart(byId("inspector-plot"), { widths: [1], stacks: [stack] }, describePlot(s));
     fillCounts(s);
   };
   const fillCounts = (s) => {
@@ -1034,11 +1000,7 @@
   };
   const nearest = () => {
     const y = Math.floor(state.pixel / nx), x = state.pixel % nx;
-    let best = -1, least = Infinity;
-    for (const i of sample.slot.keys()) {
-      const away = (Math.floor(i / nx) - y) ** 2 + ((i % nx) - x) ** 2;
-      if (away < least) [best, least] = [i, away];
-    }
+    const best = closest((i) => (Math.floor(i / nx) - y) ** 2 + ((i % nx) - x) ** 2);
     if (best >= 0) choose(best);
   };
 
@@ -1241,7 +1203,7 @@
       if (asked.select) await selectAsked(asked.select, state.map.fact.path);
       if (asked.pixel >= 0 && asked.pixel !== state.pixel) choose(asked.pixel, { quiet: true });
     });
-    new ResizeObserver(() => { layout(); showHistogram(); if (current) drawPixel(current); }).observe(app);
+    new ResizeObserver(() => { layout(); showHistogram(); }).observe(app);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { paint(); redraw(); showScale(); });
   };
   const tellTrouble = ({ trouble }) => {

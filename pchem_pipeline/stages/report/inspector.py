@@ -10,7 +10,7 @@ import functools
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +23,16 @@ from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.model.maps.ordered import Ordered
-from pchem_pipeline.report.inspector.inspector_data import InspectorData, MapEntry, PixelSample
-from pchem_pipeline.report.inspector.packing import AT_ONCE, PackedMap, choose_scale, pack_map, some_of
+from pchem_pipeline.report.inspector import (
+    AT_ONCE,
+    InspectorData,
+    MapEntry,
+    PackedMap,
+    PixelSample,
+    choose_scale,
+    pack_map,
+    some_of,
+)
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
 
 if TYPE_CHECKING:
@@ -64,18 +72,11 @@ _LABELS = {
 #: The maps that are first in the file, in case that not all fit.
 _FIRST = (
     "fit/fit_status",
-    "maps/read_noise_e",
-    "maps/read_noise_e_stderr",
-    "maps/conversion_gain",
-    "maps/conversion_gain_stderr",
-    "maps/quanta_exposure",
-    "maps/quanta_exposure_stderr",
-    "maps/charge_rate",
-    "maps/charge_rate_stderr",
-    "maps/dark_current",
-    "maps/dark_current_stderr",
-    "maps/bias",
-    "maps/bias_stderr",
+    *(
+        f"maps/{name}{end}"
+        for name in ("read_noise_e", "conversion_gain", "quanta_exposure", *CHARGE_RATES, "bias")
+        for end in ("", "_stderr")
+    ),
     "fit/goodness_p",
     "maps/quality",
 )
@@ -85,16 +86,11 @@ _MANY_PIXELS = 1_000_000
 _WORDS = re.compile(r"(\d+) ([^,;:]+)")
 
 
-@dataclass(frozen=True)
-class Listed:
-    """A stored map: its variable and the attributes of its array."""
+def listed_maps(store: RunStore, shape: tuple[int, int]) -> list[MapEntry]:
+    """Return the stored arrays with the dimensions (y, x) and the shape of the sensor, in the order shown.
 
-    variable: Variable
-    attributes: Mapping[str, Any]
-
-
-def listed_maps(store: RunStore, shape: tuple[int, int]) -> list[Listed]:
-    """Return the stored arrays with the dimensions (y, x) and the shape of the sensor, in the order shown."""
+    These are their words; the maps themselves are not read.
+    """
     known = [variable for variable in VARIABLES.values() if variable.dims == ("y", "x")]
     groups = [*_GROUPS, *dict.fromkeys(v.group for v in known if v.group not in _GROUPS)]
     places = {path: i for i, path in enumerate(VARIABLES)}
@@ -103,13 +99,12 @@ def listed_maps(store: RunStore, shape: tuple[int, int]) -> list[Listed]:
     for variable in known:
         repeated = variable.group == "fit" and f"maps/{variable.name}" in VARIABLES
         if not repeated and store.has(variable.path) and store.array(variable.path).shape == shape:
-            found.append(Listed(variable, store.attributes(variable.path)))
+            found.append(_entry(variable, store.attributes(variable.path)))
     return found
 
 
-def map_entry(listed: Listed) -> MapEntry:
-    """Return the words of a stored map; the map itself is not read."""
-    variable, attributes = listed.variable, listed.attributes
+def _entry(variable: Variable, attributes: Mapping[str, Any]) -> MapEntry:
+    """Return the words of a stored map."""
     # the sentences of these groups begin with the name of the quantity, those of others explain it
     named = variable.group in ("maps", "truth")
     label = variable.long_name.split(":")[0] if named else variable.name.replace("_", " ")
@@ -135,31 +130,6 @@ def map_entry(listed: Listed) -> MapEntry:
 def _flag_texts(attributes: Mapping[str, Any], key: str) -> dict[int, str]:
     texts = str(attributes.get("flag_meanings", "")).split()
     return {int(n): text.replace("_", " ") for n, text in zip(attributes[key], texts, strict=False)}
-
-
-def read_maps(
-    store: RunStore,
-    shape: tuple[int, int],
-    index: NDArray[np.int64],
-    loaded: Mapping[str, NDArray[Any]] | None = None,
-    threads: int = 1,
-) -> tuple[list[MapEntry], dict[str, NDArray[np.float64]]]:
-    """Read every stored map: packed as far as they fit into the page, and exact for some pixels.
-
-    Args:
-        store: the run.
-        shape: of the sensor.
-        index: ``y * nx + x`` of the pixels that are held in full.
-        loaded: maps that were read already, by path; None: none.
-        threads: that pack a map each.
-
-    Returns:
-        The maps, in the order of the list, and by path of those that fit their values, shape (n,).
-
-    Raises:
-        StoreError: an array is missing or corrupt.
-    """
-    return _packed(StoredMaps(store, loaded), listed_maps(store, shape), shape, index, threads)
 
 
 class StoredMaps:
@@ -201,57 +171,71 @@ def inspector_data(
     )
 
 
-def _packed(
-    maps: StoredMaps,
-    listed: Sequence[Listed],
+def read_maps(
+    store: RunStore,
     shape: tuple[int, int],
     index: NDArray[np.int64],
-    threads: int,
+    loaded: Mapping[str, NDArray[Any]] | None = None,
+    threads: int = 1,
 ) -> tuple[list[MapEntry], dict[str, NDArray[np.float64]]]:
-    """Pack maps, the important ones first, until the budget is spent; see `read_maps`."""
-    n = shape[0] * shape[1]
+    """Read every stored map: packed, the important ones first, until the page is full; exact for some pixels.
+
+    Args:
+        store: the run.
+        shape: of the sensor.
+        index: ``y * nx + x`` of the pixels that are held in full.
+        loaded: maps that were read already, by path; None: none.
+        threads: that pack a map each.
+
+    Returns:
+        The maps, in the order of the list, and by path of those that fit their values, shape (n,).
+
+    Raises:
+        StoreError: an array is missing or corrupt.
+    """
+    maps, listed, n = StoredMaps(store, loaded), listed_maps(store, shape), shape[0] * shape[1]
     budget = min(_MAPS_BUDGET * max(1.0, n / _PAPER_PIXELS) ** _MAPS_POWER, _MOST_BYTES)
-    order = sorted(listed, key=lambda each: _importance(each.variable.path))
+    order = sorted(listed, key=lambda entry: _importance(entry.path))
     found: dict[str, MapEntry] = {}
     exact: dict[str, NDArray[np.float64]] = {}
     for start in range(0, len(order), threads):
         some = order[start : start + threads]
-        tasks = [functools.partial(_coded, maps, each.variable, index, budget > 0) for each in some]
-        for each, coded in zip(some, call_all(tasks, threads), strict=True):
-            entry, alike, packed = map_entry(each), coded.alike, coded.packed
-            if alike is not None and alike[0] in found and found[alike[0]].packed is not None:
-                entry = replace(entry, same_as=alike)
-            else:
-                if alike is not None and budget > 0:
-                    packed = packed_map(maps, each.variable)
+        tasks = [functools.partial(_coded, maps, entry, index, budget > 0) for entry in some]
+        for entry, values in call_all(tasks, threads):
+            if entry.same_as is not None and not _is_packed(found.get(entry.same_as[0])):
+                entry = replace(
+                    entry, same_as=None, packed=packed_map(maps, entry.path) if budget > 0 else None
+                )
+            if entry.same_as is None:
                 # packing many pixels takes long: there the first map that does not fit is the last tried
-                size = math.inf if packed is None else 4 * len(packed.data) / 3
+                size = math.inf if entry.packed is None else 4 * len(entry.packed.data) / 3
                 fits = size <= budget
                 budget -= size if fits else math.inf if n > _MANY_PIXELS else 0.0
-                entry = replace(entry, packed=packed if fits else None)
+                entry = replace(entry, packed=entry.packed if fits else None)
             found[entry.path] = entry
             if entry.packed is not None or entry.same_as is not None:
-                exact[entry.path] = coded.exact
-    paths = [each.variable.path for each in listed]
+                exact[entry.path] = values
+    paths = [entry.path for entry in listed]
     return [found[path] for path in paths], {path: exact[path] for path in paths if path in exact}
 
 
-@dataclass(frozen=True)
-class _Coded:
-    """A map in few bytes, or as a multiple of another, and its values at some pixels, shape (n,)."""
-
-    alike: tuple[str, float] | None
-    packed: PackedMap | None
-    exact: NDArray[np.float64]
+def _is_packed(entry: MapEntry | None) -> bool:
+    return entry is not None and entry.packed is not None
 
 
-def _coded(maps: StoredMaps, variable: Variable, index: NDArray[np.int64], pack: bool) -> _Coded:
-    """Return a map as the page can hold it; it is packed only where asked for, and no multiple."""
-    alike = _multiple_of_exposure(maps, variable)
+def _coded(
+    maps: StoredMaps, entry: MapEntry, index: NDArray[np.int64], pack: bool
+) -> tuple[MapEntry, NDArray[np.float64]]:
+    """Return a map in few bytes, or as a multiple of another, and its values at some pixels, shape (n,).
+
+    It is packed only where asked for, and no multiple.
+    """
+    alike = _multiple_of_exposure(maps, entry.path)
     if alike is None and not pack:
-        return _Coded(None, None, np.empty(0))
-    packed = packed_map(maps, variable) if alike is None else None
-    return _Coded(alike, packed, maps.read(variable.path).reshape(-1)[index].astype(np.float64))
+        return entry, np.empty(0)
+    packed = packed_map(maps, entry.path) if alike is None else None
+    values = maps.read(entry.path).reshape(-1)[index].astype(np.float64)
+    return replace(entry, packed=packed, same_as=alike), values
 
 
 def _importance(path: str) -> tuple[int, int]:
@@ -261,19 +245,19 @@ def _importance(path: str) -> tuple[int, int]:
     return 1 + (_GROUPS.index(group) if group in _GROUPS else 1), 0
 
 
-def packed_map(maps: StoredMaps, variable: Variable) -> PackedMap:
+def packed_map(maps: StoredMaps, path: str) -> PackedMap:
     """Return a stored map, quantised well below its standard error.
 
     Raises:
         StoreError: it is missing or corrupt.
     """
-    values = maps.read(variable.path)
+    values = maps.read(path)
     coarse, _ = _coarse(values.size)
     step = 0.0
-    if variable.name.endswith("_stderr"):
+    if path.endswith("_stderr"):
         step = _STEP_OF_ERRORS * _median(values)
-    elif maps.has(f"{variable.path}_stderr"):
-        step = _median(maps.read(f"{variable.path}_stderr")) / _STEPS_PER_ERROR
+    elif maps.has(f"{path}_stderr"):
+        step = _median(maps.read(f"{path}_stderr")) / _STEPS_PER_ERROR
     return pack_map(values, choose_scale(values, step=step, coarse=coarse))
 
 
@@ -287,15 +271,15 @@ def _median(values: NDArray[Any]) -> float:
     return known.median if known.size else 0.0
 
 
-def _multiple_of_exposure(maps: StoredMaps, variable: Variable) -> tuple[str, float] | None:
+def _multiple_of_exposure(maps: StoredMaps, path: str) -> tuple[str, float] | None:
     """Return the map of H, or of its error, with the factor that makes it this one; None for other maps."""
-    rate = next((name for name in CHARGE_RATES if variable.path.startswith(f"maps/{name}")), None)
+    rate = next((name for name in CHARGE_RATES if path.startswith(f"maps/{name}")), None)
     if rate is None:
         return None
-    other = variable.path.replace(rate, "quanta_exposure")
+    other = path.replace(rate, "quanta_exposure")
     if not maps.has(other):
         return None
-    current, exposure = maps.read(variable.path), maps.read(other)
+    current, exposure = maps.read(path), maps.read(other)
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = _median(some_of(current.ravel()) / some_of(exposure.ravel()))
     rows = max(1, AT_ONCE // current.shape[1])

@@ -17,7 +17,7 @@ from pchem_pipeline.model.fit.status import MEANINGS, describe
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.data import MAP_NAMES, PixelFit
-from pchem_pipeline.report.inspector.packing import some_of
+from pchem_pipeline.report.inspector import some_of
 from pchem_pipeline.report.style.wording import symbol
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
 from pchem_pipeline.stages.report.stored import PixelHistograms
@@ -213,18 +213,20 @@ def choose_inspected(
     status = np.asarray(fit["fit_status"])
     ny, nx = status.shape
     everything, most = (min(n, MAX_BINS // bins) for n in (everything, most))
-    rng = np.random.default_rng(_SEED)
+    rng, p = np.random.default_rng(_SEED), fit.get("goodness_p", np.full(status.shape, np.nan))
     reasons = [
         ("shown in the report", _places(shown, nx)),
         ("from the search for missing effects", _places(suspects, nx)),
-        *_poor(fit, status),
+        ("poorest goodness of fit", _smallest(np.asarray(p, dtype=np.float64).ravel(), _POOR)),
         *_flagged(status, rng),
         *_extreme(maps),
     ]
     kept = [(words, where) for words, where in reasons if where.size]
     first = np.concatenate([where for _, where in kept]) if kept else np.empty(0, np.int64)
     rest = np.arange(status.size) if status.size <= everything else _even(ny, nx, most, rng)
-    index = _once(np.concatenate([first, rest]))
+    index = np.concatenate([first, rest])
+    _, once = np.unique(index, return_index=True)  # each where it comes first
+    index = index[np.sort(once)]
     if status.size > everything:
         index = index[:most]
     there = set(index.tolist())
@@ -234,17 +236,6 @@ def choose_inspected(
 
 def _places(pixels: Sequence[tuple[int, int]], nx: int) -> NDArray[np.int64]:
     return np.array([y * nx + x for y, x in pixels], dtype=np.int64)
-
-
-def _once(index: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return each index once, where it comes first."""
-    _, first = np.unique(index, return_index=True)
-    return index[np.sort(first)]
-
-
-def _poor(fit: Mapping[str, NDArray[Any]], status: NDArray[Any]) -> list[tuple[str, NDArray[np.int64]]]:
-    p = np.asarray(fit.get("goodness_p", np.full(status.shape, np.nan)), dtype=np.float64).ravel()
-    return [("poorest goodness of fit", _smallest(p, _POOR))]
 
 
 def _smallest(values: NDArray[np.float64], n: int) -> NDArray[np.int64]:

@@ -13,24 +13,42 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
-from pchem_pipeline.compute.executor import Beside, beside
+from pchem_pipeline.compute.environment import available_workers
+from pchem_pipeline.compute.executor import (
+    Beside,
+    Executor,
+    PoolExecutor,
+    SerialExecutor,
+    beside,
+    can_start_processes,
+    map_all,
+)
+from pchem_pipeline.compute.memory import BASE_BYTES, SECOND_PROGRAM_BYTES
+from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
+from pchem_pipeline.model.maps.ordered import median_of
+from pchem_pipeline.planning.frames import contour_data, frames_needed, precision
+from pchem_pipeline.planning.point import Point
+from pchem_pipeline.planning.targets import Target, parse_target
 from pchem_pipeline.report.data import PixelFit, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
 from pchem_pipeline.report.figures.ensemble import case_name
+from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.stability import stability_figures
-from pchem_pipeline.report.inspector.inspector_data import InspectorData, PixelSample
+from pchem_pipeline.report.inspector import InspectorData, PixelSample
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
-from pchem_pipeline.report.pages.quick_look import check_sentence
+from pchem_pipeline.report.pages.pictures import DrawAll, Drawn, draw_figure
 from pchem_pipeline.report.pages.report import render_report
+from pchem_pipeline.report.pages.summary import check_sentence
+from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import short_name
+from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
 from pchem_pipeline.stages.discrepancy.result import verdict_data
 from pchem_pipeline.stages.maps import NO_TIME
 from pchem_pipeline.stages.quick_look import read_sums, run_quick_look
-from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_workers
 from pchem_pipeline.stages.report.inspector import deciding_parameters, inspector_data, read_maps
 from pchem_pipeline.stages.report.pixels import (
     Chosen,
@@ -41,7 +59,6 @@ from pchem_pipeline.stages.report.pixels import (
     pixel_fits,
     pixel_index,
 )
-from pchem_pipeline.stages.report.plan_section import plan_section
 from pchem_pipeline.stages.report.stored import PixelHistograms, StoredRun, read_histograms, read_run
 from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.stages.table import pipeline
@@ -192,7 +209,8 @@ def _of_pixels(store: RunStore, run: StoredRun, config: RunConfig) -> _Pixels:
     """Choose pixels, and read their histograms."""
     shown = _shown(run, config)
     places, bins = [(y, x) for _, y, x in shown], store.array("histogram/counts").shape[2]
-    full = choose_inspected(run.maps, run.fit, places, _suspects(run), bins=bins)
+    suspects = [] if run.verdict is None else [p for each in run.verdict.where for p in each.pixels]
+    full = choose_inspected(run.maps, run.fit, places, suspects, bins=bins)
     index = np.concatenate([pixel_index(shown, run.sensor.shape), full.index])
     histograms = read_histograms(store, index, run.sensor.shape)
     drawn, held, some = slice(0, len(shown)), slice(len(shown), None), slice(0, len(shown) + _SOME_MASSES)
@@ -232,11 +250,6 @@ def _shown(run: StoredRun, config: RunConfig) -> list[Chosen]:
     if not chosen:
         chosen = choose_pixels(run.maps["read_noise_e"], run.maps["quanta_exposure"], run.fit["fit_status"])
     return chosen
-
-
-def _suspects(run: StoredRun) -> list[tuple[int, int]]:
-    """Return the pixels to which the verdict points."""
-    return [] if run.verdict is None else [p for each in run.verdict.where for p in each.pixels]
 
 
 def report_data(
@@ -390,3 +403,79 @@ _PARTS = {
     "electrons": "no electron numbers",
     "components": "no component widths",
 }
+
+
+_TARGETS = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
+_DRAWN = _TARGETS[:2]
+_FINE = 14  # points along each axis of the figure
+
+
+def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict[str, Any] | None:
+    """Return the numbers of the section, or None where no pixel has a value.
+
+    Args:
+        maps: of the run.
+        n_frames: frames of the run, or None where pixels differ.
+    """
+    names = ("quanta_exposure", "read_noise_e", "conversion_gain")
+    medians = [median_of(maps[name]) for name in names if name in maps]
+    if len(medians) < len(names) or not np.isfinite(medians).all():
+        return None
+    exposure, noise, gain = medians
+    try:
+        point = Point(exposure, noise, gain)
+    except ConfigError:
+        return None
+    rows = [
+        {"target": str(target), "name": target.name, "frames": frames_needed(target, point)}
+        for target in map(parse_target, _TARGETS)
+    ]
+    reached = {} if n_frames is None else precision(point, n_frames)
+    mark = (exposure, noise)
+    return {"rows": rows, "reached": reached, "n_frames": n_frames, "mark": mark, "contours": _contours()}
+
+
+@functools.cache
+def _contours() -> dict[str, Any]:
+    """Return the frames over exposure and read noise; relative targets look alike for every sensor."""
+    targets: list[Target] = [parse_target(text) for text in _DRAWN]
+    return contour_data(targets, 0.01, fine=_FINE)
+
+
+def drawing_executor(workers: int, n_figures: int) -> Executor:
+    """Return who draws: processes, since drawing shares its settings within one; or this one alone."""
+    count = min(workers, available_workers(), n_figures)
+    several = count > 1 and can_start_processes()
+    return PoolExecutor(count, processes=True) if several else SerialExecutor()
+
+
+def drawing_workers(wanted: int | None, settings: ComputeSettings) -> int:
+    """Return how many may work on a report at a time: as asked for, else as the section ``compute`` says."""
+    if wanted is not None:
+        return wanted
+    workers = available_workers() if settings.workers == "auto" else settings.workers
+    if settings.max_memory is not None:
+        workers = min(workers, max(1, ((settings.max_memory << 20) - BASE_BYTES) // SECOND_PROGRAM_BYTES))
+    return workers
+
+
+def draw_by_workers(workers: int, reporter: Reporter, label: str) -> DrawAll:
+    """Return a function that draws figures with up to so many processes.
+
+    It raises the first error of a figure once the others are drawn.
+
+    Args:
+        workers: of the run.
+        reporter: hears of each figure.
+        label: of the bar.
+    """
+
+    def draw(figures: Sequence[Figure], settings: ReportSettings) -> Mapping[str, Drawn]:
+        drawn: dict[str, Drawn] = {}
+        task = functools.partial(draw_figure, settings=settings)
+        executor = drawing_executor(workers, len(figures))
+        with reporter.progress(label, len(figures), "figure") as advance:
+            map_all(executor, task, figures, lambda each, value: drawn.update({each.name: value}), advance)
+        return drawn
+
+    return draw

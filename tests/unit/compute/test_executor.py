@@ -16,7 +16,7 @@ from pchem_pipeline.compute.executor import SerialExecutor, Stop, beside, make_e
 from pchem_pipeline.compute.memory import BASE_BYTES, affordable, keep_to_limit, resident_bytes
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.load import make_config
-from pchem_pipeline.stages.report.drawing import drawing_executor
+from pchem_pipeline.stages.report.report import drawing_executor
 
 BACKENDS = ["serial", "threads", "processes", "distributed"]
 

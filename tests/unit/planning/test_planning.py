@@ -16,13 +16,13 @@ from pchem_pipeline.planning.split import best_samples, best_split, split_frames
 from pchem_pipeline.planning.targets import TARGET_NAMES, parse_target
 from pchem_pipeline.planning.verify import frames_simulated, verify
 from pchem_pipeline.report.charts.chart import Line
+from pchem_pipeline.report.charts.on_paper import Look
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import csv_text
 from pchem_pipeline.report.figures.plan import frames_chart, frames_table, plan_figures
 from pchem_pipeline.report.pages.tables import result_tables
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.style import Look
-from pchem_pipeline.stages.report.plan_section import plan_section
+from pchem_pipeline.stages.report.report import plan_section
 
 GAIN = 1 / 11
 ONE_PERCENT = parse_target("conversion_gain=1%")

@@ -37,15 +37,14 @@ from pchem_pipeline.report.charts.chart import (
     y_window,
 )
 from pchem_pipeline.report.charts.on_page import page_chart, rounded
-from pchem_pipeline.report.charts.on_paper import draw_chart
+from pchem_pipeline.report.charts.on_paper import Look, draw_chart
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.stability import stability_figures
-from pchem_pipeline.report.inspector.inspector import json_for_html
+from pchem_pipeline.report.inspector import json_for_html
 from pchem_pipeline.report.pages.pictures import draw_figure
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.palette import DIVERGING, LIGHT, MAP_COLOURS, shades
-from pchem_pipeline.report.style.style import Look
 from pchem_pipeline.report.style.wording import symbol, without_formulas
 
 HOSTILE = "</script><script>alert(1)</script><!-- & $\\mu$"

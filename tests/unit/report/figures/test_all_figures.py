@@ -14,7 +14,14 @@ from PIL import Image
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.model.fit.status import MEANINGS, FitStatus
 from pchem_pipeline.report.charts.chart import COLUMN_MM, PAGE_MM, Words
-from pchem_pipeline.report.charts.on_paper import draw_chart
+from pchem_pipeline.report.charts.on_paper import (
+    Drawing,
+    Look,
+    draw_chart,
+    drawing_bytes,
+    palette_of,
+    small_png,
+)
 from pchem_pipeline.report.data import PixelFit
 from pchem_pipeline.report.figures.ensemble import (
     component_table,
@@ -49,7 +56,6 @@ from pchem_pipeline.report.figures.stability import (
     stability_figures,
 )
 from pchem_pipeline.report.style.palette import DARK, LIGHT
-from pchem_pipeline.report.style.style import Drawing, Look, drawing_bytes, palette_of, small_png
 from pchem_pipeline.report.style.wording import power_of_ten
 
 LOOK = Look()

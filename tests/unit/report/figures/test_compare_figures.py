@@ -8,11 +8,14 @@ import pytest
 from pchem_pipeline.commands.compare.settings import settings_that_differ
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.checks.run_differences import MapDifference, compare_maps
-from pchem_pipeline.report.charts.on_paper import draw_chart
+from pchem_pipeline.report.charts.on_paper import Drawing, Look, draw_chart
 from pchem_pipeline.report.comparison import HistoryRow, RunFacts
-from pchem_pipeline.report.figures.compare import difference_chart, ensemble_tables, ensembles_chart
-from pchem_pipeline.report.figures.history import history_figures
-from pchem_pipeline.report.style.style import Drawing, Look
+from pchem_pipeline.report.figures.compare import (
+    difference_chart,
+    ensemble_tables,
+    ensembles_chart,
+    history_figures,
+)
 
 
 def difference(shape: tuple[int, int], size: float, *, same_data: bool = False):

@@ -19,13 +19,13 @@ from PIL import Image
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.commands.figures import millimetres
+from pchem_pipeline.report.charts.on_paper import Look
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES, run_figures
 from pchem_pipeline.report.figures.figure import DataTable, Figure, csv_text
 from pchem_pipeline.report.figures.paper import PaperFigure, draw_paper_figure, read_style_sheet
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.palette import LIGHT
-from pchem_pipeline.report.style.style import Look
 
 SETTINGS = ReportSettings()
 

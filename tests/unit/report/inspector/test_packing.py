@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.packed_maps import unpack_map
 
-from pchem_pipeline.report.inspector.packing import (
+from pchem_pipeline.report.inspector import (
     Scale,
     choose_scale,
     pack_counts,

@@ -27,19 +27,24 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.verdict import Place, Verdict
 from pchem_pipeline.effects.framework.registry import effect_class
 from pchem_pipeline.report.charts.chart import PAGE_MM
+from pchem_pipeline.report.charts.on_paper import Look
 from pchem_pipeline.report.data import DiscrepancyData, ReportData
-from pchem_pipeline.report.figures import discrepancy_gap, discrepancy_series
+from pchem_pipeline.report.figures import discrepancy_gap, discrepancy_where
 from pchem_pipeline.report.figures.catalogue import DISCREPANCY_FIGURES, discrepancy_figures
 from pchem_pipeline.report.figures.discrepancy_gap import largest_pulls
-from pchem_pipeline.report.figures.discrepancy_sensor import largest_maps, regions_of
+from pchem_pipeline.report.figures.discrepancy_where import largest_maps, regions_of
 from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.pages.discrepancy import frames_text, key_facts, remarks
-from pchem_pipeline.report.pages.discrepancy_tables import discrepancy_tables, place_text
+from pchem_pipeline.report.pages.discrepancy import (
+    discrepancy_tables,
+    frames_text,
+    key_facts,
+    place_text,
+    remarks,
+)
 from pchem_pipeline.report.pages.report import RenderedReport, render_report
 from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.palette import LIGHT
-from pchem_pipeline.report.style.style import Look
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays, path_arrays
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 
@@ -358,7 +363,7 @@ def test_noisy_frames_are_seen_where_their_noise_is_known() -> None:
     number = arrays["frame_number"]
     noisy = np.where(number == number[7], 9.0, 0.0)
     data, known = replace(data, arrays=arrays), replace(data, arrays=arrays | {"frame_noise": noisy})
-    (before,), (after,) = (discrepancy_series.frame_figures(each) for each in (data, known))
+    (before,), (after,) = (discrepancy_where.frame_figures(each) for each in (data, known))
     assert [len(each.chart.stacks[0].panels) for each in (before, after)] == [2, 3]
     assert after.tables[0]["noise"].max() == 9.0
     assert "noise: standard deviation" in after.alt
@@ -366,14 +371,14 @@ def test_noisy_frames_are_seen_where_their_noise_is_known() -> None:
 
 def test_a_comb_a_pile_up_and_an_alternation_are_in_the_numbers() -> None:
     arrays = discrepancy_data().arrays
-    table = discrepancy_series.code_table(arrays)
+    table = discrepancy_where.code_table(arrays)
     dn, residual = table["dn"], table["residual"]
     assert dn[np.argmax(residual)] == 150
     number = np.arange(400)
     noise = np.random.default_rng(1).standard_normal(400)
-    assert abs(discrepancy_series.parity_difference(number, noise, 1.0)) < 5
-    assert discrepancy_series.parity_difference(number, noise + number % 2, 1.0) < -5
-    centre, mean, n = discrepancy_series.trends(number, 0.5 * number)
+    assert abs(discrepancy_where.parity_difference(number, noise, 1.0)) < 5
+    assert discrepancy_where.parity_difference(number, noise + number % 2, 1.0) < -5
+    centre, mean, n = discrepancy_where.trends(number, 0.5 * number)
     assert n.sum() == 400
     assert mean == pytest.approx(0.5 * centre)
 

@@ -14,10 +14,16 @@ from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.data import ReportData, Sample, Samples
-from pchem_pipeline.report.pages.criteria import criteria
-from pchem_pipeline.report.pages.next_steps import next_steps
 from pchem_pipeline.report.pages.report_json import report_json, report_numbers
-from pchem_pipeline.report.pages.summary import Flag, answers, flags, key_numbers, sentence
+from pchem_pipeline.report.pages.summary import (
+    Flag,
+    answers,
+    criteria,
+    flags,
+    key_numbers,
+    next_steps,
+    sentence,
+)
 from pchem_pipeline.report.pages.tables import result_tables
 from pchem_pipeline.report.settings import Criteria
 

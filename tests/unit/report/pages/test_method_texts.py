@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from pchem_pipeline.report.charts.on_paper import Look
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import csv_text
 from pchem_pipeline.report.figures.methods import (
@@ -12,9 +13,8 @@ from pchem_pipeline.report.figures.methods import (
     measured_crossing,
     method_figures,
 )
-from pchem_pipeline.report.pages.methods import method_rows, method_tables, methods_text
+from pchem_pipeline.report.pages.tables import method_rows, method_tables, methods_text
 from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.style import Look
 
 
 def errors(rmse):

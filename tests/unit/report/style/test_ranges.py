@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.model.maps.ordered import Ordered
-from pchem_pipeline.report.style.ranges import histogram_edges, robust_range
-from pchem_pipeline.report.style.stretch import map_colours
+from pchem_pipeline.report.style.ranges import histogram_edges, map_colours, robust_range
 
 
 def test_hot_pixels_do_not_stretch_the_axis_and_are_counted() -> None:

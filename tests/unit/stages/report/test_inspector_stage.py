@@ -13,11 +13,11 @@ from pchem_pipeline.base import variables
 from pchem_pipeline.base.variables import Variable
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.inspector.inspector import map_facts
-from pchem_pipeline.report.pages import sections
-from pchem_pipeline.report.pages.sections import Section
+from pchem_pipeline.report.inspector import map_facts
+from pchem_pipeline.report.pages import report as page_report
+from pchem_pipeline.report.pages.page import Section
 from pchem_pipeline.stages.report import inspector
-from pchem_pipeline.stages.report.inspector import listed_maps, map_entry, read_maps
+from pchem_pipeline.stages.report.inspector import listed_maps, read_maps
 from pchem_pipeline.stages.report.pixels import choose_inspected
 from pchem_pipeline.store.run_store import RunStore
 
@@ -38,7 +38,7 @@ def test_the_list_is_that_of_the_store(store: RunStore) -> None:
     store.write_array("summary/lag1_covariance", np.zeros(SHAPE))
     store.write_array("discrepancy/goodness", np.zeros((4, 4), np.float32))
     store.write_array("fit/bias", np.zeros(SHAPE))
-    paths = [each.variable.path for each in listed_maps(store, SHAPE)]
+    paths = [each.path for each in listed_maps(store, SHAPE)]
     assert paths[0] == "maps/quanta_exposure"
     assert "maps/bias" in paths
     assert "fit/bias" not in paths, "a repetition of maps/bias"
@@ -64,7 +64,7 @@ def test_a_new_array_appears_by_itself(
 def test_words_and_kinds(store: RunStore) -> None:
     store.write_array("maps/quality", np.zeros(SHAPE, np.uint8))
     store.write_array("truth/defect", np.zeros(SHAPE, np.uint8))
-    entries = {each.variable.path: map_entry(each) for each in listed_maps(store, SHAPE)}
+    entries = {each.path: each for each in listed_maps(store, SHAPE)}
     assert entries["maps/bias"].label == "bias"
     assert entries["maps/bias_stderr"].kind == "stderr"
     assert entries["maps/bias_stderr"].label == "standard error of the bias"
@@ -96,7 +96,7 @@ def test_of_many_pixels_a_page_holds_few_megabytes_and_little_is_tried(
     monkeypatch.setattr(inspector, "_MANY_PIXELS", 0)
     tried = []
     pack = inspector.packed_map
-    monkeypatch.setattr(inspector, "packed_map", lambda *a: tried.append(a[1].path) or pack(*a))
+    monkeypatch.setattr(inspector, "packed_map", lambda *a: tried.append(a[1]) or pack(*a))
     shown = inspector_of(store, data.maps, data.fit)
     here = [each.path for each in shown.maps if each.packed is not None]
     assert "fit/fit_status" in here
@@ -181,10 +181,11 @@ def test_the_choice_repeats() -> None:
 
 
 def test_a_new_section_is_one_entry_in_one_list(data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:
-    def mine(material: sections.Material) -> Section:
-        return Section("mine", "My <section>", "text", {"text": f"{material.data.title} & more"})
+    def mine(material: page_report.Material) -> Section:
+        text = f"{material.data.title} & more"
+        return Section(id="mine", title="My <section>", kind="text", content=text)
 
-    monkeypatch.setattr(sections, "PAGE", (*sections.PAGE, mine, lambda _: None))
+    monkeypatch.setattr(page_report, "PAGE", (*page_report.PAGE, mine, lambda _: None))
     page = page_without_pictures(data)
     assert '<li><a href="#mine">My &lt;section&gt;</a></li>' in page
     assert '<h2 id="mine-heading">My &lt;section&gt;</h2>' in page

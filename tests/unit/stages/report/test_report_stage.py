@@ -28,9 +28,8 @@ from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.report import report
-from pchem_pipeline.stages.report.drawing import draw_by_workers, drawing_executor
 from pchem_pipeline.stages.report.pixels import choose_pixels
-from pchem_pipeline.stages.report.report import gather
+from pchem_pipeline.stages.report.report import draw_by_workers, drawing_executor, gather
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.run_store import RunStore
 
@@ -207,7 +206,7 @@ def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(
     def fail(exhibit: object, settings: object) -> None:
         raise MemoryError("no room to draw")
 
-    monkeypatch.setattr("pchem_pipeline.stages.report.drawing.draw_figure", fail)
+    monkeypatch.setattr("pchem_pipeline.stages.report.report.draw_figure", fail)
     state = execute("report", make_context(folder))
     assert state.state == "failed"
     assert state.why.startswith("1 of 1 units failed, first all: out of memory (no room to draw); use fewer")

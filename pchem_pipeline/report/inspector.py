@@ -1,0 +1,494 @@
+"""The inspector: maps and histograms in few bytes, its data as plain values, and its part of the page.
+
+A map becomes one code of 16 bits per pixel: 0 for no value, 2 to 65534 for ``low + step * (code - 2)`` (its
+power of ten where the map is logarithmic), and 1 and 65535 for the few values below and above that range,
+which follow as they are; a 1 of a logarithmic map that does not follow is 0. The order of the codes is the
+order of the values, so that ranks and percentiles can be counted on codes. Histograms are stored without
+their empty ends, small counts in one byte.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import importlib.resources
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup, escape
+from numpy.typing import NDArray
+
+from pchem_pipeline.model.maps.ordered import Ordered
+from pchem_pipeline.report.data import MAP_NAMES, ReportData
+from pchem_pipeline.report.style.palette import shades
+from pchem_pipeline.report.style.ranges import DECADES
+from pchem_pipeline.report.style.wording import symbol, unit_text
+
+FloatArray = NDArray[np.float64]
+
+#: Codes with a meaning of their own, and the last one of the regular range.
+_NONE, _BELOW, _FIRST, _LAST, _ABOVE = 0, 1, 2, 65534, 65535
+#: Quantiles between which a value is surely inside the range; the range is three times wider on each side.
+_TAIL = 1e-3
+#: Values from which quantiles are taken, at least.
+_ENOUGH = 500_009
+#: Values that are worked on at a time.
+AT_ONCE = 1 << 17
+#: Step of logarithmic maps: 2.3 %.
+_LOG_STEP = 0.01
+#: Bars of a map's histogram, at least and at most.
+_FEWEST_BARS, _MOST_BARS = 8, 96
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How codes stand for values: ``low + step * (code - 2)``, a power of ten of it where ``log``."""
+
+    low: float
+    step: float
+    log: bool = False
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Histogram of a map whose codes are too coarse to show one: bars narrower than a step.
+
+    Attributes:
+        first: code with whose values the bars begin.
+        parts: bars of a code.
+        counts: values in each bar.
+    """
+
+    first: int
+    parts: int
+    counts: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class PackedMap:
+    """A map in few bytes.
+
+    Attributes:
+        scale: meaning of the codes.
+        n_odd: values outside the range of the codes, at the end of ``data`` as indices and float32.
+        data: gzip of the low bytes, the high bytes, ``n_odd`` uint32 and ``n_odd`` float32, little-endian.
+        bars: its histogram; None where the codes are fine enough.
+    """
+
+    scale: Scale
+    n_odd: int
+    data: bytes
+    bars: Bars | None = None
+
+
+def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0) -> Scale:
+    """Choose the range and the step of a map's codes.
+
+    Args:
+        values: any shape; NaN and infinities are left out. Integers keep a step of 1.
+        step: wanted step, in the unit of the map; 0: a 64th of the robust standard deviation.
+        coarse: factor on the step, for maps that must be smaller.
+    """
+    flat = np.asarray(values).ravel()
+    if flat.dtype.kind in "iub" and flat.size:
+        low, high = float(flat.min()), float(flat.max())
+        return Scale(low, max(1.0, np.ceil((high - low) / (_LAST - _FIRST))))
+    known = Ordered.of(some_of(flat))
+    if known.size == 0:
+        return Scale(0.0, 1.0)
+    log = False
+    if known.values[0] >= 0 and known.values[-1] > 0:
+        above = Ordered(known.values[known.size - known.n_above(0.0) :])
+        bulk = above.quantiles([0.01, 0.99])
+        log = bool(bulk[1] > DECADES * bulk[0]) or bool(known.values[0] == 0 and bulk[1] > bulk[0])
+        known = Ordered(np.log10(above.values)) if log else known
+    low, q25, middle, q75, high = known.quantiles([_TAIL, 0.25, 0.5, 0.75, 1.0 - _TAIL]).tolist()
+    margin = 3.0 * (high - low)
+    first, last = max(float(known.values[0]), low - margin), min(float(known.values[-1]), high + margin)
+    fine = _LOG_STEP if log else step or float(q75 - q25) / 1.35 / 64.0
+    smallest = max((last - first) / (_LAST - _FIRST - 257), abs(float(middle)) * 1e-9, 1e-300)
+    wide = float(max(fine * coarse, smallest))
+    # the median in the middle of 256 codes: where these hold the bulk, the high bytes cost next to nothing
+    shift = (128 - _FIRST - round((float(middle) - first) / wide)) % 256
+    return Scale(float(first) - shift * wide, wide, log)
+
+
+def some_of(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the values of a flat array, of many every k-th: enough for a quantile that only sets a scale.
+
+    k is odd: no column of a sensor is left out for good.
+    """
+    return values[:: max(values.size // _ENOUGH, 1) | 1]
+
+
+def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
+    """Return a map in few bytes; values are kept to half a step, those outside the range to 1e-7.
+
+    Args:
+        values: shape (ny, nx); NaN where there is no value.
+        scale: from :func:`choose_scale`.
+    """
+    flat = np.asarray(values).ravel()
+    codes = np.empty(flat.size, "<u2")
+    bars = _empty_bars(flat, scale)
+    for start in range(0, flat.size, AT_ONCE):
+        part = slice(start, start + AT_ONCE)
+        place = _places(flat[part], scale)
+        if bars is not None:
+            _count(place, bars)
+        codes[part] = _codes(place, flat[part])
+    outside = (codes == _BELOW) | (codes == _ABOVE)
+    if scale.log:  # zeros, which may be many, need no place in the list
+        outside &= flat != 0
+    odd = np.flatnonzero(outside)
+    content = b"".join((codes >> shift).astype(np.uint8).tobytes() for shift in (0, 8))
+    content += odd.astype("<u4").tobytes() + flat[odd].astype("<f4").tobytes()
+    return PackedMap(scale, int(odd.size), gzip.compress(content, 6, mtime=0), bars)
+
+
+def _places(values: NDArray[Any], scale: Scale) -> FloatArray:
+    """Return the place of each value on the scale, in steps: 0 for the first code."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        place: FloatArray = np.log10(values, dtype=np.float64) if scale.log else values.astype(np.float64)
+        place -= scale.low
+        place /= scale.step
+    return place
+
+
+def _codes(place: FloatArray, values: NDArray[Any]) -> FloatArray:
+    """Return the code of each value from its place, which is changed."""
+    np.rint(place, out=place)
+    place += _FIRST
+    np.clip(place, _BELOW, _ABOVE, out=place)
+    place[~np.isfinite(values) | np.isnan(place)] = _NONE
+    return place
+
+
+def _empty_bars(flat: NDArray[Any], scale: Scale) -> Bars | None:
+    """Return bars over the bulk of a map, empty; None where codes are narrow enough to be bars.
+
+    The axis is that of the script: from the 1st to the 99th percentile and 0.3 of it beyond, where there are
+    values.
+    """
+    if flat.dtype.kind in "iub":
+        return None
+    place = Ordered.of(_places(some_of(flat), scale))
+    if place.size < 2:
+        return None
+    low, high = place.quantiles([0.01, 0.99])
+    margin = 0.3 * (high - low)
+    ends = max(low - margin, place.values[0], 0.0), min(high + margin, place.values[-1])
+    first, last = np.rint(ends).astype(int)
+    wanted = np.clip(2.0 * np.cbrt(flat.size), _FEWEST_BARS, _MOST_BARS)
+    parts = round(float(wanted) / max(int(last - first) + 1, 1))
+    if parts < 2 or not high > low:
+        return None
+    return Bars(int(first) + _FIRST, parts, np.zeros((int(last - first) + 1) * parts, np.int64))
+
+
+def _count(place: FloatArray, bars: Bars) -> None:
+    """Add the values at some places to their bars; those beyond the axis are in none."""
+    bar = (place - (bars.first - _FIRST - 0.5)) * bars.parts
+    inside = bar[(bar >= 0.0) & (bar < bars.counts.size)]
+    bars.counts[:] += np.bincount(inside.astype(np.int64), minlength=bars.counts.size)
+
+
+def varints(values: NDArray[Any]) -> bytes:
+    """Return whole numbers >= 0 with seven bits to a byte, the lowest first; the last byte is below 128."""
+    rest = np.asarray(values, dtype=np.uint64).reshape(-1, 1)
+    bits = max(int(rest.max(initial=0)).bit_length(), 1)
+    digits = rest >> np.arange(0, bits, 7, dtype=np.uint64)
+    used = digits > 0
+    used[:, 0] = True
+    digits &= np.uint64(127)
+    digits[:, :-1] |= used[:, 1:].astype(np.uint64) << np.uint64(7)
+    return digits[used].astype(np.uint8).tobytes()
+
+
+def pack_counts(
+    origin: NDArray[np.integer[Any]], counts: Sequence[NDArray[np.integer[Any]]]
+) -> tuple[NDArray[np.int32], NDArray[np.uint32], bytes]:
+    """Cut the empty ends off histograms and join them.
+
+    Args:
+        origin: DN of the first bin of each, shape (n,).
+        counts: n histograms, each of its own length.
+
+    Returns:
+        DN of the first occupied bin, number of bins from there to the last occupied one, and all counts one
+        after the other as variable-length numbers.
+    """
+    first = np.zeros(len(counts), dtype=np.int32)
+    size = np.zeros(len(counts), dtype=np.uint32)
+    kept = []
+    for i, each in enumerate(counts):
+        occupied = np.flatnonzero(each)
+        if occupied.size:
+            first[i], size[i] = origin[i] + occupied[0], occupied[-1] - occupied[0] + 1
+            # one by one: of all bins at once, those of wide histograms would take GiB
+            kept.append(varints(each[occupied[0] : occupied[-1] + 1]))
+    return first, size, b"".join(kept)
+
+
+@dataclass(frozen=True)
+class MapEntry:
+    """A map that the inspector can show.
+
+    Attributes:
+        path: ``group/name`` of the stored array.
+        label: words for the list of maps.
+        unit: unit as the store writes it.
+        sentence: the array's own sentence.
+        kind: ``value``, ``stderr``, ``bits`` (each bit has a word) or ``words`` (each number has one).
+        words: number or bit to words, for the last two.
+        packed: the map; None where it is not in the file or where ``same_as`` says it all.
+        same_as: path of a map that this one is a multiple of, and the factor.
+    """
+
+    path: str
+    label: str
+    unit: str
+    sentence: str
+    kind: str = "value"
+    words: Mapping[int, str] = field(default_factory=dict)
+    packed: PackedMap | None = None
+    same_as: tuple[str, float] | None = None
+
+
+@dataclass(frozen=True)
+class PixelSample:
+    """Pixels that are in the file in full.
+
+    Attributes:
+        index: ``y * nx + x`` of each, shape (n,).
+        exact: path of a map to its values at these pixels, shape (n,).
+        origin: DN of the first bin of each histogram, shape (n,).
+        counts: their histograms.
+        deciding: parameters that decide electron numbers, where these are not the fitted ones: (4, n).
+        masses: probability of each bin under a model with effects, of as many of the first pixels.
+        reasons: why pixels are here, with their indices, e.g. ``"poorest goodness of fit"``.
+    """
+
+    index: NDArray[np.int64]
+    exact: Mapping[str, NDArray[np.float64]]
+    origin: NDArray[np.int64]
+    counts: list[NDArray[np.integer[Any]]]
+    deciding: NDArray[np.float64] | None = None
+    masses: list[NDArray[np.float64]] = field(default_factory=list)
+    reasons: tuple[tuple[str, tuple[int, ...]], ...] = ()
+
+
+@dataclass(frozen=True)
+class InspectorData:
+    """All that the inspector holds.
+
+    Attributes:
+        maps: in the order of the list; those not packed are shown by ``pchem view`` only.
+        sample: the pixels in full.
+        kept_to: how true the packed maps are: a part of a standard error, in words.
+        command: what shows every pixel.
+    """
+
+    maps: tuple[MapEntry, ...]
+    sample: PixelSample
+    kept_to: str
+    command: str
+
+
+#: The part of the policy that forbids every connection, and that of a page which ``pchem view`` serves.
+_CONNECT_NOWHERE, _CONNECT_HERE = "connect-src 'none'", "connect-src 'self'"
+
+#: Values in the table of a pixel, in its order; the others follow below.
+PANEL_MAPS = (
+    "maps/quanta_exposure",
+    "maps/charge_rate",
+    "maps/dark_current",
+    "maps/conversion_gain",
+    "maps/bias",
+    "maps/read_noise_dn",
+    "maps/read_noise_e",
+    "maps/analog_read_noise_e",
+)
+
+#: Heading of each group of maps in the list; others have the name of their group.
+_GROUPS = {
+    "maps": "Parameters",
+    "stderr": "Standard errors",
+    "fit": "Fit",
+    "summary": "Time and neighbours",
+    "histogram": "Range of the data",
+    "discrepancy": "What the model is missing",
+    "truth": "Truth of the simulation",
+}
+
+
+@dataclass(frozen=True)
+class Embedded:
+    """What the page holds for the inspector, ready to stand in it: facts as JSON, data by id, the script."""
+
+    facts: Markup
+    blobs: list[tuple[str, Markup]]
+    script: Markup
+
+
+def embedded(data: ReportData) -> Embedded | None:
+    """Return the inspector's part of the page; None where the run has nothing to inspect."""
+    if data.inspector is None:
+        return None
+    shown = data.inspector()
+    parts = [(name, Markup(text)) for name, text in _blobs(shown)]
+    return Embedded(json_for_html(_facts(data, shown)), parts, Markup(script()))
+
+
+def script() -> str:
+    """Return the inspector's script."""
+    return text_of("inspector.js")
+
+
+def text_of(name: str, folder: str = "templates") -> str:
+    """Return a file of the pages' templates, or of another folder of the report."""
+    whole = importlib.resources.files("pchem_pipeline.report") / folder / name
+    return whole.read_text(encoding="utf-8")
+
+
+def content_policy(*texts: str) -> str:
+    """Return the page's content security policy: no network at all, and no script but these."""
+    digests = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii") for text in texts]
+    scripts = "script-src " + " ".join(f"'sha256-{each}'" for each in digests) + "; "
+    return (
+        f"default-src 'none'; {scripts}{_CONNECT_NOWHERE}; img-src data:; style-src 'unsafe-inline'; "
+        "base-uri 'none'; form-action 'none'"
+    )
+
+
+def served_page(page: str) -> str | None:
+    """Return a report as ``pchem view`` serves it: it may ask its own server, and knows that there is one.
+
+    Args:
+        page: a ``report.html``.
+
+    Returns:
+        The page; None where it holds no inspector of this version.
+    """
+    before, found, after = page.partition(str(escape(_CONNECT_NOWHERE)))
+    if not found or 'id="inspector-app"' not in after:
+        return None
+    mark, told = '<meta name="color-scheme"', '<meta name="pchem-view" content="yes">'
+    return f"{before}{escape(_CONNECT_HERE)}{after}".replace(mark, f"{told}\n{mark}", 1)
+
+
+def json_for_html(content: Any) -> Markup:
+    """Return JSON that may stand inside a ``script`` element: it cannot end it, nor begin a comment."""
+    text = json.dumps(content, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    for sign in "<>&\u2028\u2029":
+        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    return Markup(text)
+
+
+def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
+    """Return what the script must know beside the maps."""
+    sample = shown.sample
+    return {
+        "shape": list(data.shape),
+        "noun": data.noun,
+        "channels": list(data.channel_names),
+        "samples": "samples" if data.shape[0] == 1 else "frames",
+        "statusWords": {str(bit): text for bit, text in data.status_words.items()},
+        "failedMask": data.failed_mask,
+        "model": data.run.get("model", ""),
+        "command": shown.command,
+        "keptTo": shown.kept_to,
+        "colours": shades().tobytes().hex(),
+        "maps": [map_facts(entry) for entry in shown.maps],
+        "panel": list(PANEL_MAPS),
+        "sample": {
+            "n": int(sample.index.size),
+            "exact": list(sample.exact),
+            "deciding": sample.deciding is not None,
+            "masses": len(sample.masses),
+        },
+        "notable": [
+            {"words": words, "pixels": list(where), "path": _shown_value(words)}
+            for words, where in sample.reasons
+        ],
+    }
+
+
+def _shown_value(reason: str) -> str:
+    """Return the path of the map whose value makes a pixel notable; empty where it is no value."""
+    if reason == "poorest goodness of fit":
+        return "fit/goodness_p"
+    for name in MAP_NAMES:
+        words = symbol(name)[1]
+        if reason.endswith(f"standard error of the {words}"):
+            return f"maps/{name}_stderr"
+        if reason in (f"largest {words}", f"smallest {words}"):
+            return f"maps/{name}"
+    return ""
+
+
+def map_facts(entry: MapEntry) -> dict[str, Any]:
+    """Return what the script must know of a map."""
+    group = entry.path.split("/", 1)[0]
+    found: dict[str, Any] = {
+        "path": entry.path,
+        "group": _GROUPS["stderr"] if entry.kind == "stderr" else _GROUPS.get(group, group),
+        "label": entry.label,
+        "unit": unit_text(entry.unit),
+        "sentence": entry.sentence,
+        "kind": entry.kind,
+        "words": {str(key): text for key, text in entry.words.items()},
+        "here": entry.packed is not None or entry.same_as is not None,
+    }
+    if entry.same_as is not None:
+        found |= {"sameAs": entry.same_as[0], "factor": entry.same_as[1]}
+    if entry.packed is not None:
+        found |= packed_facts(entry.packed)
+    return found
+
+
+def packed_facts(packed: PackedMap) -> dict[str, Any]:
+    """Return what the script must know to read a packed map."""
+    scale, bars = packed.scale, packed.bars
+    found: dict[str, Any] = {"low": scale.low, "step": scale.step, "log": scale.log, "nOdd": packed.n_odd}
+    if bars is not None:
+        found["bars"] = {"first": bars.first, "parts": bars.parts, "counts": bars.counts.tolist()}
+    return found
+
+
+def _blobs(shown: InspectorData) -> list[tuple[str, str]]:
+    """Return the data of the page: element id and base64 of each."""
+    found = [
+        (f"map-{i}", _base64(entry.packed.data))
+        for i, entry in enumerate(shown.maps)
+        if entry.packed is not None
+    ]
+    return [*found, ("inspector-sample", _base64(_sample_bytes(shown.sample)))]
+
+
+def _sample_bytes(sample: PixelSample) -> bytes:
+    """Return gzip of: index, origin, bins (4 bytes each), exact maps, deciding parameters, masses, counts."""
+    origin, bins, counts = pack_counts(sample.origin, sample.counts)
+    columns = [*sample.exact.values(), *(sample.deciding if sample.deciding is not None else ())]
+    # a mass runs over the bins of the cut histogram, as the square root of its value in 16 bits
+    roots = [
+        np.rint(65535.0 * np.sqrt(np.clip(np.nan_to_num(mass), 0.0, 1.0)))[first : first + int(n)]
+        for mass, first, n in zip(sample.masses, origin - sample.origin, bins, strict=False)
+    ]
+    parts = [
+        sample.index.astype("<u4").tobytes(),
+        origin.astype("<i4").tobytes(),
+        bins.astype("<u4").tobytes(),
+        *(np.asarray(column).astype("<f4").tobytes() for column in columns),
+        *(root.astype("<u2").tobytes() for root in roots),
+        counts,
+    ]
+    return gzip.compress(b"".join(parts), 6, mtime=0)
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")

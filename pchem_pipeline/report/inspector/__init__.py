@@ -1,1 +1,0 @@
-"""The pixel inspector of the report."""
