@@ -56,7 +56,7 @@ def install(project, site):
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory, kernels):
+def done(tmp_path_factory):
     """The folder in which all commands of the page were run, in order."""
     folder = tmp_path_factory.mktemp("contributing")
     shutil.copytree(
@@ -71,7 +71,6 @@ def done(tmp_path_factory, kernels):
     pchem.chmod(0o755)
     environment = {
         **os.environ,
-        "NUMBA_CACHE_DIR": kernels,
         "PYTHONPATH": os.pathsep.join(map(str, (folder, folder / "site"))),
         "PATH": os.pathsep.join([str(folder / "bin"), str(Path(sys.executable).parent), os.environ["PATH"]]),
     }

@@ -8,7 +8,6 @@ import sys
 import tomllib
 
 import pytest
-from helpers.commands import Shell
 from helpers.places import TESTS
 
 RUN = """
@@ -65,7 +64,7 @@ def with_plugin(shell, site, stack):
     candidates = ", ".join([RIVALS, "chessboard_offset", *BROKEN])
     (shell.folder / "run.yaml").write_text(RUN.replace("CANDIDATES", candidates))
     path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
-    return Shell(shell.folder, {**shell.environment, "PYTHONPATH": path})
+    return shell.alone(PYTHONPATH=path)
 
 
 def test_a_plug_in_is_found_named_and_added_and_broken_ones_are_left_out(with_plugin, stack):
