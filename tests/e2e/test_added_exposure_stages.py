@@ -1,7 +1,5 @@
 """A sensor with pixels whose dark current blinks: after the search the fit gives their steady exposure."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Runs compared: a rerun is proven to be the same, and what changed is found and shown."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Sensors, frames, electron numbers and evidence for the tests of the effects on light and charge."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pchem_pipeline.discrepancy.observe.observe import observe

@@ -1,7 +1,5 @@
 """A small sensor for the tests of common modes, of the ADC and of the data path."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The same frames at every division into blocks of frames and bands of rows."""
 
-from __future__ import annotations
-
 import itertools
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar, Literal

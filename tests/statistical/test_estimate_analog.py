@@ -1,7 +1,5 @@
 """What the estimators of the analog effects make of simulated frames: near the truth, else silent."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What the estimators of common modes, ADC and data path make of simulated frames."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

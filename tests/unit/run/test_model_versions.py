@@ -1,7 +1,5 @@
 """The model of a run as an artefact: its versions, and the one in force."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

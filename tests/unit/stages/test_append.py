@@ -1,7 +1,5 @@
 """Frames appended to a finished run: what all frames together give, without reading the old ones."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

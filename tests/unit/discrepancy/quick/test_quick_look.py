@@ -1,7 +1,5 @@
 """The quick look: nothing on clean stacks whatever their pixels are, and each disturbance with its size."""
 
-from __future__ import annotations
-
 import re
 import zlib
 from collections.abc import Callable

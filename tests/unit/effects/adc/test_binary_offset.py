@@ -1,7 +1,5 @@
 """Binary offset: the forward model, the regression on bits, and what the estimator makes of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken

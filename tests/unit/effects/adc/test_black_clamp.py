@@ -1,7 +1,5 @@
 """Black-level clamp: the forward model, its moments, and what the estimator makes of it and of relatives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import drawn_truth, seen, taken

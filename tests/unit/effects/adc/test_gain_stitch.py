@@ -1,7 +1,5 @@
 """Stitch point of two gains: the forward model, its law, and what the estimator makes of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, seen

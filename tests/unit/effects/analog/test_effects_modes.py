@@ -1,7 +1,5 @@
 """Common modes, ADC and data path: what their forward models do to frames, and what they refuse."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

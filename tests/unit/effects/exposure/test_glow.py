@@ -1,7 +1,5 @@
 """Glow at a place: the forward model, the law of what it adds, and what the estimator makes of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken

@@ -1,7 +1,5 @@
 """Properties of every effect: described, neutral at no strength, the same frames in any division."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

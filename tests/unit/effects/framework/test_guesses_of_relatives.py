@@ -1,7 +1,5 @@
 """What estimators guess where nothing is, or a relative, and of frames without an order in time: nothing."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import replace
 

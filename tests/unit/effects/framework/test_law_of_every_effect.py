@@ -1,7 +1,5 @@
 """The law of a pixel's samples with an effect, against samples that its forward model makes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import make, taken

@@ -1,7 +1,5 @@
 """The law of the samples under effects with a place and a time, against frames made by plain numpy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import make

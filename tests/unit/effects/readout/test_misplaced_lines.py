@@ -1,7 +1,5 @@
 """Misplaced lines: the forward model, in pieces too, the likelihood ratios, and what is made of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken

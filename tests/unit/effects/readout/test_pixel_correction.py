@@ -1,7 +1,5 @@
 """Pixel correction: its forward model, what it shows, and what its estimator makes of that."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken

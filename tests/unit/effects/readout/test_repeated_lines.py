@@ -1,7 +1,5 @@
 """Repeated lines: the forward model, in pieces too, and the count of equal lines."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken

@@ -1,7 +1,5 @@
 """The loops of the fit against the paper's equations on raw samples, and compiled against plain."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The plan of a run: said before it starts, and kept."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

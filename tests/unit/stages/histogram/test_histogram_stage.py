@@ -1,7 +1,5 @@
 """The histogram stage on a store: exact arrays, whatever the tiles, the memory and the workers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

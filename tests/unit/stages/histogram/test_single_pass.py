@@ -1,7 +1,5 @@
 """The one pass over the camera files: every byte read once, and the results of the separate stages."""
 
-from __future__ import annotations
-
 import json
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Effects with a place: found where they are in frames that plain numpy made, and told on the sensor."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The empirical component: moves of the samples are measured, simulated and fitted, and never compete."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Gain, light or noise that samples share: measured by the sums of their scores, simulated as it is told."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Noise that samples share: simulated by its spectrum, measured by its covariances, never on clean data."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which samples follow which is measured in frames made by plain numpy, and simulated as it is told."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
