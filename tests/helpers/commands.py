@@ -14,6 +14,7 @@ from unittest.mock import patch
 import numpy as np
 
 from pchem_pipeline.cli.app import main
+from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.store.run_store import RunStore
 
 PCHEM = str(Path(sys.executable).with_name("pchem"))
@@ -95,6 +96,7 @@ class Shell:
                 main(arguments)
             except SystemExit as end:
                 code = end.code
+        open_store.cache_clear()  # as a process of its own forgets them
         return Result(code or 0, stdout.getvalue(), stderr.getvalue())
 
     def ok(self, *arguments) -> Result:

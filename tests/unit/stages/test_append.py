@@ -12,7 +12,6 @@ from pchem_pipeline.commands.append import append_frames
 from pchem_pipeline.compute import memory
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.runner.session import Command, run_stages, run_status
 from pchem_pipeline.stages.fit.start import kept_fit
@@ -27,12 +26,6 @@ def frames():
     stack = small_stack((70, 20), 700, 3)
     stack[650, 5, 6] = 30_000  # a glitch among the new frames
     return stack
-
-
-@pytest.fixture(autouse=True)
-def _forget_stores():
-    yield
-    open_store.cache_clear()
 
 
 def write(folder: Path, frames, cuts) -> None:
