@@ -44,6 +44,7 @@ def test_row_noise_is_found_on_a_noisy_sensor():
     found = find_discrepancies(np.maximum(frames, 0).astype(np.uint16), settings=QUICK).verdict
     assert found.verdict in ("named", "named_in_part")
     assert found.effects == ("row_noise",)
+    assert found.limit == ""
 
 
 def test_what_rests_on_the_parameters_does_not_count_where_they_are_not_identified(perfect):
