@@ -388,7 +388,7 @@ def test_a_sample_at_the_limit_less_its_offset_is_censored(striped, shell):
     electrons, night = np.load(striped / "electrons.npy"), tifffile.imread(striped / "night.tif")
     for limit in (106, 118):
         frames = np.minimum(night, limit)
-        tifffile.imwrite(f"{limit}.tif", frames)
+        tifffile.imwrite(shell.folder / f"{limit}.tif", frames)
         said = shell.ok("apply", striped / "run.zarr", f"{limit}.tif", "--output", f"{limit}.zarr").stderr
         # offsets that the limit hides stay in the frames
         assert ("row_noise not subtracted" in said) == (limit == 106)
