@@ -94,8 +94,8 @@ def test_input_that_is_refused_costs_a_finished_run_nothing(shell):
     before = {name: RunStore.open(store).read(name) for name in ("frames/dn", "fit/bias")}
     content = (night / "b.tif").read_bytes()
     (night / "a.tif").unlink()
-    # an empty file, one file twice, and no files at all: then what was copied stays valid
-    for names, other, code in (("bc", b"", 4), ("bc", content, 4), ("", b"", 0)):
+    # no files at all: what was copied stays valid; an empty file, and one file twice
+    for names, other, code in (("", b"", 0), ("bc", b"", 4), ("bc", content, 4)):
         for path in night.iterdir():
             path.unlink()
         for name in names:
@@ -105,7 +105,7 @@ def test_input_that_is_refused_costs_a_finished_run_nothing(shell):
             assert np.array_equal(RunStore.open(store).read(name), values, equal_nan=True)
         shell.ok("status", "run.yaml")
         shell.ok("export", "run.zarr", "--format", "npz", "--output", "maps")
-    (night / "b.tif").write_bytes(content)
+    (night / "c.tif").unlink()
     shell.ok("run", "run.yaml", "--until", "maps")
     assert len(RunStore.open(store).read("frames/dn")) == 200
 
