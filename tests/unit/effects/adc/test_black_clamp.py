@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import drawn_truth, seen, taken
+from helpers.small_sensors import drawn_truth, seen, taken
 from hidden.chain import hide
 
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, seen
+from helpers.small_sensors import context_of, seen
 from hidden.chain import hide
 
 from pchem_pipeline.effects.adc.gain_stitch import GainStitch

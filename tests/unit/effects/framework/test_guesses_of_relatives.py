@@ -4,7 +4,7 @@ import functools
 from dataclasses import replace
 
 import pytest
-from helpers.sensor_of_modes import drawn_truth, seen, taken
+from helpers.small_sensors import drawn_truth, seen, taken
 
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import make, taken
+from helpers.small_sensors import make, taken
 
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.mass import sample_mass

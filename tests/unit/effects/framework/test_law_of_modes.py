@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, offsets
+from helpers.small_sensors import context_of, offsets
 from scipy.special import ndtri
 
 from pchem_pipeline.effects.adc.adc_dnl import AdcDnl

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import make
+from helpers.small_sensors import make
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law

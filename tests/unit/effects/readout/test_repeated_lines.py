@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
+from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
 from pchem_pipeline.effects.readout.repeated_lines import RepeatedLines
 

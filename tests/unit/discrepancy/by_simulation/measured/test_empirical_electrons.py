@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.charge_material import a_uniform_sensor
-from helpers.charge_material import simulated as simulated_frames
+from helpers.small_sensors import a_uniform_sensor
+from helpers.small_sensors import simulated as simulated_frames
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.by_simulation.measured.electrons import electron_chances, measured_electrons
