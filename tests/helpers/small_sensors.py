@@ -47,9 +47,11 @@ def a_uniform_sensor(shape, exposure, gain, bias, noise) -> TruthMaps:
     return TruthMaps(*values, defect=np.zeros(shape, np.uint8))
 
 
-def simulated(truth, *effects, n_frames, seed=1, frames=None, rows=None, of_run=None, **more):
+def simulated(truth, *effects, n_frames, seed=1, frames=None, rows=None, of_run=None, bit_depth=14, **more):
     """Return frames (frame, y, x), DN, and electron numbers of a sensor with effects."""
-    settings = SimulateSettings(shape=truth.shape, n_frames=of_run or n_frames, seed=seed, effects=effects)
+    settings = SimulateSettings(
+        shape=truth.shape, n_frames=of_run or n_frames, seed=seed, effects=effects, bit_depth=bit_depth
+    )
     return simulate_block(truth, settings, frames or (0, n_frames), rows, **more)
 
 
