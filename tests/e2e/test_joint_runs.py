@@ -1,10 +1,8 @@
 """``pchem joint``: a run whose samples are runs of one sensor, from command line to report and verdict."""
 
-import http.client
 import json
 import re
 import shutil
-import threading
 import time
 
 import numpy as np
@@ -15,7 +13,7 @@ from helpers.places import ROOT
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.commands.joint import find_joint, run_joint
 from pchem_pipeline.commands.notebook import open_run
-from pchem_pipeline.commands.view import make_server
+from pchem_pipeline.commands.view import RunView
 from pchem_pipeline.discrepancy.verdict import read_verdict
 from pchem_pipeline.run.stage import Options
 from pchem_pipeline.run.target import find_run
@@ -205,18 +203,11 @@ def test_what_looks_at_a_run_looks_at_this_one(joint, tmp_path):
     assert "4 samples of 6,000 frames in all" in repr(run)
     assert run.pixel(2, 3).histogram.sum() == 1500
     assert "dark_current" in run.maps
-    server, _ = make_server(joint / "dark.zarr")
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
-    connection.request("GET", "/api/pixel?y=2&x=3")
-    answer = connection.getresponse()
+    answer = RunView(RunStore.open(joint / "dark.zarr")).answer(
+        "GET", "/api/pixel?y=2&x=3", {"host": "127.0.0.1:1"}, 1
+    )
     assert answer.status == 200
-    assert json.loads(answer.read())
-    connection.close()
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    assert json.loads(answer.content)
     refused = shell("electrons", "dark.zarr")
     assert refused.code == 4
     assert "was made from samples; electron numbers need" in refused.last
