@@ -38,6 +38,7 @@ def test_the_commands_in_readme_work(shell, frames):
     [notebook] = blocks("python")
     script = "\n".join(["set -e", first, QUICKER, *others, f"python - <<'END'\n{notebook}\nEND"])
     script = script.replace("pchem simulate simulated.yaml", f"{SMALLER}\npchem simulate simulated.yaml")
+    script = script.replace("pchem run simulated.yaml", "pchem run simulated.yaml --until ensemble")
     assert script.count("pchem ") >= 10
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     result = subprocess.run(

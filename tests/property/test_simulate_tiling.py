@@ -34,13 +34,14 @@ SENSORS = {
         {"tag": "row_noise", "row_noise_dn": 3.0},
         {"tag": "clipping", "low": 90, "high": 160},
     ),
+    # what the frame before and the rows beside lend is of frames and rows that have borrowed themselves
     "every kind of state": make(
-        MEMORY,
-        {"tag": "cosmic_rays", "tracks_per_frame": 1.0},  # an unknown number of draws per frame
-        LEAK,
         {"tag": "dark_current_rts", "fraction": 0.5, "step_e": 2.0, "dwell_low_frames": 3.0},  # Markov chains
-        LEAK,
+        {"tag": "cosmic_rays", "tracks_per_frame": 1.0},  # an unknown number of draws per frame
+        {"tag": "charge_lag", "fraction": 0.3},
+        {"tag": "charge_diffusion", "fraction": 0.3},
         MEMORY,
+        LEAK,
     ),
 }
 TRUTH = {name: draw_truth(sensor) for name, sensor in SENSORS.items()}
