@@ -261,7 +261,7 @@ def test_electron_stack(finished: StageContext) -> None:
     np.testing.assert_array_equal(ensemble["electron_counts"], np.bincount(use, minlength=ensemble["k"].size))
 
 
-@pytest.mark.parametrize(("tile", "backend"), [(24, "serial"), (64, "threads"), (16, "pickled")])
+@pytest.mark.parametrize(("tile", "backend"), [(8, "serial"), (64, "threads"), (16, "pickled")])
 def test_result_depends_on_neither_tile_nor_backend(
     finished: StageContext, tmp_path: Path, tile: int, backend: str
 ) -> None:
